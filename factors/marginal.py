@@ -10,7 +10,7 @@ import numpy as np
 from factors import positive
 from factors.displaced import common_error
 from factors.se2 import Array
-from factors.update import Sightings
+from factors.update import SightingFactor
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Marginalized:
     An error of a value is common to all K sightings: see :func:`~factors.displaced.common_error`.
     """
 
-    factor: Sightings
+    factor: SightingFactor
     values: tuple[Array, ...]
     spreads: tuple[Array | None, ...]
 

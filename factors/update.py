@@ -24,7 +24,7 @@ GATE = 9.21  # 99 % of chi-square with two degrees of freedom
 GATES = {1: 6.63, 2: GATE, 3: 11.34}  # by degrees of freedom
 
 
-class Sightings(Protocol):
+class SightingFactor(Protocol):
     """A factor of K sightings with g coordinates each, such as :class:`~factors.landmarks.factor.BearingRangeFactor`."""
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
@@ -57,7 +57,7 @@ class Correction:
 
 
 def robust_update(
-    factor: Sightings, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
+    factor: SightingFactor, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
 ) -> Correction:
     """Kalman update of ``pose`` (3,) and correlated states by a factor on the pose only; see :func:`update_state`.
 
@@ -77,7 +77,7 @@ def robust_update(
 
 
 def linearized_update(
-    factor: Sightings, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
+    factor: SightingFactor, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
 ) -> Correction:
     """:func:`robust_update` by a factor of any kind."""
 

@@ -24,7 +24,7 @@ SMALLEST = 1e-8  # mean squared error [m^2, rad^2]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StretchErrors:
     """Results of an estimator on S stretches.
 
     ``squared`` (S, 2, 3): mean squared position error [m^2], mean squared heading error [rad^2] and mean NEES of the causal and
@@ -36,7 +36,7 @@ class Outcome:
     dof: int
 
     @staticmethod
-    def of(scores: Sequence[Mapping[str, Any] | None], dof: int) -> Outcome:
+    def of(scores: Sequence[Mapping[str, Any] | None], dof: int) -> StretchErrors:
         """Build from scores of :func:`factorgraph_loc.evaluation.metrics.score`, None where the run failed."""
         squared, scored = np.full((len(scores), 2, 3), np.nan), np.zeros((len(scores), 2))
         for row, found in enumerate(scores):
@@ -52,7 +52,7 @@ class Outcome:
                     np.nan if heading is None else heading**2,
                     np.nan if nees is None else nees,
                 )
-        return Outcome(squared, scored, dof)
+        return StretchErrors(squared, scored, dof)
 
     @property
     def lost(self) -> NDArray[np.bool_]:
@@ -103,7 +103,7 @@ class Judgement:
         return "refused: it does not improve the estimator on held-out data"
 
 
-def judged(names: tuple[str, ...], new: Outcome, old: Outcome) -> Judgement:
+def judged(names: tuple[str, ...], new: StretchErrors, old: StretchErrors) -> Judgement:
     """Whether ``new`` is better than ``old``: the score improves significantly (jackknife over the stretches) and the error
     does not grow by more than 2 %. The one that fails on more stretches is worse.
     """

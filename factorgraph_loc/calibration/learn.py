@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from factorgraph_loc.fitting.constants import Learnt
+from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import Calibrator
@@ -23,7 +23,7 @@ class Knowledge:
     """
 
     rig: Rig
-    constants: tuple[Learnt, ...]
+    constants: tuple[FittedConstant, ...]
     notes: tuple[str, ...]
     found: Mapping[str, Any]
     details: Mapping[str, Any]
@@ -108,7 +108,7 @@ def sensing(rig: Rig, log: Log) -> Rig:
     return rig.model_copy(update={"sensors": (*kept, *added)})
 
 
-def _uncertainties(rig: Rig, learnt: Sequence[Learnt]) -> Rig:
+def _uncertainties(rig: Rig, learnt: Sequence[FittedConstant]) -> Rig:
     """``rig`` with the standard deviations of constants between logs, where there are several."""
     sections: dict[str, object] = {}
     for calibrator in calibrators().values():

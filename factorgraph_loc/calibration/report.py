@@ -7,7 +7,7 @@ from typing import Any
 from factorgraph_loc.calibration.calibrate import Calibration, Scores, estimator_for
 from factorgraph_loc.calibration.learn import calibrators
 from factorgraph_loc.drawing.markup import Rows, number, table, text
-from factorgraph_loc.fitting.constants import Learnt
+from factorgraph_loc.fitting.constants import FittedConstant
 from factors.se2 import Array
 
 KINDS = ("causal", "final")
@@ -18,7 +18,7 @@ th:first-child,td:last-child{text-align:left}tbody th{font-weight:normal}.wide{o
 .doubt{background:#fff4d6;padding:.5em 1em;margin:.4em 0}"""
 
 
-def constants_table(constants: Sequence[Learnt]) -> Rows:
+def constants_table(constants: Sequence[FittedConstant]) -> Rows:
     """The constants before and after, with standard errors."""
     header = ("constant", "input rig", "fitted", "standard error", "in the rig")
     rows: list[tuple[str, ...]] = [
@@ -193,7 +193,7 @@ def _estimator(calibration: Calibration) -> str:
     return name.upper() if name == "ekf" else name
 
 
-def _label(c: Learnt) -> str:
+def _label(c: FittedConstant) -> str:
     units = {name: unit for one in calibrators().values() for name, unit in one.units.items()}
     unit = f" [{units[c.name]}]" if c.name in units else ""
     return f"{c.sensor}.{c.name}{unit}"

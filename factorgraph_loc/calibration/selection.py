@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from factorgraph_loc.calibration.held_out import Fold
-from factorgraph_loc.calibration.judging import Judgement, Outcome, judged
+from factorgraph_loc.calibration.judging import Judgement, StretchErrors, judged
 from factorgraph_loc.calibration.learn import Knowledge, calibrators, has_heading, learn, settled
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.model.log import Log
@@ -112,14 +112,14 @@ class Bench:
         self, folds: Sequence[Fold], learners: Sequence[Learner], evaluate: Callable[[Log], Mapping[str, Any]]
     ) -> None:
         self._folds, self.learners, self._evaluate = folds, learners, evaluate
-        self._known: dict[State, Outcome] = {}
+        self._known: dict[State, StretchErrors] = {}
         self.judgements: dict[Unit, Judgement] = {}
 
     def forget(self) -> None:
         """Discard outcomes after a change of what was learnt."""
         self._known = {}
 
-    def outcome(self, state: State) -> Outcome:
+    def outcome(self, state: State) -> StretchErrors:
         """The outcome with the parameters of ``state``."""
         if state not in self._known:
             tests = [
@@ -128,7 +128,7 @@ class Bench:
                 for test in fold.tests
             ]
             dof = 3 if all(has_heading(test) for test in tests) else 2
-            self._known[state] = Outcome.of([self._scores(test) for test in tests], dof)
+            self._known[state] = StretchErrors.of([self._scores(test) for test in tests], dof)
         return self._known[state]
 
     def better(self, state: State, others: State) -> bool:

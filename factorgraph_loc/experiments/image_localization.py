@@ -40,7 +40,7 @@ HEADER = ("feature", "images", "method", "located", "position [m]", "angle [degr
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class ImageErrors:
     """Errors of a query's images ``frames`` (F,), numbered as in the log: of the camera's centre (F,) [m] and of its rotation
     (F,) [rad], infinite if not located; ``cameras``: estimated poses, NaN likewise."""
 
@@ -73,7 +73,7 @@ class Outcome:
 class ImageResults:
     """All ``outcomes``, the ``maps`` by feature, and the reference poses of the cameras of all images (N, 3)."""
 
-    outcomes: list[Outcome]
+    outcomes: list[ImageErrors]
     maps: Mapping[str, PointReport]
     reference: Array
     warnings: tuple[str, ...]
@@ -92,7 +92,7 @@ def evaluate_images(
 
     Poses of queries are used for their errors only. Raises InputError if the log has no such images or poses.
     """
-    outcomes: list[Outcome] = []
+    outcomes: list[ImageErrors] = []
     maps: dict[str, PointReport] = {}
     doubts: list[str] = []
     steps = len(features) * (1 + 2 * len(queries))
@@ -203,7 +203,7 @@ def _span(wanted: Sequence[int]) -> str:
 
 def _outcome(
     feature: str, query: str, method: str, numbers: Sequence[int], places: Sequence[Located | None], truth: Cameras
-) -> Outcome:
+) -> ImageErrors:
     position, angle = np.full(len(places), np.inf), np.full(len(places), np.inf)
     cameras = np.full((len(places), 3), np.nan)
     for i, place in enumerate(places):
@@ -212,7 +212,7 @@ def _outcome(
             position[i] = np.linalg.norm(place.position - truth.positions[i])
             cosine = (np.trace(place.rotation.T @ truth.rotations[i]) - 1.0) / 2.0
             angle[i] = np.arccos(np.clip(cosine, -1.0, 1.0))
-    return Outcome(feature, query, method, numbers, position, angle, cameras)
+    return ImageErrors(feature, query, method, numbers, position, angle, cameras)
 
 
 def _rows(results: ImageResults) -> pl.DataFrame:

@@ -11,7 +11,7 @@ from factorgraph_loc.files.models import FileModel, nearest
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.registry import channels, functions, moving
-from factorgraph_loc.sensors.usage import Prepared, Use, lacking_section
+from factorgraph_loc.sensors.usage import PreparedLog, Use, lacking_section
 from factorgraph_loc.text import listed, quoted
 
 
@@ -65,13 +65,13 @@ def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel
     return Use(log, tuple(sensors), estimator, settings, modalities, getattr(kind, "estimates_points", False))
 
 
-def prepare(use: Use, progress: Callable[[float], None] = lambda _: None) -> Prepared:
+def prepare(use: Use, progress: Callable[[float], None] = lambda _: None) -> PreparedLog:
     """The log of a run after the preparation by its sensors, and warnings."""
-    made = Prepared(use.log)
+    made = PreparedLog(use.log)
     for _, function in functions("prepare"):
-        one: Prepared = function(replace(use, log=made.log), progress)
+        one: PreparedLog = function(replace(use, log=made.log), progress)
         images, seconds = made.images + one.images, made.seconds + one.seconds
-        made = Prepared(one.log, (*made.warnings, *one.warnings), images, seconds)
+        made = PreparedLog(one.log, (*made.warnings, *one.warnings), images, seconds)
     return made
 
 

@@ -31,7 +31,7 @@ from factorgraph_loc.model.scoring import MAX_GAP, check_max_gap
 from factorgraph_loc.model.ticks import TICK_GAP, Ticks, check_tick_gap
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.registry import functions, moving
-from factorgraph_loc.sensors.usage import Prepared
+from factorgraph_loc.sensors.usage import PreparedLog
 from factorgraph_loc.text import listed
 from factorgraph_loc.version import __version__
 from factors.se2 import Array
@@ -115,7 +115,7 @@ def run(
     prepared = prepare(use, lambda share: report(0.5 * share))
     before = 0.5 if prepared.images else 0.0
     ticks = Ticks(_begin(log, sensors, prior), config.tick_gap)
-    loop = _Loop(
+    loop = _CausalRun(
         guard,
         estimator,
         prepared.log,
@@ -177,7 +177,7 @@ def run(
     )
 
 
-class _Loop:
+class _CausalRun:
     """The causal part of a run."""
 
     def __init__(
@@ -230,7 +230,7 @@ class _Loop:
         self._seconds = perf_counter() - started
         self._progress(1.0)
 
-    def timings(self, final_seconds: float, prepared: Prepared) -> Timings:
+    def timings(self, final_seconds: float, prepared: PreparedLog) -> Timings:
         """The times of the loop, of the preparation, and of the final trajectory."""
         return Timings(
             update_t=np.array(self._update_t),

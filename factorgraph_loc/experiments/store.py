@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.evaluation.warned import row_of
-from factorgraph_loc.experiments.stored_files import DamagedError, Failure, Figures, Manifest, parse_stored
+from factorgraph_loc.experiments.stored_files import DamagedError, Failure, Figures, RunManifest, parse_stored
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files.temporary import sweep
 
@@ -94,7 +94,7 @@ class Store:
         ``warnings``, one per line. Raises DamagedError as :meth:`read` does."""
         return self._row(self._manifest(key))
 
-    def _row(self, manifest: Manifest) -> dict[str, Any]:
+    def _row(self, manifest: RunManifest) -> dict[str, Any]:
         folder = self.path(manifest.key)
         state: dict[str, Any] = {"status": "ok", "kind": None, "reason": None}
         scores: dict[str, Any] = {}
@@ -108,7 +108,7 @@ class Store:
             scores |= {name: value for name, value in times.model_dump().items() if name.startswith(TIMING)}
         return row_of(state | {name: value for name, value in scores.items() if name not in state})
 
-    def _read(self, manifest: Manifest, name: str) -> bytes:
+    def _read(self, manifest: RunManifest, name: str) -> bytes:
         path = self.path(manifest.key) / name
         said = manifest.files.get(name)
         content = self._content(path)
@@ -118,9 +118,9 @@ class Store:
             raise DamagedError(f"{path}: is damaged (its sha256 differs){_AGAIN}")
         return content
 
-    def _manifest(self, key: str) -> Manifest:
+    def _manifest(self, key: str) -> RunManifest:
         path = self.path(key) / MANIFEST
-        manifest = parse_stored(Manifest, self._content(path), path)
+        manifest = parse_stored(RunManifest, self._content(path), path)
         if manifest.key != key:
             raise DamagedError(f"{path}: is that of another run{_AGAIN}")
         return manifest

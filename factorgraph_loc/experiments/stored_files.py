@@ -29,7 +29,7 @@ class FileSum(StoredFile):
     sha256: str
 
 
-class Manifest(StoredFile):
+class RunManifest(StoredFile):
     """The ``key`` of a run and its ``files`` by name."""
 
     key: str

@@ -29,7 +29,7 @@ LEAST = 1e-12  # m^2 or rad^2: least variance of an edge, for a finite informati
 
 
 @dataclass(frozen=True)
-class Sighting:
+class LandmarkEdge:
     """A landmark at ``point`` (2,) in the robot's frame, with ``covariance`` (2, 2) [m^2], sighted from the pose ``index``."""
 
     index: int
@@ -49,7 +49,7 @@ class PoseGraph:
     motions: tuple[Increment, ...]
     landmarks: Mapping[str, Array]
     known: bool
-    sightings: tuple[Sighting, ...]
+    sightings: tuple[LandmarkEdge, ...]
 
 
 def pose_graph(
@@ -74,7 +74,7 @@ def pose_graph(
     if len(t) < 2:
         raise InputError(f"{log.name}: the run has {len(t)} poses, expected two or more for a pose graph")
     index = {at: i for i, at in enumerate(t.tolist())}
-    sightings = tuple(Sighting(index[at], name, point, covariance) for at, name, point, covariance in seen)
+    sightings = tuple(LandmarkEdge(index[at], name, point, covariance) for at, name, point, covariance in seen)
     found = {s.landmark for s in seen}
     landmarks = {name: place for name, place in landmarks.items() if name in found}
     motion = whole_motion(log, moving(used, "floor", "turn"))

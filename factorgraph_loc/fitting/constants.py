@@ -10,7 +10,7 @@ from factors.se2 import Array
 
 
 @dataclass(frozen=True)
-class Learnt:
+class FittedConstant:
     """The result for one constant.
 
     ``gain``: improvement of the loss on held-out data [nats]; ``kept``: whether the rig takes the value ``fitted``, rather than
@@ -43,7 +43,7 @@ def describe(
     logs: int,
     denied: Collection[str],
     uncertain: Collection[str],
-) -> list[Learnt]:
+) -> list[FittedConstant]:
     """Return the results for the constants of one sensor. ``alone``: fits to each log, or to the halves of one log;
     ``uncertain``: names of the constants that an estimator can learn during a run.
     """
@@ -64,7 +64,7 @@ def describe(
         if c.name in uncertain and logs > 1:
             uncertainty = max(spread, error) / (abs(value) if "scale" in c.name else 1.0)
         out.append(
-            Learnt(
+            FittedConstant(
                 sensor,
                 c.name,
                 before=c.neutral,

@@ -61,7 +61,7 @@ class Backend(Protocol):
 
 
 @dataclass
-class _View:
+class _KeyframeView:
     """What sensors see of the graph: the ``guess`` of one keyframe."""
 
     graph: Graph
@@ -177,7 +177,7 @@ class Builder:
                 self._backend.attach(graph.newest, Addition(nodes), (graph.pose, graph.covariance))
             self._gatherer = sensor
         odometry = graph.motion.state(m.t)
-        view = _View(graph, graph.newest, (graph.pose, graph.covariance), offset, newest=True)
+        view = _KeyframeView(graph, graph.newest, (graph.pose, graph.covariance), offset, newest=True)
         for seen in sensor.observe(m, view):
             if isinstance(seen, NewVariable):
                 continue
@@ -226,7 +226,7 @@ class Builder:
         graph, sensor = self._graph, self._graph.sensors[m.modality]
         odometry = graph.motion.state(m.t)
         expected = self._backend.guess_of(keyframe.index) if guess is None else guess
-        view = _View(graph, keyframe, expected, offset, newest=guess is not None)
+        view = _KeyframeView(graph, keyframe, expected, offset, newest=guess is not None)
         for seen in sensor.observe(m, view):
             if isinstance(seen, NewVariable):
                 self._add_block(seen, sensor, view, addition)
@@ -263,7 +263,7 @@ class Builder:
         constants = None if key is None else graph.values[key]
         return GraphView(graph.keyframes, *estimates, between, shared, constants)
 
-    def _add_block(self, new: NewVariable, sensor: Sensor, view: _View, addition: Addition) -> None:
+    def _add_block(self, new: NewVariable, sensor: Sensor, view: _KeyframeView, addition: Addition) -> None:
         """A landmark comes into the graph, with the sightings that told it, or with its prior."""
         key = self._graph.new_block(new, view.covariance)
         addition.values[key] = new.mean

@@ -20,26 +20,26 @@ class DeadReckoningSettings(FilterSettings):
 
 
 @dataclass(frozen=True)
-class _State:
+class _PoseState:
     pose: Array
     covariance: Array  # body frame
 
 
 @dataclass(frozen=True)
-class _Record:
+class _PoseRecord:
     t: float
-    state: _State
+    state: _PoseState
 
 
 class DeadReckoning(Filter):
     """Composes the odometry, with the covariance that grows on the way; all else is counted as ignored."""
 
     modalities = frozenset[str]()
-    _state: _State
+    _state: _PoseState
 
     def trajectory(self) -> Trajectory:
         """The same as the causal estimates: there is nothing to smooth."""
-        records: list[_Record] = self._records
+        records: list[_PoseRecord] = self._records
         return at_ticks(
             self._ticks,
             np.array([r.t for r in records]),
@@ -47,12 +47,12 @@ class DeadReckoning(Filter):
             np.array([r.state.covariance for r in records]),
         )
 
-    def _start(self, prior: PosePrior) -> _State:
-        return _State(np.array(prior.pose, dtype=float), se2.world_to_body(prior.pose, prior.covariance))
+    def _start(self, prior: PosePrior) -> _PoseState:
+        return _PoseState(np.array(prior.pose, dtype=float), se2.world_to_body(prior.pose, prior.covariance))
 
     def _predict(self, increment: Increment) -> None:
         s = self._state
-        self._state = _State(se2.compose(s.pose, increment.delta), propagate(s.covariance, increment))
+        self._state = _PoseState(se2.compose(s.pose, increment.delta), propagate(s.covariance, increment))
 
     def _see(self, m: Measurement) -> None:
         raise AssertionError("dead reckoning has no sensor but odometry")
@@ -60,5 +60,5 @@ class DeadReckoning(Filter):
     def _estimate(self) -> PoseEstimate:
         return world_estimate(self._t, self._state.pose, self._state.covariance)
 
-    def _record(self) -> _Record:
-        return _Record(self._t, self._state)
+    def _record(self) -> _PoseRecord:
+        return _PoseRecord(self._t, self._state)

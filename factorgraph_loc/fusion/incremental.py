@@ -20,7 +20,7 @@ from factorgraph_loc.fusion.kept import Kept
 from factorgraph_loc.fusion.marginals import IndeterminateError, covariances
 from factorgraph_loc.fusion.solvers import MARGIN, FullHistory, Solver, Window, read_all
 from factorgraph_loc.fusion.stalled import Stalled
-from factorgraph_loc.fusion.summary import Summary, is_missing
+from factorgraph_loc.fusion.summary import MarginalSummary, is_missing
 from factorgraph_loc.fusion.variables import (
     Node,
     Values,
@@ -312,7 +312,7 @@ class Incremental:
             self._graph.diagnostics.reject("newest keyframe: the graph cannot be solved with it", count)
             newest.nodes[:] = [node for node in newest.nodes if not node.has_pose]
 
-    def _stall(self, newest: Keyframe, guess: Guess, summary: Summary | None, error: RuntimeError) -> None:
+    def _stall(self, newest: Keyframe, guess: Guess, summary: MarginalSummary | None, error: RuntimeError) -> None:
         """Go on as a filter where the graph cannot be solved."""
         self._filtered[newest.index] = self._graph.pose, self._graph.covariance = guess
         self._waiting = Addition()
@@ -330,7 +330,7 @@ class Incremental:
     def _start_again(
         self,
         newest: Keyframe,
-        summary: Summary | None,
+        summary: MarginalSummary | None,
         near: Mapping[int, Array] = NOWHERE,
         throws: bool = False,
         factorization: str | None = None,

@@ -59,22 +59,22 @@ class ParticleFilterSettings(FilterSettings):
     self_calibration: bool = True
 
 
-class _View:
+class CloudView:
     """What sensors see of the filter, at its time."""
 
     offset = None
     newest = True
 
-    def __init__(self, owner: ParticleFilter) -> None:
+    def __init__(self, owner: Filter) -> None:
         self._filter, self.t = owner, owner._t
 
     @property
     def localized(self) -> bool:
-        return self._filter._state.localized
+        return bool(self._filter._state.localized)
 
     @property
     def pose(self) -> Array:
-        return self._filter._state.moments[0]
+        return np.asarray(self._filter._state.moments[0])
 
     @property
     def covariance(self) -> Array:
@@ -239,7 +239,7 @@ class ParticleFilter(Filter):
             if self._search.look(m, self._odometry):
                 self._state = self._found(self._t)
             return
-        sensor, view = self._sensors[m.modality], _View(self)
+        sensor, view = self._sensors[m.modality], CloudView(self)
         for seen in sensor.observe(m, view):
             if isinstance(seen, NewVariable):
                 if not seen.sightings:
@@ -265,7 +265,7 @@ class ParticleFilter(Filter):
 
     def _pose_back(self, t: float, pose: Array) -> Array:
         """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""
-        return se2.compose(pose, _View(self).poses_at(np.array([t]))[0])
+        return se2.compose(pose, CloudView(self).poses_at(np.array([t]))[0])
 
     def _weigh(self, observation: Observation) -> float:
         """Weigh the particles by an observation, by a share of it at a time if it leaves too few effective ones: they are resampled

@@ -31,7 +31,7 @@ BEFORE = 2.0  # s before a suspicion in which a change may lie
 APART = 16.0  # squared Mahalanobis distance to the track, beyond which it is another place
 
 
-class Kept(NamedTuple):
+class WeighedObservation(NamedTuple):
     """An observation on the way, and the log of its probability under the track."""
 
     odometry: ChainState
@@ -55,7 +55,7 @@ class Search:
         bounds = [s.bounds for s in sensors.values() if s.bounds is not None]
         self._bounds = None if not bounds else np.array((np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]))
         self._population = self._new_population(None)
-        self._kept: deque[Kept] = deque()
+        self._kept: deque[WeighedObservation] = deque()
         self._last: dict[str, float] = {}  # when a sensor last told something new of a place
         self._newest: ChainState | None = None
         self._since = -math.inf
@@ -154,7 +154,7 @@ class Search:
         seen = observation.at_its_time() if self._bounds is not None else None
         if seen is None or not self._is_due(sensor, odometry.t):
             return
-        self._kept.append(Kept(odometry, seen, evidence()))
+        self._kept.append(WeighedObservation(odometry, seen, evidence()))
         while self._kept[0].odometry.t < odometry.t - DURATION:
             self._kept.popleft()
         if self._population is not None:

@@ -16,7 +16,7 @@ from typing import Any, Protocol, cast
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.summary import Summary, oldest_pose
+from factorgraph_loc.fusion.summary import MarginalSummary, oldest_pose
 from factorgraph_loc.fusion.variables import Node, Values, gather, gtsam_errors, is_point, is_pose, read, to_gtsam
 from factors.graph import jacobian_factor, pose_array, silenced
 from factors.se2 import Array
@@ -55,7 +55,7 @@ class Solver(Protocol):
     def oldest(self) -> int:
         """The index of the oldest pose in the graph before the last update."""
 
-    def summary(self, *, failed: bool) -> Summary | None:
+    def summary(self, *, failed: bool) -> MarginalSummary | None:
         """What is known of all that is no more in the graph, before the last update if that ``failed``; None where all is there."""
 
 
@@ -86,7 +86,7 @@ class FullHistory:
     def oldest(self) -> int:
         return 0
 
-    def summary(self, *, failed: bool) -> Summary | None:
+    def summary(self, *, failed: bool) -> MarginalSummary | None:
         return None
 
     def value(self, key: int) -> Array:
@@ -161,9 +161,9 @@ class Window:
     def oldest(self) -> int:
         return oldest_pose(self._before[0].keyVector())
 
-    def summary(self, *, failed: bool) -> Summary | None:
+    def summary(self, *, failed: bool) -> MarginalSummary | None:
         graph, at, ours = self._before if failed else self._state()
-        return Summary.of(graph, at, ours) if graph.size() else None
+        return MarginalSummary.of(graph, at, ours) if graph.size() else None
 
     def _state(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, frozenset[int]]:
         return self._smoother.getFactors(), self._smoother.getLinearizationPoint(), self._ours.slots

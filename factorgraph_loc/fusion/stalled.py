@@ -7,7 +7,7 @@ from typing import Never
 
 import gtsam
 
-from factorgraph_loc.fusion.summary import Summary
+from factorgraph_loc.fusion.summary import MarginalSummary
 from factors.se2 import Array
 
 FIRST_WAIT = 1.0  # s until the next try, twice as long each time
@@ -19,7 +19,7 @@ class Stalled:
     last time that it did."""
 
     def __init__(
-        self, t: float, known: Callable[[int], Array], left: Summary | None, before: Stalled | None = None
+        self, t: float, known: Callable[[int], Array], left: MarginalSummary | None, before: Stalled | None = None
     ) -> None:
         self.wait: float = FIRST_WAIT if before is None else 2.0 * before.wait
         self.until = t + self.wait
@@ -41,5 +41,5 @@ class Stalled:
     def oldest(self) -> int:
         return 0 if self._left is None else self._left.oldest
 
-    def summary(self, *, failed: bool) -> Summary | None:
+    def summary(self, *, failed: bool) -> MarginalSummary | None:
         return self._left

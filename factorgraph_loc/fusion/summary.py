@@ -23,7 +23,7 @@ def oldest_pose(keys: Iterable[int]) -> int:
 
 
 @dataclass(frozen=True)
-class Summary:
+class MarginalSummary:
     """``factors``: marginal ones, and priors; ``keys`` of all variables of the graph; ``at``: where the graph is linearised."""
 
     factors: tuple[gtsam.NonlinearFactor, ...]
@@ -31,7 +31,7 @@ class Summary:
     at: gtsam.Values
 
     @classmethod
-    def of(cls, graph: gtsam.NonlinearFactorGraph, at: gtsam.Values, ours: Collection[int] = ()) -> Summary:
+    def of(cls, graph: gtsam.NonlinearFactorGraph, at: gtsam.Values, ours: Collection[int] = ()) -> MarginalSummary:
         """Of a graph that is linearised ``at`` there. ``ours``: places of factors of our own, which are not marginal ones."""
         every = (graph.at(i) for i in range(graph.size()) if i not in ours)
         kept = tuple(
@@ -47,13 +47,13 @@ class Summary:
         """The index of the oldest pose."""
         return oldest_pose(self.keys)
 
-    def before(self, pose: int) -> Summary:
+    def before(self, pose: int) -> MarginalSummary:
         """What is left once the poses from the index ``pose`` on are taken back: others come under their keys."""
         kept = frozenset(key for key in self.keys if not is_pose(key) or index_of(key) < pose)
         at = gtsam.Values(self.at)
         for key in self.keys - kept:
             at.erase(key)
-        return Summary(tuple(self.on(kept)), kept, at)
+        return MarginalSummary(tuple(self.on(kept)), kept, at)
 
     def on(self, present: Collection[int]) -> list[gtsam.NonlinearFactor]:
         """The factors on variables that are ``present``, with all that those on others tell of these."""

@@ -41,7 +41,7 @@ class SwitchingSettings(FilterSettings):
 
 
 @dataclass(frozen=True)
-class _Record:
+class _PoseBelief:
     """What was believed at one time: ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
 
     odometry: ChainState
@@ -76,7 +76,7 @@ class Switching:
         self._active: Filter = self._tags if by_scans else self._vision
         self._newest_scan = -np.inf
         self._ticks: list[float] = []
-        self._records: dict[float, _Record] = {}  # by their times: the last one counts
+        self._records: dict[float, _PoseBelief] = {}  # by their times: the last one counts
 
     def initialize(self, prior: PosePrior) -> None:
         """Start from a Gaussian."""
@@ -151,10 +151,10 @@ class Switching:
         now = self._active.estimate()
         if now.status != "unlocalized":
             body = se2.world_to_body(now.pose, now.covariance)
-            self._records[now.t] = _Record(self._motion.state(now.t), now.pose, body + LEAST)
+            self._records[now.t] = _PoseBelief(self._motion.state(now.t), now.pose, body + LEAST)
 
 
-def _smoothed(record: _Record, step: Increment, after: tuple[Array, Array]) -> tuple[Array, Array]:
+def _smoothed(record: _PoseBelief, step: Increment, after: tuple[Array, Array]) -> tuple[Array, Array]:
     """A record given what came later: ``step`` led from it to where ``after`` is the smoothed pose with its covariance."""
     predicted = propagate(record.covariance, step)
     error = se2.log(se2.between(se2.compose(record.pose, step.delta), after[0]))

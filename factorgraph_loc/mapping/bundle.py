@@ -67,7 +67,7 @@ class Known:
         return Known(np.searchsorted(left, self.points[rows]), self.positions[rows], self.covariances[rows])
 
 
-class Motion(Protocol):
+class MotionPrior(Protocol):
     """A motion model between consecutive cameras."""
 
     def add_to(self, graph: gtsam.NonlinearFactorGraph) -> None:
@@ -82,7 +82,7 @@ def adjust(
     points: Array,
     *,
     known: Known | None = None,
-    motion: Motion | None = None,
+    motion: MotionPrior | None = None,
     focal: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Bundle:

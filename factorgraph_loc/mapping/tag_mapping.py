@@ -13,7 +13,7 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.mapping import mapping
 from factorgraph_loc.mapping.mapping import LandmarkMap
 from factorgraph_loc.mapping.tag_looks import TagLooks, tag_looks
-from factorgraph_loc.mapping.tag_search import Found, Mode, search, sigma
+from factorgraph_loc.mapping.tag_search import TagMode, TagPosterior, search, sigma
 from factorgraph_loc.mapping.tag_slam import tag_slam
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.learnt import LearntPoint
@@ -42,7 +42,7 @@ class MadeTags:
     made: LandmarkMap
     poses: Array
     open: Mapping[str, str]
-    modes: Mapping[str, tuple[Mode, ...]]
+    modes: Mapping[str, tuple[TagMode, ...]]
 
     @property
     def rms(self) -> float | None:
@@ -106,7 +106,7 @@ def map_tags(
     return MadeTags(world, made, se2.compose(made.frame, way), why, doubtful)
 
 
-def _along_reference(log: Log, looks: TagLooks) -> tuple[dict[int, LearntPoint], Array, list[Found], Array]:
+def _along_reference(log: Log, looks: TagLooks) -> tuple[dict[int, LearntPoint], Array, list[TagPosterior], Array]:
     """Learnt tags by index; facings (T,); the search result of each tag; and the poses (K, 3) of the antenna observations."""
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference, expected one, or that the poses come from odometry")
@@ -129,7 +129,7 @@ def _along_reference(log: Log, looks: TagLooks) -> tuple[dict[int, LearntPoint],
     return learnt, facing, found, at[which]
 
 
-def _why(one: Found, reads: int) -> str:
+def _why(one: TagPosterior, reads: int) -> str:
     """The reason why a tag is not in the map."""
     if not reads:
         return "never read"

@@ -22,15 +22,15 @@ CHUNK = 256  # candidates refined at once, to bound the memory
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class TagCandidates:
     """C candidate positions (C, 2) of the tags ``tag`` (C,), with facings (C,)."""
 
     tag: NDArray[np.int64]
     places: Array
     facing: Array
 
-    def __getitem__(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> Candidates:
-        return Candidates(self.tag[which], self.places[which], self.facing[which])
+    def __getitem__(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> TagCandidates:
+        return TagCandidates(self.tag[which], self.places[which], self.facing[which])
 
 
 def reach(model: RfidModel) -> float:
@@ -49,9 +49,9 @@ def reach(model: RfidModel) -> float:
 
 
 def refine(
-    model: RfidModel, looks: TagReadCounts, heights: Array, candidates: Candidates
-) -> tuple[Candidates, Array, Array]:
-    """Candidates at the nearest local optimum, with negative log-likelihood (C,) and covariance (C, 2, 2)."""
+    model: RfidModel, looks: TagReadCounts, heights: Array, candidates: TagCandidates
+) -> tuple[TagCandidates, Array, Array]:
+    """TagCandidates at the nearest local optimum, with negative log-likelihood (C,) and covariance (C, 2, 2)."""
     places, nll = candidates.places.copy(), np.empty(len(candidates.tag))
     covariances = np.empty((len(nll), 2, 2))
     prior = np.eye(2) / reach(model) ** 2
@@ -62,7 +62,7 @@ def refine(
         problem = _Refinement(model, mine, heights[tag], facing)
         places[part], nll[part], information = problem.solve(places[part])
         covariances[part] = np.linalg.inv(information + prior)
-    return Candidates(candidates.tag, places, candidates.facing), nll, covariances
+    return TagCandidates(candidates.tag, places, candidates.facing), nll, covariances
 
 
 @dataclass(frozen=True, eq=False)

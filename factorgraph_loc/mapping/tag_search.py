@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.mapping.tag_refinement import Candidates, reach, refine
+from factorgraph_loc.mapping.tag_refinement import TagCandidates, reach, refine
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.model import RfidModel
 from factors.se2 import Array, wrap, wrap_scalar
@@ -35,7 +35,7 @@ LOOKS = 2000  # observations evaluated on the lattice at once, to bound the memo
 
 
 @dataclass(frozen=True)
-class Mode:
+class TagMode:
     """A mode of a tag's position: ``position`` (2,) [m], ``covariance`` (2, 2), ``facing`` [rad] or NaN, and its weight."""
 
     weight: float
@@ -45,12 +45,12 @@ class Mode:
 
 
 @dataclass(frozen=True)
-class Found:
+class TagPosterior:
     """Search result of one tag: ``modes``, by descending weight (sum 1); ``reads``: rounds that read it; ``gain``: tempered
     log-likelihood at the best position, relative to a tag out of reach.
     """
 
-    modes: tuple[Mode, ...]
+    modes: tuple[TagMode, ...]
     reads: int
     gain: float
 
@@ -75,7 +75,7 @@ def sigma(covariance: Array) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
-def search(model: RfidModel, looks: TagReadCounts, heights: Array, facing: Array) -> list[Found]:
+def search(model: RfidModel, looks: TagReadCounts, heights: Array, facing: Array) -> list[TagPosterior]:
     """Search for T tags with ``heights`` (T,) and ``facing`` (T,), NaN where unknown. ``looks``: read counts from known poses,
     relative to the world's origin.
     """
@@ -92,15 +92,15 @@ def search(model: RfidModel, looks: TagReadCounts, heights: Array, facing: Array
     )
     if uses_facing and np.isnan(facing[coarse.tag]).any():
         between = np.pi / DIRECTIONS * np.where(np.isnan(facing[coarse.tag]), 1.0, 0.0)
-        sides = [Candidates(coarse.tag, coarse.places, coarse.facing + s * between) for s in (-1.0, 0.0, 1.0)]
-        coarse = Candidates(*(np.concatenate([getattr(c, n) for c in sides]) for n in ("tag", "places", "facing")))
+        sides = [TagCandidates(coarse.tag, coarse.places, coarse.facing + s * between) for s in (-1.0, 0.0, 1.0)]
+        coarse = TagCandidates(*(np.concatenate([getattr(c, n) for c in sides]) for n in ("tag", "places", "facing")))
     fine, nll, covariances = refine(model, looks, heights, coarse)
     out = []
     for t in range(len(heights)):
         mine = np.flatnonzero(fine.tag == t)
         mine = mine[np.argsort(nll[mine], kind="stable")]
         gain = float(nowhere[t] - nll[mine[0]]) if len(mine) else 0.0
-        out.append(Found(_modes(fine[mine], nll[mine], covariances[mine]), int(reads[t]), gain))
+        out.append(TagPosterior(_modes(fine[mine], nll[mine], covariances[mine]), int(reads[t]), gain))
     return out
 
 
@@ -128,7 +128,7 @@ def merged(looks: TagReadCounts, distance: float, angle: float) -> TagReadCounts
 
 def _lattice_search(
     model: RfidModel, looks: TagReadCounts, read: NDArray[np.bool_], heights: Array, facing: Array
-) -> Candidates:
+) -> TagCandidates:
     """The best candidates of each tag that is ``read`` (T,), on a lattice wherever the antennas reach."""
     cells = _cells(looks.offsets[:, :2], reach(model))
     uses_facing = any(m.uses_facing for m in model.models)
@@ -147,7 +147,7 @@ def _lattice_search(
                 tables[t].append((nll[:, column], float(direction)))
     rows = [(t, *c) for t, table in enumerate(tables) if table for c in _best(cells, table)]
     out = np.array(rows).reshape(-1, 4)
-    return Candidates(out[:, 0].astype(np.int64), out[:, 1:3], out[:, 3])
+    return TagCandidates(out[:, 0].astype(np.int64), out[:, 1:3], out[:, 3])
 
 
 def _cells(places: Array, distance: float) -> Array:
@@ -200,7 +200,7 @@ def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, f
     return out
 
 
-def _modes(found: Candidates, nll: Array, covariances: Array) -> tuple[Mode, ...]:
+def _modes(found: TagCandidates, nll: Array, covariances: Array) -> tuple[TagMode, ...]:
     """Optima of one tag, best first, as modes; neighbouring ones, which differ in facing, are merged."""
     kept: list[int] = []
     for i in range(len(nll)):
@@ -233,5 +233,7 @@ def _modes(found: Candidates, nll: Array, covariances: Array) -> tuple[Mode, ...
         mean = share @ found.places[members]
         off = found.places[members] - mean
         spread = np.einsum("k,kij->ij", share, covariances[members] + off[:, :, None] * off[:, None, :])
-        out.append(Mode(float(weights[group].sum()), mean, spread, float(found.facing[members[int(share.argmax())]])))
+        out.append(
+            TagMode(float(weights[group].sum()), mean, spread, float(found.facing[members[int(share.argmax())]]))
+        )
     return tuple(sorted(out, key=lambda mode: -mode.weight))

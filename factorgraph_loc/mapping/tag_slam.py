@@ -19,7 +19,7 @@ from factorgraph_loc.fusion.problem import Problem
 from factorgraph_loc.fusion.variables import Values, constants_key, landmark_key, pose_key
 from factorgraph_loc.mapping.tag_looks import TagLooks
 from factorgraph_loc.mapping.tag_refinement import reach
-from factorgraph_loc.mapping.tag_search import Found, search
+from factorgraph_loc.mapping.tag_search import TagPosterior, search
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.learnt import LearntPoint
 from factorgraph_loc.model.log import Log
@@ -56,7 +56,7 @@ class TagSlam:
     poses: Array
     tags: dict[int, LearntPoint]
     facing: Array
-    found: list[Found]
+    found: list[TagPosterior]
 
 
 def tag_slam(
@@ -110,13 +110,13 @@ class _Problem:
             self._values[pose_key(i)] = se2.compose(self._values[pose_key(i - 1)], step)
         self._count = max(self._count, count)
 
-    def search(self, wanted: NDArray[np.bool_], first: int) -> list[Found]:
+    def search(self, wanted: NDArray[np.bool_], first: int) -> list[TagPosterior]:
         """Search the ``wanted`` (T,) tags in observations from keyframe ``first`` on; the result of the others is empty."""
         which = self._used & (self._keyframe >= first) & (self._keyframe < self._count)
         poses = se2.compose(self._poses()[self._keyframe[which]], self._offsets[which])
         along = self._looks.along(poses, which)
         tags = np.flatnonzero(wanted)
-        out = [Found((), 0, 0.0) for _ in wanted]
+        out = [TagPosterior((), 0, 0.0) for _ in wanted]
         if len(tags) and len(poses):
             mine = TagReadCounts(along.offsets, along.antennas, along.rounds, np.ascontiguousarray(along.hits[:, tags]))
             found = search(self._looks.model, mine, self._looks.heights[tags], self._looks.facing[tags])
@@ -124,7 +124,7 @@ class _Problem:
                 out[tag] = one
         return out
 
-    def add_located(self, found: list[Found]) -> bool:
+    def add_located(self, found: list[TagPosterior]) -> bool:
         """Add located tags, and move mapped ones that were located significantly elsewhere; whether anything changed."""
         changed = False
         for tag, one in enumerate(found):
@@ -144,7 +144,7 @@ class _Problem:
     def solve(self, iterations: int) -> None:
         self._values = self._problem().solve(self._values, iterations).values
 
-    def result(self, found: list[Found]) -> TagSlam:
+    def result(self, found: list[TagPosterior]) -> TagSlam:
         tags = np.flatnonzero(self.mapped & ~self._known).tolist()
         keys = [landmark_key(i) for i in tags]
         try:

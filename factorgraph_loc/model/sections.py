@@ -45,7 +45,7 @@ class _Channel(Protocol):
     def section(self) -> str: ...
 
 
-class Sensor(Protocol):
+class HasSections(Protocol):
     """The part of a registered sensor that is used here."""
 
     @property
@@ -57,9 +57,9 @@ class Sensor(Protocol):
 
 
 @cache
-def registered() -> Mapping[str, Sensor]:
+def registered() -> Mapping[str, HasSections]:
     """The registered sensors by name, built-in ones first. InputError if one cannot be loaded or two share a name."""
-    found: dict[str, Sensor] = dict(SENSORS)
+    found: dict[str, HasSections] = dict(SENSORS)
     owners: dict[tuple[str, str], str] = {}
     for name, sensor in found.items():
         names = {"channel": [c.name for c in sensor.channels], "setting": sensor.settings, "layer": sensor.layers}

@@ -25,6 +25,7 @@ from scipy.special import logsumexp
 
 from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.cloud import Cloud, effective_size, largest_share, normalised, systematic, weighable
+from factorgraph_loc.fusion.particle_filter import CloudView
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks
 from factorgraph_loc.maps.free_space import CELL, FreeSpace
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status
@@ -56,38 +57,12 @@ class ActiveMclSettings(FilterSettings):
     particles: Annotated[int, Field(ge=100, le=100_000)] = 2000
 
 
-class _View:
-    """The view of the filter for sensors, at its time."""
-
-    offset = None
-    newest = True
-
-    def __init__(self, owner: "ActiveMcl") -> None:
-        self._filter, self.t = owner, owner._t
+class _ActiveView(CloudView):
+    """Shows sensors whether the particles agree on one place."""
 
     @property
     def localized(self) -> bool:
-        return self._filter._is_one_place(self._filter._state)
-
-    @property
-    def pose(self) -> Array:
-        return self._filter._state.moments[0]
-
-    @property
-    def covariance(self) -> Array:
-        return se2.world_to_body(*self._filter._state.moments)
-
-    def value(self, name: str) -> None:
-        return None
-
-    def spread(self, name: str) -> Array:
-        raise KeyError(name)
-
-    def joint(self) -> tuple[Array, dict[str, slice]]:
-        return self.covariance, {}
-
-    def poses_at(self, times: Array) -> Array:
-        return self._filter._motion.poses_at(self._filter._odometry, times, np.zeros(0))
+        return _is_one_place(self._filter._state)
 
 
 class ActiveMcl(Filter):
@@ -143,7 +118,7 @@ class ActiveMcl(Filter):
 
     def _see(self, m: Measurement) -> None:
         sensor = self._sensors[m.modality]
-        for seen in sensor.observe(m, _View(self)):
+        for seen in sensor.observe(m, _ActiveView(self)):
             if isinstance(seen, NewVariable) or not seen.is_judged:  # strength and phase have many optima
                 continue
             if seen.found and sensor.finder is None:
@@ -153,8 +128,8 @@ class ActiveMcl(Filter):
                 if told < else_told + LOST:
                     self._state = anywhere
                     sensor.restart(-math.inf)  # discard missed reads attributed to the old pose
-            if self._is_one_place(self._state):
-                view = _View(self)
+            if _is_one_place(self._state):
+                view = _ActiveView(self)
                 correction = seen.correct(view.pose, view.covariance, {}, {}, 1)
                 if not sensor.judge(seen, correction, view):
                     continue
@@ -181,13 +156,8 @@ class ActiveMcl(Filter):
         return cloud
 
     def _estimate(self) -> PoseEstimate:
-        status: Status = "localized" if self._is_one_place(self._state) else "ambiguous"
+        status: Status = "localized" if _is_one_place(self._state) else "ambiguous"
         return PoseEstimate(self._t, *self._state.moments, status)
-
-    @staticmethod
-    def _is_one_place(cloud: Cloud) -> bool:
-        covariance = cloud.moments[1]
-        return bool(np.linalg.eigvalsh(covariance[:2, :2])[-1] < ONE_PLACE**2 and covariance[2, 2] < ONE_HEADING**2)
 
     def _record(self) -> PoseEstimate:
         return self._estimate()
@@ -215,3 +185,8 @@ def _evidence(cloud: Cloud, log_likelihood: Array) -> float:
 
 def _cloud(poses: Array) -> Cloud:
     return Cloud(poses, np.zeros((len(poses), 0)), np.full(len(poses), -math.log(len(poses))), localized=False)
+
+
+def _is_one_place(cloud: Cloud) -> bool:
+    covariance = cloud.moments[1]
+    return bool(np.linalg.eigvalsh(covariance[:2, :2])[-1] < ONE_PLACE**2 and covariance[2, 2] < ONE_HEADING**2)

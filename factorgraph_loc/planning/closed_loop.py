@@ -75,7 +75,7 @@ def run_active(
     guard = Guard(f"{estimator} on {simulation.name}")
     with guard:
         made = _estimator(estimator, setup, settings)
-    loop = _Loop(robot, guard, made, chooser, setup, space, simulation, settings, of_policy)
+    loop = _ClosedLoop(robot, guard, made, chooser, setup, space, simulation, settings, of_policy)
     localized = loop.run()
     position, heading = loop.errors()
     return ActiveRun(
@@ -95,7 +95,7 @@ def run_active(
     )
 
 
-class _Loop:
+class _ClosedLoop:
     """One run: propose, predict, choose, move, and update by the actual reads."""
 
     def __init__(

@@ -25,7 +25,7 @@ from factors.graph import Factor
 from factors.marginal import Marginalized
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
-from factors.update import CONVERGED, Correction, Sightings, update_state
+from factors.update import CONVERGED, Correction, SightingFactor, update_state
 
 
 @dataclass(frozen=True)
@@ -279,7 +279,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class ResidualObservation:
-    """An observation made of residual factors (:class:`~factors.update.Sightings`) of one sensor.
+    """An observation made of residual factors (:class:`~factors.update.SightingFactor`) of one sensor.
 
     Its log-likelihood is evaluated pose by pose; sensors that need speed with particles override it.
     """
@@ -306,9 +306,9 @@ class ResidualObservation:
         return tuple(dict.fromkeys(name for term in self.terms for name in term.blocks))
 
     @property
-    def factors(self) -> list[Sightings]:
+    def factors(self) -> list[SightingFactor]:
         """The factors of the terms."""
-        return [cast(Sightings, term.factor) for term in self.terms]
+        return [cast(SightingFactor, term.factor) for term in self.terms]
 
     @property
     def dof(self) -> int:
@@ -353,5 +353,5 @@ class ResidualObservation:
         terms = []
         for term in self.terms:
             held = tuple(values[name] for name in term.blocks), tuple(spreads.get(name) for name in term.blocks)
-            terms.append(Term(Marginalized(cast(Sightings, term.factor), *held), (), term.rows))
+            terms.append(Term(Marginalized(cast(SightingFactor, term.factor), *held), (), term.rows))
         return ResidualObservation(self.t, tuple(terms))

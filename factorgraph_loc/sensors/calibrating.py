@@ -9,7 +9,7 @@ import numpy as np
 
 from factorgraph_loc.drawing.markup import Rows
 from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.fitting.constants import Learnt, describe
+from factorgraph_loc.fitting.constants import FittedConstant, describe
 from factorgraph_loc.fitting.robust import Constant, Fit, blocks, fit, folds, gains, is_worth
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -40,7 +40,7 @@ class Settled:
     each) on what could not be learnt, and ``details`` for its report."""
 
     sections: Mapping[str, Any] = field(default_factory=dict)
-    constants: Sequence[Learnt] = ()
+    constants: Sequence[FittedConstant] = ()
     notes: Sequence[str] = ()
     details: Any = None
 
@@ -106,9 +106,11 @@ class Calibrator:
         ones. Without ``by_log``, individual logs are not examined."""
         raise NotImplementedError
 
-    def constant_units(self, _found: Any, kept: Sequence[Learnt], _learnt: Rig, _start: Rig) -> dict[Unit, float]:
+    def constant_units(
+        self, _found: Any, kept: Sequence[FittedConstant], _learnt: Rig, _start: Rig
+    ) -> dict[Unit, float]:
         """The units of the constants that were ``kept``, with the gain of the fits by each."""
-        groups: dict[str, list[Learnt]] = {}
+        groups: dict[str, list[FittedConstant]] = {}
         for c in kept:
             groups.setdefault(next((names[0] for names in self.together if c.name in names), c.name), []).append(c)
         return {Unit(self.section, tuple(c.name for c in some)): sum(c.gain for c in some) for some in groups.values()}
@@ -240,7 +242,7 @@ class ConstantsCalibrator(Calibrator):
         return fit(constants, np.array([start[n] for n in names]), whitened, blocks([one.t for one in parts], BLOCK))
 
     def finished(
-        self, _found: Any, _logs: Sequence[Log], _rig: Rig, base: Any, learnt: Sequence[Learnt], *, by_log: bool
+        self, _found: Any, _logs: Sequence[Log], _rig: Rig, base: Any, learnt: Sequence[FittedConstant], *, by_log: bool
     ) -> Settled:
         """Complete the result with what depends on the constants; without ``by_log``, omit the results of individual logs."""
         del by_log

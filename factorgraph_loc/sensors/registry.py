@@ -61,11 +61,10 @@ class SensorType:
     For estimators: ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor`, or None if a run does not use it;
     ``predict``: ``(rig, sensors, diagnostics, self_calibration) ->`` :class:`~factorgraph_loc.model.motion.Motion`.
 
-    Of a run (:class:`~factorgraph_loc.sensors.usage.Use`): ``check``: ``(use)``, InputError where log and settings do not go
-    together; ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.usage.Prepared`; ``doubts``: ``(use,
-    diagnostics, learnt)``, the warnings at its end; ``findable``: ``(log, sensors)``, a plural for what these channels can find in
-    the map and the words for that nothing of it was found, or None; ``mappable``: ``(log)``, the layer of a world that
-    ``fgloc map`` can make of what it measured, or None.
+    For runs (:class:`~factorgraph_loc.sensors.usage.Use`): ``check``: ``(use)``, raises InputError if log and settings do not fit;
+    ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.usage.PreparedLog`; ``doubts``: ``(use, diagnostics,
+    learnt)``, warnings at the end; ``findable``: ``(log, sensors)``, a plural for the map elements that the channels can detect and
+    a message that none was detected, or None; ``mappable``: ``(log)``, the world layer that ``fgloc map`` can make, or None.
 
     For simulated logs, whose settings have the sections ``simulation``: ``simulate``: ``(ride) ->``
     :class:`~factorgraph_loc.sensors.simulated.Simulated`, from a :class:`~factorgraph_loc.sensors.simulated.Ride`; ``looks``:

@@ -23,7 +23,7 @@ class Use:
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedLog:
     """A ``log`` that can be run, with images replaced by features. ``images``: number of images whose features were computed or
     loaded from the cache, in ``seconds``."""
 

@@ -9,7 +9,7 @@ from scipy.special import ndtri
 
 from factorgraph_loc.simulation import raycasting
 from factorgraph_loc.simulation.raycasting import Surroundings
-from factorgraph_loc.simulation.scene import LEVELS, Scene
+from factorgraph_loc.simulation.scene import LEVELS, TexturedScene
 from factorgraph_loc.simulation.settings import ImageSettings
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
@@ -30,7 +30,7 @@ class Renderer:
     from :func:`factors.camera.model.camera_pose` for a robot on the floor.
     """
 
-    def __init__(self, scene: Scene, model: CameraModel, settings: ImageSettings | None = None) -> None:
+    def __init__(self, scene: TexturedScene, model: CameraModel, settings: ImageSettings | None = None) -> None:
         self.scene, self.model, self.settings = scene, model, settings or ImageSettings()
         v, u = np.mgrid[: model.height, : model.width]
         pixels = np.column_stack((u.ravel(), v.ravel()))

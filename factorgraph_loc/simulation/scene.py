@@ -27,7 +27,7 @@ LEVELS = 7  # mip levels of a texture, including the first
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class TexturedScene:
     """``faces`` (F, 4) [m]: segments visible from the left; ``bottoms`` and ``tops`` (F,) [m] of them. ``lids`` (B, 6): top
     sides of boxes: x1, y1, x2, y2, height [m], and the index of the face whose texture they share.
 
@@ -48,7 +48,7 @@ class Scene:
     texel: float
 
 
-def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Scene:
+def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> TexturedScene:
     """The building of a plan, with random textures and heights of furniture; tags with a facing appear as small labels."""
     walls, boxes = plan.faces()
     doors = np.array([side for door in plan.doors for side in both_sides(door)]).reshape(-1, 4)
@@ -82,7 +82,7 @@ def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Sce
     texels, layout = _stored([*sizes, across, across], drawn())
     sides = w + 4 * np.arange(len(plan.boxes))
     lids = np.column_stack((np.array(plan.boxes).reshape(-1, 4), tops[sides], sides))
-    return Scene(faces, bottoms, tops, lids, plan.width, plan.depth, ROOM_HEIGHT, texels, layout, texel)
+    return TexturedScene(faces, bottoms, tops, lids, plan.width, plan.depth, ROOM_HEIGHT, texels, layout, texel)
 
 
 def _outer(plan: Plan, face: Array) -> bool:

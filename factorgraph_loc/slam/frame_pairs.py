@@ -25,7 +25,7 @@ MAX_TIME = 2.0
 
 
 @dataclass(frozen=True)
-class _Image:
+class _Frame:
     keyframe: Keyframe
     pixels: dict[Hashable, Array]
 
@@ -35,7 +35,7 @@ class FramePairs:
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
-        self._last: _Image | None = None
+        self._last: _Frame | None = None
 
     def previous(self, keyframe: Keyframe, keyframes: Sequence[Keyframe]) -> Keyframe | None:
         """The keyframe of the last image, if it is still one of ``keyframes`` and not much older than ``keyframe``."""
@@ -55,7 +55,7 @@ class FramePairs:
         ``predicted``: the motion from that image's keyframe. None if there is no previous image, or the tracks do not determine
         the motion.
         """
-        last, here = self._last, _Image(keyframe, dict(zip(names, pixels, strict=True)))
+        last, here = self._last, _Frame(keyframe, dict(zip(names, pixels, strict=True)))
         if last is None or predicted is None:
             self._last = here
             return None

@@ -14,7 +14,7 @@ import numpy as np
 from factorgraph_loc.fusion.graph_parts import Keyframe
 from factorgraph_loc.fusion.problem import Problem
 from factorgraph_loc.fusion.variables import Values, point_key
-from factorgraph_loc.slam.new_points import FEWEST, Place, Sighting, agreed, apart
+from factorgraph_loc.slam.new_points import FEWEST, KeyframeCamera, PointSighting, agreed, apart
 from factors.camera.factor import ReprojectionFactor
 from factors.camera.model import CameraModel
 from factors.camera.native import PointSightings
@@ -33,13 +33,13 @@ def bundled(
     keyframes: Sequence[Keyframe],
     poses: Sequence[Array],
     slacks: Sequence[float],
-    waiting: Mapping[Hashable, Sequence[Sighting]],
+    waiting: Mapping[Hashable, Sequence[PointSighting]],
 ) -> list[Array] | None:
     """Adjusted poses (3,) of consecutive ``keyframes``, the first one held, from the initial ``poses``, which displace points by
     ``slacks`` [px]; None with fewer than :data:`ENOUGH` points.
     """
     first = keyframes[0].index
-    places = [Place.of(model, pose, slack) for pose, slack in zip(poses, slacks, strict=True)]
+    places = [KeyframeCamera.of(model, pose, slack) for pose, slack in zip(poses, slacks, strict=True)]
     values: Values = {k.key: pose for k, pose in zip(keyframes, poses, strict=True)}
     make = PointSightings(model)
     natives = []

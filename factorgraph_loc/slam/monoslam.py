@@ -85,7 +85,7 @@ class MonoslamSettings(FilterSettings):
 
 
 @dataclass(frozen=True)
-class _Record:
+class _UpdateRecord:
     """``step``: from the previous record; ``predicted``, ``covariance`` (12, 12): before and after the update. ``anew``: the pose
     was found by relocalization, independent of the past.
     """
@@ -162,7 +162,7 @@ class Monoslam(Filter):
 
     def _past(self) -> list[tuple[float, RobotState, Array]]:
         """Time, robot state and covariance (12, 12) of each record."""
-        records: list[_Record] = self._records
+        records: list[_UpdateRecord] = self._records
         smooth = self._smooth and self._settings.landmarks == "known"
         size = ROBOT if self._by_velocity else POSE
         if not records:
@@ -331,14 +331,14 @@ class Monoslam(Filter):
         own = covariance[:6, :6]
         return own if self._origin is None else own + self._origin.of_pose(robot)
 
-    def _record(self) -> _Record:
+    def _record(self) -> _UpdateRecord:
         s = self._state
         step, predicted = self._step or standstill(s.robot), self._predicted
         if self._step is None:  # a second measurement at the same time
             predicted = self._records[-1].covariance if self._records else s.covariance[:ROBOT, :ROBOT]
             step = standstill(self._records[-1].robot if self._records else s.robot)
         self._step, anew, self._anew = None, self._anew, False
-        return _Record(self._t, step, predicted.copy(), s.robot, s.covariance[:ROBOT, :ROBOT].copy(), anew)
+        return _UpdateRecord(self._t, step, predicted.copy(), s.robot, s.covariance[:ROBOT, :ROBOT].copy(), anew)
 
 
 def _starting() -> Array:
@@ -347,7 +347,7 @@ def _starting() -> Array:
 
 
 def _smoothed(
-    here: _Record, after: _Record, robot: RobotState, covariance: Array, size: int
+    here: _UpdateRecord, after: _UpdateRecord, robot: RobotState, covariance: Array, size: int
 ) -> tuple[RobotState, Array]:
     """The smoothed robot state of a record, given the smoothed ``robot`` and ``covariance`` (12, 12) of ``after``. Only the first
     ``size`` values of the error are smoothed; the others have no influence later.

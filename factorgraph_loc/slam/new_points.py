@@ -28,7 +28,7 @@ ORIGIN, UNTURNED = np.zeros(3), np.eye(3)
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class PointSighting:
     """A point seen from keyframe ``keyframe`` at ``pixel`` (2,), in the direction ``ray`` (3,) of the camera frame."""
 
     keyframe: int
@@ -36,15 +36,15 @@ class Sighting:
     ray: Array
 
 
-def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[Sighting]:
+def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[PointSighting]:
     """The sightings at ``pixels`` (K, 2) from a keyframe."""
     rays = reprojection.rays(model, pixels)
     rays /= np.linalg.norm(rays, axis=1)[:, None]
-    return [Sighting(keyframe, pixel, ray) for pixel, ray in zip(pixels, rays, strict=True)]
+    return [PointSighting(keyframe, pixel, ray) for pixel, ray in zip(pixels, rays, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class KeyframeCamera:
     """Camera pose of a keyframe: ``centre`` (3,) and ``rotation`` (3, 3) in the world, and the pixel error ``slack`` [px] that
     its uncertainty causes.
     """
@@ -54,13 +54,13 @@ class Place:
     slack: float
 
     @classmethod
-    def of(cls, model: CameraModel, pose: Array, slack: float) -> Place:
+    def of(cls, model: CameraModel, pose: Array, slack: float) -> KeyframeCamera:
         """The camera of a robot at ``pose`` (3,)."""
         return cls(*reprojection.camera_pose(model, pose), slack)
 
 
 @dataclass(frozen=True, slots=True)
-class Triangulated:
+class TriangulatedPoint:
     """A point's ``position`` (3,), its ``covariance`` (3, 3) for exact poses, and squared whitened residuals (M,) of its
     sightings.
     """
@@ -75,7 +75,7 @@ class NewPoints:
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
-        self._waiting: dict[Hashable, list[Sighting]] = {}
+        self._waiting: dict[Hashable, list[PointSighting]] = {}
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -84,11 +84,11 @@ class NewPoints:
         """The number of collected sightings of a point."""
         return len(self._waiting.get(name, ()))
 
-    def waiting(self) -> Mapping[Hashable, Sequence[Sighting]]:
+    def waiting(self) -> Mapping[Hashable, Sequence[PointSighting]]:
         """All collected sightings."""
         return self._waiting
 
-    def add(self, name: Hashable, sighting: Sighting) -> None:
+    def add(self, name: Hashable, sighting: PointSighting) -> None:
         """Add a sighting; the oldest ones are dropped."""
         waiting = self._waiting.setdefault(name, [])
         waiting.append(sighting)
@@ -99,14 +99,14 @@ class NewPoints:
         self._waiting = {k: v for k, v in self._waiting.items() if v[-1].keyframe >= keyframe - PATIENCE}
 
     def ready(
-        self, names: Iterable[Hashable], places: Callable[[int], Place | None], most: int = 1000
-    ) -> list[tuple[Hashable, Triangulated, list[Sighting]]]:
+        self, names: Iterable[Hashable], places: Callable[[int], KeyframeCamera | None], most: int = 1000
+    ) -> list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]]:
         """Remove and return at ``most`` this many of the points ``names`` that are determined now, with the sightings used.
 
         ``places``: camera poses of keyframes, None for a keyframe that nothing can be added to.
         """
-        found: list[tuple[Hashable, Triangulated, list[Sighting]]] = []
-        known: dict[int, Place | None] = {}
+        found: list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]] = []
+        known: dict[int, KeyframeCamera | None] = {}
         for name in names:
             waiting = self._waiting.get(name, [])
             if len(waiting) < FEWEST or len(found) >= most:
@@ -125,7 +125,12 @@ class NewPoints:
 
 
 def apart(
-    model: CameraModel, first: Sighting, here: Place, last: Sighting, there: Place, spread: float = MAX_SPREAD
+    model: CameraModel,
+    first: PointSighting,
+    here: KeyframeCamera,
+    last: PointSighting,
+    there: KeyframeCamera,
+    spread: float = MAX_SPREAD,
 ) -> bool:
     """Cheap test whether two rays alone nearly determine the point to ``spread`` times its depth."""
     sigma = math.hypot(model.sigma, max(here.slack, there.slack)) / model.fx
@@ -134,8 +139,8 @@ def apart(
 
 
 def agreed(
-    model: CameraModel, seen: Sequence[Sighting], places: Sequence[Place], spread: float
-) -> tuple[Triangulated, list[Sighting]] | None:
+    model: CameraModel, seen: Sequence[PointSighting], places: Sequence[KeyframeCamera], spread: float
+) -> tuple[TriangulatedPoint, list[PointSighting]] | None:
     """The point ``seen`` from ``places``, and its consistent sightings; None if they do not determine it to ``spread`` times its
     depth. Of contradicting sightings the one without which the others agree best is removed.
     """
@@ -144,7 +149,7 @@ def agreed(
     while found is not None and not found.squared.sum() < chi2.ppf(GATE, 2 * len(seen) - 3):
         if len(seen) <= FEWEST:
             return None
-        best: tuple[float, int, Triangulated] | None = None
+        best: tuple[float, int, TriangulatedPoint] | None = None
         for i in range(len(seen)):
             others = _triangulate(model, seen[:i] + seen[i + 1 :], places[:i] + places[i + 1 :], spread)
             if others is not None and (best is None or others.squared.sum() < best[0]):
@@ -157,8 +162,8 @@ def agreed(
 
 
 def triangulate(
-    model: CameraModel, seen: Sequence[Sighting], places: Sequence[Place], spread: float = MAX_SPREAD
-) -> Triangulated | None:
+    model: CameraModel, seen: Sequence[PointSighting], places: Sequence[KeyframeCamera], spread: float = MAX_SPREAD
+) -> TriangulatedPoint | None:
     """Triangulate a point ``seen`` M times from ``places``, minimising the squared residuals in the images, from the point
     nearest to the rays.
 
@@ -170,8 +175,8 @@ def triangulate(
 
 
 def _triangulate(
-    model: CameraModel, seen: Sequence[Sighting], places: Sequence[Place], spread: float
-) -> Triangulated | None:
+    model: CameraModel, seen: Sequence[PointSighting], places: Sequence[KeyframeCamera], spread: float
+) -> TriangulatedPoint | None:
     """As :func:`triangulate`, with infinite residuals where the rays do not intersect in front of the camera."""
     centres, turns = np.array([p.centre for p in places]), np.array([p.rotation for p in places])
     rays = (turns @ np.array([s.ray for s in seen])[:, :, None])[:, :, 0]
@@ -183,7 +188,7 @@ def _triangulate(
     for i in range(ITERATIONS + 1):
         local = ((point - centres)[:, None, :] @ turns)[:, 0]
         if not local[:, 2].min() > NEAREST:
-            return Triangulated(point, UNTURNED, np.full(len(seen), np.inf))
+            return TriangulatedPoint(point, UNTURNED, np.full(len(seen), np.inf))
         # a point in the camera frame is like a world point seen by a camera at the origin
         at, _, by_local = reprojection.linearize_in_space(model, ORIGIN, UNTURNED, local)
         residual = (at - pixels) / sigmas[:, None]
@@ -197,4 +202,4 @@ def _triangulate(
             point = point - step
             if np.abs(step).max() < SETTLED:
                 break
-    return Triangulated(point, covariance, np.asarray(np.einsum("mi,mi->m", residual, residual)))
+    return TriangulatedPoint(point, covariance, np.asarray(np.einsum("mi,mi->m", residual, residual)))

@@ -42,7 +42,7 @@ class SpaceBatchSettings(MonoslamSettings):
 
 
 @dataclass(frozen=True)
-class _Image:
+class _SeenPoints:
     """The image of a camera at ``t``: ``pixels`` (K, 2) of ``points`` (K, 3) with covariances ``spreads`` (K, 3, 3);
     ``tempering``: exponent of the likelihood.
     """
@@ -86,7 +86,7 @@ class SpaceBatch(Monoslam):
         super().__init__(setup, settings.model_copy(update={"planar": False}))
         twist = twist_settings(setup)
         self._chain = TwistChain(twist or TwistSettings(shift=RANDOM_WALK, turn=RANDOM_WALK))
-        self._images: dict[tuple[float, bool], _Image] = {}
+        self._images: dict[tuple[float, bool], _SeenPoints] = {}
         self._prior: PosePrior | None = None
         self._conclusion: tuple[Trajectory3, Diagnostics] | None = None  # the result, until the next measurement
 
@@ -149,7 +149,7 @@ class SpaceBatch(Monoslam):
     def _matched(self, m: Pixels, match: Match, eye: Eye) -> None:
         if len(match.pixels):
             key = (m.t, m.right)
-            self._images[key] = _Image(m.t, eye, match.pixels, match.points, match.spreads, match.tempering)
+            self._images[key] = _SeenPoints(m.t, eye, match.pixels, match.points, match.spreads, match.tempering)
 
     def _motion_graph(self, t: Array) -> gtsam.NonlinearFactorGraph:
         assert self._prior is not None
@@ -187,7 +187,7 @@ def _covariances(
 
 
 def _solved(
-    motion: gtsam.NonlinearFactorGraph, images: list[tuple[int, _Image]], values: gtsam.Values
+    motion: gtsam.NonlinearFactorGraph, images: list[tuple[int, _SeenPoints]], values: gtsam.Values
 ) -> tuple[gtsam.Values, gtsam.GaussianFactorGraph]:
     """The optimum, and the problem linearised there."""
     units = {2 * len(image.pixels): gtsam.noiseModel.Unit.Create(2 * len(image.pixels)) for _, image in images}

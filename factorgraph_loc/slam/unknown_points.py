@@ -22,7 +22,7 @@ from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, Pixels, l
 from factorgraph_loc.slam.local_bundle import bundled
 from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints
 from factorgraph_loc.slam.new_points import FEWEST as FEWEST_SIGHTINGS
-from factorgraph_loc.slam.new_points import NewPoints, Place, sightings_of
+from factorgraph_loc.slam.new_points import KeyframeCamera, NewPoints, sightings_of
 from factorgraph_loc.slam.point_looks import PointLooks
 from factorgraph_loc.slam.refound_points import refound
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths, agreeing
@@ -329,7 +329,7 @@ class UnknownPoints:
 
     def _places(
         self, newest: Keyframe, pose: Array, names: Sequence[Hashable], graph: GraphView
-    ) -> tuple[dict[int, Place], Array]:
+    ) -> tuple[dict[int, KeyframeCamera], Array]:
         """The camera poses of the keyframes that see waiting points, by number, with the pixel errors they cause in the newest
         one; and the pose (3,) of the newest keyframe.
 
@@ -343,11 +343,11 @@ class UnknownPoints:
             some = [slacks[i] for i in last]
             found = bundled(self.model, [graph.keyframes[i] for i in last], poses, some, self._new.waiting())
             if found is not None:
-                return {i: Place.of(self.model, p, SLACK) for i, p in zip(last, found, strict=True)}, found[-1]
-        places = {newest.index: Place.of(self.model, pose, slacks[newest.index])}
+                return {i: KeyframeCamera.of(self.model, p, SLACK) for i, p in zip(last, found, strict=True)}, found[-1]
+        places = {newest.index: KeyframeCamera.of(self.model, pose, slacks[newest.index])}
         for i in {s.keyframe for name in names for s in self._new.waiting()[name]}:
             if i not in places and i in slacks and graph.is_open(i):
-                places[i] = Place.of(self.model, graph.current(graph.keyframes[i].key), slacks[i])
+                places[i] = KeyframeCamera.of(self.model, graph.current(graph.keyframes[i].key), slacks[i])
         return places, pose
 
     def _slacks(self, newest: Keyframe, graph: GraphView) -> dict[int, float]:

@@ -16,7 +16,7 @@ _HEAD = struct.Struct(
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class ImageFeatures:
     """``pixels`` (K, 2) and ``sizes`` (K,) [px], ``descriptors`` (K, D)."""
 
     pixels: Array
@@ -34,7 +34,7 @@ def encode(keypoints: Keypoints, descriptors: Descriptors) -> bytes:
     return _HEAD.pack(*descriptors.shape, binary, fits) + points.tobytes() + kept.tobytes()
 
 
-def decode(content: bytes) -> Found:
+def decode(content: bytes) -> ImageFeatures:
     """Decode the result of :func:`encode`; ValueError for other bytes."""
     if len(content) < _HEAD.size:
         raise ValueError("these bytes are no features")
@@ -45,4 +45,4 @@ def decode(content: bytes) -> Found:
     points = np.frombuffer(content[_HEAD.size : split], dtype="<f4").reshape(count, 3).astype(float)
     stored = np.frombuffer(content[split:], dtype=np.uint8 if fits else "<f4").reshape(count, columns)
     descriptors = stored.astype(np.uint8 if binary else np.float32)
-    return Found(np.ascontiguousarray(points[:, :2]), np.ascontiguousarray(points[:, 2]), descriptors)
+    return ImageFeatures(np.ascontiguousarray(points[:, :2]), np.ascontiguousarray(points[:, 2]), descriptors)

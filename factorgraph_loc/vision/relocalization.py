@@ -29,7 +29,7 @@ DETERMINED = 0.5  # m, rad: standard deviations beyond which a pose is not deter
 
 
 @dataclass(frozen=True)
-class Found:
+class Resection:
     """A camera pose and its inliers (K,)."""
 
     camera: CameraPose
@@ -45,7 +45,7 @@ class FoundOnFloor:
     inliers: Truths
 
 
-def located(model: CameraModel, points: Array, pixels: Array, spreads: Array | None = None) -> Found | None:
+def located(model: CameraModel, points: Array, pixels: Array, spreads: Array | None = None) -> Resection | None:
     """The pose with most inliers among ``points`` (K, 3), seen at ``pixels`` (K, 2); None if there is none.
 
     ``spreads`` (K, 3, 3) [m^2]: covariances of the points.
@@ -100,7 +100,7 @@ def on_floor(
 
 def _refined(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, spreads: Array | None
-) -> Found | None:
+) -> Resection | None:
     information = np.zeros((6, 6))
     for i in range(REFINEMENTS):
         predicted, by_camera, by_point = reprojection.linearize_in_space(model, position, rotation, points)
@@ -126,7 +126,7 @@ def _refined(
     if np.count_nonzero(inliers) < FEWEST:
         return None
     covariance = np.asarray(np.linalg.inv(information), dtype=float)
-    return Found(CameraPose(position, rotation, covariance), np.asarray(inliers))
+    return Resection(CameraPose(position, rotation, covariance), np.asarray(inliers))
 
 
 def found_on_floor(

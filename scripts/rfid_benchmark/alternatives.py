@@ -18,7 +18,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.odometry.motion import OdometryMotion
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.simulation import simulate
@@ -152,7 +152,7 @@ def problem_of(log: Log, causal: Trajectory, tags: KnownTags, make: Maker) -> tu
     prior, _ = resolve_prior(log, "log")
     assert prior is not None
     assert tags.likelihood is not None
-    motion = Motion(log.rig, SENSORS, Diagnostics(), self_calibration=True)
+    motion = OdometryMotion(log.rig, SENSORS, Diagnostics(), self_calibration=True)
     constants = log.rig.estimated("odometry")
     factors: list[tuple[Factor, tuple[int, ...]]] = [
         (PriorFactor(prior.pose, se2.world_to_body(prior.pose, prior.covariance)), (pose_key(0),)),

@@ -13,7 +13,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.odometry.motion import OdometryMotion
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factorgraph_loc.sensors.odometry.simulation import ALONG, HEADING, LATERAL, RATE
 from factorgraph_loc.sensors.odometry.stream import IncrementStream
@@ -65,7 +65,7 @@ def optimal_filter(log: Log) -> Trajectory:
     assert prior is not None
     diagnostics = Diagnostics()
     tags = KnownTags(Setup(log.rig, log.world, SENSORS, np.random.default_rng(0)), diagnostics)
-    motion = Motion(log.rig, SENSORS, diagnostics, self_calibration=True)
+    motion = OdometryMotion(log.rig, SENSORS, diagnostics, self_calibration=True)
     likelihood = tags.likelihood
     if likelihood is None:
         raise InputError(f"{log.name}: its rig has no RFID antennas")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.calibration.judging import Outcome, judged
+from factorgraph_loc.calibration.judging import StretchErrors, judged
 
 NAMES = ("bearing_range.range_scale",)
 
@@ -20,7 +20,7 @@ def outcome(positions, headings=0.05, nees=3.0):
         | {"causal.scored": 1000, "final.scored": 1000}
         for row in zip(*(column.tolist() for column in table), strict=True)
     ]
-    return Outcome.of([None if np.isnan(row["causal.position_rmse"]) else row for row in rows], 3)
+    return StretchErrors.of([None if np.isnan(row["causal.position_rmse"]) else row for row in rows], 3)
 
 
 OLD = np.array((0.10, 0.12, 0.08, 0.11))
@@ -70,6 +70,6 @@ def test_an_estimator_that_fails_on_a_stretch_is_worse():
 def test_without_headings_and_covariances_the_position_is_judged():
     rows = [{"causal.position_rmse": p, "final.position_rmse": p, "causal.scored": 9, "final.scored": 9} for p in OLD]
     new = [row | {"causal.position_rmse": 0.9 * row["causal.position_rmse"]} for row in rows]
-    found = judged(NAMES, Outcome.of(new, 2), Outcome.of(rows, 2))
+    found = judged(NAMES, StretchErrors.of(new, 2), StretchErrors.of(rows, 2))
     assert found.accepted
     assert found.gain == pytest.approx(-np.log(0.9))

@@ -6,13 +6,15 @@ import numpy as np
 import polars as pl
 import pytest
 
-from factorgraph_loc.experiments.image_localization import Outcome, evaluate_images, table, write_results
+from factorgraph_loc.experiments.image_localization import ImageErrors, evaluate_images, table, write_results
 from factorgraph_loc.io.readers import load
 
 
 def outcome(position, degrees):
     count = len(position)
-    return Outcome("sift", "A", "graph", range(count), np.array(position), np.radians(degrees), np.zeros((count, 3)))
+    return ImageErrors(
+        "sift", "A", "graph", range(count), np.array(position), np.radians(degrees), np.zeros((count, 3))
+    )
 
 
 def test_an_image_is_located_if_both_errors_are_small():

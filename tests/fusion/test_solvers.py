@@ -10,7 +10,7 @@ from landmark_world import simulate
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.solvers import FullHistory, Window, read_all
-from factorgraph_loc.fusion.summary import Summary
+from factorgraph_loc.fusion.summary import MarginalSummary
 from factorgraph_loc.fusion.variables import pose_key
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factors import se2
@@ -81,7 +81,7 @@ def test_what_is_absent_is_marginalised_out_of_a_summary():
     step = gtsam.BetweenFactorPose2(pose_key(0), pose_key(1), gtsam.Pose2(1.0, 0.0, 0.0), noise)
     graph.add(gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(0.0, 0.0, 0.0), noise))
     graph.add(gtsam.LinearContainerFactor(step.linearize(at), at))
-    (left,) = Summary.of(graph, at).on({pose_key(1)})
+    (left,) = MarginalSummary.of(graph, at).on({pose_key(1)})
     marginal = gtsam.Marginals(graph, at).marginalCovariance(pose_key(1))
     assert list(left.keys()) == [pose_key(1)]
     assert np.allclose(np.linalg.inv(left.linearize(at).information()), marginal, rtol=1e-6)

@@ -203,14 +203,14 @@ def test_sensors_faster_than_the_robot_are_refused(changes: dict) -> None:
 def test_the_belief_is_of_where_the_robot_is_now(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports of odometry come five times as often as scans: what is known by them is in the belief that the policy sees."""
     seen = []
-    choose = closed_loop._Loop._choose
+    choose = closed_loop._ClosedLoop._choose
 
     def watched(loop):
         out = choose(loop)
         seen.append((loop._estimator.estimate().t, loop._robot.t))
         return out
 
-    monkeypatch.setattr(closed_loop._Loop, "_choose", watched)
+    monkeypatch.setattr(closed_loop._ClosedLoop, "_choose", watched)
     run_active(preset("symmetric"), "information", "active_mcl", 3, ActiveSettings(max_metres=5.0, particles=200))
     assert len(seen) > 3
     assert all(known == now for known, now in seen)

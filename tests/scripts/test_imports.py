@@ -4,6 +4,7 @@ and none what is inside another: what that does not list as ``__all__``, or what
 ``EXCEPTIONS`` are imports that still do: whoever removes one takes it off the list, and nothing is put onto it.
 """
 
+import ast
 import importlib
 import re
 import tomllib
@@ -93,6 +94,16 @@ def test_what_is_public_is_there_and_is_used():
     modules = {(package, name) for package, name in public if f"{package}.{name}" in MODULES}
     assert modules <= used, "no other package imports these: take them off the `__all__` of their package"
     assert all(hasattr(importlib.import_module(package), name) for package, name in public - modules)
+
+
+def test_no_two_classes_have_one_name():
+    # a reader of a format has its options as a class of this name
+    places = defaultdict(list)
+    for module, path in MODULES.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef) and node.name != "Options":
+                places[node.name].append(module)
+    assert not {name: modules for name, modules in places.items() if len(modules) > 1}
 
 
 def test_every_folder_is_a_package():

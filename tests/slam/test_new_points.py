@@ -9,10 +9,10 @@ import pytest
 from factorgraph_loc.slam.new_points import (
     FEWEST,
     MAX_WAITING,
+    KeyframeCamera,
     NewPoints,
-    Place,
-    Sighting,
-    Triangulated,
+    PointSighting,
+    TriangulatedPoint,
     sightings_of,
     triangulate,
 )
@@ -46,13 +46,13 @@ def pixels_of(poses: Array, point: Array = POINT) -> Array:
     return np.array([predict(MODEL, pose, point[None])[0][0] for pose in poses])
 
 
-def located(poses: Array, pixels: Array, model: CameraModel = MODEL) -> Triangulated | None:
+def located(poses: Array, pixels: Array, model: CameraModel = MODEL) -> TriangulatedPoint | None:
     """The point seen from poses (M, 3) at pixels (M, 2)."""
     seen = [sightings_of(model, k, pixel[None])[0] for k, pixel in enumerate(pixels)]
-    return triangulate(model, seen, [Place.of(model, pose, 0.0) for pose in poses])
+    return triangulate(model, seen, [KeyframeCamera.of(model, pose, 0.0) for pose in poses])
 
 
-def seen_at(keyframe: int, pixel: Array) -> Sighting:
+def seen_at(keyframe: int, pixel: Array) -> PointSighting:
     return sightings_of(MODEL, keyframe, np.asarray(pixel)[None])[0]
 
 
@@ -92,8 +92,8 @@ def test_rays_that_meet_behind_the_camera_are_no_point() -> None:
     assert located(poses, pixels_of(poses)[::-1]) is None
 
 
-def places(poses: Array, slack: float = 0.0) -> Callable[[int], Place]:
-    return lambda k: Place.of(MODEL, poses[k], slack)
+def places(poses: Array, slack: float = 0.0) -> Callable[[int], KeyframeCamera]:
+    return lambda k: KeyframeCamera.of(MODEL, poses[k], slack)
 
 
 def test_a_point_waits_for_three_sightings_and_for_parallax() -> None:
@@ -149,7 +149,7 @@ def test_sightings_from_keyframes_that_are_gone_do_not_count() -> None:
     waiting = NewPoints(MODEL)
     for k, pixel in enumerate(pixels_of(poses)):
         waiting.add("a", seen_at(k, pixel))
-    assert waiting.ready(["a"], lambda k: Place.of(MODEL, poses[k], 0.0) if k else None) == []
+    assert waiting.ready(["a"], lambda k: KeyframeCamera.of(MODEL, poses[k], 0.0) if k else None) == []
 
 
 def test_what_waits_is_bounded() -> None:

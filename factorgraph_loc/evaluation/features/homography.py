@@ -14,7 +14,7 @@ from factors.se2 import Array
 _MAX_CONDITION = 1e12  # of the matrix in pixels: typical values for images of 1000 px are 1e4 to 1e7
 
 
-class View(NamedTuple):
+class ViewChange(NamedTuple):
     """Change of view to a second image: ``zoom`` (above 1: larger there), ``rotation`` [rad], ``tilt`` (ratio of the axes of the
     ellipse that a small circle becomes, at least 1)."""
 
@@ -66,12 +66,14 @@ def corner_error(estimate: Array, truth: Array, shape: tuple[int, ...]) -> float
     return float(np.mean(distances)) if np.isfinite(distances).all() else np.inf
 
 
-def view(homography: Array, shape: tuple[int, ...]) -> View:
+def view(homography: Array, shape: tuple[int, ...]) -> ViewChange:
     """Zoom, rotation and tilt at the centre of the first image, of ``shape``."""
     (local,) = jacobians(homography, corners(shape).mean(axis=0, keepdims=True))
     left, axes, right = np.linalg.svd(local)
     turn = left @ right
-    return View(float(np.sqrt(axes[0] * axes[1])), float(np.arctan2(turn[1, 0], turn[0, 0])), float(axes[0] / axes[1]))
+    return ViewChange(
+        float(np.sqrt(axes[0] * axes[1])), float(np.arctan2(turn[1, 0], turn[0, 0])), float(axes[0] / axes[1])
+    )
 
 
 def checked(matrix: Array, shape: tuple[int, ...], source: object) -> Array:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.features.homography import View, read_homography, view
+from factorgraph_loc.evaluation.features.homography import ViewChange, read_homography, view
 from factorgraph_loc.vision.images import Image, read_image
 from factors.se2 import Array
 
@@ -151,7 +151,7 @@ def _images(folder: Path) -> dict[int, Path]:
     return found
 
 
-def _change(views: Several[View]) -> tuple[str, tuple[float, ...]]:
+def _change(views: Several[ViewChange]) -> tuple[str, tuple[float, ...]]:
     """The dominant change of a sequence, from the geometry of its pairs; blur and light leave none, then images are numbered."""
     zooms = [max(v.zoom, 1.0 / v.zoom) for v in views]
     if max(v.tilt for v in views) > _TILTED:

@@ -6,14 +6,14 @@ from typing import Any
 from factorgraph_loc.evaluation.inference import pooled
 from factorgraph_loc.evaluation.paired import quantile
 from factorgraph_loc.evaluation.report.metrics import Metric
-from factorgraph_loc.evaluation.report.results import SWEEP, Comparison, Results, score
+from factorgraph_loc.evaluation.report.results import SWEEP, MetricComparison, Results, score
 
 Chart = dict[str, Any]
 Trust = Mapping[str, tuple[float, float, float]]
 _Dot = tuple[float, str]  # a value, and its label
 
 
-def ratios(results: Results, c: Comparison) -> Chart | None:
+def ratios(results: Results, c: MetricComparison) -> Chart | None:
     """Ratios of each variant to the baseline, with a dot per log and a mark at the median; None if there are none."""
     rows: list[dict[str, Any]] = []
     for place, variant in enumerate(results.variants):

@@ -19,8 +19,8 @@ from factorgraph_loc.drawing.markup import Html, data, figure, join, table, tag,
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import charts, tables
 from factorgraph_loc.evaluation.report.metrics import DEFAULT, Metric, metric_of
-from factorgraph_loc.evaluation.report.reading import Reading, RunFiles, read_runs
-from factorgraph_loc.evaluation.report.results import SWEEP, Comparison, Results, score
+from factorgraph_loc.evaluation.report.reading import RunData, RunFiles, read_runs
+from factorgraph_loc.evaluation.report.results import SWEEP, MetricComparison, Results, score
 from factorgraph_loc.evaluation.report.summary import summary
 from factorgraph_loc.evaluation.report.tracks import KINDS
 from factorgraph_loc.evaluation.warned import by_text
@@ -133,7 +133,7 @@ class _Page:
         self._charts.append(chart)
         return figure(title, caption, data_chart=len(self._charts) - 1)
 
-    def _overview(self, best: Sequence[Comparison]) -> Html:
+    def _overview(self, best: Sequence[MetricComparison]) -> Html:
         results = self._results
         several = len(results.logs) > 1
         over = "each log counted once" if several else "over the seeds"
@@ -147,7 +147,7 @@ class _Page:
             note += " Logs that differ only in a swept setting count as one log."
         return self._section("results", "Results", _note(note), tables.overview(results, best))
 
-    def _differences(self, against: Sequence[Comparison]) -> Html | str:
+    def _differences(self, against: Sequence[MetricComparison]) -> Html | str:
         if len(self._results.variants) < 2:
             return ""
         drawn = [(c, chart) for c in against if (chart := charts.ratios(self._results, c)) is not None]
@@ -180,7 +180,7 @@ class _Page:
         controls = tag("div", class_="controls")
         return self._section("by-log", "Log by log", _note(note), controls, *parts)
 
-    def _trajectories(self, drawn: Reading) -> Html | str:
+    def _trajectories(self, drawn: RunData) -> Html | str:
         if not drawn.tracks:
             return ""
         left = len(self._results.logs) - len(drawn.logs)
@@ -206,7 +206,7 @@ class _Page:
             tag("div", class_="strips"),
         )
 
-    def _distributions(self, drawn: Reading) -> Html | str:
+    def _distributions(self, drawn: RunData) -> Html | str:
         if not any(errors for by_log in drawn.errors.values() for of in by_log for errors in of):
             return ""
         figures = [
@@ -238,7 +238,7 @@ class _Page:
         note = "Pooled over logs and seeds. Whiskers: the 95 % interval, or the range where logs or seeds are too few for one."
         return self._section("sweeps", "Sweeps", _note(note), tag("div", *figures, class_="charts"))
 
-    def _consistency(self, drawn: Reading) -> Html | str:
+    def _consistency(self, drawn: RunData) -> Html | str:
         chart = charts.consistency(self._results, drawn.trust, drawn.nees)
         if chart is None:
             return ""
@@ -277,7 +277,7 @@ class _Page:
         note = f"{count} of {len(self._results.rows)} runs failed, and are excluded from all figures."
         return self._section("failures", "Failures", _note(note), tables.failures(self._results))
 
-    def _repeat(self, experiment: Mapping[str, Any], versions: Mapping[str, str], drawn: Reading) -> Html:
+    def _repeat(self, experiment: Mapping[str, Any], versions: Mapping[str, str], drawn: RunData) -> Html:
         parts: list[object] = []
         if experiment:
             asked = tag("pre", tomli_w.dumps(_toml(experiment)))

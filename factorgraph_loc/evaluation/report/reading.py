@@ -29,7 +29,7 @@ class RunFiles:
 
 
 @dataclass
-class Reading:
+class RunData:
     """The data read from all runs.
 
     ``tracks``: packed trajectories of each log in ``logs``, as elements of the page. ``errors``: by kind, log and variant,
@@ -47,9 +47,9 @@ class Reading:
     versions: dict[str, str] = field(default_factory=dict)
 
 
-def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) -> Reading:
+def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) -> RunData:
     """Read the files of all successful runs; of several seeds the trajectory with the median ``metric`` is drawn."""
-    found = Reading()
+    found = RunData()
     chosen = {
         (variant, log): row
         for log in results.logs
@@ -112,7 +112,7 @@ def _consistency(row: Row, series: Mapping[str, Series]) -> tuple[float, float, 
     return tracks.consistency(series["causal"])
 
 
-def _add_config(found: Reading, run: str, text: str) -> None:
+def _add_config(found: RunData, run: str, text: str) -> None:
     found.configs.append({"run": run, "text": text})
     if not found.versions:
         content = tomllib.loads(text)

@@ -29,7 +29,7 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class MetricComparison:
     """Comparison of the variants by one metric.
 
     ``pooled``: by variant, None without scores; ``best``: the best of the variants that have all logs; ``contrasts``: of the
@@ -99,7 +99,7 @@ class Results:
         ranked = sorted((s, i) for i, row in enumerate(well) if (s := score(row, metric)) is not None)
         return well[ranked[(len(ranked) - 1) // 2][1]] if ranked else next(iter(well), None)
 
-    def compare(self, metric: Metric, reference: str | None = None) -> Comparison:
+    def compare(self, metric: Metric, reference: str | None = None) -> MetricComparison:
         """Compare all variants with a reference, by default with the best and without intervals of the differences."""
         scores = {name: self.scores(metric.key, name) for name in self.variants}
         found = {name: p for name in scores if (p := self._pool(metric, name, scores[name])) is not None}
@@ -112,7 +112,7 @@ class Results:
             and (c := self._contrast(metric, scores[name], scores[against], interval=reference is not None)) is not None
         }
         corrected = holm([c.p for c in contrasts.values()])
-        return Comparison(metric, found, best, against, contrasts, dict(zip(contrasts, corrected, strict=True)))
+        return MetricComparison(metric, found, best, against, contrasts, dict(zip(contrasts, corrected, strict=True)))
 
     def unscored(self) -> list[str]:
         """Logs with too short a reference to be scored."""

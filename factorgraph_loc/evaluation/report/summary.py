@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from factorgraph_loc.drawing.markup import Html, join, tag
-from factorgraph_loc.evaluation.report.results import SCORED, Comparison, Results, score
+from factorgraph_loc.evaluation.report.results import SCORED, MetricComparison, Results, score
 from factorgraph_loc.evaluation.report.tables import p_value, uncertainty
 from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS
 
@@ -12,7 +12,7 @@ _SPOKEN = 2  # metrics whose best variant is named
 
 def summary(
     results: Results,
-    against_best: Sequence[Comparison],
+    against_best: Sequence[MetricComparison],
     trust: Mapping[str, tuple[float, float, float]],
     damaged: Sequence[str] = (),
 ) -> Html:
@@ -44,7 +44,7 @@ def _extent(results: Results) -> Html:
     )
 
 
-def _best(c: Comparison) -> Html:
+def _best(c: MetricComparison) -> Html:
     assert c.best is not None
     figure, unit = c.pooled[c.best], f" {c.metric.unit}" if c.metric.unit else ""
     sure = uncertainty(c.metric, figure)
@@ -90,7 +90,7 @@ def _trust(trust: Mapping[str, tuple[float, float, float]]) -> list[Html]:
     return [join(["Consistency of causal estimates: ", join(told, "; "), "."])] if told else []
 
 
-def _cautions(results: Results, comparisons: Sequence[Comparison]) -> list[Html]:
+def _cautions(results: Results, comparisons: Sequence[MetricComparison]) -> list[Html]:
     told: list[Html] = []
     if results.outdated:
         by_it = join(

@@ -7,7 +7,7 @@ from statistics import median
 from factorgraph_loc.drawing.markup import Html, join, table, tag
 from factorgraph_loc.evaluation.inference import Pooled
 from factorgraph_loc.evaluation.report.metrics import Metric, number
-from factorgraph_loc.evaluation.report.results import Comparison, Results, Row, score
+from factorgraph_loc.evaluation.report.results import MetricComparison, Results, Row, score
 from factorgraph_loc.evaluation.tables import counted
 from factorgraph_loc.evaluation.warned import by_text, label_of
 from factorgraph_loc.fitting.shares import wilson
@@ -29,7 +29,7 @@ def name(results: Results, variant: str) -> Html:
     return join((tag("i", class_=f"key c{place % 7}"), variant))
 
 
-def overview(results: Results, comparisons: Sequence[Comparison]) -> Html:
+def overview(results: Results, comparisons: Sequence[MetricComparison]) -> Html:
     """All logs together: a row per variant, a column per metric, the best of each marked, and the number of successful runs."""
     # the time to localization is of interest for unknown starts only
     is_sought = any(row.get("time_to_localized") for row in results.rows)
@@ -45,7 +45,7 @@ def overview(results: Results, comparisons: Sequence[Comparison]) -> Html:
     return table(["", *(c.metric.heading for c in comparisons), *shares], rows, class_="figures")
 
 
-def differences(results: Results, comparisons: Sequence[Comparison]) -> Html:
+def differences(results: Results, comparisons: Sequence[MetricComparison]) -> Html:
     """Differences of each variant from the baseline with interval, corrected p, and effect; grey if not significant."""
     baseline = comparisons[0].reference
     rows = []
@@ -119,7 +119,7 @@ def p_value(p: float | None) -> str:
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
-def _pooled_cell(c: Comparison, variant: str) -> Html:
+def _pooled_cell(c: MetricComparison, variant: str) -> Html:
     figure = c.pooled.get(variant)
     if figure is None:
         return tag("td", _NONE)
@@ -134,11 +134,11 @@ def _pooled_cell(c: Comparison, variant: str) -> Html:
     return _cell(mark + c.metric.text(figure.value), *lines, class_=kind)
 
 
-def _is_tied(c: Comparison, variant: str) -> bool:
+def _is_tied(c: MetricComparison, variant: str) -> bool:
     return c.can_tell and c.p.get(variant) is not None and not c.is_significant(variant)
 
 
-def _difference_cell(c: Comparison, variant: str) -> Html:
+def _difference_cell(c: MetricComparison, variant: str) -> Html:
     found = c.contrasts.get(variant)
     if found is None:
         return tag("td", _NONE, class_="grey")

@@ -13,7 +13,7 @@ from factorgraph_loc.io.bags.clock import Clock
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.frames import StaticFrames
 from factorgraph_loc.io.bags.poses import POSES, Poses
-from factorgraph_loc.io.bags.rows import Rows
+from factorgraph_loc.io.bags.rows import TopicRows
 from factorgraph_loc.model.planar import Turned, about_z
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.text import quoted
@@ -77,7 +77,7 @@ class TwistMotion:
         kind = bag.topic(options.topic).type
         self._of_odometry = kind == ODOMETRY
         self._stamped = kind.endswith("TwistStamped")
-        self._rows = Rows(f"{bag.path} {options.topic}", 2)
+        self._rows = TopicRows(f"{bag.path} {options.topic}", 2)
 
     def add(self, item: Stamped, t_ns: int) -> None:
         twist = item.message
@@ -100,7 +100,7 @@ class WheelMotion:
             raise InputError(f"{bag.path} {options.topic}: odometry.wheels is missing: left, right, radius and track")
         self._wheels = options.wheels
         self._column = "position" if options.use == "pose" else "velocity"
-        self._rows = Rows(f"{bag.path} {options.topic}", 2)
+        self._rows = TopicRows(f"{bag.path} {options.topic}", 2)
         self._seen: set[str] = set()
 
     def add(self, item: Stamped, t_ns: int) -> None:
@@ -144,7 +144,7 @@ class YawRates:
         if options.frame is not None and options.is_given():
             raise InputError(f"{bag.path} {topic.name}: tf_static has the frame, expected no axes or mounting")
         self._options = options
-        self._rows = Rows(f"{bag.path} {options.topic}", 3)
+        self._rows = TopicRows(f"{bag.path} {options.topic}", 3)
 
     def add(self, item: Stamped, t_ns: int) -> None:
         rate = item.message.angular_velocity
@@ -186,7 +186,7 @@ def increments(t_ns: Integers, moves: Array) -> IncrementStream:
     return IncrementStream(checks.seconds(t_ns, int(t_ns[0])), dx, dy, dtheta)
 
 
-def finite_columns(rows: Rows, names: tuple[str, ...], warnings: list[str]) -> tuple[Integers, list[Array]]:
+def finite_columns(rows: TopicRows, names: tuple[str, ...], warnings: list[str]) -> tuple[Integers, list[Array]]:
     """Timestamps and columns of rows in order of time, all finite; InputError names the invalid message."""
     number, t_ns, values = rows.rows, rows.t_ns, rows.values
     for i, name in enumerate(names):

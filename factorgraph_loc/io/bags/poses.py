@@ -10,7 +10,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.io.bags.clock import Clock
 from factorgraph_loc.io.bags.file import Bag, Stamped
-from factorgraph_loc.io.bags.rows import Rows
+from factorgraph_loc.io.bags.rows import TopicRows
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.planar import AS_IT_IS, Turned, on_floor, require_unit, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory
@@ -59,7 +59,7 @@ class Poses:
         self._parts = (
             ("translation", "rotation") if topic.type.endswith("TransformStamped") else ("position", "orientation")
         )
-        self.rows = Rows(f"{bag.path} {name}", 7)
+        self.rows = TopicRows(f"{bag.path} {name}", 7)
 
     def add(self, item: Stamped, t_ns: int) -> None:
         pose = self._pose(item.message)

@@ -92,7 +92,7 @@ class Reads:
         self._end_ns += [max([t_ns, *self._t_ns[first:]])] * len(antennas)
         self._round_antenna += antennas
 
-    def rounds(self, warnings: list[str]) -> native_rfid.Rounds:
+    def rounds(self, warnings: list[str]) -> native_rfid.ReadsByRound:
         """All reads in their rounds. InputError names the invalid message."""
         table = self._table()
         native_rfid.check_reads(table)
@@ -100,7 +100,7 @@ class Reads:
             return native_rfid.read_rounds(table, None, self._options.round_gap, warnings)
         signals = (table.numbers["rssi"], table.numbers["phase"], table.numbers["frequency"])
         number, end_ns = (np.array(column, dtype=np.int64) for column in (self._number, self._end_ns))
-        return native_rfid.Rounds(table.t_ns, number, table.names["epc"], signals, end_ns, self._round_antenna)
+        return native_rfid.ReadsByRound(table.t_ns, number, table.names["epc"], signals, end_ns, self._round_antenna)
 
     def _table(self) -> TableRows:
         signals = np.array(self._signals, dtype=float).reshape(-1, len(SIGNALS))

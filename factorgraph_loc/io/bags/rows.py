@@ -8,7 +8,7 @@ from factorgraph_loc.io.bags.file import Stamped
 from factors.se2 import Array, Integers
 
 
-class Rows:
+class TopicRows:
     """N rows of ``width`` numbers with timestamps, and the numbers of their messages, counted from 1 within the topic."""
 
     def __init__(self, source: str, width: int) -> None:

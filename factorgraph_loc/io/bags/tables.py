@@ -14,7 +14,7 @@ from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
 from factorgraph_loc.io.bags.clock import Clock
 from factorgraph_loc.io.bags.fields import Fields, as_number, as_text
 from factorgraph_loc.io.bags.file import Bag, Stamped
-from factorgraph_loc.io.bags.rows import Rows
+from factorgraph_loc.io.bags.rows import TopicRows
 from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.sensors.tables import stream_of
 from factorgraph_loc.text import listed
@@ -43,7 +43,7 @@ class RowsOfTopic:
         self._numbered = [column.name for column in columns if column.kind in NUMBERS]
         self._units = [units.get(name, 1.0) for name in self._numbered]
         self._names: dict[str, list[str]] = {column.name: [] for column in self._named}
-        self._rows = Rows(f"{bag.path} {topic}", len(self._numbered))
+        self._rows = TopicRows(f"{bag.path} {topic}", len(self._numbered))
 
     def add(self, item: Stamped, t_ns: int) -> None:
         """Add the rows of a message."""

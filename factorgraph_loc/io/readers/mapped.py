@@ -29,7 +29,7 @@ from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.tables import make_images
 from factorgraph_loc.sensors.odometry.columns import IMU
-from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, Rounds, read_rounds
+from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, ReadsByRound, read_rounds
 from factorgraph_loc.sensors.tables import Reading, native_tables
 from factors.se2 import Array
 
@@ -155,7 +155,7 @@ def _about_z(mapped: Mapped, mapping: ImuFile, numbers: dict[str, Array]) -> Arr
     return numbers["w"]
 
 
-def _rounds(folder: Path, options: Options, warnings: list[str]) -> Rounds | None:
+def _rounds(folder: Path, options: Options, warnings: list[str]) -> ReadsByRound | None:
     files = [options.rfid] if options.rfid else list(options.readers.values())
     if options.rfid and options.readers:
         raise InputError(f"{folder}: [options] has rfid and readers, expected one of them")

@@ -109,7 +109,7 @@ def read_reference(path: Path, warnings: list[str]) -> tuple[Trajectory, int]:
 
 
 @dataclass(frozen=True)
-class _Reads:
+class _AntennaReads:
     """The N reads of one antenna: host timestamps [ns], EPCs, and RSSI [dBm], phase [rad], frequency [Hz], each (N,)."""
 
     t_ns: Integers
@@ -119,7 +119,7 @@ class _Reads:
     frequency: Array
 
 
-def read_reads(path: Path, warnings: list[str]) -> _Reads:
+def read_reads(path: Path, warnings: list[str]) -> _AntennaReads:
     """The reads in a file of one antenna."""
     epc: list[str] = []
     stamps: list[int] = []
@@ -147,10 +147,10 @@ def read_reads(path: Path, warnings: list[str]) -> _Reads:
             raise bad_field(path, field, float(column[bad[0]]), f"{low:g} to {high:g}", row=rows[bad[0]])
     t_ns = np.array(stamps, dtype=np.int64)
     checks.arrivals(path, np.array(rows, dtype=np.int64), t_ns, warnings)
-    return _Reads(t_ns, epc, table[:, 2], np.radians(table[:, 1]), table[:, 0] * 1e6)
+    return _AntennaReads(t_ns, epc, table[:, 2], np.radians(table[:, 1]), table[:, 0] * 1e6)
 
 
-def make_stream(reads: list[_Reads], t0_ns: int, end: float, source: Path, warnings: list[str]) -> RfidStream:
+def make_stream(reads: list[_AntennaReads], t0_ns: int, end: float, source: Path, warnings: list[str]) -> RfidStream:
     """The rounds of all antennas within the odometry, 0 to ``end`` seconds."""
     t_ns = np.concatenate([r.t_ns for r in reads])
     order = np.argsort(t_ns, kind="stable")

@@ -24,7 +24,7 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
 from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder
 from factorgraph_loc.vision.features import Extractor, extractor
-from factorgraph_loc.vision.found import Found, decode, encode
+from factorgraph_loc.vision.found import ImageFeatures, decode, encode
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.images import read_image
 from factorgraph_loc.vision.keypoints import Integers
@@ -54,12 +54,12 @@ Size = tuple[int, int]  # width, height
 
 
 @dataclass(frozen=True)
-class _Image:
+class _ImageFile:
     """A file with the ``key`` of its features, the features if known, or the ``fault`` of the file."""
 
     file: Path
     key: str = ""
-    found: Found | None = None
+    found: ImageFeatures | None = None
     fault: str = ""
     other_size: Size | None = None
 
@@ -101,17 +101,17 @@ def _features(
     size: Size,
     kept: FeatureCache,
     progress: Callable[[float], None],
-) -> list[_Image]:
+) -> list[_ImageFile]:
     """The features of N images, from the cache if possible."""
     about = f"{settings.feature} {settings.count} {size} {code_version(FEATURE_CODE)} "
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading and hashing release the interpreter lock
         images = list(pool.map(lambda file: _looked_up(file, about, kept), files))
     wanted = {image.key: image.file for image in images if image.found is None and not image.fault}
-    new: dict[str, _Image] = {}
+    new: dict[str, _ImageFile] = {}
     if wanted:
         progress(0.0)
         for key, answer in zip(wanted, _computed(list(wanted.values()), settings, size), strict=True):
-            new[key] = answer if isinstance(answer, _Image) else _Image(wanted[key], key, decode(answer))
+            new[key] = answer if isinstance(answer, _ImageFile) else _ImageFile(wanted[key], key, decode(answer))
             if isinstance(answer, bytes):
                 kept.write(key, answer)
             progress(len(new) / len(wanted))
@@ -119,24 +119,24 @@ def _features(
     return [replace(new[image.key], file=image.file) if image.key in new else image for image in images]
 
 
-def _looked_up(file: Path, about: str, kept: FeatureCache) -> _Image:
+def _looked_up(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
     try:
         content = read_bytes(file, IMAGE)
     except InputError as error:
-        return _Image(file, fault=str(error))
+        return _ImageFile(file, fault=str(error))
     key = hashlib.sha256(about.encode() + content).hexdigest()
     stored = kept.read(key)
-    return _Image(file, key, None if stored is None else decode(stored))
+    return _ImageFile(file, key, None if stored is None else decode(stored))
 
 
-def _computed(files: list[Path], settings: FrontendSettings, size: Size) -> Iterator[bytes | _Image]:
+def _computed(files: list[Path], settings: FrontendSettings, size: Size) -> Iterator[bytes | _ImageFile]:
     """The features of each file as bytes, or its fault, in the order of the files."""
     processes = min(os.cpu_count() or 1, len(files) // FEW)
     if processes < 2:
         yield from (_find(file, settings, size) for file in files)
         return
     parts = [files[i : i + PART] for i in range(0, len(files), PART)]
-    early: dict[int, list[bytes | _Image]] = {}  # results of tasks that finished out of order
+    early: dict[int, list[bytes | _ImageFile]] = {}  # results of tasks that finished out of order
     due = 0
     for at, found in run_each(partial(_find_all, settings, size), parts, processes, lasting=True):
         if isinstance(found, ProcessDiedError):
@@ -149,21 +149,21 @@ def _computed(files: list[Path], settings: FrontendSettings, size: Size) -> Iter
             due += 1
 
 
-def _find_all(settings: FrontendSettings, size: Size, files: list[Path]) -> list[bytes | _Image]:
+def _find_all(settings: FrontendSettings, size: Size, files: list[Path]) -> list[bytes | _ImageFile]:
     """The features of some files; runs in a worker process."""
     cv2.setNumThreads(1)
     return [_find(file, settings, size) for file in files]
 
 
-def _find(file: Path, settings: FrontendSettings, size: Size) -> bytes | _Image:
+def _find(file: Path, settings: FrontendSettings, size: Size) -> bytes | _ImageFile:
     try:
         image = read_image(file)
     except InputError as error:
-        return _Image(file, fault=str(error))
+        return _ImageFile(file, fault=str(error))
     height, width = image.shape[:2]
     if (width, height) != size:
         fault = f"{file}: has {width} x {height} px, expected {size[0]} x {size[1]}"
-        return _Image(file, fault=fault, other_size=(width, height))
+        return _ImageFile(file, fault=fault, other_size=(width, height))
     return encode(*_extractor(settings).detectAndCompute(image))
 
 
@@ -173,15 +173,15 @@ def _extractor(settings: FrontendSettings) -> Extractor:
     return extractor(settings.feature, settings.count)
 
 
-def _nothing(settings: FrontendSettings) -> Found:
+def _nothing(settings: FrontendSettings) -> ImageFeatures:
     """The result for an image without features."""
     return decode(encode(*_extractor(settings).detectAndCompute(np.zeros((16, 16), dtype=np.uint8))))
 
 
 def _tracks(
     stream: ImageStream,
-    images: list[_Image],
-    found: list[Found],
+    images: list[_ImageFile],
+    found: list[ImageFeatures],
     settings: FrontendSettings,
     camera: CameraModel,
     kept: FeatureCache,
@@ -211,7 +211,7 @@ def _tracks(
     return tracks
 
 
-def _require_calibrated(log: Log, images: list[_Image], camera: CameraModel) -> None:
+def _require_calibrated(log: Log, images: list[_ImageFile], camera: CameraModel) -> None:
     """InputError if images can be decoded but none has the size that the camera is calibrated for."""
     sizes = [image.other_size for image in images if image.other_size is not None]
     if sizes and not any(image.found for image in images):
@@ -222,7 +222,7 @@ def _require_calibrated(log: Log, images: list[_Image], camera: CameraModel) -> 
         )
 
 
-def _doubts(log: Log, images: list[_Image]) -> tuple[str, ...]:
+def _doubts(log: Log, images: list[_ImageFile]) -> tuple[str, ...]:
     doubts = []
     for what, faults in (
         ("cannot be read", [image.fault for image in images if image.fault and image.other_size is None]),

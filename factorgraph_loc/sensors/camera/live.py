@@ -7,7 +7,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.vision.features import extractor
-from factorgraph_loc.vision.found import Found, decode, encode
+from factorgraph_loc.vision.found import ImageFeatures, decode, encode
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.images import as_image
 from factorgraph_loc.vision.keypoints import Integers
@@ -18,10 +18,10 @@ from factors.se2 import Array
 
 
 @dataclass
-class _Seen:
+class _RecentImage:
     """A recent image: directions (K, 2) and track numbers (K,) of its features, and which the next image did not match."""
 
-    found: Found
+    found: ImageFeatures
     directions: Array
     numbers: Integers
     missed: Integers
@@ -33,7 +33,7 @@ class LiveFrontend:
     def __init__(self, settings: FrontendSettings, camera: CameraModel) -> None:
         self._feature, self._camera = settings.feature, camera
         self._extractor = extractor(settings.feature, settings.count)
-        self._last: deque[_Seen] = deque(maxlen=2)
+        self._last: deque[_RecentImage] = deque(maxlen=2)
         self._following = 0
 
     def frame(self, t: float, image: object) -> CameraFrame:
@@ -51,11 +51,11 @@ class LiveFrontend:
         numbers = self._follow(found)
         return CameraFrame(t, self._feature, found.pixels, found.sizes, found.descriptors, numbers)
 
-    def _follow(self, found: Found) -> Integers:
+    def _follow(self, found: ImageFeatures) -> Integers:
         """Track numbers (K,) of the features of the next image; see :func:`~factorgraph_loc.vision.tracks.follow`."""
         every = np.arange(len(found.pixels))
         numbers = np.full(len(every), -1, dtype=np.int64)
-        here = _Seen(found, undistorted(self._camera, found.pixels), numbers, every)
+        here = _RecentImage(found, undistorted(self._camera, found.pixels), numbers, every)
         if self._last:
             last = self._last[-1]
             near = self._pairs(last, np.arange(len(last.numbers)), here, every)
@@ -71,7 +71,7 @@ class LiveFrontend:
         self._last.append(here)
         return numbers
 
-    def _pairs(self, a: _Seen, first: Integers, b: _Seen, second: Integers) -> Integers:
+    def _pairs(self, a: _RecentImage, first: Integers, b: _RecentImage, second: Integers) -> Integers:
         """Matches (M, 2) between features ``first`` of one image and ``second`` of another."""
         found = pairs(
             (a.directions[first], a.found.descriptors[first]),

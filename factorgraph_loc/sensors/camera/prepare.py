@@ -12,7 +12,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
-from factorgraph_loc.sensors.usage import Prepared, Use
+from factorgraph_loc.sensors.usage import PreparedLog, Use
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors.se2 import Array
@@ -41,21 +41,21 @@ def frames_of(log: Log) -> tuple[Array, Sequence[CameraFrame]]:
     return stream.t + log.rig.time_offset("camera"), stream.frame
 
 
-def prepare(use: Use, progress: Callable[[float], None]) -> Prepared:
+def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
     """Replace images by features if the run uses them, else by empty frames."""
     log, stream = use.log, use.log.streams.get("camera")
     if "camera" not in use.sensors or not isinstance(stream, ImageStream):
-        return Prepared(log)
+        return PreparedLog(log)
     if "camera" not in use.modalities:
         return _set_aside(log, stream, use.estimator)
     from factorgraph_loc.sensors.camera.frontend import with_features  # noqa: PLC0415 - runs without images need no OpenCV
 
     started = perf_counter()
     found, warnings = with_features(log, frontend_of(log.rig, log.world), progress)
-    return Prepared(found, warnings, len(stream.t), perf_counter() - started)
+    return PreparedLog(found, warnings, len(stream.t), perf_counter() - started)
 
 
-def _set_aside(log: Log, stream: ImageStream, estimator: str) -> Prepared:
+def _set_aside(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
     """Frames without features; their timestamps still define the start and end of the run."""
     nothing = CameraFrame(
         0.0, "", np.empty((0, 2)), np.empty(0), np.empty((0, 0), dtype=np.uint8), np.empty(0, dtype=np.int64)
@@ -63,4 +63,4 @@ def _set_aside(log: Log, stream: ImageStream, estimator: str) -> Prepared:
     frames = FeatureStream(stream.t, [nothing] * len(stream.t))
     told = (f"{log.name}: {estimator} does not use images: all {len(stream.t)} are ignored",)
     by_name = estimator == "dead_reckoning"  # obvious from its name
-    return Prepared(replace(log, streams={**log.streams, "camera": frames}), () if by_name else told)
+    return PreparedLog(replace(log, streams={**log.streams, "camera": frames}), () if by_name else told)

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from factorgraph_loc.drawing.markup import Rows, image, number, table
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.fitting.constants import Learnt
+from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.fitting.robust import Fit, folds, gains
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -96,7 +96,7 @@ class LandmarkCalibrator(ConstantsCalibrator):
         _logs: Sequence[Log],
         rig: Rig,
         base: BearingRangeSettings,
-        learnt: Sequence[Learnt],
+        learnt: Sequence[FittedConstant],
         *,
         by_log: bool,
     ) -> Settled:
@@ -108,7 +108,9 @@ class LandmarkCalibrator(ConstantsCalibrator):
         correlations = tuple(sightings.correlation(one, settings) for one in found.seen if by_log)
         return Settled({self.section: settings}, learnt, notes, correlations)
 
-    def constant_units(self, found: SensorFit, kept: Sequence[Learnt], learnt: Rig, start: Rig) -> dict[Unit, float]:
+    def constant_units(
+        self, found: SensorFit, kept: Sequence[FittedConstant], learnt: Rig, start: Rig
+    ) -> dict[Unit, float]:
         """The units; constants of another kind of ranges are left out."""
         if learnt.bearing_range.range_kind == self.settings(start).range_kind:
             return super().constant_units(found, kept, learnt, start)

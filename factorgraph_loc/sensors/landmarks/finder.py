@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.model.belief import Mode, PosePrior, Status
 from factorgraph_loc.model.motion import Motion
 from factorgraph_loc.sensors.known_position import KnownPosition
-from factorgraph_loc.sensors.landmarks.window import Sighting, Window
+from factorgraph_loc.sensors.landmarks.window import Sighting, SightingWindow
 from factors import positive, se2
 from factors.landmarks.factor import BearingRangeFactor
 from factors.landmarks.model import BearingRangeModel, robust_loss
@@ -67,7 +67,7 @@ class Relocalizer:
         self._log_volume = math.log(2.0 * math.pi * np.prod(extent + 2.0 * MARGIN))
         self._model = BearingRangeModel()
         self._sightings: dict[tuple[float, float], list[Sighting]] = {}
-        self._window: Window | None = None
+        self._window: SightingWindow | None = None
         self._hypotheses: tuple[Hypothesis, ...] = ()
         self._best: PosePrior | None = None
         self.start: KnownPosition | None = None  # known start position while the heading is sought
@@ -114,7 +114,7 @@ class Relocalizer:
         self._hypotheses, self._best, self._window = (), None, None
         if not rows:
             return
-        window = self._window = Window(self._model, rows, self._motion, self.start)
+        window = self._window = SightingWindow(self._model, rows, self._motion, self.start)
         poses = np.concatenate((window.starts(), window.alignments(), window.circles()))
         if before is not None and earlier:
             since = self._motion.relative(before.now, window.now).delta
@@ -157,14 +157,14 @@ class Relocalizer:
         other = robust_loss(window.squared(self._best.pose[None], window.whitener()), scale).sum()
         return bool(track - other > REFUTED * 0.5 * scale**2 * len(window.points))
 
-    def _log_prior(self, window: Window, poses: Array, covariances: Array) -> Array:
+    def _log_prior(self, window: SightingWindow, poses: Array, covariances: Array) -> Array:
         """Log prior probability (N,) of modes with body-frame covariances (N, 3, 3)."""
         volume: Array = 0.5 * np.linalg.slogdet(2.0 * math.pi * covariances)[1]
         density = -self._log_volume if self.start is None else self.start.log_density(poses, window.now)
         return np.asarray(np.minimum(volume + density, 0.0))
 
     def _weighed(
-        self, window: Window, poses: Array, covariances: Array, squared: Array, logs: Array
+        self, window: SightingWindow, poses: Array, covariances: Array, squared: Array, logs: Array
     ) -> tuple[Hypothesis, ...]:
         """Distinct hypotheses with posterior probabilities; the alternative is a pose outside that explains nothing."""
         covariances = se2.body_to_world(poses, covariances)
@@ -189,7 +189,7 @@ class Relocalizer:
             if weight > NEGLIGIBLE
         )
 
-    def _clear(self, window: Window) -> PosePrior | None:
+    def _clear(self, window: SightingWindow) -> PosePrior | None:
         """The most likely hypothesis if it is unambiguous, with the moments of the joint solution of its sightings."""
         if not self._hypotheses:
             return None

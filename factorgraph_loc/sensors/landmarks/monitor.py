@@ -4,7 +4,7 @@ import numpy as np
 
 from factors import positive
 from factors.se2 import Array
-from factors.update import GATE, Sightings
+from factors.update import GATE, SightingFactor
 
 STAMPS, DURATION = 4, 2.0  # minimum number of timestamps, and their duration in s
 KEPT = 100  # timestamps
@@ -27,7 +27,7 @@ class TrackMonitor:
         """The time since which most landmarks are outside, or None."""
         return self._since
 
-    def add(self, t: float, seen: Sightings, pose: Array, covariance: Array) -> None:
+    def add(self, t: float, seen: SightingFactor, pose: Array, covariance: Array) -> None:
         """Add the landmarks of a timestamp, with the predicted ``pose`` (3,) and its body-frame ``covariance`` (3, 3)."""
         residual, (jacobian,) = seen.whitened([pose])
         spread = np.eye(2) + jacobian @ covariance @ jacobian.transpose(0, 2, 1)

@@ -32,7 +32,7 @@ class Sighting:
     bearing: float
 
 
-class Window:
+class SightingWindow:
     """K sightings as constraints on the present pose, and the start if its position is known. ``now``: the odometry at the last
     one; ``points`` (K, 2): in the map."""
 

@@ -41,7 +41,7 @@ SENSOR = SensorType(
         "odometry": Section("factorgraph_loc.sensors.odometry.settings:OdometrySettings", always=True),
         "imu": Section("factorgraph_loc.sensors.odometry.settings:ImuSettings"),
     },
-    predict="factorgraph_loc.sensors.odometry.motion:Motion",
+    predict="factorgraph_loc.sensors.odometry.motion:OdometryMotion",
     summarize="factorgraph_loc.sensors.odometry.summary:summarize",
     simulate="factorgraph_loc.sensors.odometry.simulation:simulate",
     calibrator="factorgraph_loc.sensors.odometry.calibration.calibrator:CALIBRATOR",

@@ -23,7 +23,7 @@ UNUSED = {"imu": "yaw rate", "twist": "motion in space"}  # reason why rows of a
 TWIST_TIME = 0.1  # s over which the velocity is averaged
 
 
-class Motion:
+class OdometryMotion:
     """The motion sensor (:class:`~factorgraph_loc.model.motion.Motion`) made of wheel odometry.
 
     A gyro replaces the rotation of the wheels if ``sensors`` include ``imu``. ``self_calibration``: the uncertain constants of

@@ -25,7 +25,7 @@ COVERED = 0.9  # minimum share of a log that the reference should cover
 
 
 @dataclass(frozen=True)
-class Match:
+class RateMatch:
     """``shift`` [s]: delay of one signal to the other; ``slope``: ratio of their values."""
 
     shift: float
@@ -65,7 +65,7 @@ def motion_problems(log: Log) -> list[str]:
         lines += _compared("odometry", "the reference", match(_rates(heading, window), _rates(told, window)))
     else:
         found = match(_rates(way, window), _speeds(poses[:, :2], window))
-        lines += _compared("odometry", "the reference", found and Match(found.shift, 1.0))
+        lines += _compared("odometry", "the reference", found and RateMatch(found.shift, 1.0))
     return lines
 
 
@@ -76,7 +76,7 @@ def _longest(t: Array) -> tuple[float, float]:
     return float(longest[0]), float(longest[-1])
 
 
-def match(rates: Array, others: Array) -> Match | None:
+def match(rates: Array, others: Array) -> RateMatch | None:
     """Delay of ``others`` (N,) relative to ``rates`` (N,), sampled every ``STEP``; None if they are uncorrelated.
 
     The slope is negative if the signs differ. A shift that hardly improves the correlation is set to zero.
@@ -90,7 +90,7 @@ def match(rates: Array, others: Array) -> Match | None:
     left = 1.0 - found[:, 0] ** 2
     if abs(SHIFTS[best]) * STEP < LARGE or left[best] > BETTER * left[none]:
         best = none
-    return Match(float(SHIFTS[best] * STEP), float(found[best, 1])) if abs(found[best, 0]) >= ALIKE else None
+    return RateMatch(float(SHIFTS[best] * STEP), float(found[best, 1])) if abs(found[best, 0]) >= ALIKE else None
 
 
 def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]:
@@ -105,7 +105,7 @@ def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]
     return (ab / np.sqrt(aa * bb), ab / aa) if bb > 0.0 else (0.0, 0.0)
 
 
-def _compared(sensor: str, name: str, found: Match | None) -> list[str]:
+def _compared(sensor: str, name: str, found: RateMatch | None) -> list[str]:
     """Warnings about a wrong clock, sign or unit; ``sensor``: the one whose time_offset would correct it."""
     if found is None:
         return []

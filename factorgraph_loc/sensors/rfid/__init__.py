@@ -62,8 +62,8 @@ SENSOR = SensorType(
     mappable="factorgraph_loc.sensors.rfid.describe:mappable",
     draw="factorgraph_loc.sensors.rfid.draw:draw",
     simulation={
-        "rssi": Section("factorgraph_loc.sensors.rfid.simulation_settings:RssiSettings"),
-        "phase": Section("factorgraph_loc.sensors.rfid.simulation_settings:PhaseSettings"),
+        "rssi": Section("factorgraph_loc.sensors.rfid.simulation_settings:SimulatedRssiSettings"),
+        "phase": Section("factorgraph_loc.sensors.rfid.simulation_settings:SimulatedPhaseSettings"),
         "faults": Section("factorgraph_loc.sensors.rfid.simulation_settings:FaultSettings", always=True),
     },
     simulate="factorgraph_loc.sensors.rfid.simulated_drive:simulate",

@@ -15,7 +15,7 @@ from factorgraph_loc.model.variable import NOTHING, Estimated
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.monitor import ScanMonitor, Silence
+from factorgraph_loc.sensors.rfid.monitor import ScanMonitor, SilenceMonitor
 from factorgraph_loc.sensors.rfid.signals import TagSignals
 from factorgraph_loc.sensors.rfid.tag_map import extent
 from factors import positive, se2
@@ -101,7 +101,7 @@ class TagSensor(Sensor):
     """Scans of RFID tags.
 
     Each scan gives an observation of reads and misses and one of the signal strengths; once per second the recent phases give
-    another one. Silence of the reader (:class:`~factorgraph_loc.sensors.rfid.monitor.Silence`) is not used as evidence. Only reads
+    another one. Silence of the reader (:class:`.SilenceMonitor`) is not used as evidence. Only reads
     and misses are used to find a pose, because strength and phase have multimodal likelihoods.
     """
 
@@ -118,7 +118,7 @@ class TagSensor(Sensor):
         self.bounds = extent(setup.world, self.tags.map.tags) if self.tags.likelihood is not None else None
         self._diagnostics = diagnostics
         self._signals = TagSignals(setup, self.tags)
-        self._monitor, self._silence = ScanMonitor(), Silence()
+        self._monitor, self._silence = ScanMonitor(), SilenceMonitor()
         self._heard = -math.inf  # last scan that was checked for silence
 
     def observe(self, m: RfidScan, view: View) -> Iterator[TagObservation]:
@@ -152,7 +152,7 @@ class TagSensor(Sensor):
         assert correction.evidence is not None
         self._diagnostics.innovation("rfid", t, correction.nis, correction.dof)
         if view.newest and not self._is_evidence(observation, correction.evidence):
-            self._diagnostics.reject(Silence.REJECTED, observation.rounds)
+            self._diagnostics.reject(SilenceMonitor.REJECTED, observation.rounds)
             return False
         if view.newest:
             self._monitor.add(t, correction.excess_nll, correction.variance)
@@ -167,7 +167,7 @@ class TagSensor(Sensor):
         if observation.found or observation.t > self._heard:
             lasted = self._silence.lasts
             if self._silence.add(observation.found, evidence) and not lasted:
-                self._diagnostics.event(observation.t, Silence.EVENT)
+                self._diagnostics.event(observation.t, SilenceMonitor.EVENT)
                 self.tags.silent()
             self._heard = max(self._heard, observation.t)
         return not self._silence.lasts

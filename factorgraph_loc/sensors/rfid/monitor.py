@@ -13,7 +13,7 @@ SCANS = 4  # minimum number
 SILENT = 8.0  # log odds above which silence is attributed to a failure instead of the pose
 
 
-class Silence:
+class SilenceMonitor:
     """Detects that no tag is read where tags should be: the reader or the tags have failed. The misses are then uninformative, and
     would drive the estimate to an area without tags."""
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.simulation import Hits
-from factorgraph_loc.sensors.rfid.simulation_settings import PhaseSettings, RssiSettings
+from factorgraph_loc.sensors.rfid.simulation_settings import SimulatedPhaseSettings, SimulatedRssiSettings
 from factors import se2
 from factors.rfid import strength as rfid_rssi
 from factors.rfid.detection import TagArray
@@ -14,7 +14,12 @@ from factors.se2 import Array
 
 
 def strengths(
-    rfid: RfidSettings, tags: TagArray, poses: Array, hits: Hits, settings: RssiSettings, rng: np.random.Generator
+    rfid: RfidSettings,
+    tags: TagArray,
+    poses: Array,
+    hits: Hits,
+    settings: SimulatedRssiSettings,
+    rng: np.random.Generator,
 ) -> Array:
     """RSSI [dBm] (N, A, T) of the reads ``hits`` (N, A, T) at poses (N, 3), NaN elsewhere: :mod:`factors.rfid.strength`."""
     n, a, tag = np.nonzero(hits)
@@ -26,7 +31,7 @@ def strengths(
 
 
 def phases(
-    rfid: RfidSettings, tags: TagArray, poses: Array, settings: PhaseSettings, rng: np.random.Generator
+    rfid: RfidSettings, tags: TagArray, poses: Array, settings: SimulatedPhaseSettings, rng: np.random.Generator
 ) -> Array:
     """Phase (N, A, T) in [0, 2 pi) of a read of each tag by each antenna at poses (N, 3).
 

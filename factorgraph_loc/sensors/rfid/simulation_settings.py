@@ -9,7 +9,7 @@ from factorgraph_loc.model.simulation_units import Metres, Seconds, Share
 from factorgraph_loc.sensors.rfid.settings import Weight
 
 
-class PhaseSettings(FileModel):
+class SimulatedPhaseSettings(FileModel):
     """Phase of reads: carrier ``frequency``, noise ``sigma``, and the share ``flips`` of reads that are off by pi, as with most
     readers."""
 
@@ -18,7 +18,7 @@ class PhaseSettings(FileModel):
     flips: Share = 0.2
 
 
-class RssiSettings(FileModel):
+class SimulatedRssiSettings(FileModel):
     """Strength of reads: ``coefficients`` of :data:`factors.rfid.strength.FEATURES`, and Student noise of scale ``sigma`` with
     ``dof`` degrees of freedom."""
 

@@ -30,7 +30,7 @@ ROUND_GAP: float = RfidSettings.model_fields["round_gap"].default
 
 
 @dataclass(frozen=True)
-class Rounds:
+class ReadsByRound:
     """N reads in R rounds: see :func:`~factorgraph_loc.sensors.rfid.rounds.make_rfid_stream`."""
 
     t_ns: Integers
@@ -57,7 +57,9 @@ def disassemble(stream: RfidStream, writing: Writing) -> dict[str, Columns]:
     return {"rfid": reads, "inventories": inventories}
 
 
-def read_rounds(reads: TableRows | None, inventories: TableRows | None, gap: float, warnings: list[str]) -> Rounds:
+def read_rounds(
+    reads: TableRows | None, inventories: TableRows | None, gap: float, warnings: list[str]
+) -> ReadsByRound:
     """The reads in their rounds; ``gap`` [s] separates rounds if there are no ``inventories``.
 
     InputError names file, row and field of an invalid value; reads outside of every inventory are skipped with a warning.
@@ -77,7 +79,7 @@ def read_rounds(reads: TableRows | None, inventories: TableRows | None, gap: flo
     return _rounds(reads, order, number, end_ns, [antenna[i] for i in first.tolist()])
 
 
-def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings: list[str]) -> Rounds:
+def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings: list[str]) -> ReadsByRound:
     end_ns, antenna = inventories.t_ns, inventories.names["antenna"]
     duration = inventories.numbers["duration"]
     # a jump of the reader's clock is a fault of the recording: estimators drop the late scans
@@ -85,7 +87,7 @@ def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings:
     if reads is None:
         nothing = np.zeros(0)
         none = np.zeros(0, dtype=np.int64)
-        return Rounds(none, none, [], (nothing, nothing, nothing), end_ns, antenna)
+        return ReadsByRound(none, none, [], (nothing, nothing, nothing), end_ns, antenna)
     if "inventory" in reads.numbers:
         number = _told(reads, end_ns, antenna)
     else:
@@ -114,11 +116,11 @@ def _told(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Integers:
     return number
 
 
-def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> Rounds:
+def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> ReadsByRound:
     epc = [reads.names["epc"][i] for i in rows.tolist()]
     unknown = np.full(len(reads.t_ns), np.nan)
     rssi, phase, frequency = (reads.numbers.get(name, unknown)[rows] for name in ("rssi", "phase", "frequency"))
-    return Rounds(reads.t_ns[rows], number, epc, (rssi, phase, frequency), end_ns, antenna)
+    return ReadsByRound(reads.t_ns[rows], number, epc, (rssi, phase, frequency), end_ns, antenna)
 
 
 def check_reads(reads: TableRows) -> None:

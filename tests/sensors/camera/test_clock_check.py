@@ -7,7 +7,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.camera.clock_check import ClockCheck
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
-from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.odometry.motion import OdometryMotion
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 
 STEP, EVERY = 0.1, 2  # s between rows of the odometry, rows between images
@@ -20,7 +20,7 @@ def told(seed, offset, noise=NOISE):
     rng = np.random.default_rng(seed)
     heading = OdometryNoise(heading=GrowthSettings(per_time=noise))
     diagnostics = Diagnostics()
-    motion = Motion(Rig(odometry=OdometrySettings(noise=heading)), ("odometry",), diagnostics)
+    motion = OdometryMotion(Rig(odometry=OdometrySettings(noise=heading)), ("odometry",), diagnostics)
     check = ClockCheck(motion, diagnostics)
     t = np.arange(2000) * STEP
     true = lambda t: 0.8 * np.sin(0.7 * t) + 0.3 * np.sin(1.9 * t)  # noqa: E731

@@ -6,7 +6,7 @@ import pytest
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
-from factorgraph_loc.sensors.odometry.motion import Motion
+from factorgraph_loc.sensors.odometry.motion import OdometryMotion
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, ImuSettings, OdometryNoise, OdometrySettings
 from factors.motion import propagate
 
@@ -14,7 +14,7 @@ RIG = Rig(imu=ImuSettings(bias=0.1))
 
 
 def test_a_gyro_replaces_the_rotation_of_velocities():
-    motion = Motion(RIG, ("odometry", "imu"), Diagnostics())
+    motion = OdometryMotion(RIG, ("odometry", "imu"), Diagnostics())
     motion.add(VelocityOdometry(0.0, 1.0, 5.0))
     motion.add(YawRate(0.0, 0.4))
     assert motion.state(1.0).heading == pytest.approx(0.3)
@@ -24,7 +24,7 @@ def test_a_gyro_replaces_the_rotation_of_velocities():
 def test_a_gyro_replaces_the_rotation_of_increments(rig, turned):
     """Of a rig without settings of a gyro too: then its bias is 0."""
     diagnostics = Diagnostics()
-    motion = Motion(rig, ("odometry", "imu"), diagnostics)
+    motion = OdometryMotion(rig, ("odometry", "imu"), diagnostics)
     for i in range(4):
         motion.add(YawRate(0.1 * i, 0.3))
         motion.add(IncrementOdometry(0.1 * i, 0.05, 0.0, 0.5))
@@ -35,7 +35,7 @@ def test_a_gyro_replaces_the_rotation_of_increments(rig, turned):
 
 def test_a_sensor_that_is_not_used_is_ignored_and_counted():
     diagnostics = Diagnostics()
-    motion = Motion(RIG, ("imu",), diagnostics)
+    motion = OdometryMotion(RIG, ("imu",), diagnostics)
     motion.add(VelocityOdometry(0.0, 1.0, 5.0))
     assert motion.state(1.0).x == 0.0
     assert diagnostics.ignored == {"odometry": 1}
@@ -46,7 +46,7 @@ def test_a_covariance_can_be_inverted_however_far_the_robot_seems_to_go(sigma):
     """The heading's error moves the robot across, along it only the odometry's own noise does."""
     growth, across = GrowthSettings(per_distance=1e-6), GrowthSettings(per_distance=sigma, per_rotation=5.0)
     noise = OdometryNoise(along=growth, lateral=growth, heading=across)
-    motion = Motion(Rig(odometry=OdometrySettings(noise=noise)), ("odometry",), Diagnostics())
+    motion = OdometryMotion(Rig(odometry=OdometrySettings(noise=noise)), ("odometry",), Diagnostics())
     covariance, before = 1e-8 * np.eye(3), motion.state(0.0)
     for i in range(40):
         motion.add(IncrementOdometry(0.1 * i, 1000.0, 0.0, 90.0))

@@ -6,7 +6,7 @@ import pytest
 from factorgraph_loc.sensors.rfid.calibration.choice import Kind, choose
 from factorgraph_loc.sensors.rfid.calibration.fit import FACING, Floor, features, fit_beam, fit_logistic
 from factorgraph_loc.sensors.rfid.calibration.grid import Axes, design_of, fit_grid
-from factorgraph_loc.sensors.rfid.calibration.pairs import Pairs, local, terms
+from factorgraph_loc.sensors.rfid.calibration.pairs import TagPairs, local, terms
 from factorgraph_loc.sensors.rfid.calibration.rounds import distinct, rounds_of
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factors.rfid.model import BeamModel, GridModel, LogisticModel, logits, probability
@@ -23,7 +23,7 @@ def drawn(model, count=40000, seed=0, height=0.5):
     facing = rng.uniform(-1.0, 1.0, count)
     q = 0.02 + 0.96 * probability(model, points, facing)
     zeros = np.zeros(count, dtype=np.int64)
-    return Pairs(
+    return TagPairs(
         points, facing, rng.binomial(4, q).astype(float), np.full(count, 4.0), zeros, zeros, np.arange(count) % 2, zeros
     )
 
@@ -88,7 +88,7 @@ def test_a_field_beyond_the_logistic_model_is_learnt_by_a_grid():
     lobe = np.exp(-np.sum((pairs.points[:, :2] - (-2.0, 0.5)) ** 2, axis=1) / 0.8)
     rng = np.random.default_rng(1)
     hits = np.maximum(pairs.hits, rng.binomial(4, 0.8 * lobe))
-    lobed = Pairs(**{name: getattr(pairs, name) for name in pairs.__dataclass_fields__} | {"hits": hits})
+    lobed = TagPairs(**{name: getattr(pairs, name) for name in pairs.__dataclass_fields__} | {"hits": hits})
     parametric = fit_logistic(lobed, FLOOR, with_facing=False)
     grid = fit_grid(lobed, parametric, 1.0, Axes(), FLOOR)
     there = np.array(((-2.0, 0.5, 0.0),))
@@ -115,7 +115,7 @@ def test_antennas_that_differ_have_their_own_models():
     other = LogisticModel((2.5, -1.0, -0.05, -0.5, 0.1, -0.06, -0.6, -0.1, 1.9, 0.23, -0.15))
     one, two = drawn(TRUTH, 5000), drawn(other, 5000, seed=5)
     names = [name for name in one.__dataclass_fields__ if name != "antenna"]
-    both = Pairs(
+    both = TagPairs(
         **{name: np.concatenate((getattr(one, name), getattr(two, name))) for name in names},
         antenna=np.repeat((0, 1), 5000),
     )

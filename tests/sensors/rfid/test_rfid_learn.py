@@ -12,7 +12,13 @@ from factorgraph_loc.sensors.rfid.calibration.choice import Kind
 from factorgraph_loc.sensors.rfid.calibration.dead import dead_tags
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor, fit_logistic
 from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid
-from factorgraph_loc.sensors.rfid.calibration.mounting import SURVEY_PLACES, Place, alternated, moved, with_offsets
+from factorgraph_loc.sensors.rfid.calibration.mounting import (
+    SURVEY_PLACES,
+    MountingConstant,
+    alternated,
+    moved,
+    with_offsets,
+)
 from factorgraph_loc.sensors.rfid.calibration.pairs import pairs_of
 from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit
 from factorgraph_loc.sensors.rfid.calibration.rounds import rounds_of
@@ -51,7 +57,10 @@ def test_what_is_right_is_not_changed(read_tags):
 def test_constants_of_one_antenna_and_of_all(read_tags):
     settings = read_tags(seconds=60.0).rig.rfid
     changed, survey = moved(
-        settings, SurveySettings(), (Place("x"), Place("y", -1), Place("yaw", 1)), np.array((0.1, 0.2, 0.3))
+        settings,
+        SurveySettings(),
+        (MountingConstant("x"), MountingConstant("y", -1), MountingConstant("yaw", 1)),
+        np.array((0.1, 0.2, 0.3)),
     )
     left, right = changed.all_antennas().values()
     assert (survey.x, left.y, right.y) == pytest.approx((0.1, 0.4, 0.0))

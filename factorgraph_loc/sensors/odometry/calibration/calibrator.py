@@ -9,7 +9,7 @@ import numpy as np
 
 from factorgraph_loc.drawing.markup import image, number, table
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.fitting.constants import Learnt
+from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.fitting.robust import Constant, Fit, folds, gains
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -110,7 +110,7 @@ class OdometryCalibrator(ConstantsCalibrator):
         logs: Sequence[Log],
         rig: Rig,
         base: OdometryModel,
-        learnt: Sequence[Learnt],
+        learnt: Sequence[FittedConstant],
         *,
         by_log: bool,
     ) -> Settled:

@@ -6,7 +6,7 @@ import numpy as np
 
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor, fit_beam, fit_logistic
 from factorgraph_loc.sensors.rfid.calibration.grid import Axes, fit_grid
-from factorgraph_loc.sensors.rfid.calibration.pairs import Pairs, modelled
+from factorgraph_loc.sensors.rfid.calibration.pairs import TagPairs, modelled
 from factors.rfid.model import DetectionModel
 from factors.se2 import Array
 
@@ -42,7 +42,7 @@ class Kind:
 
 
 @dataclass(frozen=True)
-class Trial:
+class CrossValidation:
     """Held-out negative log-likelihood [nats per pair] of a model, per fold and over all; ``predicted`` (M,): probabilities of the
     pairs, floor included, from fits to the other folds."""
 
@@ -53,18 +53,18 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Choice:
+class ModelSelection:
     """The ``best`` trial, and all ``trials``."""
 
-    best: Trial
-    trials: tuple[Trial, ...]
+    best: CrossValidation
+    trials: tuple[CrossValidation, ...]
 
     @property
     def kind(self) -> Kind:
         return self.best.kind
 
 
-def fit(pairs: Pairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[DetectionModel, ...], tuple[int, ...]]:
+def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[DetectionModel, ...], tuple[int, ...]]:
     """The models, and the model index of each antenna. An antenna without rounds has the common model."""
     if not kind.own:
         return (_fit_one(pairs, kind, floor),), (0,) * antennas
@@ -75,18 +75,18 @@ def fit(pairs: Pairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[De
     return tuple(models), tuple(heard.index(a) if a in heard else len(heard) for a in range(antennas))
 
 
-def choose(pairs: Pairs, floor: Floor, antennas: int, *, facing: bool) -> Choice:
+def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> ModelSelection:
     """Select the model by its likelihood on held-out folds of ``pairs``.
 
     A more complex model must gain :data:`WORTH` over a simpler one. ``facing``: whether the tags' facing is known.
     """
-    trials: list[Trial] = []
+    trials: list[CrossValidation] = []
 
-    def tried(kind: Kind) -> Trial:
+    def tried(kind: Kind) -> CrossValidation:
         trials.append(_trial(pairs, kind, floor, antennas))
         return trials[-1]
 
-    def better(best: Trial, kind: Kind) -> Trial:
+    def better(best: CrossValidation, kind: Kind) -> CrossValidation:
         trial = tried(kind)
         return trial if trial.nll < best.nll - WORTH else best
 
@@ -106,10 +106,10 @@ def choose(pairs: Pairs, floor: Floor, antennas: int, *, facing: bool) -> Choice
         field = better(field, Kind("grid", uses_facing, axes=Axes(by_height=True), smoothness=smoothness))
     if field.nll < best.nll - WORTH:
         best = field
-    return Choice(best, tuple(trials))
+    return ModelSelection(best, tuple(trials))
 
 
-def held_out(pairs: Pairs, kind: Kind, floor: Floor, antennas: int) -> Array:
+def held_out(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> Array:
     """Probability (M,) of a read, floor included, for each fold from a fit to the others."""
     out = np.empty(len(pairs.facing))
     for fold in np.unique(pairs.fold):
@@ -120,16 +120,16 @@ def held_out(pairs: Pairs, kind: Kind, floor: Floor, antennas: int) -> Array:
     return out
 
 
-def _fit_one(pairs: Pairs, kind: Kind, floor: Floor) -> DetectionModel:
+def _fit_one(pairs: TagPairs, kind: Kind, floor: Floor) -> DetectionModel:
     if kind.name == "beam":
         return fit_beam(pairs.part(np.arange(len(pairs.facing)) % (1 + len(pairs.facing) // BEAM_PAIRS) == 0), floor)
     parametric = fit_logistic(pairs, floor, with_facing=kind.facing)
     return parametric if kind.name == "logistic" else fit_grid(pairs, parametric, kind.smoothness, kind.axes, floor)
 
 
-def _trial(pairs: Pairs, kind: Kind, floor: Floor, antennas: int) -> Trial:
+def _trial(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> CrossValidation:
     q = held_out(pairs, kind, floor, antennas)
     nll = -(pairs.hits * np.log(q) + (pairs.count - pairs.hits) * np.log1p(-q))
     folds = [pairs.fold == fold for fold in np.unique(pairs.fold)]
     each = tuple(float(np.sum(nll[one]) / np.sum(pairs.count[one])) for one in folds)
-    return Trial(kind, each, float(np.sum(nll) / np.sum(pairs.count)), q)
+    return CrossValidation(kind, each, float(np.sum(nll) / np.sum(pairs.count)), q)

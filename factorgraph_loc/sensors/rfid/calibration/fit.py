@@ -11,7 +11,7 @@ from scipy import sparse
 from scipy.optimize import minimize
 from scipy.sparse.linalg import splu
 
-from factorgraph_loc.sensors.rfid.calibration.pairs import REACH, Pairs, terms
+from factorgraph_loc.sensors.rfid.calibration.pairs import REACH, TagPairs, terms
 from factors.rfid.model import FEATURES, NEAR, BeamModel, LogisticModel, logits
 from factors.se2 import Array
 
@@ -75,7 +75,7 @@ def fit_linear(
     return values
 
 
-def fit_logistic(pairs: Pairs, floor: Floor, *, with_facing: bool) -> LogisticModel:
+def fit_logistic(pairs: TagPairs, floor: Floor, *, with_facing: bool) -> LogisticModel:
     """Fit a logistic model, with or without the features of the tags' facing."""
     edge, edge_facing = _edge()
     design = np.vstack((features(pairs.points, pairs.facing), features(edge, edge_facing)))
@@ -95,7 +95,7 @@ def fit_logistic(pairs: Pairs, floor: Floor, *, with_facing: bool) -> LogisticMo
     return LogisticModel(tuple(coefficients.tolist()), REACH)
 
 
-def fit_beam(pairs: Pairs, floor: Floor) -> BeamModel:
+def fit_beam(pairs: TagPairs, floor: Floor) -> BeamModel:
     """Fit a beam model."""
     bounds = [(-3.0, 7.0), (np.log(0.3), np.log(2.0 * REACH)), (np.log(0.05), np.log(5.0)), (np.log(0.1), np.log(9.0))]
 

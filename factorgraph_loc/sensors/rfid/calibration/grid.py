@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor, fit_linear
-from factorgraph_loc.sensors.rfid.calibration.pairs import Pairs
+from factorgraph_loc.sensors.rfid.calibration.pairs import TagPairs
 from factors.rfid.model import DetectionModel, GridModel, bake, logits
 from factors.se2 import Array
 
@@ -33,7 +33,7 @@ class Axes:
     by_facing: bool = False
 
 
-def fit_grid(pairs: Pairs, parametric: DetectionModel, smoothness: float, axes: Axes, floor: Floor) -> GridModel:
+def fit_grid(pairs: TagPairs, parametric: DetectionModel, smoothness: float, axes: Axes, floor: Floor) -> GridModel:
     """Fit a grid to pairs, near to the ``parametric`` model; ``smoothness``: weight of squared second differences of logits.
 
     The grid has a height axis if the heights of ``pairs`` differ, and a facing axis if the model has one. Along axes that ``axes``
@@ -51,7 +51,7 @@ def fit_grid(pairs: Pairs, parametric: DetectionModel, smoothness: float, axes: 
     return replace(base, logits=base.logits + found.reshape(varied))
 
 
-def _heights(pairs: Pairs) -> list[float]:
+def _heights(pairs: TagPairs) -> list[float]:
     """Evenly spaced heights over nearly all pairs, including zero if it is within; a single one if all are equal."""
     low, high = np.quantile(pairs.points[:, 2], (0.01, 0.99)).tolist()
     if high - low < HEIGHT_STEP:
@@ -119,7 +119,7 @@ def _roughness(shape: Sequence[int]) -> sparse.csc_array:
     return total.tocsc()
 
 
-def _together(pairs: Pairs) -> Pairs:
+def _together(pairs: TagPairs) -> TagPairs:
     """Merge pairs at nearly equal positions at their mean."""
     keys = np.floor(np.column_stack((pairs.points, pairs.facing)) / FINE).astype(np.int64)
     keys -= keys.min(axis=0)

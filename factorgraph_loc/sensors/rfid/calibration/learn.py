@@ -11,11 +11,11 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import file_name
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.rfid.calibration.choice import Choice, Kind, choose, fit
+from factorgraph_loc.sensors.rfid.calibration.choice import Kind, ModelSelection, choose, fit
 from factorgraph_loc.sensors.rfid.calibration.dead import DeadTags, dead_tags
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor
 from factorgraph_loc.sensors.rfid.calibration.mounting import Offset, with_focus, with_offsets
-from factorgraph_loc.sensors.rfid.calibration.pairs import Pairs, pairs_of
+from factorgraph_loc.sensors.rfid.calibration.pairs import TagPairs, pairs_of
 from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit, fit_phase
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, distinct, rounds_of
 from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi
@@ -50,13 +50,13 @@ class RfidKnowledge:
     models: tuple[DetectionModel, ...]
     which: tuple[int, ...]
     antennas: tuple[str, ...]
-    choice: Choice
+    choice: ModelSelection
     offsets: tuple[Offset, ...]
     phase: PhaseFit | None
     share: float
     doubts: tuple[TagDoubt, ...]
     dead: DeadTags
-    pairs: Pairs
+    pairs: TagPairs
     floor: Floor
 
 

@@ -12,7 +12,15 @@ from scipy.stats import norm
 
 from factorgraph_loc.sensors.rfid.calibration.choice import Kind, fit
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor
-from factorgraph_loc.sensors.rfid.calibration.pairs import BLOCKS, Pairs, modelled, nearby, pairs_of, stretches, terms
+from factorgraph_loc.sensors.rfid.calibration.pairs import (
+    BLOCKS,
+    TagPairs,
+    modelled,
+    nearby,
+    pairs_of,
+    stretches,
+    terms,
+)
 from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings, SurveySettings
@@ -32,7 +40,7 @@ STEP = 1e-4  # m, rad; of numerical derivatives
 
 
 @dataclass(frozen=True)
-class Place:
+class MountingConstant:
     """A constant of the survey (``antenna`` None), of all antennas jointly (-1), or of one antenna."""
 
     name: str
@@ -45,7 +53,7 @@ class Placing:
 
     settings: RfidSettings
     survey: SurveySettings
-    places: tuple[Place, ...]
+    places: tuple[MountingConstant, ...]
     changes: Array
     errors: Array
     nll: float
@@ -64,12 +72,12 @@ class Offset:
     why: str
 
 
-SURVEY_PLACES = tuple(Place(name) for name in SURVEY)
+SURVEY_PLACES = tuple(MountingConstant(name) for name in SURVEY)
 
 
-def mounting_places(antennas: Sequence[int] = (-1,)) -> tuple[Place, ...]:
+def mounting_places(antennas: Sequence[int] = (-1,)) -> tuple[MountingConstant, ...]:
     """The mounting constants of all antennas jointly, or of each of ``antennas``."""
-    return tuple(Place(name, a) for a in antennas for name in MOUNTING)
+    return tuple(MountingConstant(name, a) for a in antennas for name in MOUNTING)
 
 
 def with_focus(
@@ -93,7 +101,7 @@ def with_focus(
     )
     if not kept:
         return settings, survey, offsets
-    antennas, _ = moved(settings, survey, (Place("x", -1), Place("y", -1)), np.array(lever))
+    antennas, _ = moved(settings, survey, (MountingConstant("x", -1), MountingConstant("y", -1)), np.array(lever))
     return antennas, _rounded(phase.survey), offsets
 
 
@@ -114,7 +122,7 @@ def with_offsets(
     logs = [_thinned(log) for log in logs]
     antennas = list(settings.all_antennas())
     offsets: list[Offset] = []
-    common = (Place("yaw", -1),) if focused else (*SURVEY_PLACES, *mounting_places())
+    common = (MountingConstant("yaw", -1),) if focused else (*SURVEY_PLACES, *mounting_places())
     apart = tuple(p for p in mounting_places(range(len(antennas))) if p.name == "yaw" or not focused)
     for places in (common, apart) if len(antennas) > 1 else (common,):
         clear = _clear(alternated(logs, settings, survey, places, kind, floor))
@@ -136,7 +144,7 @@ def alternated(
     logs: Sequence[Rounds],
     settings: RfidSettings,
     survey: SurveySettings,
-    places: Sequence[Place],
+    places: Sequence[MountingConstant],
     kind: Kind,
     floor: Floor,
 ) -> Placing:
@@ -150,7 +158,7 @@ def alternated(
     return found
 
 
-def _clear(found: Placing) -> tuple[Place, ...]:
+def _clear(found: Placing) -> tuple[MountingConstant, ...]:
     """The significant constants, including the error by the detection model. The level allows one false positive among all
     constants in twenty calibrations."""
     blind = np.array([BLIND[p.name] for p in found.places])
@@ -162,7 +170,7 @@ def _gain(
     logs: Sequence[Rounds],
     settings: RfidSettings,
     survey: SurveySettings,
-    places: Sequence[Place],
+    places: Sequence[MountingConstant],
     kind: Kind,
     floor: Floor,
 ) -> Array:
@@ -186,7 +194,7 @@ def _gain(
     return np.array(gains)
 
 
-def _what(place: Place, antennas: Sequence[str]) -> str:
+def _what(place: MountingConstant, antennas: Sequence[str]) -> str:
     if place.antenna is None:
         return "survey"
     return "antennas" if place.antenna < 0 else antennas[place.antenna]
@@ -203,7 +211,7 @@ def _rounded(survey: SurveySettings) -> SurveySettings:
 
 
 def moved(
-    settings: RfidSettings, survey: SurveySettings, places: Sequence[Place], changes: Array
+    settings: RfidSettings, survey: SurveySettings, places: Sequence[MountingConstant], changes: Array
 ) -> tuple[RfidSettings, SurveySettings]:
     """The rig's antennas and survey with changed constants."""
     antennas = dict(settings.all_antennas())
@@ -223,7 +231,7 @@ def place(
     logs: Sequence[Rounds],
     settings: RfidSettings,
     survey: SurveySettings,
-    places: Sequence[Place],
+    places: Sequence[MountingConstant],
     models: Sequence[DetectionModel],
     which: Sequence[int],
     floor: Floor,
@@ -235,7 +243,7 @@ def place(
     pairs = pairs_of(logs, settings, survey, within)
     changes = np.zeros(len(places)) if start is None else start
 
-    def seen(values: Array) -> Pairs:
+    def seen(values: Array) -> TagPairs:
         return pairs_of(logs, *moved(settings, survey, places, values), within)
 
     def logit(values: Array) -> Array:

@@ -20,7 +20,7 @@ BLOCKS = 4  # folds of a single log
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
+class TagPairs:
     """M pairs. ``points`` (M, 3) [m] in the antenna's frame; ``facing`` (M,): cosine of the angle between the tag's facing and the
     direction to the antenna, 0 if unknown; ``hits`` of ``count`` (M,) rounds; ``antenna`` (M,): index in the rig; ``tag`` (M,):
     index among all logs; ``fold`` (M,): held out jointly; ``block`` (M,): of :data:`BLOCK` seconds."""
@@ -34,7 +34,7 @@ class Pairs:
     fold: Integers
     block: Integers
 
-    def part(self, keep: NDArray[np.bool_] | Integers) -> Pairs:
+    def part(self, keep: NDArray[np.bool_] | Integers) -> TagPairs:
         """The selected pairs."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
@@ -50,7 +50,7 @@ class Terms:
 
 def pairs_of(
     logs: Sequence[Rounds], settings: RfidSettings, survey: SurveySettings, within: Sequence[Integers] | None = None
-) -> Pairs:
+) -> TagPairs:
     """The pairs of several logs within :data:`REACH`, or those of ``within``: flat indices (antenna, tag) per log."""
     single = len(logs) == 1
     names = tag_names(logs)
@@ -65,7 +65,7 @@ def pairs_of(
         fold = stretches(log.t) if single else np.full(len(log.t), i, dtype=np.int64)
         tag = np.array([names[name] for name in log.names], dtype=np.int64)
         parts.append(
-            Pairs(
+            TagPairs(
                 points.reshape(-1, 3)[chosen],
                 facing.ravel()[chosen],
                 log.hits.ravel()[chosen],
@@ -76,7 +76,7 @@ def pairs_of(
                 block[row],
             )
         )
-    return Pairs(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Pairs)})
+    return TagPairs(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(TagPairs)})
 
 
 def nearby(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> Integers:
@@ -126,7 +126,7 @@ def terms(logit: Array, hits: Array, count: Array, false_read: float, miss: floa
     )
 
 
-def modelled(models: Sequence[DetectionModel], which: Sequence[int], pairs: Pairs) -> Array:
+def modelled(models: Sequence[DetectionModel], which: Sequence[int], pairs: TagPairs) -> Array:
     """Logits (M,): antenna i has the model ``which[i]`` of ``models``."""
     if len(models) == 1:
         return logits(models[0], pairs.points, pairs.facing)[0]

@@ -83,7 +83,7 @@ def _tags(logs: Sequence[Rounds]) -> dict[str, tuple[list[Rounds], str]]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Reads:
+class _TagReads:
     """The data of one tag: ``hits`` of ``count`` rounds (K,) of antennas at (K, 3) poses in the world; ``antenna`` (K,), ``height``
     (K,) of the tag above it and ``pitch`` (K,); ``place`` (2,) of the tag and direction (2,) that it faces, zero if unknown."""
 
@@ -96,7 +96,7 @@ class _Reads:
     place: Array
     normal: Array
 
-    def thinned(self, most: int) -> _Reads:
+    def thinned(self, most: int) -> _TagReads:
         step = 1 + len(self.hits) // most
         return replace(self, **{name: getattr(self, name)[::step] for name in _COLUMNS})
 
@@ -114,7 +114,7 @@ class _Reads:
         return float(np.sum(terms(z, self.hits, self.count, floor.false_read, floor.miss).nll))
 
 
-def _reads(logs: Sequence[Rounds], name: str, settings: RfidSettings, survey: SurveySettings) -> _Reads:
+def _reads(logs: Sequence[Rounds], name: str, settings: RfidSettings, survey: SurveySettings) -> _TagReads:
     antennas = np.array([(a.x, a.y, a.yaw, a.z, a.pitch) for a in settings.all_antennas().values()])
     transform = survey.transform()
     parts = []
@@ -128,14 +128,18 @@ def _reads(logs: Sequence[Rounds], name: str, settings: RfidSettings, survey: Su
         normal = np.array((np.cos(angle), np.sin(angle))) if np.isfinite(angle) else np.zeros(2)
         height = log.tags.points[column, 2] - mounted[:, 3]
         hits, pitch = log.hits[near, column], mounted[near, 4]
-        parts.append(_Reads(hits, log.count[near], poses[near], log.antenna[near], height[near], pitch, place, normal))
+        parts.append(
+            _TagReads(hits, log.count[near], poses[near], log.antenna[near], height[near], pitch, place, normal)
+        )
     return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS})
 
 
 _COLUMNS = ("hits", "count", "poses", "antenna", "height", "pitch")
 
 
-def _moved(reads: _Reads, models: Sequence[DetectionModel], which: Sequence[int], floor: Floor) -> tuple[float, Array]:
+def _moved(
+    reads: _TagReads, models: Sequence[DetectionModel], which: Sequence[int], floor: Floor
+) -> tuple[float, Array]:
     """Twice the log-likelihood ratio of the best position, and the shift (2,) to it."""
     few = reads.thinned(COARSE_LOOKS)
     steps = COARSE * np.arange(-round(FARTHEST / COARSE), round(FARTHEST / COARSE) + 1)
