@@ -368,13 +368,8 @@ class Incremental:
         )
         start = gtsam.PriorFactorPose2(self._graph.keyframes[0].key, gtsam.Pose2(*self._graph.prior.pose), noise)
         means, spreads = self._graph.constant_priors()
-        return [
-            start,
-            *(
-                gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Gaussian.Covariance(spreads[key]))
-                for key, mean in means.items()
-            ),
-        ]
+        spread_as = gtsam.noiseModel.Gaussian.Covariance
+        return [start, *(gtsam.PriorFactorVector(key, mean, spread_as(spreads[key])) for key, mean in means.items())]
 
     def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
         """The time of each variable of a window that begins; points are as if they were seen now."""
