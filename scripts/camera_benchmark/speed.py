@@ -49,7 +49,7 @@ class Steps:
 
 STEPS = (
     Steps("20 known points and all antennas, 10 Hz", KNOWN, RunConfig("smoother", {"lag": 10.0}, ALL), "0.3"),
-    Steps("the same, full history", KNOWN, RunConfig("smoother", {}, ALL), ""),
+    Steps("the same, full history", KNOWN, RunConfig("smoother", {"lag": "all"}, ALL), ""),
     Steps("the same", KNOWN, RunConfig("ekf", {}, SEEN), ""),
     Steps("the same", KNOWN, RunConfig("particle_filter", {"smooth": False}, ALL), ""),
     Steps("20 known points, 10 Hz", KNOWN, RunConfig("monoslam", {"smooth": False}, SEEN), ""),

@@ -21,7 +21,7 @@ from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid
 from factorgraph_loc.sensors.rfid.calibration.tempering import tempered
 
 RUNS = (13, 16)
-SEEDS = 5
+SEEDS = 3
 LEARNING_SEED = 100  # of the odometry of the log used for learning
 PLACES = Path(__file__).parents[2] / "datasets" / "rfid-aisle-places.rig.toml"
 DETECTIONS = ("odometry", "rfid")

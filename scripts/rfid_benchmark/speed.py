@@ -20,7 +20,8 @@ WORLD = {"world": {"tags": 20}, "rounds_per_second": RATE, "drive": {"duration":
 CALIBRATED = 400.0  # s of a log
 RUNS = {
     "smoother, lag 10 s": RunConfig("smoother", {"lag": 10.0}),
-    "smoother, full history": RunConfig("smoother"),
+    "smoother": RunConfig("smoother"),
+    "smoother, full history": RunConfig("smoother", {"lag": "all"}),
     "particle filter, 5,000": RunConfig("particle_filter", {"smooth": False}),
     "batch": RunConfig("batch"),
 }
