@@ -47,13 +47,14 @@ def moved(pose: Array, twist: Array) -> Array:
 
 @numba.njit(cache=True)
 def body_to_world(pose: Array, covariance: Array) -> Array:
-    """:func:`factors.se2.body_to_world` of one pose (3,), and of the first three components of a covariance (S, S)."""
+    """:func:`factors.se2.body_to_world` of one pose (3,), and of the first three components of a covariance (S, S), of which the
+    upper triangle is read: the result is symmetric to the last bit."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     out = np.empty((3, 3))
-    a, b, d, e = covariance[0, 0], covariance[0, 1], covariance[1, 0], covariance[1, 1]
-    p, q, r, t = c * a - s * d, c * b - s * e, s * a + c * d, s * b + c * e
-    out[0, 0], out[0, 1], out[1, 0], out[1, 1] = p * c - q * s, p * s + q * c, r * c - t * s, r * s + t * c
-    out[0, 2], out[1, 2] = c * covariance[0, 2] - s * covariance[1, 2], s * covariance[0, 2] + c * covariance[1, 2]
-    out[2, 0], out[2, 1] = covariance[2, 0] * c - covariance[2, 1] * s, covariance[2, 0] * s + covariance[2, 1] * c
-    out[2, 2] = covariance[2, 2]
+    a, b, e = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    p, q, r, t = c * a - s * b, c * b - s * e, s * a + c * b, s * b + c * e
+    out[0, 0], out[1, 1], out[2, 2] = p * c - q * s, r * s + t * c, covariance[2, 2]
+    out[0, 1] = out[1, 0] = p * s + q * c
+    out[0, 2] = out[2, 0] = c * covariance[0, 2] - s * covariance[1, 2]
+    out[1, 2] = out[2, 1] = s * covariance[0, 2] + c * covariance[1, 2]
     return out

@@ -43,8 +43,9 @@ def test_the_tutorial(hall, fgloc, monkeypatch):
     compared = fgloc("compare", "monday.toml", "-e", "dead_reckoning,smoother", "-o", "out", "--json")
     assert compared.exit_code == 0
     error = {row["estimator"]: row["final.position_rmse"] for row in json.loads(compared.stdout)["runs"]}
-    assert f"off by {error['smoother']:.2f} m, odometry alone by {error['dead_reckoning']:.1f} m" in PAGE.replace(
-        "\n", " "
+    assert (
+        f"smoother is {error['smoother']:.2f} m, that of odometry alone {error['dead_reckoning']:.1f} m"
+        in PAGE.replace("\n", " ")
     )
     assert fgloc("convert", "monday.toml", "copy").exit_code == 0
     (log,), (copy,) = load("monday.toml"), load("copy")

@@ -15,4 +15,4 @@ def test_the_command_tells_how_far_off_in_space(data_root, tmp_path, fgloc):
 def test_info_tells_of_the_reference(data_root, fgloc):
     found = fgloc("info", "starry_night", "--data-root", data_root)
     assert found.exit_code == 0, found.output
-    assert "in space, 1900 poses" in found.output
+    assert "three-dimensional, 1900 poses" in found.output

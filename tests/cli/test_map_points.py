@@ -76,7 +76,7 @@ def test_images_are_located_in_a_map_of_others(fgloc, gallery_on_disk, tmp_path)
         assert picture.width == 1600
     again = fgloc(*arguments)
     assert again.exit_code == 2
-    assert "exists already" in again.stderr
+    assert "holds results already" in again.stderr
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from factorgraph_loc.experiments.preparation import use_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import settings_of
 from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.sensors.rfid.describe import doubts
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
@@ -73,11 +74,11 @@ def test_an_estimator_is_given_all_tags_whatever_the_log_reads_later(reading, fa
 def test_tags_that_are_believed_dead_are_named(reading):
     found = Diagnostics(dead_tags={"b": 0.7, "c": 0.999})
     use = use_of(reading, ALL, "smoother", settings_of("smoother", {}))
-    assert list(doubts(use, found)) == [
+    assert list(doubts(use, found, Learnt())) == [
         "straight: 2 of 3 tags of the map are believed dead, as they were not read from where they should have been: "
         "c (> 99 %), b (70 %)",
     ]
-    assert list(doubts(use, Diagnostics())) == []
+    assert list(doubts(use, Diagnostics(), Learnt())) == []
 
 
 @pytest.mark.usefixtures("fake")

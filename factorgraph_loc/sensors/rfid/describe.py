@@ -49,7 +49,9 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
             f"{log.name}: {len(found)} of {len(tags)} tags of the map are believed dead, as they were not read from where "
             f"they should have been: {names}{more}"
         )
-    yield from (f"{log.name}: {line}" for line in _differences(log.rig.of(RfidSettings), learnt))
+    settings = log.rig.find(RfidSettings)
+    if settings is not None:
+        yield from (f"{log.name}: {line}" for line in _differences(settings, learnt))
 
 
 def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:

@@ -36,8 +36,8 @@ class PriorSettings(FileModel):
     logarithm of a factor of its range, ``read_rate`` of the logit of its largest probability. What is above zero is learnt on the
     way by every estimator that uses tags."""
 
-    range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.15
-    read_rate: Annotated[float, Field(ge=0.0, le=3.0, description="of a logit")] = 1.0
+    range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
+    read_rate: Annotated[float, Field(ge=0.0, le=3.0, description="of a logit")] = 0.5
 
 
 class BeamSettings(FileModel):
