@@ -76,17 +76,33 @@ FOUND = Branch(
     FOUND_BY_PARTICLES.reason,
     {
         **{"causal.poses": 1.2, "causal.covariances": 1.2, "final.poses": 0.01, "final.covariances": 1e-3},
-        **{"learnt.constants": 0.01, "belief.poses": 0.1, "belief.weights": 0.1},
+        **{"learnt.constants": 0.01, "belief.poses": NOT_HELD, "belief.weights": 0.1},
         **WHEN_FOUND,
     },
 )
 UNDECIDED = Branch(
     "Many places explain what was seen equally well: which of them a search keeps, and in which order, is left to rounding.",
-    dict.fromkeys(("belief", "belief.weights", "belief.poses", "causal.poses", "causal.covariances"), NOT_HELD),
+    {"final.poses": 2.0},
+    NOT_HELD,
 )
 ILL_CONDITIONED = Branch(
     "The camera's constants can hardly be told apart by now, and rounding is amplified as often as they are linearised anew.",
     tolerance=1e-4,
+)
+FAR_OFF = Branch(
+    "Glitches of metres lead far from the truth, where nothing that is seen fits, and linearisation amplifies rounding.",
+    tolerance=1e-3,
+)
+GATED = Branch(
+    "Rows that are missing or come twice make landmarks lie at the edge of what is believed: the last bits decide which are, and "
+    "whether a track is given up.",
+    {"final.poses": 10.0},
+    NOT_HELD,
+)
+FEW_PARTICLES = Branch(
+    SINGLE_PRECISION.reason
+    + " Landmarks are far more exact than tags, so that few particles are left of each of them.",
+    tolerance=NOT_HELD,
 )
 CHOSEN = Branch(
     SINGLE_PRECISION.reason + " So is the way that is chosen, and from there on everything is another run.",
@@ -113,12 +129,19 @@ def branch_of(case: str) -> Branch | None:
         found = UNDECIDED
     elif name in ("tags-unknown-start", "tags-unknown-heading", "tags-kidnapped", "tags-landmarks-unknown-start"):
         found = FOUND_BY_PARTICLES if particles or label == "switching" else FOUND
+        found = FEW_PARTICLES if case == "tags-landmarks-unknown-start/particle_filter" else found
+    elif particles and name.startswith(("fault", "tags-landmarks")):
+        found = FEW_PARTICLES
     elif hears_tags and (particles or label == "switching"):
         found = SINGLE_PRECISION
     elif particles:
         found = DRAWN
     elif name == "points-self-calibration" and label.startswith("smoother"):
         found = ILL_CONDITIONED
+    elif case in ("fault-many-glitches/smoother", "fault-many-glitches/batch"):
+        found = FAR_OFF
+    elif name in ("fault-repeated-rows", "fault-missing-rows") and label in ("smoother", "batch"):
+        found = GATED
     else:
         return None
     return found
