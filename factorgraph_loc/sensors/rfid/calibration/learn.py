@@ -35,7 +35,7 @@ from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factors.rfid.model import BeamModel, DetectionModel, GridModel, LogisticModel
 
 DEFAULT = "default"
-CALIBRATED = PriorSettings(range_scale=0.03, read_rate=0.2)  # what differs between the days of one installation
+CALIBRATED = PriorSettings(range_scale=0.02, read_rate=0.1)  # between the days of one installation
 
 
 @dataclass(frozen=True)
