@@ -84,10 +84,7 @@ class LogisticModel:
 
     @property
     def peak(self) -> float:
-        b = np.asarray(self.coefficients)
-        r, w, c = np.meshgrid(np.linspace(0.0, self.reach, 81), np.linspace(0.0, 2.0, 9), np.linspace(-1.0, 1.0, 9))
-        value = b[0] + r * (b[1] + b[2] * r) + w * (b[3] + b[4] * w + b[5] * r)
-        return _probability(float(np.max(value + c * (b[7] + b[8] * c + b[9] * r + b[10] * w))))
+        return _probability(_logistic_peak(np.array(self.coefficients), self.reach))
 
     def compiled(self) -> tuple[int, Sequence[float], Array]:
         return LOGISTIC, tuple(self.coefficients), np.empty((0, 0, 0, 0))
@@ -284,6 +281,17 @@ def logistic_value(b: Array, r: float, w: float, height: float, c: float) -> flo
     height, and facing c."""
     value = b[0] + r * (b[1] + b[2] * r) + w * (b[3] + b[4] * w + b[5] * r) + b[6] * abs(height)
     return float(value + c * (b[7] + b[8] * c + b[9] * r + b[10] * w))
+
+
+@numba.njit(cache=True)
+def _logistic_peak(b: Array, reach: float) -> float:
+    """The largest logit at the antenna's height, over ranges, bearings and facings."""
+    largest = -np.inf
+    for r in np.linspace(0.0, reach, 81):
+        for w in np.linspace(0.0, 2.0, 9):
+            for c in np.linspace(-1.0, 1.0, 9):
+                largest = max(largest, logistic_value(b, r, w, 0.0, c))
+    return largest
 
 
 @numba.njit(cache=True)

@@ -12,7 +12,7 @@ from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.usage import Use
 from factorgraph_loc.text import quoted
-from factors.rfid.adjustment import MOST_CERTAIN, PARAMETERS, rates
+from factors.rfid.adjustment import MOST_CERTAIN, rates
 
 SHOWN = 5  # names in a warning
 CLEARLY = 3.0  # standard deviations
@@ -56,17 +56,18 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
 
 def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
     """What was learnt of the antennas' models and is clearly not what the rig says."""
-    for name, model in settings.models.items():
-        peak = min(model.model().peak, MOST_CERTAIN)
-        for prefix, of in (("rfid.", "the antennas"), (f"rfid.{name}.", f"the antennas of model {quoted(name)}")):
-            ranges, rate = (learnt.values.get(prefix + parameter, (0.0, 0.0)) for parameter in PARAMETERS)
-            factor = math.exp(ranges[0])
-            if abs(ranges[0]) > CLEARLY * ranges[1] and abs(factor - 1.0) > DIFFERENT:
-                more = f"{100.0 * abs(factor - 1.0):.0f} % {'farther' if factor > 1.0 else 'less far'}"
-                yield f"{of} reach {more} than the rig says"
-            found = peak * float(rates(np.asarray(peak), np.asarray(rate[0])))
-            if abs(rate[0]) > CLEARLY * rate[1] and abs(found - peak) > DIFFERENT:
-                yield f"{of} read {100.0 * found:.0f} % of the tags next to them, where the rig says {100.0 * peak:.0f} %"
+    names = settings.parameter_names()
+    for name, parameters in names.items():
+        peak = min(settings.models[name].model().peak, MOST_CERTAIN)
+        of = "the antennas" if len(names) == 1 else f"the antennas of model {quoted(name)}"
+        ranges, rate = (learnt.values.get(f"rfid.{parameter}", (0.0, 0.0)) for parameter in parameters)
+        factor = math.exp(ranges[0])
+        if abs(ranges[0]) > CLEARLY * ranges[1] and abs(factor - 1.0) > DIFFERENT:
+            more = f"{100.0 * abs(factor - 1.0):.0f} % {'farther' if factor > 1.0 else 'less far'}"
+            yield f"{of} reach {more} than the rig says"
+        found = peak * float(rates(np.asarray(peak), np.asarray(rate[0])))
+        if abs(rate[0]) > CLEARLY * rate[1] and abs(found - peak) > DIFFERENT:
+            yield f"{of} read {100.0 * found:.0f} % of the tags next to them, where the rig says {100.0 * peak:.0f} %"
 
 
 def _percent(probability: float) -> str:

@@ -207,10 +207,16 @@ class RfidSettings(SensorSettings):
 
     def estimated(self) -> Estimated:
         """The parameters of the models of the antennas that are not known exactly, among those of all models."""
-        used = {antenna.model for antenna in self.all_antennas().values()}
-        names = [name if len(used) == 1 else f"{model}.{name}" for model in self.models for name in PARAMETERS]
+        used = self.parameter_names()
+        names = [used[model][i] if model in used else "" for model in self.models for i in range(len(PARAMETERS))]
         sigmas = [getattr(m.prior, name) * (k in used) for k, m in self.models.items() for name in PARAMETERS]
         return Estimated.among(names, np.array(sigmas))
+
+    def parameter_names(self) -> dict[str, tuple[str, ...]]:
+        """The names of the parameters of each model that an antenna has; with the model's name where there are several."""
+        used = {antenna.model for antenna in self.all_antennas().values()}
+        prefixes = {model: "" if len(used) == 1 else f"{model}." for model in self.models if model in used}
+        return {model: tuple(prefix + name for name in PARAMETERS) for model, prefix in prefixes.items()}
 
     def model(self) -> RfidModel:
         """The model of all antennas, in the order of :meth:`all_antennas`. InputError if a grid cannot be read."""

@@ -99,10 +99,19 @@ GATED = Branch(
     {"final.poses": 10.0},
     NOT_HELD,
 )
+SUMS = tuple(
+    f"{what}.sums"
+    for what in ("nis.rfid", "nis.bearing_range", "residuals.bearing_range.range", "residuals.bearing_range.bearing")
+)
 FEW_PARTICLES = Branch(
     SINGLE_PRECISION.reason
     + " Landmarks are far more exact than tags, so that few particles are left of each of them.",
-    tolerance=NOT_HELD,
+    {
+        **SINGLE_PRECISION.loose,
+        **WHEN_FOUND,
+        **dict.fromkeys(SUMS, 1.5),
+        **{"learnt.constants": 5.0, "causal.poses": 8.0, "final.poses": 8.0, "warnings": NOT_HELD},
+    },
 )
 CHOSEN = Branch(
     SINGLE_PRECISION.reason + " So is the way that is chosen, and from there on everything is another run.",

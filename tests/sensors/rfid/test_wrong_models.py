@@ -10,7 +10,7 @@ import pytest
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.rfid.settings import BeamSettings, PriorSettings, RfidSettings
+from factorgraph_loc.sensors.rfid.settings import AntennaSettings, BeamSettings, PriorSettings, RfidSettings
 from factorgraph_loc.simulation import preset, simulate
 
 ESTIMATORS = ("ekf", "smoother", "particle_filter")
@@ -75,3 +75,17 @@ def test_nothing_is_said_of_antennas_that_are_as_the_rig_says():
     result, _ = outcome(office(), "smoother")
     assert set(result.learnt.values) >= {"rfid.range_scale", "rfid.read_rate"}
     assert not [line for line in result.warnings if "the rig says" in line]
+
+
+def test_parameters_are_named_after_their_models_where_antennas_have_several():
+    models = {"default": BeamSettings(), "narrow": BeamSettings(sigma_phi=0.4), "unused": BeamSettings()}
+    antennas = {"a": AntennaSettings(), "b": AntennaSettings(model="narrow")}
+    several, one = (
+        RfidSettings(antennas=antennas, models=models),
+        RfidSettings(antennas={"a": antennas["a"]}, models=models),
+    )
+    assert several.estimated().names == (
+        *("default.range_scale", "default.read_rate", "narrow.range_scale", "narrow.read_rate"),
+    )
+    assert one.estimated().names == ("range_scale", "read_rate")
+    assert one.estimated().indices == (0, 1)
