@@ -82,8 +82,12 @@ FOUND = Branch(
 )
 UNDECIDED = Branch(
     "Many places explain what was seen equally well: which of them a search keeps, and in which order, is left to rounding.",
-    {"final.poses": 2.0},
-    NOT_HELD,
+    {
+        **dict.fromkeys(("belief", "belief.weights", "belief.poses", "causal.poses", "causal.covariances"), NOT_HELD),
+        **WHEN_FOUND,
+        "final.poses": 2.0,
+    },
+    0.2,
 )
 ILL_CONDITIONED = Branch(
     "The camera's constants can hardly be told apart by now, and rounding is amplified as often as they are linearised anew.",
@@ -96,8 +100,8 @@ FAR_OFF = Branch(
 GATED = Branch(
     "Rows that are missing or come twice make landmarks lie at the edge of what is believed: the last bits decide which are, and "
     "whether a track is given up.",
-    {"final.poses": 10.0},
-    NOT_HELD,
+    {"final.poses": 10.0, "events": NOT_HELD, "events.t": NOT_HELD},
+    10.0,
 )
 SUMS = tuple(
     f"{what}.sums"
