@@ -75,6 +75,10 @@ class Group(Mapping[str, Any]):
             raise InputError(f"{what} has no {missing[0]}, which the interface requires")
         return found
 
+    def __contains__(self, name: object) -> bool:
+        """Whether a name is registered; nothing is loaded."""
+        return name in self.own or name in self._installed()
+
     def __iter__(self) -> Iterator[str]:
         yield from (*self.own, *self._installed())
 

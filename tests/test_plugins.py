@@ -72,6 +72,10 @@ def test_estimators_and_readers_of_another_package(install, sonar):
     assert estimators.estimator_type("guess") is sonar.Guess
     assert isinstance(estimators.settings_of("guess", {}), sonar.GuessSettings)
     assert readers.reader("sonar_log").read is print
+    sonar.Guess.__doc__, sonar.Guess.modalities, sonar.Guess.causal = "Guesses. Often.", {"rfid"}, False
+    found = estimators.describe("guess")
+    assert (found.about, found.causal, found.smoothed) == ("Guesses.", False, True)
+    assert found.sensors == ("odometry", "imu", "rfid", "rssi", "phase")
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from factorgraph_loc.cli import (
     features,
     images,
     inspecting,
+    lookups,
     manifest,
     mapping,
     running,
@@ -78,6 +79,7 @@ app = typer.Typer(
     "output closed the pipe.",
 )
 app.command()(inspecting.datasets)
+app.command()(lookups.estimators)
 app.command()(inspecting.info)
 app.command()(inspecting.convert)
 app.command()(manifest.manifest)

@@ -36,7 +36,12 @@ DataRoot = Annotated[
     Path | None,
     typer.Option(help="Folder that paths in manifests are relative to; by default the environment's FGLOC_DATA."),
 ]
-Reader = Annotated[str | None, typer.Option(help="Reader of LOG, if LOG is neither a manifest nor a native folder.")]
+Reader = Annotated[
+    str | None,
+    typer.Option(
+        help="Reader of LOG, if LOG is neither a manifest nor a native folder.", autocompletion=completion.reader
+    ),
+]
 ReaderOption = Annotated[
     list[str] | None, typer.Option(metavar="KEY=VALUE", help="Option of the reader; may be repeated.")
 ]
@@ -54,7 +59,12 @@ Estimators = Annotated[
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing results.")]
 Sensors = Annotated[
-    str | None, typer.Option(metavar="A,B", help="Sensors that the estimators may use; by default those of the rig.")
+    str | None,
+    typer.Option(
+        metavar="A,B",
+        help="Sensors that the estimators may use; by default those of the rig.",
+        autocompletion=completion.sensors,
+    ),
 ]
 Prior = Annotated[
     str | None,
@@ -77,7 +87,7 @@ Settings = Annotated[
     typer.Option(
         "--set",
         metavar="NAME.KEY=VALUE",
-        help="Setting of an estimator, e.g. smoother.lag=10; may be repeated.",
+        help="Setting of an estimator, such as smoother.lag=10; `fgloc estimators NAME` lists them. May be repeated.",
         autocompletion=completion.setting,
     ),
 ]

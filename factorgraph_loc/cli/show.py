@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import is_dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from factorgraph_loc.text import MESSAGE, one_line, plain
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 WARNINGS = 20  # number of warnings printed
+NARROW, BETWEEN = 20, 2  # characters of a column that is wrapped, at least, and between columns
 
 
 def line(text: str = "") -> None:
@@ -50,26 +51,34 @@ def document(content: Any) -> None:
     print("".join(c if c == "\n" or c.isprintable() else json.dumps(c)[1:-1] for c in text), flush=True)
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table on stdout: the first column left-aligned, numbers right-aligned."""
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], wrapped: Sequence[str] = ()) -> None:
+    """Print a table on stdout: the first column left-aligned, numbers right-aligned. ``wrapped``: columns of text, which take
+    several lines in a narrow terminal."""
     from rich.table import Table
 
     out = Table(box=None, pad_edge=False, header_style="bold")
+    least: list[int] = []
     for i, name in enumerate(header):
         numeric = i > 0 and all(_is_number(row[i]) for row in rows)
-        out.add_column(plain(name), justify="right" if numeric else "left", no_wrap=True)
+        longest = max(map(len, (name, *(row[i] for row in rows))))
+        least.append(min(longest, NARROW) if name in wrapped else longest)
+        justify: Literal["left", "right"] = "right" if numeric else "left"
+        out.add_column(plain(name), justify=justify, no_wrap=name not in wrapped, overflow="fold", min_width=least[-1])
     for row in rows:
         out.add_row(*(plain(cell, MESSAGE) for cell in row))
-    rich_table(out)
+    rich_table(out, sum(least) + BETWEEN * (len(least) - 1) if wrapped else None)
 
 
-def rich_table(content: Table) -> None:
-    """Print a rich table on stdout. A narrow terminal wraps its lines but truncates nothing."""
+def rich_table(content: Table, least: int | None = None) -> None:
+    """Print a rich table on stdout, at least so many characters wide, by default as wide as its text. A narrow terminal wraps its
+    lines but truncates nothing."""
     from rich.console import Console
 
     console = Console(markup=False, emoji=False, highlight=False, width=1000)
     if sys.stdout.isatty():
-        console.width = max(shutil.get_terminal_size().columns, console.measure(content).maximum)
+        console.width = max(
+            shutil.get_terminal_size().columns, console.measure(content).maximum if least is None else least
+        )
     console.print(content)
 
 

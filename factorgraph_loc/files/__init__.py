@@ -12,6 +12,7 @@ __all__ = [
     "parquet",
     "quiet",
     "results",
+    "settings",
     "shipped",
     "tables",
     "temporary",

@@ -11,6 +11,7 @@ import tomllib
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import date, time
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar, get_args, get_origin
@@ -34,9 +35,12 @@ _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST
 
 
 class FileModel(BaseModel):
-    """Base class of everything that people write in TOML: frozen, without unknown keys."""
+    """Base class of everything that people write in TOML: frozen, without unknown keys.
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    A docstring below a field is its meaning; see :mod:`factorgraph_loc.files.settings`.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """A copy with updated values. Numbers are clipped to the bounds of their fields, so that computed settings remain
@@ -47,6 +51,13 @@ class FileModel(BaseModel):
     def bounded(cls, **values: Any) -> Self:
         """A model of computed values, with numbers clipped to the bounds of their fields."""
         return cls(**{key: _within(cls, key, value) for key, value in values.items()})
+
+
+@dataclass(frozen=True)
+class InUnit:
+    """The unit of a number, given in the annotation of a field: ``Annotated[float, InUnit("m")]``."""
+
+    name: str
 
 
 def add_fields(model: type[BaseModel], fields: Mapping[str, tuple[Any, Any]], *, after: str) -> None:
@@ -62,7 +73,7 @@ def add_fields(model: type[BaseModel], fields: Mapping[str, tuple[Any, Any]], *,
 
 Model = TypeVar("Model", bound=BaseModel)
 FARTHEST = 1e7  # m; the maximum of UTM northings
-Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, description="m")]
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST), InUnit("m")]
 
 
 def bounds(metadata: Sequence[Any]) -> tuple[float, float]:

@@ -24,6 +24,9 @@ EVERY: Container[str] = _Every()  # modalities of an estimator that takes whatev
 class Estimator(Protocol):
     """An estimator. It is given measurements in the order of arrival and can be asked at any time.
 
+    Its class may say ``causal = False``, if its estimates are of no use before the end, and ``smoothed = False``, if its final
+    trajectory repeats the causal one.
+
     Only what it is given changes it: whatever is asked, and however often, all later answers are the same to the last bit.
     """
 

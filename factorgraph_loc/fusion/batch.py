@@ -27,13 +27,16 @@ ITERATIONS_PER_WIDTH = 5
 
 
 class BatchSettings(GraphSettings):
-    """``widest_loss``: how many times wider than its own scale the robust loss begins; 1 for a plain robust start."""
+    """Settings of the batch estimator."""
 
     widest_loss: Annotated[float, Field(ge=1.0, le=1000.0)] = 8.0
+    """how many times wider than its own scale the robust loss begins; 1 for a plain robust start"""
 
 
 class Batch(GraphEstimator):
-    """The batch estimator; see the module."""
+    """Robust optimum over the whole log, computed once at its end. See the module."""
+
+    causal = False
 
     def __init__(self, setup: Setup, settings: BatchSettings) -> None:
         self._settings = settings

@@ -16,7 +16,7 @@ from factors.se2 import Array
 
 
 class DeadReckoningSettings(FilterSettings):
-    """Dead reckoning has nothing of its own to set."""
+    """Settings of dead reckoning, which has none of its own."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,10 @@ class _PoseRecord:
 
 
 class DeadReckoning(Filter):
-    """Composes the odometry, with the covariance that grows on the way; all else is counted as ignored."""
+    """Odometry only, with the covariance that grows on the way."""
 
     modalities = frozenset[str]()
+    smoothed = False
     _state: _PoseState
 
     def trajectory(self) -> Trajectory:

@@ -36,16 +36,15 @@ SKEW = 1e-7  # of two standard deviations: more asymmetry is not one of a few ro
 
 
 class EkfSettings(FilterSettings):
-    """``iterations``: 1 is the plain update; more linearise again at the updated pose (Bell and Cathey, 1993). Sensors that need
-    more, as pixels and tags do, have as many as they need.
-
-    ``self_calibration``: constants to which the rig gives an uncertainty are states. ``landmarks``: ``known`` takes the map as it
-    is and ignores others, ``extended`` estimates the others, ``unknown`` estimates all, as if there were no map.
-    """
+    """Settings of the EKF."""
 
     iterations: Annotated[int, Field(ge=1, le=20)] = 1
+    """linearisations of an update; 1 is the plain one, more linearise again at the updated pose (Bell and Cathey, 1993);
+    sensors such as pixels and tags have as many as they need"""
     self_calibration: bool = True
+    """whether constants to which the rig gives an uncertainty are states"""
     landmarks: MapUse = "known"
+    """known takes the map as it is and ignores other landmarks, extended estimates the others, unknown estimates all"""
 
 
 class _State(NamedTuple):
@@ -128,7 +127,7 @@ class _View:
 
 
 class Ekf(Filter):
-    """The EKF; see the module."""
+    """Extended Kalman filter on SE(2), with a smoother (RTS) at the end. See the module."""
 
     _state: _State
 

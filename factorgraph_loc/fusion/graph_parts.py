@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, PlainSerializer, ValidatorFunctionWrapHandler, WrapValidator
 
-from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.fusion.variables import Node, Values, pose_key
 from factorgraph_loc.model.setup import MapUse
 from factorgraph_loc.model.trajectory import Trajectory
@@ -18,20 +18,20 @@ from factors.se2 import Array
 
 
 class GraphSettings(FileModel):
-    """Settings of every graph estimator, in seconds; see the module. ``max_delay``: how late a measurement may come.
-    ``keyframe_interval``: by default 0.09 s, and 0.5 s where landmarks are estimated, which makes each update far dearer.
+    """Settings of every graph estimator."""
 
-    ``self_calibration``: constants to which the rig gives an uncertainty are variables. ``landmarks``: see
-    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`. ``visual_odometry``: what is followed from image to image,
-    but is no point of map or graph, tells the motion between them (:mod:`~factorgraph_loc.slam.frame_pairs`).
-    """
-
-    keyframe_interval: Annotated[float, Field(ge=0.0, le=10.0)] | None = None
-    keyframe_max_interval: Annotated[float, Field(ge=0.01, le=60.0)] = 1.0
-    max_delay: Annotated[float, Field(ge=0.0, le=4.0)] = 0.5
+    keyframe_interval: Annotated[float, Field(ge=0.0, le=10.0), InUnit("s")] | None = None
+    """shortest time between poses of the graph; by default 0.09 s, or 0.5 s where landmarks are estimated"""
+    keyframe_max_interval: Annotated[float, Field(ge=0.01, le=60.0), InUnit("s")] = 1.0
+    """longest time between poses of the graph while measurements come"""
+    max_delay: Annotated[float, Field(ge=0.0, le=4.0), InUnit("s")] = 0.5
+    """how late a measurement may come; later ones are counted and dropped"""
     self_calibration: bool = True
+    """whether constants to which the rig gives an uncertainty are variables"""
     landmarks: MapUse = "known"
+    """known takes the map as it is and ignores other landmarks, extended estimates the others, unknown estimates all"""
     visual_odometry: bool = False
+    """whether features that are followed from image to image, and are no points of map or graph, tell the motion"""
 
 
 def _lag(value: Any, bounded: ValidatorFunctionWrapHandler) -> Any:
@@ -43,16 +43,20 @@ def _written(lag: float | None) -> float | str | None:
 
 
 class SmootherSettings(GraphSettings):
-    """``lag`` [s]: length of a window, behind which poses are final. By default causal estimates come from a window of 10 s and
-    the final trajectory from the whole problem, solved at the end; ``all`` (infinity in Python) keeps the full history solved all
-    the time, as is always done where landmarks or points are estimated. ``relinearize_*``: how far a variable may move (m and rad;
-    for the odometry's constants in their units) before its factors are linearised anew, and after how many updates that is
-    checked. ``smooth`` off: the final trajectory repeats the causal one."""
+    """Settings of the smoother. ``lag`` is infinite in Python for ``all`` in files."""
 
-    lag: Annotated[float | None, Field(ge=0.1, le=3600.0), WrapValidator(_lag), PlainSerializer(_written)] = None
+    lag: Annotated[
+        float | None, Field(ge=0.1, le=3600.0), InUnit("s"), WrapValidator(_lag), PlainSerializer(_written)
+    ] = None
+    """length of the window, behind which poses are final, or all: the full history is kept solved. By default causal estimates
+    come from a window of 10 s and the final trajectory from the whole problem; where landmarks or points are estimated,
+    all"""
     relinearize_threshold: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
+    """change of a variable [m, rad, or the unit of a constant] above which its factors are linearised again"""
     relinearize_skip: Annotated[int, Field(ge=1, le=100)] = 10
+    """updates between checks of that"""
     smooth: bool = True
+    """whether the final trajectory uses all measurements, else it repeats the causal one"""
 
 
 @dataclass

@@ -22,6 +22,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.cloud import Cloud, largest_share, normalised, systematic, vector_moments, weighable
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
@@ -43,20 +44,23 @@ from factors.se2 import Array
 
 
 class ParticleFilterSettings(FilterSettings):
-    """``particles``: their number; with ``kld`` the largest, of which no more are resampled than their spread needs, but at least
-    ``min_particles`` (KLD sampling: Fox, IJRR 22(12), 2003). ``resample_below``: effective sample size, as a share, below which
-    they are resampled. ``smoothing_trajectories``: drawn backwards for the final result, through clouds
-    ``smoothing_interval`` seconds apart. ``self_calibration``: constants to which the rig gives an uncertainty travel with
-    each particle, but not the sensor's time offset, which is taken as the rig has it, and not those of the camera, which widen
-    the noise of its pixels instead."""
+    """Settings of the particle filter. With ``kld`` their number is chosen by KLD sampling (Fox, IJRR 22(12), 2003)."""
 
     particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
+    """number of particles; with kld the largest"""
     kld: bool = False
+    """whether no more particles are resampled than their spread needs"""
     min_particles: Annotated[int, Field(ge=10, le=1_000_000)] = 500
+    """smallest number of particles, with kld"""
     resample_below: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.5
+    """effective sample size, as a share of the particles, below which they are resampled"""
     smoothing_trajectories: Annotated[int, Field(ge=10, le=10_000)] = 100
-    smoothing_interval: Annotated[float, Field(ge=0.1, le=60.0)] = 1.0
+    """trajectories drawn backwards for the final result"""
+    smoothing_interval: Annotated[float, Field(ge=0.1, le=60.0), InUnit("s")] = 1.0
+    """time between the clouds through which these are drawn"""
     self_calibration: bool = True
+    """whether constants to which the rig gives an uncertainty travel with each particle; not time offsets, and not those of
+    a camera, which widen its noise"""
 
 
 class CloudView:
@@ -102,7 +106,7 @@ class CloudView:
 
 
 class ParticleFilter(Filter):
-    """The particle filter; see the module."""
+    """Monte-Carlo localization, with resampling from a kernel density and backward simulation. See the module."""
 
     deterministic = False
     supports_unknown_start = True

@@ -1,14 +1,29 @@
-"""The estimators by name, and how one is made for a run."""
+"""The estimators by name, what is known of each, and how one is made for a run."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, nearest, parse_model
-from factorgraph_loc.fusion.base import Estimator, SpaceEstimator
+from factorgraph_loc.files.settings import first_sentence
+from factorgraph_loc.fusion.base import EVERY, Estimator, SpaceEstimator
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.plugins import ESTIMATORS, load
+from factorgraph_loc.sensors.registry import Channel, channels
 from factorgraph_loc.text import quoted
+
+
+@dataclass(frozen=True)
+class Description:
+    """What there is to know of an estimator. ``about``: one sentence; ``sensors``: channels that it takes; ``causal``: whether it
+    has estimates while it runs; ``smoothed``: whether its final trajectory uses all measurements."""
+
+    name: str
+    about: str
+    sensors: tuple[str, ...]
+    causal: bool
+    smoothed: bool
 
 
 def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
@@ -22,6 +37,28 @@ def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
 def create(name: str, setup: Setup, settings: FileModel) -> Estimator:
     """An estimator by name."""
     return cast(Estimator, estimator_type(name)(setup, settings))
+
+
+def describe(name: str) -> Description:
+    """The description of an estimator; InputError for an unknown one."""
+    kind = estimator_type(name)
+    taken = tuple(channel.name for channel in channels().values() if _takes(kind, channel))
+    return Description(
+        name, first_sentence(kind), taken, getattr(kind, "causal", True), getattr(kind, "smoothed", True)
+    )
+
+
+def _takes(kind: type[Any], channel: Channel) -> bool:
+    if channel.in_space and not issubclass(kind, SpaceEstimator):
+        return False
+    modalities = getattr(kind, "modalities", EVERY)
+    return bool(channel.motion) or any(modality in modalities for modality in _modalities(channel))
+
+
+def _modalities(channel: Channel) -> Iterator[str]:
+    for place in (channels()[channel.column_of] if channel.column_of else channel).measurements:
+        modality = load(place).modality
+        yield modality if isinstance(modality, str) else channel.name
 
 
 def check_names(names: Sequence[str]) -> None:

@@ -16,7 +16,7 @@ from factorgraph_loc.model.setup import Setup
 
 
 class Smoother(GraphEstimator):
-    """The iSAM2 smoother; see the module."""
+    """Incremental factor graph (iSAM2): a window and the whole problem at the end, a fixed lag, or the full history. See above."""
 
     def __init__(self, setup: Setup, settings: SmootherSettings) -> None:
         self._settings = settings

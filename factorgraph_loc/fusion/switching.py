@@ -35,9 +35,10 @@ LEAST = np.diag((1e-4, 1e-4, 1e-4)) ** 2  # m, m, rad: particles that agree to t
 
 
 class SwitchingSettings(FilterSettings):
-    """``particles``: of the particle filter."""
+    """Settings of the switch."""
 
     particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
+    """number of particles of the particle filter"""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class _PoseBelief:
 
 
 class Switching:
-    """The switch; see the module."""
+    """The fusion of the paper: the particle filter while tags are read, else the EKF. See the module."""
 
     deterministic = False
     takes_rows = True

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple, Self
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.fusion.base import EVERY
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status, gaussian_belief
 from factorgraph_loc.model.diagnostics import Diagnostics, Written
@@ -28,10 +28,12 @@ from factors.se2 import Array
 
 
 class FilterSettings(FileModel):
-    """Settings of every filter. ``max_delay`` [s]: how late a measurement may come. ``smooth``: final differs from causal."""
+    """Settings of every filter."""
 
-    max_delay: Annotated[float, Field(ge=0.0, le=5.0)] = 0.5
+    max_delay: Annotated[float, Field(ge=0.0, le=5.0), InUnit("s")] = 0.5
+    """how late a measurement may come; later ones are counted and dropped"""
     smooth: bool = True
+    """whether the final trajectory uses all measurements, else it repeats the causal one"""
 
 
 class _Taken(NamedTuple):

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.files.models import Coordinate, FileModel
+from factorgraph_loc.files.models import Coordinate, FileModel, InUnit
 from factorgraph_loc.maps.points import PointMap
 from factors.se2 import Array
 
@@ -38,7 +38,7 @@ MarkerFamily = Literal[
     "7x7_1000",
 ]
 
-Turn = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi, description="rad, not degrees")]
+Turn = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi), InUnit("rad")]
 # right and up seen from the front, in the corner order of ArUco detectors
 CORNERS = np.array(((0.0, -0.5, 0.5), (0.0, 0.5, 0.5), (0.0, 0.5, -0.5), (0.0, -0.5, -0.5)))
 
@@ -53,11 +53,11 @@ class Marker(FileModel):
     x: Coordinate
     y: Coordinate
     z: Coordinate
-    size: Annotated[float, Field(ge=1e-3, le=10.0, description="m")]
+    size: Annotated[float, Field(ge=1e-3, le=10.0), InUnit("m")]
     facing: Turn
-    pitch: Annotated[float, Field(ge=-1.6, le=1.6, description="rad, not degrees")] = 0.0
+    pitch: Annotated[float, Field(ge=-1.6, le=1.6), InUnit("rad")] = 0.0
     roll: Turn = 0.0
-    sigma: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 0.0
+    sigma: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
 
     def corners(self) -> Array:
         """Return the corners (4, 3) [m] in the world: upper left, upper right, lower right, lower left, seen from the front."""

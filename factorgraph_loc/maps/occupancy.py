@@ -11,13 +11,13 @@ from pydantic import BeforeValidator, Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.bounded import IMAGE, opened
 from factorgraph_loc.files.images import pillow_image
-from factorgraph_loc.files.models import Coordinate, FileModel, inside, parse_model
+from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, inside, parse_model
 from factorgraph_loc.files.yaml import read_yaml
 from factors import se2
 from factors.se2 import Array
 
 Wall = tuple[float, float, float, float]
-Yaw = Annotated[float, Field(ge=-7.0, le=7.0, description="rad")]
+Yaw = Annotated[float, Field(ge=-7.0, le=7.0), InUnit("rad")]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 TOLERANCE = 0.75  # cells between a wall and the cell centres: half a cell for an oblique line
 MIN_EXTENT = 2.0  # cells; smaller groups are noise of the mapping sensor
@@ -32,7 +32,7 @@ class MapFile(FileModel):
     """The YAML file of map_server (ROS or Nav2). ``origin``: x, y [m] and yaw [rad] of the lower left corner of the image."""
 
     image: str
-    resolution: Annotated[float, Field(ge=1e-4, le=10.0, description="m per cell")]
+    resolution: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("m per cell")]
     origin: tuple[Coordinate, Coordinate, Yaw]
     occupied_thresh: Share = 0.65
     free_thresh: Share = 0.196

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field
 from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.models import FileModel, InUnit
 from factors.se2 import Array
 
 Integers = NDArray[np.int64]
@@ -20,7 +20,7 @@ NEGLIGIBLE = 1e-9  # of an axis
 UNIT = 0.01  # tolerance of the norm of a quaternion
 NAMED = {"body": "x y z", "optical": "z -x -y"}
 
-Angle = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi, description="rad, not degrees")]
+Angle = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi), InUnit("rad")]
 
 
 def _matrix(text: str) -> Array:

@@ -5,6 +5,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field
 
+from factorgraph_loc.files.models import InUnit
 from factors.se2 import Array
 
 
@@ -16,7 +17,7 @@ def _positive_semidefinite(value: tuple[float, float, float]) -> tuple[float, fl
     return value
 
 
-Variance = Annotated[float, Field(ge=-1e8, le=1e8, description="m^2")]
+Variance = Annotated[float, Field(ge=-1e8, le=1e8), InUnit("m^2")]
 Covariance = Annotated[tuple[Variance, Variance, Variance], AfterValidator(_positive_semidefinite)]
 
 

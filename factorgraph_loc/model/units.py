@@ -5,9 +5,11 @@ from typing import Annotated
 
 from pydantic import Field
 
-Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
-Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot frame")]
-Scale = Annotated[float, Field(ge=0.2, le=5.0, description="true divided by reported")]
-Seconds = Annotated[float, Field(ge=-5.0, le=5.0, description="s")]
-Rate = Annotated[float, Field(ge=-1.0, le=1.0, description="rad/s")]
+from factorgraph_loc.files.models import InUnit
+
+Angle = Annotated[float, Field(ge=-math.pi, le=math.pi), InUnit("rad")]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0), InUnit("m")]
+Scale = Annotated[float, Field(ge=0.2, le=5.0)]
+Seconds = Annotated[float, Field(ge=-5.0, le=5.0), InUnit("s")]
+Rate = Annotated[float, Field(ge=-1.0, le=1.0), InUnit("rad/s")]
 Noise = Annotated[float, Field(ge=0.0, le=5.0)]

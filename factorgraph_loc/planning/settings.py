@@ -5,9 +5,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.models import FileModel, InUnit
 
-Metres = Annotated[float, Field(ge=1e-3, le=1000.0, description="m")]
+Metres = Annotated[float, Field(ge=1e-3, le=1000.0), InUnit("m")]
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 Dimension = Literal["x", "y", "heading"]
 
@@ -20,12 +20,12 @@ class PolicySettings(FileModel):
     the Fisher information in closed form.
     """
 
-    horizon: Annotated[float, Field(gt=0.0, le=100.0, description="m")] = 3.0
+    horizon: Annotated[float, Field(gt=0.0, le=100.0), InUnit("m")] = 3.0
     far: Metres = 25.0
     replan: Metres = 0.5
-    per_metre: Annotated[float, Field(ge=0.0, le=100.0, description="nats per m")] = 0.3
+    per_metre: Annotated[float, Field(ge=0.0, le=100.0), InUnit("nats/m")] = 0.3
     expectation: Literal["sampled", "fisher"] = "sampled"
-    per_second: Annotated[float, Field(ge=0.0, le=100.0, description="nats per s")] = 0.0
+    per_second: Annotated[float, Field(ge=0.0, le=100.0), InUnit("nats/s")] = 0.0
     samples: Annotated[int, Field(ge=8, le=10_000)] = 128
     dimensions: tuple[Dimension, ...] = ("x", "y", "heading")
 
@@ -48,12 +48,12 @@ class ActiveSettings(FileModel):
 
     policy: PolicySettings = PolicySettings()
     particles: Annotated[int, Field(ge=100, le=100_000)] = 2000
-    speed: Annotated[float, Field(ge=0.01, le=3.0, description="m/s")] = 0.5
-    turn_rate: Annotated[float, Field(ge=0.01, le=6.0, description="rad/s")] = 1.0
-    clearance: Annotated[float, Field(ge=0.05, le=2.0, description="m")] = 0.35
+    speed: Annotated[float, Field(ge=0.01, le=3.0), InUnit("m/s")] = 0.5
+    turn_rate: Annotated[float, Field(ge=0.01, le=6.0), InUnit("rad/s")] = 1.0
+    clearance: Annotated[float, Field(ge=0.05, le=2.0), InUnit("m")] = 0.35
     sight: Metres = 3.0
     start: tuple[Coordinate, Coordinate, Coordinate] | None = None
     position_limit: Metres = 0.3
-    heading_limit: Annotated[float, Field(gt=0.0, le=math.pi, description="rad, not degrees")] = math.radians(10.0)
+    heading_limit: Annotated[float, Field(gt=0.0, le=math.pi), InUnit("rad")] = math.radians(10.0)
     max_metres: Metres = 100.0
-    max_seconds: Annotated[float, Field(gt=0.0, le=36_000.0, description="s")] = 600.0
+    max_seconds: Annotated[float, Field(gt=0.0, le=36_000.0), InUnit("s")] = 600.0

@@ -49,6 +49,11 @@ class Channel:
     check: Place = ""
     sequence: Place = ""
 
+    @property
+    def in_space(self) -> bool:
+        """Whether only logs in three dimensions have it: there is no table for it in a log of a robot on a floor."""
+        return bool(self.described) and not self.tables
+
 
 @dataclass(frozen=True)
 class SensorType:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.models import FileModel, add_fields, inside, nearest, parse_model, read_toml
+from factorgraph_loc.files.models import FileModel, InUnit, add_fields, inside, nearest, parse_model, read_toml
 from factorgraph_loc.io.native.rig_file import read_rig
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.simulation_units import Hertz
@@ -32,12 +32,12 @@ class WorldSettings(FileModel):
     """
 
     plan: Literal["office", "hall", "warehouse", "corridors"] = "office"
-    width: Annotated[float, Field(ge=2.0, le=500.0, description="m")] = 20.0
-    depth: Annotated[float, Field(ge=2.0, le=500.0, description="m")] = 12.0
+    width: Annotated[float, Field(ge=2.0, le=500.0), InUnit("m")] = 20.0
+    depth: Annotated[float, Field(ge=2.0, le=500.0), InUnit("m")] = 12.0
     tags: Annotated[int, Field(ge=0, le=MOST_TAGS)] | None = None
-    density: Annotated[float, Field(ge=1e-4, le=100.0, description="tags per m^2")] | None = None
+    density: Annotated[float, Field(ge=1e-4, le=100.0), InUnit("tags per m^2")] | None = None
     surfaces: Annotated[tuple[Surface, ...], Field(min_length=1)] = ("wall", "shelf")
-    tag_height: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 1.2
+    tag_height: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 1.2
     even: bool = False
     landmarks: Annotated[int, Field(ge=0, le=10_000)] = 0
     points: Annotated[int, Field(ge=0, le=10_000)] = 0
@@ -59,11 +59,11 @@ class WorldSettings(FileModel):
 class DriveSettings(FileModel):
     """A drive between random places. ``rate``: of the reference. ``clearance``: of the path from walls."""
 
-    duration: Annotated[float, Field(ge=1.0, le=14_400.0, description="s")] = 600.0
-    speed: Annotated[float, Field(ge=0.01, le=3.0, description="m/s")] = 0.5
-    turn_rate: Annotated[float, Field(ge=0.01, le=6.0, description="rad/s")] = 1.0
-    rate: Annotated[float, Field(ge=10.0, le=50.0, description="1/s")] = 10.0
-    clearance: Annotated[float, Field(ge=0.25, le=2.0, description="m")] = 0.3
+    duration: Annotated[float, Field(ge=1.0, le=14_400.0), InUnit("s")] = 600.0
+    speed: Annotated[float, Field(ge=0.01, le=3.0), InUnit("m/s")] = 0.5
+    turn_rate: Annotated[float, Field(ge=0.01, le=6.0), InUnit("rad/s")] = 1.0
+    rate: Annotated[float, Field(ge=10.0, le=50.0), InUnit("1/s")] = 10.0
+    clearance: Annotated[float, Field(ge=0.25, le=2.0), InUnit("m")] = 0.3
 
 
 class ImageSettings(FileModel):
@@ -73,7 +73,7 @@ class ImageSettings(FileModel):
     """
 
     rate: Hertz = 5.0
-    exposure: Annotated[float, Field(ge=0.0, le=0.2, description="s")] = 0.005
+    exposure: Annotated[float, Field(ge=0.0, le=0.2), InUnit("s")] = 0.005
     read_noise: Annotated[float, Field(ge=0.0, le=50.0, description="of 255")] = 1.5
     shot_noise: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
     gain_drift: Annotated[float, Field(ge=0.0, le=0.5)] = 0.1

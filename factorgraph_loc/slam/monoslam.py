@@ -18,6 +18,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings
 from factorgraph_loc.model.belief import PoseEstimate, PosePrior, SpacePose
 from factorgraph_loc.model.learnt import Learnt, LearntPoint
@@ -63,25 +64,27 @@ VAGUE = 0.5  # m, rad: standard deviations beyond which the pose is unknown
 
 
 class MonoslamSettings(FilterSettings):
-    """``acceleration``, ``angular_acceleration``: standard deviations of the constant-velocity model, as published.
-
-    ``planar``: the robot is on a floor, up to ``height_sigma`` and ``tilt_sigma``; by default unless it starts with a pose in
-    space. ``landmarks``: use of the map's points, as of :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`.
-    ``max_points``: in the state; ``per_image``: new ones are added if fewer than these should be visible. ``iterations`` of the
-    update in a known map; 1 is the published update. With points in the state it is always 1, as repeated linearization makes the
-    filter inconsistent. ``smooth``: smooth the final trajectory of a run in a known map; with points in the state it is the
-    causal one.
-    """
+    """Settings of the monoSLAM filter. With points in the state the update is never iterated, which would make the filter
+    inconsistent, and the final trajectory is the causal one."""
 
     planar: bool | None = None
-    acceleration: Annotated[float, Field(ge=1e-3, le=100.0, description="m/s^2")] = 4.0
-    angular_acceleration: Annotated[float, Field(ge=1e-3, le=100.0, description="rad/s^2")] = 6.0
-    height_sigma: Annotated[float, Field(ge=1e-5, le=1.0, description="m")] = 0.005
-    tilt_sigma: Annotated[float, Field(ge=1e-5, le=0.5, description="rad")] = 0.005
+    """whether the robot is on a floor; by default unless it starts with a pose in space"""
+    acceleration: Annotated[float, Field(ge=1e-3, le=100.0), InUnit("m/s^2")] = 4.0
+    """standard deviation of the constant-velocity model, as published"""
+    angular_acceleration: Annotated[float, Field(ge=1e-3, le=100.0), InUnit("rad/s^2")] = 6.0
+    """standard deviation of the constant-velocity model, as published"""
+    height_sigma: Annotated[float, Field(ge=1e-5, le=1.0), InUnit("m")] = 0.005
+    """standard deviation of the height of a robot on a floor"""
+    tilt_sigma: Annotated[float, Field(ge=1e-5, le=0.5), InUnit("rad")] = 0.005
+    """standard deviation of roll and pitch of a robot on a floor"""
     landmarks: MapUse = "known"
+    """known takes the map's points and ignores others, extended estimates the others, unknown estimates all"""
     max_points: Annotated[int, Field(ge=1, le=1000)] = 100
+    """largest number of points in the state"""
     per_image: Annotated[int, Field(ge=1, le=1000)] = 20
+    """new points are added if fewer than these should be visible"""
     iterations: Annotated[int, Field(ge=1, le=20)] = 3
+    """linearizations of an update in a known map; 1 is the published update"""
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ class _UpdateRecord:
 
 
 class Monoslam(Filter):
-    """The monoSLAM filter; see the module."""
+    """The EKF of the paper: a camera in space, with points that it maps on the way. See the module."""
 
     modalities = frozenset({"camera"})
     estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks

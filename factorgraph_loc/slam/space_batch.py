@@ -73,10 +73,11 @@ class _SeenPoints:
 
 
 class SpaceBatch(Monoslam):
-    """The batch estimator in space; see the module."""
+    """Robust optimum over the whole log in space, for a camera that is carried by hand. See the module."""
 
     estimates_points = False
     starts_in_space = True
+    causal = False
 
     def __init__(self, setup: Setup, settings: SpaceBatchSettings) -> None:
         if settings.landmarks != "known" or settings.planar:

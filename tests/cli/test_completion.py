@@ -9,6 +9,8 @@ import shellingham
 
 from factorgraph_loc.cli import completion
 from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.fusion.registry import settings_type
+from factorgraph_loc.plugins import ESTIMATORS
 from factorgraph_loc.simulation import PRESETS
 
 FGLOC = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
@@ -28,6 +30,11 @@ def test_the_names_are_those_of_the_registries():
     assert completion.logs("") == list(manifests())
 
 
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_the_settings_are_those_of_the_models(name):
+    assert completion.settings_of(name) == list(settings_type(name).model_fields)
+
+
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
@@ -39,6 +46,14 @@ def test_the_names_are_those_of_the_registries():
         ("fgloc simulate c", ["corridor"]),
         ("fgloc run plaza2 -e ekf --prior u", ["unknown"]),
         ("fgloc run plaza2 -e ekf --set ek", ["ekf."]),
+        (
+            "fgloc run plaza2 -e smoother --set smoother.re",
+            ["smoother.relinearize_threshold=", "smoother.relinearize_skip="],
+        ),
+        ("fgloc run plaza2 -e ekf --set no_such.", []),
+        ("fgloc run plaza2 -e ekf --sensors odometry,rfid,r", ["odometry,rfid,rssi"]),
+        ("fgloc info data --reader m", ["mapped", "mrclam"]),
+        ("fgloc estimators sm", ["smoother"]),
         ("fgloc run no-such-log", []),  # the shell goes on with files
     ],
 )
@@ -51,6 +66,7 @@ def test_completion_loads_no_numerical_libraries():
         "import sys, factorgraph_loc.cli.app\n"
         "from factorgraph_loc.cli import completion\n"
         "assert completion.logs('plaza') and completion.estimators('ekf,') and completion.preset('')\n"
+        "assert completion.setting('smoother.') and completion.reader('m')\n"
         "print(sorted({'numpy', 'gtsam', 'polars', 'scipy', 'pydantic'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

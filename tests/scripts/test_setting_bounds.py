@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 import pytest
-from limits_tables import FILES, numbers_of, tables
+from limits_tables import ESTIMATORS, FILES, numbers_of, tables
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import parse_model
@@ -21,14 +21,12 @@ from factorgraph_loc.sensors.odometry.settings import (
     OdometryUncertainty,
 )
 
-NUMBERS = [
-    pytest.param(*number, id=f"{file}-{number[0]}") for file, kind in FILES.items() for number in numbers_of(kind)
-]
+ALL = FILES | ESTIMATORS
 
 
-@pytest.mark.parametrize("file", list(FILES))
+@pytest.mark.parametrize("file", list(ALL))
 def test_every_number_of_settings_has_bounds(file):
-    without = [key for key, _, low, high in numbers_of(FILES[file]) if not math.isfinite(high - low)]
+    without = [number.key for number in numbers_of(ALL[file]) if not math.isfinite(number.high - number.low)]
     assert not without
 
 
@@ -77,8 +75,8 @@ def test_computed_settings_can_be_read_again(factor):
 
 @pytest.mark.parametrize("name", list(registry.ESTIMATORS))
 def test_settings_of_estimators_are_refused_in_one_line(name):
-    for key, kind, low, high in numbers_of(FILES[f"settings of {name}"]):
-        for value in (low - 1.0, high + 1.0):
-            with pytest.raises(InputError, match=f"settings of {name}: {key} is ") as caught:
-                registry.settings_of(name, {key: kind(value) if kind is float else math.floor(value)})
+    for number in numbers_of(ESTIMATORS[f"settings of {name}"]):
+        for value in (number.low - 1.0, number.high + 1.0):
+            with pytest.raises(InputError, match=f"settings of {name}: {number.key} is ") as caught:
+                registry.settings_of(name, {number.key: value if number.kind == "number" else math.floor(value)})
             assert "\n" not in str(caught.value)

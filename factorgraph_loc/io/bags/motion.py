@@ -7,7 +7,7 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.models import FileModel, nearest
+from factorgraph_loc.files.models import FileModel, InUnit, nearest
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.bags.clock import Clock
 from factorgraph_loc.io.bags.file import Bag, Stamped
@@ -31,8 +31,8 @@ class WheelSettings(FileModel):
 
     left: str
     right: str
-    radius: Annotated[float, Field(gt=0.0, le=5.0, description="m")]
-    track: Annotated[float, Field(gt=0.0, le=20.0, description="m")]
+    radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")]
+    track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")]
 
 
 class OdometryTopic(Turned):

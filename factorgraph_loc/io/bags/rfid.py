@@ -10,7 +10,7 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.column_mapping import SECONDS, EpcCase, in_case
 from factorgraph_loc.files.columns import LATEST
-from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.io.bags.clock import Clock
 from factorgraph_loc.io.bags.fields import LIST, Fields, as_nanoseconds, as_number, as_text
@@ -37,7 +37,7 @@ class RfidTopic(FileModel):
     epc_case: EpcCase = "as written"
     frames: dict[str, str] = Field(default_factory=dict)
     rounds: Literal["gaps", "message"] = "gaps"
-    round_gap: Annotated[float, Field(gt=0.0, le=10.0, description="s")] = 0.05
+    round_gap: Annotated[float, Field(gt=0.0, le=10.0), InUnit("s")] = 0.05
     clock: Clock | None = None
 
 

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.columns import LATEST
-from factorgraph_loc.files.models import Coordinate, FileModel, inside, parse_model, read_toml
+from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, inside, parse_model, read_toml
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.maps.markers import MarkerSettings
 from factorgraph_loc.model.log import StartPose
@@ -25,10 +25,10 @@ class StartSettings(FileModel):
 
     x: Coordinate
     y: Coordinate
-    heading: Annotated[float, Field(ge=-7.0, le=7.0, description="rad")]
-    sigma_position: Annotated[float, Field(ge=1e-6, le=1000.0, description="m")]
-    sigma_heading: Annotated[float, Field(ge=1e-6, le=10.0, description="rad")]
-    t_ns: Annotated[int, Field(ge=-LATEST, le=LATEST, description="ns")] | None = None
+    heading: Annotated[float, Field(ge=-7.0, le=7.0), InUnit("rad")]
+    sigma_position: Annotated[float, Field(ge=1e-6, le=1000.0), InUnit("m")]
+    sigma_heading: Annotated[float, Field(ge=1e-6, le=10.0), InUnit("rad")]
+    t_ns: Annotated[int, Field(ge=-LATEST, le=LATEST), InUnit("ns")] | None = None
 
     def pose(self, t0_ns: int) -> StartPose:
         """The start of a log whose t = 0 is at ``t0_ns``."""

@@ -11,6 +11,7 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, read_mapped
 from factorgraph_loc.files.columns import LENGTH
 from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
+from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.readers.space_poses import read_kitti
 from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
@@ -20,7 +21,7 @@ from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStr
 from factors import se2
 from factors.se2 import Array, Integers
 
-Offset = Annotated[float, Field(ge=-1e10, le=1e10, description="s")]
+Offset = Annotated[float, Field(ge=-1e10, le=1e10), InUnit("s")]
 
 QUATERNION = ("qx", "qy", "qz", "qw")
 POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION), ("t", "x", "y", "z", *QUATERNION))
@@ -34,7 +35,7 @@ class OdometryFile(ColumnMapping, Turned):
     quaternion (poses, of which only the relative motion is used); left, right (distances of the wheels, with their ``track``).
     ``clock_offset`` [s]: added to all timestamps."""
 
-    track: Annotated[float, Field(gt=0.0, le=10.0, description="m between the wheels")] | None = None
+    track: Annotated[float, Field(gt=0.0, le=10.0), InUnit("m")] | None = None
     clock_offset: Offset = 0.0
 
 

@@ -12,7 +12,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, Mapped, in_case, read_mapped
 from factorgraph_loc.files.columns import PURE, Column
-from factorgraph_loc.files.models import FileModel, inside
+from factorgraph_loc.files.models import FileModel, InUnit, inside
 from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.sensors.rfid.columns import INVENTORIES, RFID
 from factorgraph_loc.sensors.rfid.tables import check_reads
@@ -73,8 +73,8 @@ PRESETS: dict[str, dict[str, dict[str, str]]] = {
 class Channels(FileModel):
     """Evenly spaced channels: the frequency of channel 1, and the step."""
 
-    first: Annotated[float, Field(gt=100.0, lt=10_000.0, description="MHz")]
-    step: Annotated[float, Field(gt=0.0, lt=100.0, description="MHz")]
+    first: Annotated[float, Field(gt=100.0, lt=10_000.0), InUnit("MHz")]
+    step: Annotated[float, Field(gt=0.0, lt=100.0), InUnit("MHz")]
 
 
 class RfidFile(ColumnMapping):
@@ -88,10 +88,10 @@ class RfidFile(ColumnMapping):
     preset: Literal["impinj_itemtest", "impinj_iot", "sllurp_log", "sllurp_reports"] | None = None
     antenna: str | None = None
     antennas: dict[str, str] = Field(default_factory=dict)
-    channels: tuple[Annotated[float, Field(gt=100.0, lt=10_000.0, description="MHz")], ...] | Channels | None = None
+    channels: tuple[Annotated[float, Field(gt=100.0, lt=10_000.0), InUnit("MHz")], ...] | Channels | None = None
     epc_case: EpcCase = "as written"
-    round_gap: Annotated[float, Field(gt=0.0, le=10.0, description="s")] | None = None
-    clock_offset: Annotated[float, Field(ge=-1e10, le=1e10, description="s")] = 0.0
+    round_gap: Annotated[float, Field(gt=0.0, le=10.0), InUnit("s")] | None = None
+    clock_offset: Annotated[float, Field(ge=-1e10, le=1e10), InUnit("s")] = 0.0
 
     @model_validator(mode="before")
     @classmethod

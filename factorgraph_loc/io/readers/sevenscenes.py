@@ -16,7 +16,7 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.bounded import IMAGE, opened
 from factorgraph_loc.files.images import size_of_file
-from factorgraph_loc.files.models import FileModel, inside, read_text
+from factorgraph_loc.files.models import FileModel, InUnit, inside, read_text
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory3 import Trajectory3
@@ -39,7 +39,7 @@ RIG = Rig(
 class Options(FileModel):
     """``rate`` [Hz]: nominal frame rate."""
 
-    rate: Annotated[float, Field(gt=0.0, le=1000.0, description="Hz")] = 15.0
+    rate: Annotated[float, Field(gt=0.0, le=1000.0), InUnit("Hz")] = 15.0
 
 
 def read(path: Path | None, options: Options) -> Log:

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.models import FileModel, parse_model
+from factorgraph_loc.files.models import FileModel, InUnit, parse_model
 from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
 from factorgraph_loc.io.readers.matlab import read_matlab
 from factorgraph_loc.model.log import Log
@@ -29,7 +29,7 @@ FIELDS = {**dict.fromkeys(SERIES, 1), "r": LANDMARKS, "b": LANDMARKS, "l": 2}
 class Options(FileModel):
     """``max_range`` [m]: landmarks farther away are ignored."""
 
-    max_range: Annotated[float, Field(gt=0.0, description="m")] = 5.0
+    max_range: Annotated[float, Field(gt=0.0), InUnit("m")] = 5.0
 
 
 def read(path: Path | None, options: Options) -> Log:

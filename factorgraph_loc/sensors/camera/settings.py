@@ -8,20 +8,20 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field, model_validator
 
-from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.model.settings import SensorSettings
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 
-Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
-Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot frame")]
-Focal = Annotated[float, Field(gt=1.0, le=1e5, description="px")]
-Pixel = Annotated[float, Field(ge=-1e5, le=1e5, description="px")]
+Angle = Annotated[float, Field(ge=-math.pi, le=math.pi), InUnit("rad")]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0), InUnit("m")]
+Focal = Annotated[float, Field(gt=1.0, le=1e5), InUnit("px")]
+Pixel = Annotated[float, Field(ge=-1e5, le=1e5), InUnit("px")]
 Lens = Annotated[float, Field(ge=-1000.0, le=1000.0)]
-Side = Annotated[int, Field(ge=16, le=100_000, description="px")]
-Metres = Annotated[float, Field(ge=0.0, le=10.0, description="m")]
-Turn = Annotated[float, Field(ge=0.0, le=1.0, description="rad")]
+Side = Annotated[int, Field(ge=16, le=100_000), InUnit("px")]
+Metres = Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")]
+Turn = Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")]
 WIDEST_ANGLE = math.degrees(math.atan(math.sqrt(reprojection.WIDEST)))
 
 
@@ -38,7 +38,7 @@ class CameraUncertainty(FileModel):
     pitch: Turn = 0.0
     yaw: Turn = 0.0
     focal: Annotated[float, Field(ge=0.0, le=1.0, description="relative")] = 0.0
-    time_offset: Annotated[float, Field(ge=0.0, le=1.0, description="s")] = 0.0
+    time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] = 0.0
 
 
 class CameraSettings(SensorSettings):
@@ -70,7 +70,7 @@ class CameraSettings(SensorSettings):
     roll: Angle = 0.0
     pitch: Angle = 0.0
     yaw: Angle = 0.0
-    pixel_sigma: Annotated[float, Field(ge=0.01, le=100.0, description="px")] = 1.0
+    pixel_sigma: Annotated[float, Field(ge=0.01, le=100.0), InUnit("px")] = 1.0
     robust: Annotated[float, Field(ge=0.01, le=100.0, description="scale of Huber's loss, in sigmas")] = 2.0
     tempering: Annotated[float, Field(ge=1e-6, le=1.0, description="exponent of the likelihood")] = 0.03
     frontend: FrontendSettings = FrontendSettings()

@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.model.settings import SensorSettings
 from factorgraph_loc.model.units import Angle, Offset
 from factors.landmarks.model import PARAMETERS, BearingRangeModel
@@ -13,12 +13,12 @@ from factors.landmarks.model import PARAMETERS, BearingRangeModel
 class BearingRangeUncertainty(FileModel):
     """Standard deviations of constants that differ between robots or runs; those above 0 are estimated."""
 
-    x: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 0.0
-    y: Annotated[float, Field(ge=0.0, le=10.0, description="m")] = 0.0
-    bearing_bias: Annotated[float, Field(ge=0.0, le=1.0, description="rad")] = 0.0
+    x: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
+    y: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
+    bearing_bias: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] = 0.0
     range_scale: Annotated[float, Field(ge=0.0, le=1.0, description="relative")] = 0.0
-    depth_axis: Annotated[float, Field(ge=0.0, le=1.0, description="rad")] = 0.0
-    time_offset: Annotated[float, Field(ge=0.0, le=1.0, description="s")] = 0.0
+    depth_axis: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] = 0.0
+    time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] = 0.0
 
 
 class BearingRangeSettings(SensorSettings):
@@ -36,9 +36,9 @@ class BearingRangeSettings(SensorSettings):
     range_scale: Annotated[float, Field(ge=0.2, le=5.0, description="reported divided by true")] = 1.0
     range_kind: Annotated[Literal["distance", "depth"], Field(description="depth: along one axis only")] = "distance"
     depth_axis: Annotated[Angle, Field(description="of that axis, in the sensor frame")] = 0.0
-    range_sigma: Annotated[float, Field(ge=1e-4, le=10.0, description="m")]
-    range_sigma_relative: Annotated[float, Field(ge=0.0, le=1.0, description="m per m of range")] = 0.0
-    bearing_sigma: Annotated[float, Field(ge=1e-5, le=0.5, description="rad, not degrees")] = 0.05
+    range_sigma: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("m")]
+    range_sigma_relative: Annotated[float, Field(ge=0.0, le=1.0), InUnit("m per m")] = 0.0
+    bearing_sigma: Annotated[float, Field(ge=1e-5, le=0.5), InUnit("rad")] = 0.05
     robust: Annotated[float, Field(ge=0.01, le=100.0, description="scale of the Geman-McClure loss, in sigmas")] = 4.0
     exact_survey: Annotated[float, Field(ge=0.0, le=10.0, description="relative to range_sigma")] = 0.2
     uncertainty: BearingRangeUncertainty = BearingRangeUncertainty()

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.model.simulation_units import Hertz, Metres
 
 
@@ -14,4 +14,4 @@ class SightingSettings(FileModel):
 
     rate: Hertz = 2.0
     max_range: Metres = 6.0
-    field_of_view: Annotated[float, Field(ge=0.01, le=6.3, description="rad")] = 6.3
+    field_of_view: Annotated[float, Field(ge=0.01, le=6.3), InUnit("rad")] = 6.3

@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.model.settings import SensorSettings
 from factorgraph_loc.model.units import Angle, Noise, Rate, Scale
 from factors.odometry.model import PARAMETERS, Growth
@@ -37,8 +37,8 @@ class OdometryUncertainty(FileModel):
 
     scale_distance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     scale_rotation: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    heading_rate_bias: Annotated[float, Field(ge=0.0, le=1.0, description="rad/s")] = 0.0
-    heading_drift: Annotated[float, Field(ge=0.0, le=1.0, description="rad/m")] = 0.0
+    heading_rate_bias: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad/s")] = 0.0
+    heading_drift: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad/m")] = 0.0
 
 
 class OdometrySettings(SensorSettings):
@@ -47,14 +47,14 @@ class OdometrySettings(SensorSettings):
     constants: ClassVar[tuple[str, ...]] = PARAMETERS
     scale_distance: Scale = 1.0
     scale_rotation: Scale = 1.0
-    speed_bias: Annotated[float, Field(ge=-1.0, le=1.0, description="m/s, reported at rest")] = 0.0
+    speed_bias: Annotated[float, Field(ge=-1.0, le=1.0), InUnit("m/s")] = 0.0
     heading_rate_bias: Rate = 0.0
-    heading_drift: Annotated[float, Field(ge=-1.0, le=1.0, description="rad/m")] = 0.0
+    heading_drift: Annotated[float, Field(ge=-1.0, le=1.0), InUnit("rad/m")] = 0.0
     direction: Angle = 0.0
-    delay: Annotated[float, Field(ge=0.0, le=2.0, description="s")] = 0.0
-    lag: Annotated[float, Field(ge=0.0, le=5.0, description="s")] = 0.0
-    turn_slowdown: Annotated[float, Field(ge=0.0, le=5.0, description="m/rad")] = 0.0
-    max_hold: Annotated[float, Field(ge=1e-3, le=60.0, description="s")] = 1.5
+    delay: Annotated[float, Field(ge=0.0, le=2.0), InUnit("s")] = 0.0
+    lag: Annotated[float, Field(ge=0.0, le=5.0), InUnit("s")] = 0.0
+    turn_slowdown: Annotated[float, Field(ge=0.0, le=5.0), InUnit("m/rad")] = 0.0
+    max_hold: Annotated[float, Field(ge=1e-3, le=60.0), InUnit("s")] = 1.5
     unknown_distance: Noise = 0.2
     unknown_rotation: Noise = 0.2
     noise: OdometryNoise = OdometryNoise()

@@ -12,7 +12,7 @@ from pydantic import Field
 from factorgraph_loc.errors import bad_field
 from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, in_case, read_mapped
 from factorgraph_loc.files.csv_cells import read_cells
-from factorgraph_loc.files.models import Coordinate, FileModel, inside, parse_model, write_text
+from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, inside, parse_model, write_text
 from factorgraph_loc.model.survey import Covariance, spread_of
 from factorgraph_loc.sensors.rfid.columns import TAGS
 from factors.se2 import Array
@@ -31,7 +31,7 @@ class Tag(FileModel):
     x: Coordinate
     y: Coordinate
     z: Coordinate = 0.0
-    facing: Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi, description="rad, not degrees")] | None = None
+    facing: Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi), InUnit("rad")] | None = None
     sigma: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
     covariance: Covariance | None = None
 

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
-from factorgraph_loc.files.models import Coordinate, FileModel, inside
+from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, inside
 from factorgraph_loc.model.settings import SensorSettings
 from factorgraph_loc.model.variable import Estimated
 from factorgraph_loc.sensors.rfid.grids import read_grid, write_grid
@@ -25,8 +25,8 @@ from factors.rfid.phase import PhaseModel
 from factors.rfid.strength import RssiModel
 from factors.se2 import Array
 
-Angle = Annotated[float, Field(ge=-math.pi, le=math.pi, description="rad")]
-Offset = Annotated[float, Field(ge=-10.0, le=10.0, description="m, in the robot frame")]
+Angle = Annotated[float, Field(ge=-math.pi, le=math.pi), InUnit("rad")]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0), InUnit("m")]
 Weight = Annotated[float, Field(ge=-1e6, le=1e6)]
 Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 
@@ -46,9 +46,9 @@ class BeamSettings(FileModel):
     kind: Literal["beam"] = "beam"
     prior: PriorSettings = Field(default_factory=PriorSettings)
     p0: Annotated[float, Field(ge=1e-6, le=1.0 - 1e-6)] = 0.9
-    r_max: Annotated[float, Field(ge=0.01, le=50.0, description="m")] = 4.5
-    s_r: Annotated[float, Field(ge=1e-3, le=10.0, description="m")] = 0.3
-    sigma_phi: Annotated[float, Field(ge=1e-3, le=10.0, description="rad, not degrees")] = 0.698
+    r_max: Annotated[float, Field(ge=0.01, le=50.0), InUnit("m")] = 4.5
+    s_r: Annotated[float, Field(ge=1e-3, le=10.0), InUnit("m")] = 0.3
+    sigma_phi: Annotated[float, Field(ge=1e-3, le=10.0), InUnit("rad")] = 0.698
 
     def model(self) -> DetectionModel:
         return BeamModel(self.p0, self.r_max, self.s_r, self.sigma_phi)
@@ -97,7 +97,7 @@ class AntennaSettings(FileModel):
     y: Offset = 0.0
     z: Offset = 0.0
     yaw: Angle = 0.0
-    pitch: Annotated[float, Field(ge=-1.6, le=1.6, description="rad, not degrees")] = 0.0
+    pitch: Annotated[float, Field(ge=-1.6, le=1.6), InUnit("rad")] = 0.0
     model: str = "default"
 
 
@@ -105,7 +105,7 @@ class RssiSettings(FileModel):
     """See :class:`factors.rfid.strength.RssiModel`; ``coefficients`` in the order of ``factors.rfid.strength.FEATURES``."""
 
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)]
-    sigma: Annotated[float, Field(ge=0.01, le=30.0, description="dB")]
+    sigma: Annotated[float, Field(ge=0.01, le=30.0), InUnit("dB")]
     dof: Annotated[float, Field(ge=0.1, le=1000.0, description="degrees of freedom of the Student density")]
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.005
 
@@ -120,10 +120,10 @@ class PhaseSettings(FileModel):
 
     kappa: Annotated[float, Field(ge=1e-6, le=100.0)] = 1.0
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
-    max_range: Annotated[float, Field(ge=0.01, le=50.0, description="m")] = 1.5
+    max_range: Annotated[float, Field(ge=0.01, le=50.0), InUnit("m")] = 1.5
     min_reads: Annotated[int, Field(ge=2, le=1000)] = 3
-    window: Annotated[float, Field(ge=1e-3, le=60.0, description="s")] = 2.0
-    step: Annotated[float, Field(ge=1e-3, le=60.0, description="s")] = 1.0
+    window: Annotated[float, Field(ge=1e-3, le=60.0), InUnit("s")] = 2.0
+    step: Annotated[float, Field(ge=1e-3, le=60.0), InUnit("s")] = 1.0
 
     @model_validator(mode="after")
     def _has_no_gaps(self) -> PhaseSettings:
@@ -174,8 +174,8 @@ class RfidSettings(SensorSettings):
     false_read: Share = 1e-3
     miss: Share = 0.0
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 1.0
-    round_gap: Annotated[float, Field(ge=1e-4, le=10.0, description="s")] = 0.05
-    pass_sigma: Annotated[float, Field(ge=0.01, le=10.0, description="m")] = 0.1
+    round_gap: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("s")] = 0.05
+    pass_sigma: Annotated[float, Field(ge=0.01, le=10.0), InUnit("m")] = 0.1
     dead_tags: Share = 0.03
     rssi: RssiSettings | None = None
     phase: PhaseSettings | None = None
@@ -236,8 +236,8 @@ class SurveySettings(FileModel):
     """The transform from the tags' survey frame to the world: rotation by ``heading`` about the point (``about_x``, ``about_y``) of
     the survey, then translation by ``x`` and ``y``."""
 
-    x: Annotated[float, Field(ge=-1000.0, le=1000.0, description="m")] = 0.0
-    y: Annotated[float, Field(ge=-1000.0, le=1000.0, description="m")] = 0.0
+    x: Annotated[float, Field(ge=-1000.0, le=1000.0), InUnit("m")] = 0.0
+    y: Annotated[float, Field(ge=-1000.0, le=1000.0), InUnit("m")] = 0.0
     heading: Angle = 0.0
     about_x: Coordinate = 0.0
     about_y: Coordinate = 0.0

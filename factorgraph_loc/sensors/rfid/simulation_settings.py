@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.model.simulation_units import Metres, Seconds, Share
 from factorgraph_loc.sensors.rfid.settings import Weight
 
@@ -13,8 +13,8 @@ class SimulatedPhaseSettings(FileModel):
     """Phase of reads: carrier ``frequency``, noise ``sigma``, and the share ``flips`` of reads that are off by pi, as with most
     readers."""
 
-    frequency: Annotated[float, Field(ge=3e8, le=6e9, description="Hz")] = 920.625e6
-    sigma: Annotated[float, Field(ge=0.0, le=3.0, description="rad")] = 0.1
+    frequency: Annotated[float, Field(ge=3e8, le=6e9), InUnit("Hz")] = 920.625e6
+    sigma: Annotated[float, Field(ge=0.0, le=3.0), InUnit("rad")] = 0.1
     flips: Share = 0.2
 
 
@@ -23,14 +23,14 @@ class SimulatedRssiSettings(FileModel):
     ``dof`` degrees of freedom."""
 
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)] = (-50.0, 2.0, -8.0, 0.0, 2.0, 0.0)
-    sigma: Annotated[float, Field(ge=0.0, le=30.0, description="dB")] = 2.0
+    sigma: Annotated[float, Field(ge=0.0, le=30.0), InUnit("dB")] = 2.0
     dof: Annotated[float, Field(ge=0.1, le=100.0)] = 4.0
 
 
 class Fading(FileModel):
     """Persistent misses: each antenna misses each tag for times of mean ``duration``, a ``share`` of all time."""
 
-    duration: Annotated[float, Field(ge=1e-3, le=1000.0, description="s")] = 2.0
+    duration: Annotated[float, Field(ge=1e-3, le=1000.0), InUnit("s")] = 2.0
     share: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
 
 
@@ -48,7 +48,7 @@ class ClockJump(FileModel):
     """From ``time`` on the reader's timestamps are ``jump`` seconds late."""
 
     time: Seconds
-    jump: Annotated[float, Field(ge=-60.0, le=60.0, description="s")]
+    jump: Annotated[float, Field(ge=-60.0, le=60.0), InUnit("s")]
 
 
 class Silence(FileModel):

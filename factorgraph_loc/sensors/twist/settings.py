@@ -4,9 +4,10 @@ from typing import Annotated
 
 from pydantic import Field
 
+from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.model.settings import SensorSettings
 
-PerRootSecond = Annotated[float, Field(ge=1e-6, le=5.0, description="per sqrt(s)")]
+PerRootSecond = Annotated[float, Field(ge=1e-6, le=5.0), InUnit("per sqrt(s)")]
 
 
 class TwistSettings(SensorSettings):

@@ -1,0 +1,179 @@
+"""What models of settings say of themselves: keys, defaults, bounds, units and meanings.
+
+A field of a :class:`~factorgraph_loc.files.models.FileModel` has its bounds from ``Field``, its unit from a
+:class:`~factorgraph_loc.files.models.InUnit` in its annotation, and its meaning from the docstring below it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
+
+from factorgraph_loc.files.models import InUnit, bounds
+
+TABLE = "table"
+_KINDS = {float: "number", int: "whole number", bool: "true or false", str: "text"}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A key of a model, with dots; ``*`` stands for a name of the user's own.
+
+    ``kind``: "number", "whole number", "true or false", "text", "choice", "table", or several of them; ``count``: how many values
+    a list has, 1 for no list, 0 for any number. ``default``: None for nothing. ``low``, ``high``: inclusive bounds, infinite
+    without.
+    """
+
+    key: str
+    kind: str
+    count: int
+    default: Any
+    required: bool
+    low: float
+    high: float
+    choices: tuple[str, ...]
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class _Part:
+    """An alternative of an annotation that is no union."""
+
+    type: Any
+    metadata: tuple[Any, ...]
+    path: str = ""
+    count: int = 1
+
+
+def settings_in(model: type[BaseModel], prefix: str = "", default: BaseModel | None = None) -> list[Setting]:
+    """All settings of a model, in its order; those of models in it have their keys after a dot. ``default``: a model whose values
+    are the defaults."""
+    found: dict[str, Setting] = {}
+    for name, field in model.model_fields.items():
+        key = f"{prefix}{name}"
+        value = field.get_default(call_default_factory=True) if default is None else getattr(default, name)
+        required = value is PydanticUndefined
+        value = None if required else value
+        parts = list(_parts(_Part(field.annotation, tuple(field.metadata))))
+        meaning = " ".join((field.description or "").split())
+        for setting in (
+            *_own(key, parts, Setting(key, "", 1, value, required, -math.inf, math.inf, (), "", meaning)),
+            *_nested(key, parts, value),
+        ):
+            there = found.get(setting.key)
+            if there is None:
+                found[setting.key] = setting
+            elif there.choices and setting.choices:  # the kinds of alternative models
+                choices = dict.fromkeys((*there.choices, *setting.choices))
+                found[setting.key] = replace(there, choices=tuple(choices))
+    return list(found.values())
+
+
+def bound_text(value: float) -> str:
+    """A bound in readable form: as a multiple of pi, or rounded; infinity is empty."""
+    if not math.isfinite(value):
+        return ""
+    for times, name in ((2.0, "2 pi"), (1.0, "pi"), (0.5, "pi / 2")):
+        if math.isclose(abs(value), times * math.pi, rel_tol=1e-12):
+            return name if value > 0.0 else f"-{name}"
+    if 0.0 < abs(value) < 1e-300:
+        return "above 0"
+    return f"{value:.6g}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
+
+
+def default_text(setting: Setting) -> str:
+    """The default of a setting as in TOML; ``required``, or a dash where nothing is set."""
+    return "required" if setting.required else _toml(setting.default)
+
+
+def values_text(setting: Setting) -> str:
+    """What a setting may be: ``0 to 5 s``, ``known, extended, unknown``, ``text``."""
+    low, high = bound_text(setting.low), bound_text(setting.high)
+    between = f"{low} to {high}" if low and high else f"{low} or more" if low else f"at most {high}" if high else ""
+    bounded = f"{between} {setting.unit}".strip() or setting.kind
+    if setting.kind == "whole number" and between:
+        bounded = f"{between}, whole"
+    text = ", ".join(setting.choices) or bounded
+    return text if setting.count == 1 else f"a list of {setting.count or 'any number'}: {text}"
+
+
+def first_sentence(documented: Any) -> str:
+    """The first sentence of a docstring, on one line; empty without one."""
+    text = " ".join((inspect.getdoc(documented) or "").split()).replace("``", "")
+    return text.partition(". ")[0].rstrip(".") + "." if text else ""
+
+
+def _parts(part: _Part) -> Iterator[_Part]:
+    origin, arguments = get_origin(part.type), get_args(part.type)
+    if origin is Annotated:
+        yield from _parts(replace(part, type=arguments[0], metadata=(*part.metadata, *arguments[1:])))
+    elif origin in (Union, UnionType):
+        for argument in arguments:
+            yield from _parts(replace(part, type=argument))
+    elif origin is dict:
+        yield from _parts(_Part(arguments[1], (), f"{part.path}.*", part.count))
+    elif origin in (tuple, list) and arguments:
+        count = 0 if origin is list or Ellipsis in arguments else len(arguments)
+        for argument in dict.fromkeys(arguments):
+            if argument is not Ellipsis:
+                yield from _parts(_Part(argument, (), part.path, count))
+    elif part.type is not NoneType:
+        yield part
+
+
+def _is_model(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def _own(key: str, parts: list[_Part], setting: Setting) -> Iterator[Setting]:
+    """The setting of a key itself; for a table only if it says what it means."""
+    own = [part for part in parts if not _is_model(part.type)]
+    if not own:
+        if setting.meaning:
+            yield replace(setting, kind=TABLE, default=None)
+        return
+    choices = tuple(str(a) for part in own if get_origin(part.type) is Literal for a in get_args(part.type))
+    kinds = [
+        "choice" if get_origin(part.type) is Literal else _KINDS.get(part.type, TABLE if part.path else "value")
+        for part in own
+    ]
+    numbers = [part for part in own if part.type in (float, int)]
+    metadata = numbers[0].metadata if numbers else ()
+    low, high = bounds(metadata)
+    unit = next((entry.name for entry in metadata if isinstance(entry, InUnit)), "")
+    yield replace(
+        setting,
+        key=key + own[0].path,
+        kind=" or ".join(dict.fromkeys(kinds)),
+        count=own[0].count,
+        low=low,
+        high=high,
+        choices=choices,
+        unit=unit,
+    )
+
+
+def _nested(key: str, parts: list[_Part], value: Any) -> Iterator[Setting]:
+    for part in parts:
+        if _is_model(part.type):
+            yield from settings_in(part.type, f"{key}{part.path}.", value if isinstance(value, part.type) else None)
+
+
+def _toml(value: Any) -> str:
+    if value is None or (isinstance(value, Mapping) and not value):
+        return "-"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return bound_text(value)
+    if isinstance(value, (tuple, list)):
+        return f"[{', '.join(map(_toml, value))}]"
+    return str(value)
