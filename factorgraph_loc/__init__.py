@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.errors import FglocError, InputError, RunFailedError
     from factorgraph_loc.evaluation.inference import contrast
     from factorgraph_loc.experiments.index import load_results
+    from factorgraph_loc.experiments.trajectory_score import score
     from factorgraph_loc.io.native.native import write_native
     from factorgraph_loc.io.native.rig_file import read_rig, write_rig
     from factorgraph_loc.io.native.world_file import read_world, write_world
@@ -120,6 +121,7 @@ __all__ = [
     "read_world",
     "report",
     "run",
+    "score",
     "simulate",
     "write_grid",
     "write_log",
@@ -134,6 +136,7 @@ _MODULES = {
     "errors": ("FglocError", "InputError", "RunFailedError"),
     "evaluation.inference": ("contrast",),
     "experiments.index": ("load_results",),
+    "experiments.trajectory_score": ("score",),
     "io.native.native": ("write_native",),
     "io.native.rig_file": ("read_rig", "write_rig"),
     "io.native.world_file": ("read_world", "write_world"),

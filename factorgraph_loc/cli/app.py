@@ -20,6 +20,7 @@ from factorgraph_loc.cli import (
     manifest,
     mapping,
     running,
+    scoring,
     show,
     simulating,
     viewing,
@@ -85,6 +86,7 @@ app.command()(inspecting.convert)
 app.command()(manifest.manifest)
 app.command()(running.run)
 app.command()(running.compare)
+app.command()(scoring.score)
 app.command()(viewing.view)
 app.command()(exporting.export)
 app.command()(calibrating.calibrate)

@@ -16,5 +16,6 @@ __all__ = [
     "report",
     "statistics",
     "tables",
+    "trajectories",
     "warned",
 ]

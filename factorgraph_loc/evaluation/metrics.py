@@ -6,7 +6,6 @@ Tracking and Navigation", 2001, section 5.4. Relative pose error: Sturm et al., 
 systems", 2012, section IV.A, over path length instead of time.
 """
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from factorgraph_loc.evaluation import alignment, space
+from factorgraph_loc.evaluation import alignment, pieces, space
 from factorgraph_loc.evaluation.alignment import rms
 from factorgraph_loc.evaluation.pairing import TOLERANCE, pairs, pauses
 from factorgraph_loc.evaluation.warned import WARNINGS
@@ -180,16 +179,11 @@ def relative_errors(poses: Array, reference: Array, breaks: Sequence[int] | Inte
     of the estimate over a piece, the error is the translation and rotation of ``Q^-1 P``, not divided by the length. Without gaps
     this is evo's RPE with ``delta=1``, ``delta_unit=meters``, ``all_pairs=False``, ``pairs_from_reference=True``.
     """
-    ends_of_pieces: list[tuple[int, int]] = []
+    found: list[tuple[int, int]] = []
     for start, stop in _unbroken(np.isfinite(reference[:, 0]) & np.isfinite(poses[:, 0]), breaks):
         steps = np.linalg.norm(np.diff(reference[start:stop, :2], axis=0), axis=1)
-        begin, path = start, 0.0
-        for i, step in enumerate(steps.tolist(), start=start + 1):
-            path += step
-            if path >= RPE_DISTANCE:
-                ends_of_pieces.append((begin, i))
-                begin, path = i, 0.0
-    begins, ends = np.array(ends_of_pieces, dtype=int).reshape(-1, 2).T
+        found += pieces.successive(steps, RPE_DISTANCE, start)
+    begins, ends = pieces.indices(found)
     error = se2.between(se2.between(reference[begins], reference[ends]), se2.between(poses[begins], poses[ends]))
     return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
 
@@ -199,8 +193,7 @@ def _unbroken(valid: NDArray[np.bool_], breaks: Sequence[int] | Integers) -> lis
     edges = np.flatnonzero(np.diff(np.concatenate(([False], valid, [False])).astype(int)))
     found = []
     for start, stop in edges.reshape(-1, 2).tolist():
-        bounds = [start, *(int(b) for b in breaks if start < b < stop), stop]
-        found += list(itertools.pairwise(bounds))
+        found += [(start + a, start + b) for a, b in pieces.between(stop - start, (int(i) - start for i in breaks))]
     return found
 
 

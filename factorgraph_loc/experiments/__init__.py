@@ -16,4 +16,5 @@ __all__ = [
     "run",
     "seeds",
     "store",
+    "trajectory_score",
 ]

@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.results import writing
+from factorgraph_loc.model.pose_path import upright
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factors.se2 import Array
@@ -21,13 +22,9 @@ def matrices(trajectory: Trajectory | Trajectory3) -> Array:
     """The poses (N, 3, 4) of the robot in the world: rotation and position."""
     if isinstance(trajectory, Trajectory3):
         return np.concatenate((trajectory.rotations, trajectory.positions[:, :, None]), axis=2)
-    x, y, heading = trajectory.poses.T
     out = np.zeros((len(trajectory), 3, 4))
-    out[:, 0, 0] = out[:, 1, 1] = np.cos(heading)
-    out[:, 1, 0] = np.sin(heading)
-    out[:, 0, 1] = -np.sin(heading)
-    out[:, 2, 2] = 1.0
-    out[:, 0, 3], out[:, 1, 3] = x, y
+    out[:, :, :3] = upright(trajectory.poses[:, 2])
+    out[:, :2, 3] = trajectory.poses[:, :2]
     return out
 
 

@@ -8,6 +8,7 @@ __all__ = [
     "measurement",
     "motion",
     "planar",
+    "pose_path",
     "result",
     "rig",
     "scoring",

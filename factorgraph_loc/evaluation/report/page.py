@@ -4,29 +4,25 @@ The page loads nothing: style, script and data are included, and its content sec
 unescaped string could not run. The same results give the same bytes.
 """
 
-import base64
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from importlib import resources
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import polars as pl
 import tomli_w
 
-from factorgraph_loc.drawing.markup import Html, data, figure, join, table, tag, text
+from factorgraph_loc.drawing.markup import Html, data, figure, join, table, tag
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import charts, tables
 from factorgraph_loc.evaluation.report.metrics import DEFAULT, Metric, metric_of
 from factorgraph_loc.evaluation.report.reading import RunData, RunFiles, read_runs
 from factorgraph_loc.evaluation.report.results import SWEEP, MetricComparison, Results, score
+from factorgraph_loc.evaluation.report.shell import SCRIPTS, remark, whole_page
 from factorgraph_loc.evaluation.report.summary import summary
 from factorgraph_loc.evaluation.report.tracks import KINDS
 from factorgraph_loc.evaluation.warned import by_text
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.text import listed, quoted
-from factorgraph_loc.version import __version__
 
 SHOWN = 8  # variants that are visible initially
 _SWEPT = 3  # metrics that are plotted over a swept setting
@@ -111,19 +107,8 @@ class _Page:
             "errors": drawn.errors,
             "charts": self._charts,
         }
-        style = _asset("page.css")
-        script = "".join(_asset(name) for name in ("charts.js", "tracks.js", "page.js"))
-        return Template(_asset("page.html")).substitute(
-            title=text(title),
-            contents=join(tag("a", name, href=f"#{identity}") for identity, name in self._sections),
-            body=join(body, "\n"),
-            data=join([data("page", content), data("config-texts", drawn.configs), *drawn.tracks]),
-            style=style,
-            style_hash=_digest(style),
-            script=script,
-            script_hash=_digest(script),
-            version=__version__,
-        )
+        held = join([data("page", content), data("config-texts", drawn.configs), *drawn.tracks])
+        return whole_page(title, self._sections, body, held, SCRIPTS)
 
     def _section(self, identity: str, name: str, *content: object) -> Html:
         self._sections.append((identity, name))
@@ -145,7 +130,7 @@ class _Page:
         )
         if len(set(results.logs.values())) < len(results.logs):
             note += " Logs that differ only in a swept setting count as one log."
-        return self._section("results", "Results", _note(note), tables.overview(results, best))
+        return self._section("results", "Results", remark(note), tables.overview(results, best))
 
     def _differences(self, against: Sequence[MetricComparison]) -> Html | str:
         if len(self._results.variants) < 2:
@@ -165,9 +150,9 @@ class _Page:
         return self._section(
             "differences",
             f"Differences from {self._baseline}",
-            _note(note),
+            remark(note),
             tables.differences(self._results, against),
-            _note(below),
+            remark(below),
             tag("div", *figures, class_="charts"),
         )
 
@@ -178,7 +163,7 @@ class _Page:
         ]
         note = "The figure of each log, pooled over its seeds, and below it the range over them. ● best of the row."
         controls = tag("div", class_="controls")
-        return self._section("by-log", "Log by log", _note(note), controls, *parts)
+        return self._section("by-log", "Log by log", remark(note), controls, *parts)
 
     def _trajectories(self, drawn: RunData) -> Html | str:
         if not drawn.tracks:
@@ -198,11 +183,11 @@ class _Page:
         return self._section(
             "trajectories",
             "Trajectories and errors over time",
-            _note(note),
+            remark(note),
             tag("div", class_="controls"),
             tag("div", class_="legend"),
             tag("div", class_="map"),
-            _note(below),
+            remark(below),
             tag("div", class_="strips"),
         )
 
@@ -220,7 +205,7 @@ class _Page:
         return self._section(
             "distributions",
             "Distribution of errors",
-            _note(note),
+            remark(note),
             tag("div", class_="controls"),
             tag("div", class_="legend"),
             tag("div", *figures, class_="charts"),
@@ -236,7 +221,7 @@ class _Page:
         if not figures:
             return ""
         note = "Pooled over logs and seeds. Whiskers: the 95 % interval, or the range where logs or seeds are too few for one."
-        return self._section("sweeps", "Sweeps", _note(note), tag("div", *figures, class_="charts"))
+        return self._section("sweeps", "Sweeps", remark(note), tag("div", *figures, class_="charts"))
 
     def _consistency(self, drawn: RunData) -> Html | str:
         chart = charts.consistency(self._results, drawn.trust, drawn.nees)
@@ -250,7 +235,7 @@ class _Page:
             "A dot is a log, the bar the mean over logs. Shaded: the 95 % band of that mean for correct covariances, based on "
             "the effective number of independent values, since errors of successive poses are correlated."
         )
-        return self._section("consistency", "Consistency", _note(note), self._figure(chart, "Causal ANEES", caption))
+        return self._section("consistency", "Consistency", remark(note), self._figure(chart, "Causal ANEES", caption))
 
     def _times(self) -> Html | str:
         found = _known(self._results, tables.TIMINGS, whole=False)
@@ -262,20 +247,20 @@ class _Page:
         )
         drawn = [(m, chart) for m in found[:1] if (chart := charts.times(self._results, m)) is not None]
         figures = [self._figure(chart, m.title, "A dot is a log, the bar the median over logs.") for m, chart in drawn]
-        return self._section("times", "Times", _note(note), tables.timing(self._results, found), *figures)
+        return self._section("times", "Times", remark(note), tables.timing(self._results, found), *figures)
 
     def _warnings(self) -> Html | str:
         if not by_text(self._results.rows):
             return ""
         note = "Warnings of the runs about logs, rigs and settings that may affect the results."
-        return self._section("warnings", "Warnings", _note(note), tables.warnings(self._results))
+        return self._section("warnings", "Warnings", remark(note), tables.warnings(self._results))
 
     def _failures(self) -> Html | str:
         count = sum(row["status"] != "ok" for row in self._results.rows)
         if not count:
             return ""
         note = f"{count} of {len(self._results.rows)} runs failed, and are excluded from all figures."
-        return self._section("failures", "Failures", _note(note), tables.failures(self._results))
+        return self._section("failures", "Failures", remark(note), tables.failures(self._results))
 
     def _repeat(self, experiment: Mapping[str, Any], versions: Mapping[str, str], drawn: RunData) -> Html:
         parts: list[object] = []
@@ -294,7 +279,7 @@ class _Page:
         return self._section(
             "method",
             "Statistics",
-            _note(
+            remark(
                 "Runs are paired by log and seed, and logs are the statistical units. With six logs or more intervals are a "
                 "percentile bootstrap that draws logs and, within each, seeds; with one log they are over its seeds, if there "
                 "are six or more, and hold for this log only. Otherwise figures are listed without a test. The test is "
@@ -314,11 +299,6 @@ def _known(results: Results, keys: Sequence[str], *, whole: bool = True) -> list
     return found or ([metric_of(k) for k in keys] if whole else [])
 
 
-def _note(note: str) -> Html:
-    """An explanatory paragraph; a number and its percent sign are not separated."""
-    return tag("p", note.replace(" %", "\u00a0%"), class_="note")
-
-
 def _toml(content: Any) -> Any:
     """Omit null values, which TOML lacks."""
     if isinstance(content, Mapping):
@@ -326,11 +306,3 @@ def _toml(content: Any) -> Any:
     if isinstance(content, list | tuple):
         return [_toml(value) for value in content if value is not None]
     return content if isinstance(content, str | int | float | bool) else str(content)
-
-
-def _asset(name: str) -> str:
-    return resources.files("factorgraph_loc.evaluation.report").joinpath("assets", name).read_text(encoding="utf-8")
-
-
-def _digest(content: str) -> str:
-    return base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()

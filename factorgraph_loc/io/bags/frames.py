@@ -15,6 +15,7 @@ from factorgraph_loc.io.bags.clock import Stamper
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.poses import ReferenceTopic, check_rotations, seven
 from factorgraph_loc.model.planar import on_floor
+from factorgraph_loc.model.pose_path import PosePath, path_of
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.text import listed, quoted
@@ -89,6 +90,17 @@ class FrameReference:
             edge.values.extend(seven(transform.transform, "translation", "rotation"))
 
     def trajectory(self, static: StaticFrames, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory:
+        """The poses of :meth:`in_space` on the floor."""
+        space = self.in_space(static, t0_ns, warnings)
+        flat = on_floor(self._source, space.positions, space.rotations, warnings, self._turned)
+        return Trajectory(space.t, flat, has_heading=has_heading)
+
+    def path(self, static: StaticFrames, warnings: list[str]) -> PosePath:
+        """The poses of :meth:`in_space` with absolute times."""
+        t0_ns = min((edge.t_ns[0] for edge in self._edges.values()), default=0)
+        return path_of(self.in_space(static, t0_ns, warnings), self._source, t0_ns)
+
+    def in_space(self, static: StaticFrames, t0_ns: int, warnings: list[str]) -> Trajectory3:
         """Poses at the timestamps of the most frequent transform where all are known; the others are interpolated."""
         moving: list[Trajectory3] = []
         steps: list[tuple[int, Array]] = []
@@ -113,8 +125,7 @@ class FrameReference:
             pose[:, :3, :3], pose[:, :3, 3] = at.rotations, at.positions
             poses = pose @ fixed @ poses
         poses = before @ poses
-        flat = on_floor(self._source, poses[:, :3, 3], poses[:, :3, :3], warnings, self._turned)
-        return Trajectory(t, flat, has_heading=has_heading)
+        return Trajectory3(t, poses[:, :3, 3], poses[:, :3, :3])
 
     def _chain(self, static: StaticFrames) -> list[str]:
         """The frames from the child up to the parent, without the parent."""

@@ -13,6 +13,7 @@ from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.rows import TopicRows
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.planar import AS_IT_IS, Turned, on_floor, require_unit, rotations_of
+from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.trajectory import Trajectory
 from factors.se2 import Array, Integers
 
@@ -70,14 +71,28 @@ class Poses:
 
     def in_order(self, warnings: list[str]) -> tuple[Integers, Array]:
         """Timestamps (N,) and planar poses (N, 3), the last one of equal timestamps; InputError names the invalid message."""
-        rows, t_ns = self.rows.rows, self.rows.t_ns
-        values, turns = self.rows.values, None
-        check_rotations(self.rows.source, rows, values)
-        if not self._are_points:
-            turns = rotations_of(self.rows.source, rows, values[:, 3:])
-        poses = on_floor(self.rows.source, values[:, :3], turns, warnings, self._turned)
-        keep = checks.in_order(self.rows.source, rows, t_ns, warnings)
-        return t_ns[keep], poses[keep]
+        places = self._checked()[:, :3]
+        turns = None if self._are_points else self._rotations()
+        poses = on_floor(self.rows.source, places, turns, warnings, self._turned)
+        keep = self._kept(warnings)
+        return self.rows.t_ns[keep], poses[keep]
+
+    def in_space(self, warnings: list[str]) -> PosePath:
+        """The poses as they are; InputError names the invalid message."""
+        places = self._checked()[:, :3]
+        path = PosePath(self.rows.source, places, self._rotations(), self.rows.t_ns, not self._are_points)
+        return path.rows(self._kept(warnings))
+
+    def _checked(self) -> Array:
+        values = self.rows.values
+        check_rotations(self.rows.source, self.rows.rows, values)
+        return values
+
+    def _rotations(self) -> Array:
+        return rotations_of(self.rows.source, self.rows.rows, self.rows.values[:, 3:])
+
+    def _kept(self, warnings: list[str]) -> Integers:
+        return checks.in_order(self.rows.source, self.rows.rows, self.rows.t_ns, warnings)
 
     def trajectory(self, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory:
         t_ns, poses = self.in_order(warnings)

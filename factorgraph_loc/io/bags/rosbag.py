@@ -133,9 +133,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     listeners = Listeners(bag, options.clock)
     motion = odometry(bag, options.odometry)
     listeners.listen(options.odometry, motion)
-    frames = StaticFrames()
-    if STATIC in bag.topics and bag.topics[STATIC].type in TF and bag.topics[STATIC].count:
-        listeners.add(STATIC, frames, listeners.stamper(STATIC, None), timed=False)
+    frames = static_frames(listeners)
     gathered = _listen(listeners, options)
     if gathered.camera:
         stack.callback(gathered.camera.discard)
@@ -170,6 +168,14 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
         warnings=tuple(warnings),
         metadata={"clock": clock} | ({"robot": "; ".join(notes)} if notes else {}),
     )
+
+
+def static_frames(listeners: Listeners) -> StaticFrames:
+    """Register a collector for the static transforms of the bag, if it has any, and return it."""
+    bag, frames = listeners.bag, StaticFrames()
+    if STATIC in bag.topics and bag.topics[STATIC].type in TF and bag.topics[STATIC].count:
+        listeners.add(STATIC, frames, listeners.stamper(STATIC, None), timed=False)
+    return frames
 
 
 def _listen(listeners: Listeners, options: Options) -> Gathered:

@@ -17,6 +17,7 @@ __all__ = [
     "mapped",
     "mrclam",
     "plaza",
+    "pose_file",
     "read_log",
     "read_manifest",
     "rf_robot",

@@ -16,7 +16,7 @@ from factorgraph_loc.io.readers.columns import read_columns
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factors.camera import model as reprojection
-from factors.se2 import Integers
+from factors.se2 import Array, Integers
 
 ORTHONORMAL = 2e-3  # tolerance of rotation matrices: KITTI's have seven digits
 MATRIX = tuple(f"{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
@@ -28,14 +28,22 @@ def read_kitti(path: Path, times: Path) -> tuple[Integers, Integers, Trajectory3
     The file's poses are those of a camera with z forward and y down, in the frame of the first one (Geiger, Lenz, Urtasun, "Are we
     ready for autonomous driving?", CVPR 2012). They are converted to x forward and z up. InputError names file and row.
     """
+    rows, matrices = read_matrices(path)
+    stamps = read_times(times)
+    if len(stamps) < len(rows):
+        raise bad_field(times, "number of rows", len(stamps), f"at least {len(rows)}, one for each pose of {path.name}")
+    u, _, vt = np.linalg.svd(matrices[:, :, :3])
+    ahead = reprojection.FORWARD
+    t_ns = stamps[: len(rows)]
+    return rows, t_ns, Trajectory3((t_ns - t_ns[0]) / 1e9, matrices[:, :, 3] @ ahead.T, ahead @ (u @ vt) @ ahead.T)
+
+
+def read_matrices(path: Path) -> tuple[Integers, Array]:
+    """Rows (N,) and poses (N, 3, 4), rotation and position, of a file in KITTI's format, as they are written. InputError names
+    file and row."""
     table, rows = read_columns(path, MATRIX)
     if not len(table):
         raise InputError(f"{path}: contains no poses")
-    stamps = read_times(times)
-    if len(stamps) < len(table):
-        raise bad_field(
-            times, "number of rows", len(stamps), f"at least {len(table)}, one for each pose of {path.name}"
-        )
     matrices = table.reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
     off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
@@ -43,10 +51,7 @@ def read_kitti(path: Path, times: Path) -> tuple[Integers, Integers, Trajectory3
     if len(bad):
         i = int(bad[0])
         raise bad_field(path, "rotation", rotations[i].tolist(), "an orthonormal matrix", row=int(rows[i]))
-    u, _, vt = np.linalg.svd(rotations)
-    ahead = reprojection.FORWARD
-    t_ns = stamps[: len(table)]
-    return rows, t_ns, Trajectory3((t_ns - t_ns[0]) / 1e9, matrices[:, :, 3] @ ahead.T, ahead @ (u @ vt) @ ahead.T)
+    return rows, matrices
 
 
 def read_times(path: Path) -> Integers:

@@ -1,0 +1,103 @@
+"""Which pose of an estimate belongs to which pose of the reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.pairing import pairs, pairs_in_space, pauses
+from factorgraph_loc.model.pose_path import PosePath, path_of
+from factorgraph_loc.model.scoring import Association
+from factors.se2 import Array, Integers
+
+
+@dataclass(frozen=True)
+class Associated:
+    """N poses of an ``estimate`` and as many of the ``reference``. ``gaps``: indices of poses that follow a gap, which no relative
+    error spans; ``from_reference``: whether these are taken over the path of the reference, not of the estimate."""
+
+    estimate: PosePath
+    reference: PosePath
+    gaps: Integers
+    from_reference: bool
+
+
+def associate(
+    estimate: PosePath, reference: PosePath, how: Association, *, max_diff: float, max_gap: float
+) -> Associated:
+    """Pairs of poses of both, at least one.
+
+    By index if one of them has no stamps, which must then be of equal length. ``nearest``: each pose of the shorter one (of the
+    estimate, if they are of equal length) with that of the other whose stamp is nearest, if it is at most ``max_diff`` [s] away.
+    ``interpolate``: as runs are scored, see :mod:`factorgraph_loc.evaluation.pairing`; in the plane if one of both is planar.
+
+    InputError if there are none.
+    """
+    if estimate.t_ns is None or reference.t_ns is None:
+        if how != "nearest":
+            without = estimate if estimate.t_ns is None else reference
+            raise InputError(f"{without.name}: has no stamps to interpolate at, expected a trajectory with stamps")
+        if len(estimate) != len(reference):
+            raise InputError(
+                f"{estimate.name}: has {len(estimate)} poses, expected {len(reference)} as {reference.name} has: without stamps, "
+                "rows are matched by their number"
+            )
+        return Associated(estimate, reference, np.empty(0, dtype=np.int64), from_reference=False)
+    if how == "nearest":
+        rows, of_reference = _nearest(estimate.seconds(), reference.seconds(), max_diff)
+        found = Associated(
+            estimate.rows(rows), reference.rows(of_reference), np.empty(0, dtype=np.int64), from_reference=False
+        )
+    else:
+        found = _interpolated(estimate, reference, max_gap)
+    if not len(found.estimate):
+        raise _nothing_in_common(estimate, reference, how, max_diff, max_gap)
+    return found
+
+
+def _nearest(estimate: Array, reference: Array, max_diff: float) -> tuple[Integers, Integers]:
+    """Rows of the estimate and of the reference, for their stamps [s]."""
+    swapped = len(estimate) > len(reference)
+    short, long = (reference, estimate) if swapped else (estimate, reference)
+    after = np.searchsorted(long, short).clip(max=len(long) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(np.abs(short - long[before]) <= np.abs(long[after] - short), before, after)
+    kept = np.flatnonzero(np.abs(long[nearest] - short) <= max_diff)
+    return (nearest[kept], kept) if swapped else (kept, nearest[kept])
+
+
+def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> Associated:
+    assert estimate.t_ns is not None
+    t0_ns = int(estimate.t_ns[0])
+    if estimate.is_planar or reference.is_planar:
+        above, true = estimate.planar(t0_ns), reference.planar(t0_ns)
+        pair = pairs(above, true, max_gap)
+        known = np.isfinite(pair.poses[:, 0])
+        kept = np.flatnonzero(known)
+        gaps = np.searchsorted(kept, np.concatenate((pauses(pair.t), np.flatnonzero(~known))))
+        found = path_of(replace(above, t=pair.t[kept], poses=pair.poses[kept]), estimate.name, t0_ns)
+        truth = path_of(replace(true, t=pair.t[kept], poses=pair.truth[kept]), reference.name, t0_ns)
+        return Associated(found, truth, np.asarray(gaps, dtype=np.int64), from_reference=True)
+    space, true3 = pairs_in_space(estimate.in_space(t0_ns), reference.in_space(t0_ns), max_gap)
+    paths = path_of(space, estimate.name, t0_ns), path_of(true3, reference.name, t0_ns)
+    return Associated(*paths, pauses(true3.t), from_reference=True)
+
+
+def _nothing_in_common(
+    estimate: PosePath, reference: PosePath, how: Association, max_diff: float, max_gap: float
+) -> InputError:
+    ours, theirs = estimate.seconds(), reference.seconds()
+    if ours[0] > theirs[-1] or theirs[0] > ours[-1]:
+        spans = (f"{t[0]:.3f} to {t[-1]:.3f} s" for t in (ours, theirs))
+        told = " and ".join(f"{path.name} {span}" for path, span in zip((estimate, reference), spans, strict=True))
+        return InputError(f"the trajectories do not overlap in time: {told}, expected one clock")
+    if how == "nearest":
+        expected = "a larger --max-diff, or --associate interpolate"
+        return InputError(
+            f"{estimate.name}: no stamp is within {max_diff:g} s of {reference.name}, expected {expected}"
+        )
+    return InputError(
+        f"{estimate.name}: no stamp of {reference.name} lies between poses at most {max_gap:g} s apart, expected a larger --max-gap"
+    )

@@ -1,0 +1,245 @@
+"""Absolute and relative errors of an estimated trajectory against a reference.
+
+Absolute (APE) and relative pose errors (RPE): Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012,
+section IV; relative ones over a metre of path too. With the association ``nearest`` the figures are those of the package evo.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation import pieces
+from factorgraph_loc.evaluation.alignment import rms
+from factorgraph_loc.evaluation.pairing import TOLERANCE, pauses
+from factorgraph_loc.evaluation.trajectories.aligning import Similarity, alignment
+from factorgraph_loc.evaluation.trajectories.association import associate
+from factorgraph_loc.model.planar import MOST, RISE
+from factorgraph_loc.model.pose_path import PosePath, require_poses
+from factorgraph_loc.model.scoring import (
+    ALIGNMENTS,
+    ASSOCIATIONS,
+    MAX_DIFF,
+    MAX_GAP,
+    Alignment,
+    Association,
+    check_max_gap,
+)
+from factorgraph_loc.text import listed, quoted
+from factors.se2 import Array, Integers
+
+DELTA = 1.0  # m, and s, over which relative errors are taken
+HOW = ("rmse", "mean", "median", "p95", "max", "min", "std")
+_MANY = 0.5  # share of poses that are paired, below which there is a warning
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """K errors: ``position`` (K,) [m], and ``rotation`` (K,) [rad], the angle of the rotation, or None where a trajectory has no
+    rotations. ``ends`` (K,): of each the index of its pose, for a relative error that of its last one."""
+
+    position: Array
+    rotation: Array | None
+    ends: Integers
+
+    def figures(self, name: str) -> dict[str, float | None]:
+        """Statistics as ``NAME.position_rmse``, ...; None where there are no errors."""
+        told: dict[str, float | None] = {}
+        for what, values in (("position", self.position), ("rotation", self.rotation)):
+            told |= {f"{name}.{what}_{how}": value for how, value in _statistics(values).items()}
+        return told
+
+
+@dataclass(frozen=True)
+class TrajectoryScore:
+    """The errors of an estimate.
+
+    ``estimate``, aligned, and ``reference``: N poses each, as they were compared. ``transform``: from the frame of the estimate to
+    that of the reference. ``ape``: absolute errors (N,). ``rpe_per_m``, ``rpe_per_s``: relative errors over a metre of path and
+    over a second, None where rotations are missing, or stamps. ``lengths`` [m] and ``poses`` of the whole estimate and of the
+    whole reference. ``settings``: how they were compared. ``warnings``: one line for each doubt.
+    """
+
+    estimate: PosePath
+    reference: PosePath
+    transform: Similarity
+    ape: PoseErrors
+    rpe_per_m: PoseErrors | None
+    rpe_per_s: PoseErrors | None
+    lengths: tuple[float, float]
+    poses: tuple[int, int]
+    settings: dict[str, Any]
+    warnings: tuple[str, ...]
+
+    @property
+    def figures(self) -> dict[str, float | None]:
+        """All figures by dotted key, in metres and radians, None where undefined.
+
+        ``pairs``: number of compared poses. ``ape.position_*``, ``ape.rotation_*``, ``rpe_per_m.position_*``, ...: ``rmse``,
+        ``mean``, ``median``, ``p95``, ``max``, ``min`` and ``std``. ``rpe_per_m.pieces``, ``rpe_per_s.pieces``: number of
+        relative errors.
+        """
+        told: dict[str, float | None] = {"pairs": len(self.estimate)}
+        told |= self.ape.figures("ape")
+        for name, errors in (("rpe_per_m", self.rpe_per_m), ("rpe_per_s", self.rpe_per_s)):
+            known = errors or _NONE
+            told |= known.figures(name) | {f"{name}.pieces": len(known.position) if errors else None}
+        return told
+
+    def seconds(self) -> Array | None:
+        """Times (N,) of the pairs from the first one on [s], None without stamps."""
+        return _seconds(self.estimate, self.reference)
+
+    def document(self) -> dict[str, Any]:
+        """The score as plain values: settings, figures, the alignment and the warnings."""
+        names = ("estimate", "reference")
+        extents = zip(names, self.poses, self.lengths, strict=True)
+        return {
+            **{name: path.name for name, path in zip(names, (self.estimate, self.reference), strict=True)},
+            **self.settings,
+            **{
+                f"{name}.{what}": value
+                for name, *of in extents
+                for what, value in zip(("poses", "length"), of, strict=True)
+            },
+            **self.figures,
+            "transform.rotation": self.transform.rotation.tolist(),
+            "transform.translation": self.transform.translation.tolist(),
+            "transform.scale": self.transform.scale,
+            "warnings": list(self.warnings),
+        }
+
+
+_NONE = PoseErrors(np.empty(0), np.empty(0), np.empty(0, dtype=np.int64))
+
+
+def score_paths(
+    estimate: PosePath,
+    reference: PosePath,
+    align: Alignment = "none",
+    associate_by: Association = "nearest",
+    *,
+    max_diff: float = MAX_DIFF,
+    max_gap: float = MAX_GAP,
+    all_pairs: bool = False,
+) -> TrajectoryScore:
+    """Compare an estimate with a reference.
+
+    ``align``: see :func:`~factorgraph_loc.evaluation.trajectories.aligning.alignment`; ``se2`` compares both seen from above.
+    ``associate_by``, ``max_diff``, ``max_gap``: see :func:`~factorgraph_loc.evaluation.trajectories.association.associate`.
+    ``all_pairs``: relative errors over all pairs of poses about as far apart, not over pieces one after the other. InputError if
+    the two have nothing in common, or do not determine the alignment.
+    """
+    _check(align, associate_by, max_diff, max_gap)
+    require_poses(estimate)
+    require_poses(reference)
+    pair = associate(estimate, reference, associate_by, max_diff=max_diff, max_gap=max_gap)
+    found, truth = pair.estimate, pair.reference
+    if align == "se2":
+        found, truth = found.seen_from_above(), truth.seen_from_above()
+    transform = alignment(found, truth, align)
+    found = transform.of(found)
+    settings: dict[str, Any] = {"align": align, "associate": associate_by, "all_pairs": all_pairs}
+    if found.t_ns is not None and truth.t_ns is not None:
+        settings |= {"max_diff": max_diff} if associate_by == "nearest" else {"max_gap": max_gap}
+    distance = np.linalg.norm(found.positions - truth.positions, axis=1)
+    ape = PoseErrors(distance, None, np.arange(len(found)))
+    per_m = per_s = None
+    if found.has_rotations and truth.has_rotations:
+        ape = replace(ape, rotation=_angles(found.rotations.transpose(0, 2, 1) @ truth.rotations))
+        path = _steps(truth if pair.from_reference else found)
+        per_m = _relative(found, truth, path, DELTA, pair.gaps, all_pairs=all_pairs)
+        if (t := _seconds(found, truth)) is not None:
+            gaps = np.union1d(pair.gaps, pauses(t))
+            per_s = _relative(found, truth, np.diff(t), DELTA - TOLERANCE, gaps, all_pairs=all_pairs)
+    lengths = float(_steps(estimate).sum()), float(_steps(reference).sum())
+    poses = len(estimate), len(reference)
+    warnings = [*estimate.warnings, *reference.warnings, *_doubts(estimate, reference, associate_by, align)]
+    if associate_by == "nearest" and len(found) < _MANY * min(poses):
+        warnings.append(
+            f"{estimate.name}: {len(found)} of {min(poses)} poses have a stamp within {max_diff:g} s in {reference.name}: a larger "
+            "max_diff finds more, and associate interpolate needs none"
+        )
+    return TrajectoryScore(found, truth, transform, ape, per_m, per_s, lengths, poses, settings, tuple(warnings))
+
+
+def _check(align: str, associate_by: str, max_diff: float, max_gap: float) -> None:
+    for name, value, known in (("align", align, ALIGNMENTS), ("associate", associate_by, ASSOCIATIONS)):
+        if value not in known:
+            raise InputError(f"{name} is {quoted(value)}, expected one of {listed(known)}")
+    if not 0.0 <= max_diff < np.inf:
+        raise InputError(f"max_diff is {max_diff:g}, expected a time of 0 s or more")
+    check_max_gap(max_gap)
+
+
+def _relative(
+    found: PosePath, truth: PosePath, steps: Array, length: float, gaps: Integers, *, all_pairs: bool
+) -> PoseErrors:
+    """The translation and rotation of ``Q^-1 P`` for the motions Q of the reference and P of the estimate over each piece."""
+    cut = pieces.all_pairs if all_pairs else pieces.successive
+    ranges = pieces.between(len(found), gaps.tolist())
+    begins, ends = pieces.indices([one for a, b in ranges for one in cut(steps[a : b - 1], length, a)])
+    (turn, way), (true_turn, true_way) = (_motions(path, begins, ends) for path in (found, truth))
+    back = true_turn.transpose(0, 2, 1)
+    error = np.linalg.norm(np.einsum("kij,kj->ki", back, way - true_way), axis=1)
+    return PoseErrors(error, _angles(back @ turn), ends)
+
+
+def _motions(path: PosePath, begins: Integers, ends: Integers) -> tuple[Array, Array]:
+    """Rotations (K, 3, 3) and translations (K, 3) from poses to later ones."""
+    back = path.rotations[begins].transpose(0, 2, 1)
+    ways = path.positions[ends] - path.positions[begins]
+    return back @ path.rotations[ends], np.einsum("kij,kj->ki", back, ways)
+
+
+def _steps(path: PosePath) -> Array:
+    return np.asarray(np.linalg.norm(np.diff(path.positions, axis=0), axis=1))
+
+
+def _angles(rotations: Array) -> Array:
+    """The angles (K,) [rad] of rotations (K, 3, 3)."""
+    return np.asarray(Rotation.from_matrix(rotations).magnitude()) if len(rotations) else np.empty(0)
+
+
+def _seconds(found: PosePath, truth: PosePath) -> Array | None:
+    t_ns = truth.t_ns if found.t_ns is None else found.t_ns
+    return None if t_ns is None else (t_ns - t_ns[0]) / 1e9
+
+
+def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, align: Alignment) -> list[str]:
+    """What is likely not meant: heights that count though one of both has none, and a plane that is not the floor."""
+    if align == "se2":
+        rises = [(path.name, float(np.ptp(path.positions[:, 2]))) for path in (estimate, reference)]
+        return [
+            f"{name}: z varies by {rise:.1f} m, and is ignored: does it point up?"
+            for name, rise in rises
+            if rise > MOST
+        ]
+    flat, other = (estimate, reference) if estimate.is_planar else (reference, estimate)
+    if associate_by == "interpolate" or not flat.is_planar or align in ("se3", "sim3"):
+        return []
+    apart = float(np.abs(other.positions[:, 2] - flat.positions[0, 2]).max())
+    if apart <= RISE:
+        return []
+    return [
+        f"{flat.name} is planar, and {other.name} is up to {apart:.1f} m above or below it: heights count, but not with "
+        "align se2 or associate interpolate"
+    ]
+
+
+def _statistics(values: Array | None) -> dict[str, float | None]:
+    if values is None or not len(values):
+        return dict.fromkeys(HOW)
+    return {
+        "rmse": rms(values),
+        "mean": float(np.mean(values)),
+        "median": float(np.median(values)),
+        "p95": float(np.percentile(values, 95)),
+        "max": float(np.max(values)),
+        "min": float(np.min(values)),
+        "std": float(np.std(values)),
+    }

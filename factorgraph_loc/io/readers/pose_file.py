@@ -1,0 +1,42 @@
+"""Files of poses alone: TUM, KITTI and EuRoC, told apart by their first row."""
+
+from pathlib import Path
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import checks
+from factorgraph_loc.files.models import read_text
+from factorgraph_loc.io.readers import euroc, tum_rgbd
+from factorgraph_loc.io.readers.space_poses import MATRIX, read_matrices, read_poses
+from factorgraph_loc.model.planar import rotations_of
+from factorgraph_loc.model.pose_path import PosePath
+from factorgraph_loc.model.trajectory import read_tum_rows
+
+EXPECTED = (
+    "8 values (TUM: t x y z qx qy qz qw), 12 (KITTI), or 8 or more with commas (EuRoC: t, x, y, z, qw, qx, qy, qz)"
+)
+
+
+def read_pose_file(path: Path) -> PosePath:
+    """The poses in a file of TUM, KITTI or EuRoC format. InputError names file and row."""
+    warnings: list[str] = []
+    row, first = _first_row(path)
+    cells = first.split(",") if "," in first else first.split()
+    if "," in first and len(cells) >= len(euroc.STATE):
+        t_ns, poses = read_poses(path, euroc.STATE, unit="ns", separator=",", warnings=warnings)
+        return PosePath(str(path), poses.positions, poses.rotations, t_ns, warnings=tuple(warnings))
+    if "," not in first and len(cells) == len(MATRIX):
+        _, matrices = read_matrices(path)
+        return PosePath(str(path), matrices[:, :, 3], matrices[:, :, :3], None)
+    if "," in first or len(cells) != len(tum_rgbd.POSES):
+        raise bad_field(path, "row", first, EXPECTED, row=row)
+    rows, t_ns, table = read_tum_rows(path)
+    rotations = rotations_of(path, rows, table[:, 3:])
+    keep = checks.in_order(path, rows, t_ns, warnings)
+    return PosePath(str(path), table[:, :3], rotations, t_ns, warnings=tuple(warnings)).rows(keep)
+
+
+def _first_row(path: Path) -> tuple[int, str]:
+    for row, line in enumerate(read_text(path).splitlines(), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            return row, line.strip()
+    raise InputError(f"{path}: contains no poses, expected at least one row")

@@ -1,0 +1,92 @@
+"""``fgloc score``: tables, documents, files, and what is refused."""
+
+import json
+from pathlib import Path
+
+import polars as pl
+import pytest
+from pose_files import wander, write
+
+from factorgraph_loc import score
+
+
+def assert_refused(result, *fragments):
+    assert (result.exit_code, result.stdout) == (2, "")
+    (line,) = result.stderr.splitlines()
+    assert all(fragment in line for fragment in ("error: ", *fragments))
+
+
+@pytest.fixture
+def pair(tmp_path):
+    reference, estimate = wander(7)
+    return write(tmp_path / "estimate.tum", estimate), write(tmp_path / "reference.tum", reference)
+
+
+def test_the_errors_are_a_table(fgloc, pair):
+    result = fgloc("score", *pair, "--align", "sim3")
+    assert result.exit_code == 0, result.output
+    figures = score(*pair, align="sim3").figures
+    (row,) = (line for line in result.stdout.splitlines() if line.startswith("absolute position [m]"))
+    expected = [figures[f"ape.position_{how}"] for how in ("rmse", "mean", "median", "p95", "max", "min", "std")]
+    assert row.split()[3:] == [f"{value:.4f}" for value in expected]
+    assert "pairs      100, nearest stamps, at most 0.01 s apart; 9." in result.stdout
+    assert "alignment  sim3: translation (" in result.stdout
+
+
+def test_the_document_holds_all_figures(fgloc, pair):
+    document = json.loads(fgloc("score", *pair, "--associate", "interpolate", "--json").stdout)
+    figures = score(*pair, associate="interpolate").figures
+    assert {key: document[key] for key in figures} == pytest.approx(figures)
+    assert (document["associate"], document["max_gap"], document["align"]) == ("interpolate", 0.5, "none")
+    assert document["estimate"] == str(pair[0])
+
+
+@pytest.mark.parametrize("suffix", [".tum", ".kitti"])
+def test_the_folder_holds_a_report(fgloc, tmp_path, suffix):
+    reference, estimate = wander(7)
+    pair = write(tmp_path / f"estimate{suffix}", estimate), write(tmp_path / f"reference{suffix}", reference)
+    out = tmp_path / "out"
+    result = fgloc("score", *pair, "-o", out)
+    assert result.stdout.endswith(f"results are in {out}: report.html, score.json, errors.csv, plots/\n")
+    figures = json.loads((out / "score.json").read_text())
+    table = pl.read_csv(out / "errors.csv")
+    assert table["error_position"].max() == pytest.approx(figures["ape.position_max"])
+    assert len(table) == figures["pairs"] == 100
+    report = (out / "report.html").read_text()
+    assert report.count("data:image/png;base64,") == 3
+    assert f"{figures['ape.position_rmse']:.4f}" in report
+    assert sorted(path.name for path in (out / "plots").iterdir()) == [
+        "errors.png",
+        "relative-errors.png",
+        "trajectories.png",
+    ]
+    assert_refused(fgloc("score", *pair, "-o", out), "holds results already (errors.csv)")
+    assert fgloc("score", *pair, "-o", out, "--overwrite").exit_code == 0
+
+
+def test_a_run_against_its_log(fgloc, short_log, tmp_path):
+    run = json.loads(fgloc("run", short_log, "-e", "dead_reckoning", "-o", tmp_path / "run", "--json").stdout)
+    result = json.loads(fgloc("score", tmp_path / "run", short_log, "--associate", "interpolate", "--json").stdout)
+    assert result["pairs"] == run["final.scored"]
+    assert result["ape.position_rmse"] == pytest.approx(run["final.position_rmse"], rel=1e-6)
+    assert result["rpe_per_m.position_rmse"] == pytest.approx(run["final.rpe_position_per_m"], rel=1e-6)
+
+
+def test_results_of_several_runs_are_not_one(fgloc, tmp_path, pair):
+    for name in ("a", "b"):
+        folder = tmp_path / f"out/runs/log/{name}/seed0"
+        folder.mkdir(parents=True)
+        (folder / "final.tum").write_text(Path(pair[0]).read_text())
+    assert_refused(fgloc("score", tmp_path / "out", pair[1]), "holds 2 runs, expected the folder of one, such as")
+
+
+def test_rows_without_stamps_must_be_as_many(fgloc, tmp_path, pair):
+    reference, _ = wander(7, 99)
+    shorter = write(tmp_path / "reference.kitti", reference)
+    assert_refused(fgloc("score", pair[0], shorter), "has 100 poses, expected 99 as", "matched by their number")
+    assert_refused(fgloc("score", pair[0], shorter, "--associate", "interpolate"), "has no stamps to interpolate at")
+
+
+def test_what_is_not_there(fgloc, pair):
+    assert_refused(fgloc("score", "nowhere.tum", pair[1]), "nowhere.tum: is neither a file, nor a folder")
+    assert_refused(fgloc("score", "nowhere.bag:/odom", pair[1]), "nowhere.bag: does not exist")

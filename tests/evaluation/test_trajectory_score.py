@@ -1,0 +1,207 @@
+"""Scores of trajectories against those of the package evo, and on cases whose answer is known."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+from evo import main_ape, main_rpe
+from evo.core import sync
+from evo.core.metrics import PoseRelation, Unit
+from evo.core.trajectory import Plane
+from evo.tools import file_interface
+from pose_files import T0, wander, write
+from scipy.spatial.transform import Rotation
+
+from factorgraph_loc import InputError, Trajectory, Trajectory3, read_tum, score
+from factorgraph_loc.evaluation import metrics, pieces
+from factorgraph_loc.model.scoring import ALIGNMENTS
+
+OPTIONS = {
+    "none": {},
+    "origin": {"align_origin": True},
+    "se2": {"align": True, "project_to_plane": Plane.XY},
+    "se3": {"align": True},
+    "sim3": {"align": True, "correct_scale": True},
+}
+READ = {
+    ".tum": file_interface.read_tum_trajectory_file,
+    ".kitti": file_interface.read_kitti_poses_file,
+    ".csv": file_interface.read_euroc_csv_trajectory,
+}
+T0_NS = round(T0 * 1e9)
+HOW = ("rmse", "mean", "median", "max", "min", "std")
+
+
+def of_evo(estimate, reference, align, **options):
+    """Statistics of evo by the names of our figures."""
+    true, found = READ[reference.suffix](reference), READ[estimate.suffix](estimate)
+    if reference.suffix != ".kitti":
+        true, found = sync.associate_trajectories(true, found)
+    relations = {"position": PoseRelation.translation_part, "rotation": PoseRelation.rotation_angle_rad}
+    expected = {}
+    for what, relation in relations.items():
+        results = {
+            "ape": main_ape.ape(copy.deepcopy(true), copy.deepcopy(found), relation, **OPTIONS[align]),
+            "rpe_per_m": main_rpe.rpe(
+                copy.deepcopy(true),
+                copy.deepcopy(found),
+                relation,
+                delta=1.0,
+                delta_unit=Unit.meters,
+                **OPTIONS[align],
+                **options,
+            ),
+        }
+        for name, result in results.items():
+            expected |= {f"{name}.{what}_{how}": result.stats[how] for how in HOW}
+    return expected
+
+
+def check(found, expected):
+    ours = {key: found.figures[key] for key in expected}
+    exact = {key: value for key, value in expected.items() if "position" in key}
+    assert {key: ours[key] for key in exact} == pytest.approx(exact, abs=1e-9)
+    assert ours == pytest.approx(expected, abs=1e-6)  # the cosine of a small angle has half the digits
+
+
+@pytest.mark.parametrize("suffix", READ)
+@pytest.mark.parametrize("align", ALIGNMENTS)
+def test_the_figures_are_those_of_evo(tmp_path, align, suffix):
+    reference, estimate = wander(3, flat=align == "se2")
+    paths = write(tmp_path / f"estimate{suffix}", estimate), write(tmp_path / f"reference{suffix}", reference)
+    check(score(*paths, align=align), of_evo(*paths, align))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("all_pairs", [False, True])
+def test_unequal_rates_are_paired_as_in_evo(tmp_path, seed, all_pairs):
+    (t, *true), (late, *found) = wander(seed, 400)
+    rng = np.random.default_rng(seed)
+    some, others = (np.sort(rng.choice(400, n, replace=False)) for n in ((150, 300) if seed % 2 else (300, 150)))
+    estimate = write(tmp_path / "estimate.tum", (late[some], *(values[some] for values in found)))
+    reference = write(tmp_path / "reference.tum", (t[others], *(values[others] for values in true)))
+    result = score(estimate, reference, align="se3", all_pairs=all_pairs)
+    assert 90 < result.figures["pairs"] < 150
+    check(result, of_evo(estimate, reference, "se3", all_pairs=all_pairs))
+
+
+def test_interpolated_estimates_are_scored_as_runs_are(tmp_path):
+    reference, (t, *found) = wander(5, 300, flat=True)
+    gap = np.r_[0:120, 140:300]
+    write(tmp_path / "reference.tum", reference)
+    write(tmp_path / "estimate.tum", (t[gap] + 0.03, *(values[gap] for values in found)))
+    expected = metrics.accuracy(*(read_tum(tmp_path / f"{name}.tum", T0_NS) for name in ("estimate", "reference")))
+    figures = score(tmp_path / "estimate.tum", tmp_path / "reference.tum", associate="interpolate").figures
+    assert figures["pairs"] == expected["scored"]
+    assert figures["rpe_per_m.pieces"] == expected["rpe_pieces"]
+    for ours, theirs in (("ape.position", "position"), ("ape.rotation", "heading")):
+        for how in ("rmse", "median", "p95", "max"):
+            assert figures[f"{ours}_{how}"] == pytest.approx(expected[f"{theirs}_{how}"], abs=1e-8)
+    assert figures["rpe_per_m.position_rmse"] == pytest.approx(expected["rpe_position_per_m"], abs=1e-8)
+    assert figures["rpe_per_m.rotation_rmse"] == pytest.approx(expected["rpe_heading_per_m"], abs=1e-7)
+
+
+def along_x(speed=1.0, seconds=10.0, **others):
+    t = np.arange(round(seconds * 10) + 1) / 10
+    return Trajectory(t, np.column_stack((speed * t, 0.0 * t, 0.0 * t)), **others)
+
+
+def test_errors_per_second_are_those_of_speed():
+    figures = score(along_x(1.1), along_x(1.0)).figures
+    assert figures["rpe_per_s.position_rmse"] == pytest.approx(0.1)
+    assert figures["rpe_per_s.pieces"] == 10
+    assert figures["rpe_per_m.position_max"] == pytest.approx(0.1, abs=1e-6)
+    assert figures["ape.position_max"] == pytest.approx(1.0)
+    assert figures["ape.rotation_max"] == 0.0
+
+
+def test_no_piece_of_a_second_spans_a_gap():
+    whole = along_x(1.1, 20.0)
+    kept = (whole.t < 5.05) | (whole.t > 14.95)
+    figures = score(Trajectory(whole.t[kept], whole.poses[kept]), along_x(1.0, 20.0)).figures
+    assert figures["rpe_per_s.pieces"] == 10
+    assert figures["rpe_per_s.position_max"] == pytest.approx(0.1)
+
+
+def test_the_alignment_is_that_of_the_frames():
+    space = Trajectory3(*curve())
+    turn = Rotation.from_rotvec((0.3, -0.2, 1.0)).as_matrix()
+    moved = Trajectory3(space.t, 2.0 * space.positions @ turn.T + (1.0, 2.0, 3.0), turn @ space.rotations)
+    found = score(space, moved, align="sim3")
+    assert found.transform.scale == pytest.approx(2.0)
+    assert found.transform.rotation == pytest.approx(turn)
+    assert found.transform.translation == pytest.approx((1.0, 2.0, 3.0))
+    assert found.figures["ape.position_max"] == pytest.approx(0.0, abs=1e-12)
+
+
+def curve(count=40):
+    t = np.arange(count) / 10
+    positions = np.column_stack((np.cos(t), np.sin(2.0 * t), 0.5 * np.sin(t)))
+    return t, positions, Rotation.from_rotvec(np.outer(t, (0.1, 0.0, 1.0))).as_matrix()
+
+
+def test_a_plane_is_seen_from_above():
+    t, positions, rotations = curve()
+    heading = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
+    planar = Trajectory(t, np.column_stack((positions[:, :2], heading)))
+    figures = score(planar, Trajectory3(t, positions + np.array((5.0, 1.0, 0.7)), rotations), align="se2").figures
+    assert figures["ape.position_max"] == pytest.approx(0.0, abs=1e-9)
+    assert figures["ape.rotation_max"] == pytest.approx(0.0, abs=1e-7)
+    found = score(planar, Trajectory3(t, positions + np.array((0.0, 0.0, 5.0)), rotations))
+    assert found.warnings == (
+        "estimate is planar, and reference is up to 5.5 m above or below it: heights count, but not with align se2 or associate "
+        "interpolate",
+    )
+
+
+def test_positions_without_headings_have_absolute_errors_only():
+    bare = along_x(has_heading=False)
+    figures = score(along_x(1.1), bare, align="se2").figures
+    assert figures["ape.position_rmse"] > 0.0
+    assert figures["ape.rotation_rmse"] is figures["rpe_per_m.position_rmse"] is figures["rpe_per_s.pieces"] is None
+    with pytest.raises(InputError, match="has no headings, which --align origin needs"):
+        score(along_x(), bare, align="origin")
+
+
+@pytest.mark.parametrize(
+    ("estimate", "options", "message"),
+    [
+        (along_x(), {"align": "se3"}, "its positions lie on a line, which --align se3 cannot turn"),
+        (along_x(0.0), {"align": "sim3"}, "its positions lie on a line"),
+        (along_x(0.0), {"align": "se2"}, "all positions are one, which --align se2 cannot turn"),
+        (along_x(1.0, 0.1), {"align": "se2"}, "2 poses are paired with reference, expected at least 3"),
+        (along_x(math.nan), {}, "pose 1 is not finite"),
+        (Trajectory(np.empty(0), np.empty((0, 3))), {}, "contains no poses"),
+        (
+            Trajectory(along_x().t + 20.0, along_x().poses),
+            {},
+            "do not overlap in time: estimate 20.000 to 30.000 s and refer",
+        ),
+        (Trajectory(along_x().t + 0.05, along_x().poses), {}, "no stamp is within 0.01 s of reference"),
+        (Trajectory(along_x().t[::50] + 0.01, along_x().poses[::50]), {"associate": "interpolate"}, "--max-gap"),
+        (along_x(), {"align": "se4"}, "align is 'se4', expected one of none, origin, se2, se3"),
+        (along_x(), {"max_diff": -1.0}, "max_diff is -1, expected a time of 0 s or more"),
+    ],
+)
+def test_what_cannot_be_scored_is_refused(estimate, options, message):
+    with pytest.raises(InputError, match=message.replace("(", "\\(")):
+        score(estimate, along_x(), **options)
+
+
+def test_few_partners_give_a_warning():
+    late = Trajectory(along_x().t * 1.01, along_x().poses)
+    assert "of 101 poses have a stamp within 0.01 s in reference" in score(late, along_x()).warnings[0]
+
+
+def test_pieces_of_all_pairs_are_those_of_a_search():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        steps = rng.choice((0.0, 0.25, 0.5, 2.0), 30)
+        covered = np.concatenate(([0.0], np.cumsum(steps)))
+        expected = []
+        for i in range(30):
+            far = np.abs(covered[i + 1 :] - covered[i] - 1.0)
+            if far.min() <= 0.1:
+                expected.append((i, i + 1 + int(np.argmin(far))))
+        assert pieces.all_pairs(steps, 1.0) == expected
