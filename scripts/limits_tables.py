@@ -13,13 +13,15 @@ from factorgraph_loc.sensors.tables import all_tables
 from factorgraph_loc.simulation.settings import SimulationSettings
 
 FILES: dict[str, type[BaseModel]] = {
-    "`NAME.rig.toml`": Rig,
     "`NAME.world.toml`": World,
     "`[start]`": StartSettings,
     "settings of simulations": SimulationSettings,
     "settings of active robots": ActiveSettings,
 }
-ESTIMATORS = {f"settings of {name}": registry.settings_type(name) for name in registry.ESTIMATORS}
+ESTIMATORS: dict[str, type[BaseModel]] = {
+    f"settings of {name}": registry.settings_type(name) for name in registry.ESTIMATORS
+}
+RIG: dict[str, type[BaseModel]] = {"`NAME.rig.toml`": Rig}  # as the former on the page of settings
 
 
 def numbers_of(model: type[BaseModel]) -> list[Setting]:

@@ -4,21 +4,45 @@ from collections.abc import Sequence
 
 from factorgraph_loc.files.settings import Setting, default_text, settings_in, values_text
 from factorgraph_loc.fusion import registry
-from factorgraph_loc.plugins import ESTIMATORS
+from factorgraph_loc.io.readers import reader
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
+from factorgraph_loc.sensors.registry import about, sections_of, sensor
 
 
 def tables() -> list[str]:
     """The lines of all tables, with their headings."""
+    return [*_estimators(), *_rig(), *_readers()][:-1]
+
+
+def _estimators() -> list[str]:
     lines = ["## Estimators", ""]
     for name in ESTIMATORS.own:
         found = registry.describe(name)
         kinds = " and ".join(word for word, there in (("causal", found.causal), ("smoothed", found.smoothed)) if there)
         lines += [f"### {name}", "", found.about, f"Its estimates are {kinds}; it takes {_names(found.sensors)}.", ""]
-        lines += table(settings_in(registry.settings_type(name)))
-    return lines[:-1]
+        lines += _table(settings_in(registry.settings_type(name)))
+    return lines
 
 
-def table(settings: Sequence[Setting]) -> list[str]:
+def _rig() -> list[str]:
+    top = [setting for setting in settings_in(Rig) if "." not in setting.key and setting.kind == "text"]
+    lines = ["## Rig", "", *_table(top)]
+    for name in SENSORS.own:
+        for section, settings in sections_of(sensor(name)).items():
+            lines += [f"### [{section}]", "", f"A section of the sensor `{name}`. {about(name)}", "", *_table(settings)]
+    return lines
+
+
+def _readers() -> list[str]:
+    lines = ["## Options of readers", ""]
+    for name in READERS.own:
+        options = settings_in(reader(name).options)
+        lines += [f"### {name}", "", reader(name).about, "", *(_table(options) if options else ["No options.", ""])]
+    return lines
+
+
+def _table(settings: Sequence[Setting]) -> list[str]:
     """A table of settings."""
     lines = ["| setting | default | values | what it is |", "|---|---|---|---|"]
     for s in settings:

@@ -81,6 +81,8 @@ app = typer.Typer(
 )
 app.command()(inspecting.datasets)
 app.command()(lookups.estimators)
+app.command()(lookups.sensors)
+app.command()(lookups.readers)
 app.command()(inspecting.info)
 app.command()(inspecting.convert)
 app.command()(manifest.manifest)

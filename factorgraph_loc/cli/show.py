@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 WARNINGS = 20  # number of warnings printed
-NARROW, BETWEEN = 20, 2  # characters of a column that is wrapped, at least, and between columns
+NARROW, PADDING = 18, 2  # characters of a column that is wrapped, at least, and beside each column
 
 
 def line(text: str = "") -> None:
@@ -66,7 +67,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], wrapped: Sequenc
         out.add_column(plain(name), justify=justify, no_wrap=name not in wrapped, overflow="fold", min_width=least[-1])
     for row in rows:
         out.add_row(*(plain(cell, MESSAGE) for cell in row))
-    rich_table(out, sum(least) + BETWEEN * (len(least) - 1) if wrapped else None)
+    rich_table(out, sum(least) + PADDING * len(least) if wrapped else None)
 
 
 def rich_table(content: Table, least: int | None = None) -> None:
@@ -76,10 +77,16 @@ def rich_table(content: Table, least: int | None = None) -> None:
 
     console = Console(markup=False, emoji=False, highlight=False, width=1000)
     if sys.stdout.isatty():
-        console.width = max(
-            shutil.get_terminal_size().columns, console.measure(content).maximum if least is None else least
-        )
+        console.width = max(_terminal_width(), console.measure(content).maximum if least is None else least)
     console.print(content)
+
+
+def _terminal_width() -> int:
+    """The width of the terminal that stdout is, which need not be the interpreter's own stream."""
+    try:
+        return os.get_terminal_size(sys.stdout.fileno()).columns
+    except OSError:
+        return shutil.get_terminal_size().columns
 
 
 @contextmanager

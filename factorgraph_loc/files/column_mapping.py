@@ -35,15 +35,21 @@ EpcCase = Literal["as written", "upper", "lower"]
 
 
 class ColumnMapping(FileModel):
-    """``columns``: the column of the file for each field; in JSON lines a path of keys, ``event.epc``; without ``header`` the
-    column number from 1. ``units`` by field: the name of a unit, or a factor. ``decimal``: the decimal mark."""
+    """A table of another program."""
 
     file: str
+    """file of the table, relative to the path of the manifest"""
     columns: dict[str, str]
+    """column of the file for each field; in JSON lines a path of keys, such as event.epc; without header the number from
+    1"""
     units: dict[str, str | float] = Field(default_factory=dict)
+    """unit of each field, or a factor to ours"""
     separator: Literal[",", ";", "\t", " "] = ","
+    """separator of the columns"""
     decimal: Literal[".", ","] = "."
+    """decimal mark"""
     header: bool = True
+    """whether the first row has the names of the columns"""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import bad_field
 from factorgraph_loc.files.models import FARTHEST
+from factorgraph_loc.files.settings import bound_text
 from factorgraph_loc.plugins import Place
 from factors.se2 import Array
 
@@ -63,6 +64,17 @@ class Column:
     def measured(self) -> Column:
         """The column as in a stream or a measurement."""
         return replace(self, name=self.field or self.name, low=max(self.low, self.left_out_below))
+
+    @property
+    def unit(self) -> str:
+        """Our unit of its values, empty for pure numbers and names."""
+        return "" if self.units is PURE else next(iter(self.units), "")
+
+    @property
+    def values(self) -> str:
+        """Valid values in short: ``-200 to 200 dBm, or empty``."""
+        between = f"{bound_text(self.low)} to {bound_text(self.high)} {self.unit}".strip() if self.units else "text"
+        return between + (", or empty" if self.may_lack else "")
 
     @property
     def expected(self) -> str:

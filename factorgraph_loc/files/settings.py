@@ -121,7 +121,9 @@ def _parts(part: _Part) -> Iterator[_Part]:
     elif origin is dict:
         yield from _parts(_Part(arguments[1], (), f"{part.path}.*", part.count))
     elif origin in (tuple, list) and arguments:
-        count = 0 if origin is list or Ellipsis in arguments else len(arguments)
+        least, most = ({getattr(entry, f"{side}_length", 0) for entry in part.metadata} for side in ("min", "max"))
+        any_number = max(least & most, default=0)
+        count = any_number if origin is list or Ellipsis in arguments else len(arguments)
         for argument in dict.fromkeys(arguments):
             if argument is not Ellipsis:
                 yield from _parts(_Part(argument, (), part.path, count))

@@ -44,11 +44,14 @@ Axes = Annotated[str, AfterValidator(_axes)]
 
 
 class Mounting(FileModel):
-    """Orientation of a sensor on the robot: rotations about x by ``roll``, y by ``pitch`` (down is positive), z by ``yaw``."""
+    """Orientation of a sensor on the robot: rotations about x, then y, then z."""
 
     roll: Angle = 0.0
+    """rotation about the x axis"""
     pitch: Angle = 0.0
+    """rotation about the y axis; down is positive"""
     yaw: Angle = 0.0
+    """rotation about the z axis; left is positive"""
 
     def rotation(self) -> Array:
         """The rotation matrix (3, 3) from the sensor frame to the robot frame."""
@@ -56,11 +59,12 @@ class Mounting(FileModel):
 
 
 class Turned(FileModel):
-    """Axes and mounting of a source. ``axes``: the axes that point forward, left and up: ``body`` (x, y, z), ``optical`` (z, -x,
-    -y), or such a list. ``mounting``: the orientation of the measured frame on the robot."""
+    """Axes and mounting of a source."""
 
     axes: Axes | None = None
+    """recorded axes that point forward, left and up: body (x, y, z), optical (z, -x, -y), or such a list"""
     mounting: Mounting = Mounting()
+    """orientation of the measured frame on the robot"""
 
     def is_given(self) -> bool:
         """Whether axes or mounting are set."""

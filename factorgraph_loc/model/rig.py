@@ -26,7 +26,9 @@ class Rig(FileModel):
     if the robot lacks the sensor."""
 
     name: str = "rig"
+    """name of the robot"""
     sensors: tuple[str, ...] = ("odometry", "bearing_range")
+    """sensors that estimators use by default"""
 
     if TYPE_CHECKING:
 

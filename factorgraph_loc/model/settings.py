@@ -9,11 +9,12 @@ from factorgraph_loc.model.variable import Estimated
 
 
 class SensorSettings(FileModel):
-    """The section of a sensor in a rig. ``time_offset`` [s] is added to its timestamps. ``constants``: names of the calibration
-    constants that may be estimated; the section's ``uncertainty`` holds their standard deviations."""
+    """The section of a sensor in a rig. ``constants``: names of the calibration constants that may be estimated; the section's
+    ``uncertainty`` holds their standard deviations."""
 
     constants: ClassVar[tuple[str, ...]] = ()
     time_offset: Seconds = 0.0
+    """added to the timestamps"""
 
     def estimated(self) -> Estimated:
         """The constants that are estimated."""

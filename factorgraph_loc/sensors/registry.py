@@ -13,6 +13,7 @@ from typing import Any, Literal, cast
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import nearest
+from factorgraph_loc.files.settings import Setting, first_sentence, settings_in
 from factorgraph_loc.model.sections import Layer, Section, registered
 from factorgraph_loc.plugins import SENSORS, Place, load
 from factorgraph_loc.text import quoted
@@ -104,6 +105,25 @@ class SensorType:
 def sensors() -> Mapping[str, SensorType]:
     """All sensors by name, built-in ones first. InputError if one cannot be loaded or two share a name."""
     return cast(Mapping[str, SensorType], registered())
+
+
+def sensor(name: str) -> SensorType:
+    """A sensor by its name or that of one of its channels; InputError if it is unknown."""
+    if name in sensors():
+        return sensors()[name]
+    if name in channels():
+        return sensor_of(name)
+    raise InputError(f"no sensor is called {quoted(name)}{nearest(name, [*sensors(), *channels()])}")
+
+
+def sections_of(sensor: SensorType) -> dict[str, list[Setting]]:
+    """The settings in each of a sensor's sections of the rig."""
+    return {name: settings_in(load(section.kind)) for name, section in sensor.settings.items()}
+
+
+def about(name: str) -> str:
+    """The first sentence of what a sensor's package says of itself."""
+    return first_sentence(load(SENSORS.place(name).partition(":")[0]))
 
 
 @cache

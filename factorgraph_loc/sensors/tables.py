@@ -22,7 +22,7 @@ from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.plugins import load
-from factorgraph_loc.sensors.registry import Channel, channels, sensors
+from factorgraph_loc.sensors.registry import Channel, SensorType, channels, sensors
 from factors.se2 import Array, Integers
 
 Columns = Mapping[str, Array | Integers | Sequence[str]]
@@ -65,9 +65,14 @@ def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
 def all_tables() -> Iterator[Table]:
     """The descriptions of all tables of all sensors."""
     for sensor in sensors().values():
-        for channel in sensor.channels:
-            yield from (load(place) for place in (*channel.tables, *channel.described))
-        yield from (load(layer.table) for layer in sensor.layers.values() if layer.table)
+        yield from tables_of_sensor(sensor)
+
+
+def tables_of_sensor(sensor: SensorType) -> Iterator[Table]:
+    """The descriptions of the tables of a sensor: of its channels, then of its layers of the map."""
+    for channel in sensor.channels:
+        yield from (load(place) for place in (*channel.tables, *channel.described))
+    yield from (load(layer.table) for layer in sensor.layers.values() if layer.table)
 
 
 def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) -> Stream:

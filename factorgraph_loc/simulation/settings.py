@@ -74,7 +74,7 @@ class ImageSettings(FileModel):
 
     rate: Hertz = 5.0
     exposure: Annotated[float, Field(ge=0.0, le=0.2), InUnit("s")] = 0.005
-    read_noise: Annotated[float, Field(ge=0.0, le=50.0, description="of 255")] = 1.5
+    read_noise: Annotated[float, Field(ge=0.0, le=50.0), InUnit("of 255")] = 1.5
     shot_noise: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
     gain_drift: Annotated[float, Field(ge=0.0, le=0.5)] = 0.1
     vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = 0.3

@@ -9,7 +9,9 @@ from factorgraph_loc.maps.points import Feature
 
 
 class FrontendSettings(FileModel):
-    """The ``feature`` to detect, by name, and the maximum number (``count``) per image."""
+    """What is detected in images."""
 
     feature: Feature = "colour"
+    """kind of feature to detect, if the map's points have no descriptors"""
     count: Annotated[int, Field(ge=10, le=20_000)] = 500
+    """largest number of features per image"""

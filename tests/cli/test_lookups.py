@@ -5,7 +5,9 @@ import json
 import pytest
 
 from factorgraph_loc.fusion.registry import settings_of
-from factorgraph_loc.plugins import ESTIMATORS
+from factorgraph_loc.io.readers import reader
+from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
+from factorgraph_loc.sensors.registry import channels
 
 
 def test_the_list_names_all_estimators(fgloc):
@@ -32,3 +34,46 @@ def test_a_bad_name_is_told_with_the_nearest(fgloc):
     assert done.exit_code == 2
     assert done.stderr == "error: no estimator is called 'smother': did you mean smoother?\n"
     assert "known: batch, dead_reckoning, ekf" in fgloc("estimators", "zzz").stderr
+
+
+def test_the_list_of_sensors_has_their_channels(fgloc):
+    found = json.loads(fgloc("sensors", "--json").stdout)
+    assert [one["name"] for one in found] == list(SENSORS)
+    assert [name for one in found for name in one["channels"]] == list(channels())
+    printed = fgloc("sensors")
+    assert printed.exit_code == 0
+    assert "rfid, rssi, phase" in printed.stdout
+
+
+def test_a_sensor_has_columns_with_units_and_the_keys_of_the_rig(fgloc):
+    found = json.loads(fgloc("sensors", "rfid", "--json").stdout)
+    tables = {table["name"]: {column["name"]: column for column in table["columns"]} for table in found["tables"]}
+    assert list(tables) == ["rfid", "inventories", "reads", "tags"]
+    assert (tables["rfid"]["rssi"]["unit"], tables["rfid"]["rssi"]["may_lack"]) == ("dBm", True)
+    assert tables["rfid"]["epc"]["high"] is None
+    keys = {setting["key"]: setting for setting in found["settings"]["rfid"]}
+    assert (keys["round_gap"]["default"], keys["round_gap"]["unit"]) == (0.05, "s")
+    printed = fgloc("sensors", "rfid").stdout
+    assert "-200 to 200 dBm, or empty" in printed
+    assert "models.*.sigma_phi" in printed
+
+
+def test_a_channel_stands_for_its_sensor(fgloc):
+    assert fgloc("sensors", "sightings").stdout == fgloc("sensors", "camera").stdout
+    assert "did you mean bearing_range?" in fgloc("sensors", "bearing_rang").stderr
+    assert "did you mean landmarks?" in fgloc("sensors", "landmark").stderr
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_every_option_of_a_reader_is_told(fgloc, name):
+    found = json.loads(fgloc("readers", name, "--json").stdout)
+    assert {one["key"].partition(".")[0] for one in found["options"]} == set(reader(name).options.model_fields)
+    assert all(one["meaning"] for one in found["options"])
+    assert fgloc("readers", name).exit_code == 0
+
+
+def test_the_list_of_readers(fgloc):
+    found = json.loads(fgloc("readers", "--json").stdout)
+    assert [one["name"] for one in found] == list(READERS)
+    assert all(one["about"] in fgloc("readers").stdout for one in found)
+    assert "did you mean rosbag?" in fgloc("readers", "rosbags").stderr

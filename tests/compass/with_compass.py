@@ -193,6 +193,15 @@ def test_it_is_named_on_the_command_line(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+def test_it_is_listed_with_its_table_and_its_keys():
+    listed = json.loads(command("sensors", "--json").stdout)
+    assert listed[-1] == {"name": "compass", "about": listed[-1]["about"], "channels": ["compass"], "rig": ["compass"]}
+    found = json.loads(command("sensors", "compass", "--json").stdout)
+    assert {"name": "heading", "unit": "rad"}.items() <= found["tables"][0]["columns"][1].items()
+    assert "bias" in {setting["key"] for setting in found["settings"]["compass"]}
+    assert "compass" in json.loads(command("estimators", "ekf", "--json").stdout)["sensors"]
+
+
 def test_a_simulated_drive_has_it():
     changes = {
         "drive": {"duration": 20.0},

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 import pytest
-from limits_tables import ESTIMATORS, FILES, numbers_of, tables
+from limits_tables import ESTIMATORS, FILES, RIG, numbers_of, tables
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import parse_model
@@ -21,7 +21,7 @@ from factorgraph_loc.sensors.odometry.settings import (
     OdometryUncertainty,
 )
 
-ALL = FILES | ESTIMATORS
+ALL = FILES | ESTIMATORS | RIG
 
 
 @pytest.mark.parametrize("file", list(ALL))

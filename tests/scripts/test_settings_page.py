@@ -5,6 +5,7 @@ from settings_tables import tables
 
 from factorgraph_loc.files.settings import settings_in
 from factorgraph_loc.fusion.registry import settings_type
+from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.plugins import ESTIMATORS
 
 
@@ -15,6 +16,6 @@ def test_the_page_of_settings_is_up_to_date():
     )
 
 
-def test_every_setting_of_an_estimator_has_a_meaning():
-    without = [f"{name}.{s.key}" for name in ESTIMATORS for s in settings_in(settings_type(name)) if not s.meaning]
-    assert not without
+def test_every_setting_has_a_meaning():
+    models = {name: settings_type(name) for name in ESTIMATORS} | {"rig": Rig}
+    assert not [f"{name}.{s.key}" for name, model in models.items() for s in settings_in(model) if not s.meaning]

@@ -56,11 +56,14 @@ ENCODINGS: dict[str, tuple[type, int, Callable[[Pixels], Pixels]]] = {
 
 
 class CameraTopic(FileModel):
-    """A topic of images, and the ``info`` topic with lens, size and frame of the camera."""
+    """A topic of images."""
 
     topic: str
+    """name of the topic"""
     info: str | None = None
+    """topic with lens, size and frame of the camera"""
     clock: Clock | None = None
+    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 class Images:

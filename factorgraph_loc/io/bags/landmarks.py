@@ -44,15 +44,19 @@ PLACES = tuple(replace(POSES[axis], may_lack=True) for axis in "xyz")  # in the 
 
 
 class LandmarkTopic(Turned):
-    """``fields``: paths of the landmark's name, and of its range and bearing, or of its position x, y, z in the sensor frame; known
-    for common marker detectors. ``frame``: the sensor's, whose pose is in tf_static; without it use ``axes`` of the sensor
-    (``optical``, ``body``, or a list) and its ``mounting`` on the robot."""
+    """A topic of landmarks, such as those of common marker detectors."""
 
     topic: str
+    """name of the topic"""
     fields: dict[LandmarkField, str] | None = None
+    """paths of the landmark's name, and of its range and bearing, or of its position x, y, z in the sensor frame; known for
+    common marker detectors"""
     axes: Axes = "optical"
+    """axes of the sensor that point forward, left and up: body (x, y, z), optical (z, -x, -y), or such a list"""
     frame: str | None = None
+    """frame of the sensor, whose pose is in tf_static; without it use axes and mounting"""
     clock: Clock | None = None
+    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 class PixelTopic(FileModel):
@@ -60,8 +64,11 @@ class PixelTopic(FileModel):
     :func:`factorgraph_loc.maps.markers.corner_names`."""
 
     topic: str
+    """name of the topic"""
     fields: dict[PixelField, str] | None = None
+    """paths of landmark, u and v in a message; not for corners of AprilTags"""
     clock: Clock | None = None
+    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 class Landmarks(RowsOfTopic):

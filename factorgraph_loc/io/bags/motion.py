@@ -27,31 +27,40 @@ IMU = "sensor_msgs/msg/Imu"
 
 
 class WheelSettings(FileModel):
-    """A differential drive: names of the two wheel joints, wheel radius, and track."""
+    """A differential drive."""
 
     left: str
+    """name of the left wheel's joint"""
     right: str
+    """name of the right wheel's joint"""
     radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")]
+    """radius of the wheels"""
     track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")]
+    """distance between the wheels"""
 
 
 class OdometryTopic(Turned):
-    """``use``: the ``pose`` of odometry (as motion between messages) or its ``twist``; for wheels, position or velocity.
-    ``wheels``: needed for a topic of joints."""
+    """A topic of odometry or of wheel joints."""
 
     topic: str
+    """name of the topic"""
     use: Literal["pose", "twist"] = "pose"
+    """the pose of odometry, as motion between messages, or its twist; for wheels, position or velocity"""
     wheels: WheelSettings | None = None
+    """wheels of a topic of joints"""
     clock: Clock | None = None
+    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 class ImuTopic(Turned):
-    """A topic of an IMU: its turn rate about the robot's z axis. ``frame``: the IMU's, whose orientation is in tf_static; without
-    it use ``axes`` and ``mounting``; by default its z axis points up."""
+    """A topic of an IMU: its turn rate about the robot's z axis."""
 
     topic: str
+    """name of the topic"""
     frame: str | None = None
+    """frame of the IMU, whose orientation is in tf_static; without it use axes and mounting"""
     clock: Clock | None = None
+    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 Motion = IncrementStream | VelocityStream

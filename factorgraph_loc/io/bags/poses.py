@@ -28,21 +28,27 @@ POSES: dict[str, Callable[[Any], Any]] = {
 
 
 class ReferenceTopic(Turned):
-    """A topic of poses, or of tf with frames: the robot ``child`` in the world ``parent``. ``has_heading``: False if the heading is
-    meaningless."""
+    """A topic of poses, or of tf with two frames."""
 
     topic: str
+    """name of the topic"""
     parent: str | None = None
+    """frame of the world, for tf"""
     child: str | None = None
+    """frame of the robot, for tf"""
     has_heading: bool = True
+    """whether the heading means anything"""
     clock: Clock | None = None
+    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 class StartTopic(Turned):
     """A topic whose first pose with covariance is the known start."""
 
     topic: str
+    """name of the topic"""
     clock: Clock | None = None
+    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 class Poses:

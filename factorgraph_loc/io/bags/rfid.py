@@ -23,22 +23,28 @@ SIGNALS = {name: RFID[name].units for name in ("rssi", "phase", "frequency")}
 
 
 class RfidTopic(FileModel):
-    """``fields``: paths of the EPC, the antenna, and other values, with ``units`` if these are not dBm, rad, Hz and us.
-    ``antenna``: name of the only antenna, if messages do not name it. ``antennas``: names in the rig of those in messages;
-    ``frames``: their frames in tf_static, if named differently. ``epc_case``: letter case in which EPCs are compared with the
-    map. ``rounds``: ``message`` if a message holds the reads of one inventory round; ``gaps`` if rounds are separated by
-    ``round_gap`` seconds without reads."""
+    """A topic of reads."""
 
     topic: str
+    """name of the topic"""
     fields: dict[ReadField, str]
+    """paths of the EPC, the antenna and other values in a message"""
     units: dict[Literal["rssi", "phase", "frequency", "stamp"], str | float] = Field(default_factory=dict)
+    """units of rssi, phase, frequency and stamp, if not dBm, rad, Hz and us; or factors"""
     antenna: str | None = None
+    """name of the only antenna, if messages do not name it"""
     antennas: dict[str, str] = Field(default_factory=dict)
+    """names in the rig of those in messages"""
     epc_case: EpcCase = "as written"
+    """letter case in which EPCs are compared with the map"""
     frames: dict[str, str] = Field(default_factory=dict)
+    """frames of antennas in tf_static, if named differently"""
     rounds: Literal["gaps", "message"] = "gaps"
+    """message if a message holds the reads of one inventory round, gaps if rounds are separated by round_gap"""
     round_gap: Annotated[float, Field(gt=0.0, le=10.0), InUnit("s")] = 0.05
+    """gap between reads that ends an inventory round"""
     clock: Clock | None = None
+    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 class Reads:

@@ -32,8 +32,7 @@ from factorgraph_loc.text import told
 
 
 class Options(FileModel):
-    """The sensor of each topic. ``clock``: whether timestamps are those of message headers or of receipt; a topic may override it.
-    ``base_frame``: the robot's, for mountings in tf_static."""
+    """The topic of each sensor."""
 
     odometry: OdometryTopic
     imu: ImuTopic | None = None
@@ -44,7 +43,9 @@ class Options(FileModel):
     reference: ReferenceTopic | None = None
     start: StartTopic | None = None
     clock: Clock = "header"
+    """timestamps of message headers or of receipt; a topic may override it"""
     base_frame: str = "base_link"
+    """frame of the robot, for mountings in tf_static"""
 
 
 OTHERS = [table for table in tables_of_messages().values() if table.name not in Options.model_fields]

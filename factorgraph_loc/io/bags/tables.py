@@ -22,13 +22,16 @@ from factors.se2 import Array
 
 
 class TableTopic(FileModel):
-    """``fields``: path of each column of the table, by default a field with the column's name. ``units``: factors to our units, by
-    column."""
+    """A topic of rows of a table."""
 
     topic: str
+    """name of the topic"""
     fields: dict[str, str] = Field(default_factory=dict)
+    """path of each column of the table, by default a field with its name"""
     units: dict[str, float] = Field(default_factory=dict)
+    """factors to our units, by column"""
     clock: Clock | None = None
+    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 class RowsOfTopic:

@@ -2,6 +2,7 @@
 
 from factorgraph_loc.io.readers.load import load, read_log
 from factorgraph_loc.io.readers.manifests import Dataset, Manifest, describe, read_manifest, verify
+from factorgraph_loc.io.readers.registry import reader
 from factorgraph_loc.plugins import READERS
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "pose_file",
     "read_log",
     "read_manifest",
+    "reader",
     "rf_robot",
     "sevenscenes",
     "starry_night",

@@ -32,9 +32,10 @@ UNDISTORTED = ("none", "pinhole", "")
 
 
 class Options(FileModel):
-    """``camera``: its number."""
+    """The options of the reader."""
 
     camera: Annotated[int, Field(ge=0, le=9)] = 0
+    """number of the camera"""
 
 
 class _Sensor(FileModel):

@@ -24,10 +24,12 @@ from factorgraph_loc.sensors.camera.tables import make_images
 
 
 class Options(FileModel):
-    """``sequence``: its number; those from 11 have no poses. ``camera``: 0 and 1 are grey, 2 and 3 colour."""
+    """The options of the reader."""
 
     sequence: Annotated[int, Field(ge=0, le=21)] = 0
+    """number of the sequence; those from 11 have no poses"""
     camera: Annotated[int, Field(ge=0, le=3)] = 0
+    """number of the camera: 0 and 1 are grey, 2 and 3 colour"""
 
 
 def read(path: Path | None, options: Options) -> Log:

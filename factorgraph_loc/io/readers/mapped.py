@@ -38,9 +38,10 @@ RATE = replace(IMU["w"], may_lack=True)  # about one of three axes, of which som
 
 
 class SensorFile(ColumnMapping):
-    """``clock_offset`` [s]: added to all timestamps."""
+    """A table of a sensor."""
 
     clock_offset: Offset = 0.0
+    """added to all timestamps"""
 
 
 class ImuFile(SensorFile, Turned):
@@ -49,9 +50,10 @@ class ImuFile(SensorFile, Turned):
 
 
 class ImageFile(SensorFile):
-    """``folder``: of the images, by default that of the log."""
+    """The table of images."""
 
     folder: str = "."
+    """folder of the images, by default that of the log"""
 
 
 class InventoryFile(SensorFile):
@@ -59,8 +61,7 @@ class InventoryFile(SensorFile):
 
 
 class Options(FileModel):
-    """The file of each sensor table, and of the reference, relative to the manifest's ``path``. ``readers``: files of several RFID
-    readers by any names, instead of ``rfid``."""
+    """The tables of a log. ``readers`` has several RFID readers by any names, instead of ``rfid``."""
 
     odometry: OdometryFile | None = None
     imu: ImuFile | None = None

@@ -32,21 +32,27 @@ COLUMNS = {c.name: c for table in (VELOCITIES, INCREMENTS, WAYS, POSE_COLUMNS) f
 
 class OdometryFile(ColumnMapping, Turned):
     """``columns``: t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the row before); x, y, heading or a
-    quaternion (poses, of which only the relative motion is used); left, right (distances of the wheels, with their ``track``).
-    ``clock_offset`` [s]: added to all timestamps."""
+    quaternion (poses, of which only the relative motion is used); left, right (distances of the wheels, with their ``track``)."""
 
     track: Annotated[float, Field(gt=0.0, le=10.0), InUnit("m")] | None = None
+    """distance between the wheels, for columns left and right"""
     clock_offset: Offset = 0.0
+    """added to all timestamps"""
 
 
 class ReferenceFile(ColumnMapping, Turned):
-    """The reference. ``format``: ``columns`` by a mapping; ``tum``; or ``kitti``, with the file of its ``times``."""
+    """The reference."""
 
     format: Literal["columns", "tum", "kitti"] = "columns"
+    """columns by a mapping, a TUM file, or a KITTI file with its times"""
     columns: dict[str, str] = Field(default_factory=dict)
+    """column of the file for each field, if the format is columns"""
     times: str | None = None
+    """file of the times of a KITTI file"""
     has_heading: bool = True
+    """whether the headings mean anything"""
     clock_offset: Offset = 0.0
+    """added to all timestamps"""
 
 
 def read_odometry(path: Path, options: OdometryFile, warnings: list[str]) -> tuple[Integers, Array, bool]:

@@ -71,27 +71,34 @@ PRESETS: dict[str, dict[str, dict[str, str]]] = {
 
 
 class Channels(FileModel):
-    """Evenly spaced channels: the frequency of channel 1, and the step."""
+    """Evenly spaced channels."""
 
     first: Annotated[float, Field(gt=100.0, lt=10_000.0), InUnit("MHz")]
+    """frequency of channel 1"""
     step: Annotated[float, Field(gt=0.0, lt=100.0), InUnit("MHz")]
+    """frequency from one channel to the next"""
 
 
 class RfidFile(ColumnMapping):
     """``columns``: t (or the first of several reads), epc, antenna, rssi, phase, frequency or channel, and, if a row summarizes
-    several reads, ``last`` and ``count``. ``preset``: columns and units of a known tool, which those given here override.
-    ``antenna``: name of the only one. ``antennas``: names in the rig of those in the file. ``channels`` [MHz]: frequencies of
-    channels 1, 2, ... ``epc_case``: letter case in which EPCs are compared with the map. ``clock_offset`` [s]: added to all
-    timestamps."""
+    several reads, ``last`` and ``count``."""
 
     columns: dict[str, str] = Field(default_factory=dict)
+    """column of the file for each field, besides those of the preset"""
     preset: Literal["impinj_itemtest", "impinj_iot", "sllurp_log", "sllurp_reports"] | None = None
+    """columns and units of a known tool, which those given here override"""
     antenna: str | None = None
+    """name of the only antenna"""
     antennas: dict[str, str] = Field(default_factory=dict)
+    """names in the rig of those in the file"""
     channels: tuple[Annotated[float, Field(gt=100.0, lt=10_000.0), InUnit("MHz")], ...] | Channels | None = None
+    """frequencies of channels 1, 2, ..."""
     epc_case: EpcCase = "as written"
+    """letter case in which EPCs are compared with the map"""
     round_gap: Annotated[float, Field(gt=0.0, le=10.0), InUnit("s")] | None = None
+    """gap between reads that ends an inventory round"""
     clock_offset: Annotated[float, Field(ge=-1e10, le=1e10), InUnit("s")] = 0.0
+    """added to all timestamps"""
 
     @model_validator(mode="before")
     @classmethod

@@ -28,9 +28,10 @@ ROBOTS = range(1, 6)  # subject numbers; higher ones are landmarks
 
 
 class Options(FileModel):
-    """``robot``: its subject number."""
+    """The options of the reader."""
 
     robot: Annotated[int, Field(ge=1, le=5)]
+    """subject number of the robot"""
 
 
 def read(path: Path | None, options: Options) -> Log:

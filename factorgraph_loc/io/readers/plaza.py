@@ -30,9 +30,10 @@ HAS_HEADING = {1: False, 2: True}
 
 
 class Options(FileModel):
-    """``run``: 1 or 2."""
+    """The options of the reader."""
 
     run: Annotated[int, Field(ge=1, le=2)]
+    """number of the run"""
 
 
 def read(path: Path | None, options: Options) -> Log:

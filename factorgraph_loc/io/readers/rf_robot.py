@@ -42,10 +42,12 @@ THINNING = 4  # the reference has 200 Hz
 
 
 class Options(FileModel):
-    """``run``: number of the recording; ``odometry_seed``: seed of the simulated odometry."""
+    """The options of the reader."""
 
     run: Annotated[int, Field(ge=0)] = 13
+    """number of the recording"""
     odometry_seed: Annotated[int, Field(ge=0)] = 0
+    """seed of the simulated odometry"""
 
 
 def read(path: Path | None, options: Options) -> Log:

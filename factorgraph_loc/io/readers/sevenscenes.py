@@ -37,9 +37,10 @@ RIG = Rig(
 
 
 class Options(FileModel):
-    """``rate`` [Hz]: nominal frame rate."""
+    """The options of the reader."""
 
     rate: Annotated[float, Field(gt=0.0, le=1000.0), InUnit("Hz")] = 15.0
+    """nominal frame rate"""
 
 
 def read(path: Path | None, options: Options) -> Log:

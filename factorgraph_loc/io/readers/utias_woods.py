@@ -27,9 +27,10 @@ FIELDS = {**dict.fromkeys(SERIES, 1), "r": LANDMARKS, "b": LANDMARKS, "l": 2}
 
 
 class Options(FileModel):
-    """``max_range`` [m]: landmarks farther away are ignored."""
+    """The options of the reader."""
 
     max_range: Annotated[float, Field(gt=0.0), InUnit("m")] = 5.0
+    """landmarks farther away are ignored"""
 
 
 def read(path: Path | None, options: Options) -> Log:

@@ -26,55 +26,66 @@ WIDEST_ANGLE = math.degrees(math.atan(math.sqrt(reprojection.WIDEST)))
 
 
 class CameraUncertainty(FileModel):
-    """Standard deviations of constants that differ between robots or runs; those above 0 are estimated.
-
-    ``roll``, ``pitch``, ``yaw``: rotations about the robot's axes; ``focal``: relative error of the focal length.
-    """
+    """Standard deviations of constants that differ between robots or runs; those above 0 are estimated."""
 
     x: Metres = 0.0
+    """standard deviation of the constant"""
     y: Metres = 0.0
+    """standard deviation of the constant"""
     z: Metres = 0.0
+    """standard deviation of the constant"""
     roll: Turn = 0.0
+    """standard deviation of a rotation about the robot's x axis"""
     pitch: Turn = 0.0
+    """standard deviation of a rotation about the robot's y axis"""
     yaw: Turn = 0.0
-    focal: Annotated[float, Field(ge=0.0, le=1.0, description="relative")] = 0.0
+    """standard deviation of a rotation about the robot's z axis"""
+    focal: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """standard deviation of the focal length, relative"""
     time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] = 0.0
+    """standard deviation of the constant"""
 
 
 class CameraSettings(SensorSettings):
-    """A camera. See :class:`factors.camera.model.CameraModel` for the model.
-
-    Mounted at (x, y, z), it looks along the robot's x axis, rotated by ``roll`` about x, ``pitch`` about y (down is positive) and
-    ``yaw`` about z (left is positive). ``time_offset`` [s] is added to the timestamps of its images. ``pixel_sigma`` [px] and
-    ``robust``, the scale of Huber's loss in standard deviations, apply to a matched feature and include errors of lens and
-    mounting. ``tempering`` applies to features matched with a map, because errors of map and features are correlated between
-    images.
-    """
+    """A camera. See :class:`factors.camera.model.CameraModel` for the model."""
 
     constants: ClassVar[tuple[str, ...]] = reprojection.PARAMETERS
     width: Side = 640
+    """width of the images"""
     height: Side = 480
+    """height of the images"""
     fx: Focal
+    """focal length in pixels along a row"""
     fy: Focal
+    """focal length in pixels along a column"""
     cx: Pixel
+    """principal point; 0 is the centre of the upper left pixel"""
     cy: Pixel
-    distortion: Annotated[tuple[Lens, Lens, Lens, Lens], Field(description="k1, k2, p1, p2 as in OpenCV")] = (
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-    )
+    """principal point; 0 is the centre of the upper left pixel"""
+    distortion: tuple[Lens, Lens, Lens, Lens] = (0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2 as in OpenCV"""
     x: Offset = 0.0
+    """position of the camera on the robot, forward"""
     y: Offset = 0.0
+    """position of the camera on the robot, to the left"""
     z: Offset = 0.0
+    """height of the camera"""
     roll: Angle = 0.0
+    """rotation about the robot's x axis, first, from looking forward"""
     pitch: Angle = 0.0
+    """rotation about the robot's y axis, then; down is positive"""
     yaw: Angle = 0.0
+    """rotation about the robot's z axis, last; left is positive"""
     pixel_sigma: Annotated[float, Field(ge=0.01, le=100.0), InUnit("px")] = 1.0
-    robust: Annotated[float, Field(ge=0.01, le=100.0, description="scale of Huber's loss, in sigmas")] = 2.0
-    tempering: Annotated[float, Field(ge=1e-6, le=1.0, description="exponent of the likelihood")] = 0.03
+    """standard deviation of a matched feature, including errors of lens and mounting"""
+    robust: Annotated[float, Field(ge=0.01, le=100.0)] = 2.0
+    """scale of Huber's loss, in standard deviations"""
+    tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.03
+    """exponent of the likelihood of features matched with a map, whose errors are correlated between images"""
     frontend: FrontendSettings = FrontendSettings()
+    """features that are detected in images"""
     uncertainty: CameraUncertainty = CameraUncertainty()
+    """standard deviations of constants; those above 0 are estimated"""
 
     @model_validator(mode="after")
     def _is_invertible(self) -> CameraSettings:

@@ -14,34 +14,49 @@ class BearingRangeUncertainty(FileModel):
     """Standard deviations of constants that differ between robots or runs; those above 0 are estimated."""
 
     x: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
+    """standard deviation of the constant"""
     y: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
+    """standard deviation of the constant"""
     bearing_bias: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] = 0.0
-    range_scale: Annotated[float, Field(ge=0.0, le=1.0, description="relative")] = 0.0
+    """standard deviation of the constant"""
+    range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """standard deviation of the constant, relative"""
     depth_axis: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] = 0.0
+    """standard deviation of the constant"""
     time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] = 0.0
+    """standard deviation of the constant"""
 
 
 class BearingRangeSettings(SensorSettings):
-    """A sensor of identified landmarks. See :class:`factors.landmarks.model.BearingRangeModel` for the model.
-
-    A landmark with a survey sigma above ``exact_survey`` times ``range_sigma`` is estimated with its survey as prior; others are
-    treated as exact.
-    """
+    """A sensor of identified landmarks. See :class:`factors.landmarks.model.BearingRangeModel` for the model."""
 
     constants: ClassVar[tuple[str, ...]] = PARAMETERS
     x: Offset = 0.0
+    """position of the sensor on the robot, forward"""
     y: Offset = 0.0
+    """position of the sensor on the robot, to the left"""
     heading: Angle = 0.0
+    """direction of the sensor on the robot"""
     bearing_bias: Angle = 0.0
-    range_scale: Annotated[float, Field(ge=0.2, le=5.0, description="reported divided by true")] = 1.0
-    range_kind: Annotated[Literal["distance", "depth"], Field(description="depth: along one axis only")] = "distance"
-    depth_axis: Annotated[Angle, Field(description="of that axis, in the sensor frame")] = 0.0
+    """reported minus true bearing"""
+    range_scale: Annotated[float, Field(ge=0.2, le=5.0)] = 1.0
+    """reported divided by true range"""
+    range_kind: Literal["distance", "depth"] = "distance"
+    """distance, or depth along one axis, as a camera measures it by the size of a marker"""
+    depth_axis: Angle = 0.0
+    """direction of that axis, in the sensor frame"""
     range_sigma: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("m")]
+    """standard deviation of a range; that of a range r is the root of range_sigma^2 + (range_sigma_relative r)^2"""
     range_sigma_relative: Annotated[float, Field(ge=0.0, le=1.0), InUnit("m per m")] = 0.0
+    """part of it that grows with the range"""
     bearing_sigma: Annotated[float, Field(ge=1e-5, le=0.5), InUnit("rad")] = 0.05
-    robust: Annotated[float, Field(ge=0.01, le=100.0, description="scale of the Geman-McClure loss, in sigmas")] = 4.0
-    exact_survey: Annotated[float, Field(ge=0.0, le=10.0, description="relative to range_sigma")] = 0.2
+    """standard deviation of a bearing"""
+    robust: Annotated[float, Field(ge=0.01, le=100.0)] = 4.0
+    """scale of the Geman-McClure loss, in standard deviations"""
+    exact_survey: Annotated[float, Field(ge=0.0, le=10.0)] = 0.2
+    """landmarks whose survey has a sigma below this share of range_sigma are exact, others are estimated"""
     uncertainty: BearingRangeUncertainty = BearingRangeUncertainty()
+    """standard deviations of constants; those above 0 are estimated"""
 
     def model(self) -> BearingRangeModel:
         return BearingRangeModel(

@@ -11,34 +11,41 @@ from factors.odometry.model import PARAMETERS, Growth
 
 
 class GrowthSettings(FileModel):
-    """Standard deviation per sqrt(m) travelled, per sqrt(rad) turned, per sqrt(s) elapsed."""
+    """Standard deviation of an error that grows with the square root of the way, the rotation and the time."""
 
     per_distance: Noise = 0.0
+    """standard deviation per sqrt(m) travelled"""
     per_rotation: Noise = 0.0
+    """standard deviation per sqrt(rad) turned"""
     per_time: Noise = 0.0
+    """standard deviation per sqrt(s)"""
 
     def model(self) -> Growth:
         return Growth(self.per_distance, self.per_rotation, self.per_time)
 
 
 class OdometryNoise(FileModel):
-    """Growth of the error: along the track [m], across it [m], in heading [rad]. The defaults are for unknown indoor wheels."""
+    """Growth of the error. The defaults are for unknown indoor wheels."""
 
     along: GrowthSettings = GrowthSettings(per_distance=0.05, per_time=0.005)
+    """growth of the error along the track [m]"""
     lateral: GrowthSettings = GrowthSettings(per_distance=0.02, per_time=0.005)
+    """growth of the error across the track [m]"""
     heading: GrowthSettings = GrowthSettings(per_distance=0.05, per_rotation=0.05, per_time=0.002)
+    """growth of the error of the heading [rad]"""
 
 
 class OdometryUncertainty(FileModel):
-    """Standard deviations of constants that differ between robots or runs; those above 0 are estimated.
-
-    Those of the scales are relative; that of the heading-rate bias is in rad/s, that of the drift in rad/m.
-    """
+    """Standard deviations of constants that differ between robots or runs; those above 0 are estimated."""
 
     scale_distance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """standard deviation of the constant, relative"""
     scale_rotation: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """standard deviation of the constant, relative"""
     heading_rate_bias: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad/s")] = 0.0
+    """standard deviation of the constant"""
     heading_drift: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad/m")] = 0.0
+    """standard deviation of the constant"""
 
 
 class OdometrySettings(SensorSettings):
@@ -46,19 +53,33 @@ class OdometrySettings(SensorSettings):
 
     constants: ClassVar[tuple[str, ...]] = PARAMETERS
     scale_distance: Scale = 1.0
+    """true divided by reported distance"""
     scale_rotation: Scale = 1.0
+    """true divided by reported rotation"""
     speed_bias: Annotated[float, Field(ge=-1.0, le=1.0), InUnit("m/s")] = 0.0
+    """speed reported at rest"""
     heading_rate_bias: Rate = 0.0
+    """turn rate reported at rest"""
     heading_drift: Annotated[float, Field(ge=-1.0, le=1.0), InUnit("rad/m")] = 0.0
+    """unreported change of heading per metre travelled"""
     direction: Angle = 0.0
+    """direction of travel, in the robot frame"""
     delay: Annotated[float, Field(ge=0.0, le=2.0), InUnit("s")] = 0.0
+    """delay of the wheels' response to commanded velocities"""
     lag: Annotated[float, Field(ge=0.0, le=5.0), InUnit("s")] = 0.0
+    """time constant of the wheels' response to commanded velocities"""
     turn_slowdown: Annotated[float, Field(ge=0.0, le=5.0), InUnit("m/rad")] = 0.0
+    """loss of commanded speed per turn rate"""
     max_hold: Annotated[float, Field(ge=1e-3, le=60.0), InUnit("s")] = 1.5
-    unknown_distance: Noise = 0.2
-    unknown_rotation: Noise = 0.2
+    """time for which a velocity is held; after that the motion is unknown"""
+    unknown_distance: Annotated[Noise, InUnit("m per sqrt(s)")] = 0.2
+    """growth of the error of the position while the motion is unknown"""
+    unknown_rotation: Annotated[Noise, InUnit("rad per sqrt(s)")] = 0.2
+    """growth of the error of the heading while the motion is unknown"""
     noise: OdometryNoise = OdometryNoise()
+    """growth of the error of the odometry"""
     uncertainty: OdometryUncertainty = OdometryUncertainty()
+    """standard deviations of constants; those above 0 are estimated"""
 
 
 class ImuSettings(SensorSettings):
@@ -66,4 +87,6 @@ class ImuSettings(SensorSettings):
     settings has the default ones."""
 
     bias: Rate = 0.0
+    """turn rate reported at rest"""
     heading: GrowthSettings = GrowthSettings(per_time=0.005)
+    """growth of the error of the heading [rad]"""

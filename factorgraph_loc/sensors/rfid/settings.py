@@ -32,23 +32,31 @@ Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 
 
 class PriorSettings(FileModel):
-    """How well a detection model is known, as standard deviations (:mod:`factors.rfid.adjustment`): ``range_scale`` of the
-    logarithm of a factor of its range, ``read_rate`` of the logit of its largest probability. What is above zero is learnt on the
-    way by every estimator that uses tags."""
+    """How well a detection model is known, as standard deviations (:mod:`factors.rfid.adjustment`); what is above 0 is learnt on
+    the way by every estimator that uses tags."""
 
     range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
-    read_rate: Annotated[float, Field(ge=0.0, le=3.0, description="of a logit")] = 0.5
+    """standard deviation of the logarithm of a factor of its range"""
+    read_rate: Annotated[float, Field(ge=0.0, le=3.0)] = 0.5
+    """standard deviation of the logit of its largest probability"""
 
 
 class BeamSettings(FileModel):
-    """See :class:`factors.rfid.model.BeamModel`; ``prior``: how well it is known."""
+    """See :class:`factors.rfid.model.BeamModel`: p0 sigmoid((r_max - r) / s_r) exp(-(phi / sigma_phi)^2 / 2), with distance r and
+    bearing phi."""
 
     kind: Literal["beam"] = "beam"
+    """beam: falls off with distance and bearing; logistic: in eleven coefficients; grid: a learnt field"""
     prior: PriorSettings = Field(default_factory=PriorSettings)
+    """how well the model is known"""
     p0: Annotated[float, Field(ge=1e-6, le=1.0 - 1e-6)] = 0.9
+    """beam: largest probability of a read"""
     r_max: Annotated[float, Field(ge=0.01, le=50.0), InUnit("m")] = 4.5
+    """beam: distance at which it has fallen to a half"""
     s_r: Annotated[float, Field(ge=1e-3, le=10.0), InUnit("m")] = 0.3
+    """beam: width of that fall"""
     sigma_phi: Annotated[float, Field(ge=1e-3, le=10.0), InUnit("rad")] = 0.698
+    """beam: width of the beam, as standard deviation of the bearing"""
 
     def model(self) -> DetectionModel:
         return BeamModel(self.p0, self.r_max, self.s_r, self.sigma_phi)
@@ -60,17 +68,19 @@ class LogisticSettings(FileModel):
     kind: Literal["logistic"] = "logistic"
     prior: PriorSettings = Field(default_factory=PriorSettings)
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=11, max_length=11)]
+    """logistic: of the logit of the probability, by distance, bearing, height and facing"""
 
     def model(self) -> DetectionModel:
         return LogisticModel(self.coefficients)
 
 
 class GridSettings(FileModel):
-    """A learnt detection grid: the name of an ``.npz`` in the folder of the rig's file."""
+    """A learnt detection grid."""
 
     kind: Literal["grid"] = "grid"
     prior: PriorSettings = Field(default_factory=PriorSettings)
     file: str
+    """grid: the name of an .npz in the folder of the rig's file"""
     _folder: Path = PrivateAttr(default=Path())
 
     def model(self) -> GridModel:
@@ -91,23 +101,34 @@ ModelSettings = Annotated[BeamSettings | LogisticSettings | GridSettings, Field(
 
 
 class AntennaSettings(FileModel):
-    """An antenna: position and boresight in the robot frame (``pitch``: up is positive), and the name of its model."""
+    """An antenna on the robot."""
 
     x: Offset = 0.0
+    """position of the antenna, forward"""
     y: Offset = 0.0
+    """position of the antenna, to the left"""
     z: Offset = 0.0
+    """height of the antenna"""
     yaw: Angle = 0.0
+    """direction that it looks in; left is positive"""
     pitch: Annotated[float, Field(ge=-1.6, le=1.6), InUnit("rad")] = 0.0
+    """elevation of that direction; up is positive"""
     model: str = "default"
+    """its detection model, a name in models"""
 
 
 class RssiSettings(FileModel):
     """See :class:`factors.rfid.strength.RssiModel`; ``coefficients`` in the order of ``factors.rfid.strength.FEATURES``."""
 
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)]
+    """of the RSSI [dBm]: by 1, -10 log10 of the distance, w, w^2, c and c^2, with w = 1 - cosine of the bearing and c the
+    cosine of the facing"""
     sigma: Annotated[float, Field(ge=0.01, le=30.0), InUnit("dB")]
-    dof: Annotated[float, Field(ge=0.1, le=1000.0, description="degrees of freedom of the Student density")]
+    """scale of the Student noise"""
+    dof: Annotated[float, Field(ge=0.1, le=1000.0)]
+    """degrees of freedom of the Student noise"""
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.005
+    """exponent of the likelihood, below 1 for correlated reads"""
 
     def model(self, antennas: tuple[Antenna, ...]) -> RssiModel:
         """The model for the given antennas."""
@@ -115,15 +136,20 @@ class RssiSettings(FileModel):
 
 
 class PhaseSettings(FileModel):
-    """See :class:`factors.rfid.phase.PhaseModel`. Windows of ``window`` [s] begin every ``step`` [s]. Reads in overlapping windows
-    are weighted by ``step`` / ``window``."""
+    """See :class:`factors.rfid.phase.PhaseModel`. Reads in overlapping windows are weighted by ``step`` / ``window``."""
 
     kappa: Annotated[float, Field(ge=1e-6, le=100.0)] = 1.0
+    """concentration of the phases"""
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
+    """exponent of the likelihood, below 1 for correlated reads"""
     max_range: Annotated[float, Field(ge=0.01, le=50.0), InUnit("m")] = 1.5
+    """largest distance of reads that count"""
     min_reads: Annotated[int, Field(ge=2, le=1000)] = 3
+    """smallest number of reads in a window"""
     window: Annotated[float, Field(ge=1e-3, le=60.0), InUnit("s")] = 2.0
+    """length of the windows in which phases of one antenna and tag are compared"""
     step: Annotated[float, Field(ge=1e-3, le=60.0), InUnit("s")] = 1.0
+    """time between the beginnings of two windows"""
 
     @model_validator(mode="after")
     def _has_no_gaps(self) -> PhaseSettings:
@@ -158,27 +184,32 @@ def default_models() -> dict[str, BeamSettings | LogisticSettings | GridSettings
 
 
 class RfidSettings(SensorSettings):
-    """The RFID reader. ``antennas`` by name, or a ``preset`` of them at height ``preset_z``.
-
-    ``false_read`` and ``miss``: lower and upper bounds of the read probability (the latter as 1 - miss). ``tempering``: exponent of
-    the likelihood, below 1 for correlated reads. ``round_gap`` [s]: gap between reads that separates inventory rounds if the log
-    has none. ``pass_sigma`` [m]: accuracy of the pose from one pass of a tag, for tags with an inexact survey
-    (:func:`~factorgraph_loc.sensors.rfid.known_tags.trust`). ``dead_tags``: prior share of broken, hidden or missing tags of a map;
-    ``fgloc calibrate`` learns it. ``rssi``, ``phase``: models used if an estimator uses these sensors.
-    """
+    """The RFID reader, with either ``antennas`` or a ``preset`` of them."""
 
     preset: Literal["rackham"] | None = None
+    """instead of antennas: eight antennas 1 to 8 around the body, 1 to the front, the others counter-clockwise"""
     preset_z: Offset = 1.0
+    """height of these antennas"""
     antennas: dict[str, AntennaSettings] = Field(default_factory=dict)
+    """antennas by their names in the reads"""
     models: dict[str, ModelSettings] = Field(default_factory=default_models)
+    """detection models of antennas by name; the default is a beam"""
     false_read: Share = 1e-3
+    """lower bound of the probability of a read, at any position"""
     miss: Share = 0.0
+    """lower bound of the probability of a miss, at any position"""
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 1.0
+    """exponent of the likelihood, below 1 for correlated reads"""
     round_gap: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("s")] = 0.05
+    """gap between reads that ends an inventory round, if the log has no rounds"""
     pass_sigma: Annotated[float, Field(ge=0.01, le=10.0), InUnit("m")] = 0.1
+    """accuracy of the pose from one pass of a tag, for tags with an inexact survey"""
     dead_tags: Share = 0.03
+    """prior share of broken, hidden or missing tags of a map"""
     rssi: RssiSettings | None = None
+    """model of the strength of a read, for the sensor rssi"""
     phase: PhaseSettings | None = None
+    """model of the phase of a read, for the sensor phase"""
 
     @model_validator(mode="after")
     def _is_complete(self) -> RfidSettings:
@@ -233,14 +264,18 @@ class RfidSettings(SensorSettings):
 
 
 class SurveySettings(FileModel):
-    """The transform from the tags' survey frame to the world: rotation by ``heading`` about the point (``about_x``, ``about_y``) of
-    the survey, then translation by ``x`` and ``y``."""
+    """The transform from the tags' survey frame to the world: a rotation about a point, then a translation."""
 
     x: Annotated[float, Field(ge=-1000.0, le=1000.0), InUnit("m")] = 0.0
+    """translation of the map's tags"""
     y: Annotated[float, Field(ge=-1000.0, le=1000.0), InUnit("m")] = 0.0
+    """translation of the map's tags"""
     heading: Angle = 0.0
+    """rotation of the map's tags"""
     about_x: Coordinate = 0.0
+    """centre of the rotation, in the frame of the survey"""
     about_y: Coordinate = 0.0
+    """centre of the rotation, in the frame of the survey"""
 
     def transform(self) -> Array:
         """The pose (3,) of the survey's origin in the world."""

@@ -11,8 +11,9 @@ PerRootSecond = Annotated[float, Field(ge=1e-6, le=5.0), InUnit("per sqrt(s)")]
 
 
 class TwistSettings(SensorSettings):
-    """Measured motion in space. ``shift`` [m per sqrt(s)] and ``turn`` [rad per sqrt(s)]: random walk of position and orientation
-    along the robot's axes."""
+    """Measured motion in space."""
 
     shift: tuple[PerRootSecond, PerRootSecond, PerRootSecond]
+    """random walk of the position along the robot's axes [m per sqrt(s)]"""
     turn: tuple[PerRootSecond, PerRootSecond, PerRootSecond]
+    """random walk of the orientation about the robot's axes [rad per sqrt(s)]"""
