@@ -12,7 +12,7 @@ points are searched where they are predicted (:mod:`.monoslam_search`); others e
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
@@ -30,9 +30,11 @@ from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.camera.sensor import Pixels
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.sensors.twist.use import in_space, twist_settings
+from factorgraph_loc.slam.monoslam_invariance import carried
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
+from factorgraph_loc.slam.monoslam_past import UpdateRecord, smoothed
 from factorgraph_loc.slam.monoslam_sighting import FeatureMatcher, Match
-from factorgraph_loc.slam.monoslam_state import POSE, Eye, Innovation, MapPoint, SlamState, squared, widening
+from factorgraph_loc.slam.monoslam_state import Eye, Innovation, MapPoint, SlamState, squared, widening
 from factorgraph_loc.slam.space_motion import (
     PLANAR,
     ROBOT,
@@ -50,7 +52,7 @@ from factorgraph_loc.slam.space_motion import (
 )
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import FLOATS, TILTS
-from factors import positive, se2
+from factors import se2
 from factors.camera.model import carrier, huber_weight
 from factors.motion import Increment
 from factors.se2 import Array
@@ -60,6 +62,7 @@ HORIZON = 5.0  # s of measured motion that are kept
 VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s at the start
 LATELY = 5.0  # s: a point in the state that was not seen since may be hidden
 LOST_AFTER = 5  # consecutive images without a match, after which the filter is lost
+SCALE = "scale_distance"  # the constant of the odometry
 VAGUE = 0.5  # m, rad: standard deviations beyond which the pose is unknown
 
 
@@ -79,26 +82,14 @@ class MonoslamSettings(FilterSettings):
     """standard deviation of roll and pitch of a robot on a floor"""
     landmarks: MapUse = "known"
     """known takes the map's points and ignores others, extended estimates the others, unknown estimates all"""
+    self_calibration: bool = True
+    """whether the odometry's constants to which the rig gives an uncertainty are states"""
     max_points: Annotated[int, Field(ge=1, le=1000)] = 100
     """largest number of points in the state"""
     per_image: Annotated[int, Field(ge=1, le=1000)] = 20
     """new points are added if fewer than these should be visible"""
     iterations: Annotated[int, Field(ge=1, le=20)] = 3
     """linearizations of an update in a known map; 1 is the published update"""
-
-
-@dataclass(frozen=True)
-class _UpdateRecord:
-    """``step``: from the previous record; ``predicted``, ``covariance`` (12, 12): before and after the update. ``anew``: the pose
-    was found by relocalization, independent of the past.
-    """
-
-    t: float
-    step: Step
-    predicted: Array
-    robot: RobotState
-    covariance: Array
-    anew: bool = False
 
 
 class Monoslam(Filter):
@@ -116,8 +107,10 @@ class Monoslam(Filter):
         self._twists = None if twist is None else TwistChain(twist, HORIZON)
         self._planar = settings.planar is not False
         self._wheels = bool(moving(setup.sensors, "floor"))
+        constants = self._motion.constants.names
+        self._scale = constants.index(SCALE) if SCALE in constants else None
         self._step: Step | None = None
-        self._predicted, self._anew = np.zeros((ROBOT, ROBOT)), False
+        self._predicted, self._anew = np.empty((0, 0)), False
         # without a map the start is unobservable: its uncertainty is kept out of the state, where it would shrink as the
         # linearization point moves (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010)
         self._origin: Origin | None = None
@@ -133,17 +126,22 @@ class Monoslam(Filter):
             super().process(measurement)
 
     def learnt(self) -> Learnt:
-        """Points in the state, seen from above, without those of unknown depth."""
+        """The constants of the odometry, and the points in the state, seen from above, without those of unknown depth."""
+        state: SlamState | None = self._state
+        if state is None:
+            return Learnt()
+        sigmas = np.sqrt(np.diag(state.covariance)[ROBOT : state.base])
+        found = zip(state.constants.tolist(), sigmas.tolist(), strict=True)
+        values = dict(zip(self._motion.constants.names, found, strict=True))
         points = {}
-        if self._state is not None:
-            for point, start in zip(self._state.points, self._state.starts().tolist(), strict=True):
-                if not point.ray:
-                    part = slice(ROBOT + start, ROBOT + start + 3)
-                    position, spread = self._state.values[start : start + 3], self._state.covariance[part, part]
-                    if self._origin is not None:
-                        spread = spread + self._origin.of_point(position)
-                    points[point.name] = LearntPoint(position[:2], spread[:2, :2])
-        return Learnt(landmarks=points)
+        for point, start in zip(state.points, state.starts().tolist(), strict=True):
+            if not point.ray:
+                part = slice(state.base + start, state.base + start + 3)
+                position, spread = state.values[start : start + 3], state.covariance[part, part]
+                if self._origin is not None:
+                    spread = spread + self._origin.of_point(position)
+                points[point.name] = LearntPoint(position[:2], spread[:2, :2])
+        return Learnt(values, points)
 
     def trajectory(self) -> Trajectory:
         """The best estimate of the whole past, seen from above; see :meth:`space_trajectory`."""
@@ -155,33 +153,24 @@ class Monoslam(Filter):
         """
         found = self._past()
         ticks = np.unique(np.array(self._ticks))
-        chosen = [found[i] for i in np.searchsorted([t for t, *_ in found], ticks, side="right") - 1]
+        chosen = [found[i] for i in np.searchsorted([r.t for r in found], ticks, side="right") - 1]
         return Trajectory3(
             ticks,
-            np.array([r.position for _, r, _ in chosen]).reshape(-1, 3),
-            np.array([r.rotation for _, r, _ in chosen]).reshape(-1, 3, 3),
-            np.array([self._spread(r, c) for _, r, c in chosen]).reshape(-1, 6, 6),
+            np.array([r.robot.position for r in chosen]).reshape(-1, 3),
+            np.array([r.robot.rotation for r in chosen]).reshape(-1, 3, 3),
+            np.array([self._spread(r.robot, r.covariance) for r in chosen]).reshape(-1, 6, 6),
         )
 
-    def _past(self) -> list[tuple[float, RobotState, Array]]:
-        """Time, robot state and covariance (12, 12) of each record."""
-        records: list[_UpdateRecord] = self._records
-        smooth = self._smooth and self._settings.landmarks == "known"
-        size = ROBOT if self._by_velocity else POSE
-        if not records:
-            return []
-        newest = records[-1]
-        found = [(newest.t, newest.robot, newest.covariance)]
-        for after, here in zip(records[:0:-1], records[-2::-1], strict=True):
-            robot, covariance = here.robot, here.covariance
-            if smooth and not after.anew:
-                robot, covariance = _smoothed(here, after, *found[-1][1:], size)
-            found.append((here.t, robot, covariance))
-        return found[::-1]
+    def _past(self) -> list[UpdateRecord]:
+        """The records, smoothed in a known map."""
+        if self._smooth and self._settings.landmarks == "known":
+            return smoothed(self._records, by_velocity=self._by_velocity)
+        return self._records
 
     def _start(self, prior: PosePrior) -> SlamState:
         s = self._settings
-        covariance = _starting()
+        constants = self._motion.constants
+        covariance = _starting(constants.sigmas)
         self._planar = prior.space is None if s.planar is None else s.planar
         if prior.space is not None:
             position, rotation = prior.space.position, prior.space.rotation
@@ -197,7 +186,7 @@ class Monoslam(Filter):
             spread[np.ix_(free, free)] = covariance[np.ix_(free, free)]
             self._origin = Origin(robot, spread)
             covariance[free] = covariance[:, free] = 0.0
-        return SlamState(robot, covariance)
+        return SlamState(robot, np.zeros(len(constants.names)), covariance)
 
     @property
     def _by_velocity(self) -> bool:
@@ -209,7 +198,8 @@ class Monoslam(Filter):
         if self._twists is not None:
             step = measured(robot, self._twists.between(self._t, self._t + dt), dt)
         elif not self._by_velocity:
-            step = measured(robot, planar(increment), dt)
+            delta, by_constants = self._motion.changed(increment, self._state.constants)
+            step = measured(robot, planar(delta, increment.covariance, by_constants), dt)
         else:
             free = np.ones(3)
             impulse, turning = s.acceleration * dt * free, s.angular_acceleration * dt * free
@@ -220,7 +210,7 @@ class Monoslam(Filter):
             step = on_the_floor(step, dt, s.height_sigma, s.tilt_sigma)
         self._step = step
         self._state = self._state.moved(step)
-        self._predicted = self._state.covariance[:ROBOT, :ROBOT]
+        self._predicted = self._kept(self._state)
 
     def _uses(self, modality: str) -> bool:
         return modality in self.modalities
@@ -267,7 +257,10 @@ class Monoslam(Filter):
             before, delta = delta, spread.T @ whitened
             if np.abs((delta - before)[:6]).max() < SETTLED:
                 break
-        return prior.plus(delta, prior.covariance - spread.T @ spread)
+        after = prior.plus(delta, prior.covariance - spread.T @ spread)
+        if self._settings.landmarks == "known":
+            return after
+        return replace(after, covariance=carried(prior, after, self._scale))
 
     def _report(self, m: Pixels, residual: Array, innovation: Innovation, noise: Array) -> None:
         sensor = "camera_right" if m.right else "camera"
@@ -282,7 +275,7 @@ class Monoslam(Filter):
         """
         lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0
         camera = self._looker.relocated(m, eye) if lost >= LOST_AFTER or self._vague(state) else None
-        found = None if camera is None else self._standing(camera, eye)
+        found = None if camera is None else self._standing(camera, eye, state)
         if found is None:
             return replace(state, lost=lost), False
         self.diagnostics.events.append((m.t, "camera: found its place in the map"))
@@ -292,19 +285,20 @@ class Monoslam(Filter):
         """Whether the pose in a known map is too uncertain for linearization."""
         return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > VAGUE**2)
 
-    def _standing(self, camera: CameraPose, eye: Eye) -> SlamState | None:
+    def _standing(self, camera: CameraPose, eye: Eye, before: SlamState) -> SlamState | None:
         """The state of a robot with the relocalized ``camera``; None if it would float or tilt on a floor."""
         s = self._settings
         position, rotation = carrier(eye.model, camera.position, camera.rotation)
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
-        covariance = _starting()
+        covariance = _starting(np.zeros(len(before.constants)))
+        covariance[ROBOT:, ROBOT:] = before.covariance[ROBOT : before.base, ROBOT : before.base]
         back = np.linalg.inv(eye.lift)
         covariance[:6, :6] = back @ camera.covariance @ back.T
         if self._planar:
             if abs(position[2]) > FLOATS or rotation[2, 2] < math.cos(TILTS):
                 return None
             covariance[UPRIGHT, UPRIGHT] += np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
-        return SlamState(robot, covariance)
+        return SlamState(robot, before.constants, covariance)
 
     def _managed(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> SlamState:
         """The state after counting, deleting, converting (to x, y, z) and adding points."""
@@ -334,33 +328,21 @@ class Monoslam(Filter):
         own = covariance[:6, :6]
         return own if self._origin is None else own + self._origin.of_pose(robot)
 
-    def _record(self) -> _UpdateRecord:
+    def _record(self) -> UpdateRecord:
         s = self._state
         step, predicted = self._step or standstill(s.robot), self._predicted
         if self._step is None:  # a second measurement at the same time
-            predicted = self._records[-1].covariance if self._records else s.covariance[:ROBOT, :ROBOT]
+            predicted = self._records[-1].covariance if self._records else self._kept(s)
             step = standstill(self._records[-1].robot if self._records else s.robot)
         self._step, anew, self._anew = None, self._anew, False
-        return _UpdateRecord(self._t, step, predicted.copy(), s.robot, s.covariance[:ROBOT, :ROBOT].copy(), anew)
+        return UpdateRecord(self._t, step, predicted, s.robot, s.constants, self._kept(s), anew)
+
+    def _kept(self, s: SlamState) -> Array:
+        """The covariance (12 + P, 12 + P) of a state without its points."""
+        return s.covariance[: s.base, : s.base].copy()
 
 
-def _starting() -> Array:
-    """The covariance (12, 12) of a start, except for the pose."""
-    return np.diag(np.square([0.0] * 6 + [VELOCITY_SIGMA] * 3 + [RATE_SIGMA] * 3))
-
-
-def _smoothed(
-    here: _UpdateRecord, after: _UpdateRecord, robot: RobotState, covariance: Array, size: int
-) -> tuple[RobotState, Array]:
-    """The smoothed robot state of a record, given the smoothed ``robot`` and ``covariance`` (12, 12) of ``after``. Only the first
-    ``size`` values of the error are smoothed; the others have no influence later.
-    """
-    transition, predicted = after.step.transition[:size, :size], after.predicted[:size, :size]
-    own = here.covariance[:size, :size]
-    gain = positive.solve(predicted, transition @ own).T
-    change = np.zeros(ROBOT)
-    change[:size] = gain @ robot.minus(after.step.robot)[:size]
-    smoothed = here.covariance.copy()
-    own = own + gain @ (covariance[:size, :size] - predicted) @ gain.T
-    smoothed[:size, :size] = 0.5 * (own + own.T)
-    return here.robot.plus(change), smoothed
+def _starting(sigmas: Array) -> Array:
+    """The covariance (12 + P, 12 + P) of a start, except for the pose; ``sigmas`` (P,): of the constants."""
+    motion = np.array([0.0] * 6 + [VELOCITY_SIGMA] * 3 + [RATE_SIGMA] * 3)
+    return np.diag(np.concatenate((motion, sigmas)) ** 2)

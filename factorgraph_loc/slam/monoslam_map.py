@@ -10,21 +10,19 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph_loc.slam.monoslam_state import Eye, Integers, MapPoint, SlamState
-from factorgraph_loc.slam.space_motion import ROBOT
 from factors.camera import inverse_depth
 from factors.se2 import Array
 
-NEAREST_POINT = 0.5  # m: new points are farther than this with 95 % probability
+INVERSE_DEPTH, INVERSE_DEPTH_SIGMA = 0.3, 1.0  # 1/m, of a new point: so vague that many of them do not give the scale
 TRIED, FOUND = 8, 0.5  # a point that was predicted this often is kept if this fraction was found
 
 
 def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> SlamState:
     """The state with a new point of unknown depth, seen at ``pixel`` (2,)."""
-    inverse = 0.5 / NEAREST_POINT  # zero at two standard deviations below, the nearest point at two above
     position, rotation = eye.pose(state.robot)
-    ray, by_camera, by_seen = inverse_depth.begin(eye.model, position, rotation, pixel, inverse)
+    ray, by_camera, by_seen = inverse_depth.begin(eye.model, position, rotation, pixel, INVERSE_DEPTH)
     by_pose = by_camera @ eye.lift
-    noise = np.diag((eye.model.sigma, eye.model.sigma, 0.5 * inverse)) ** 2
+    noise = np.diag((eye.model.sigma, eye.model.sigma, INVERSE_DEPTH_SIGMA)) ** 2
     size, more = len(state.covariance), inverse_depth.SIZE
     carried = by_pose @ state.covariance[:6]
     covariance = np.empty((size + more, size + more))
@@ -44,7 +42,7 @@ def settled(state: SlamState, eye: Eye) -> SlamState:
         return state
     starts = state.starts()[rays]
     values = state.values[starts[:, None] + np.arange(inverse_depth.SIZE)]
-    last = ROBOT + starts + inverse_depth.SIZE - 1
+    last = state.base + starts + inverse_depth.SIZE - 1
     index = inverse_depth.linearity(values, np.sqrt(state.covariance[last, last]), position)
     ripe = [i for i, linear in zip(rays, index.tolist(), strict=True) if linear < inverse_depth.LINEAR]
     if not ripe:
@@ -54,12 +52,12 @@ def settled(state: SlamState, eye: Eye) -> SlamState:
     for i in ripe:
         s, more = int(starts[i]), inverse_depth.SIZE
         (moved[s : s + 3],), (by_ray,) = inverse_depth.positions(state.values[None, s : s + more])
-        c = ROBOT + s
+        c = state.base + s
         covariance[c : c + 3] = by_ray @ covariance[c : c + more]
         covariance[:, c : c + 3] = covariance[:, c : c + more] @ by_ray.T
         kept[s + 3 : s + more] = False
         points[i] = replace(points[i], ray=False)
-    rows = np.concatenate((np.arange(ROBOT), ROBOT + np.flatnonzero(kept)))
+    rows = np.concatenate((np.arange(state.base), state.base + np.flatnonzero(kept)))
     return replace(state, covariance=covariance[np.ix_(rows, rows)], points=tuple(points), values=moved[kept])
 
 
@@ -90,7 +88,7 @@ def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
 
 def _beyond(state: SlamState, place: int) -> bool:
     """Whether an inverse depth is significantly negative."""
-    return bool(state.values[place] < -2.0 * np.sqrt(state.covariance[ROBOT + place, ROBOT + place]))
+    return bool(state.values[place] < -2.0 * np.sqrt(state.covariance[state.base + place, state.base + place]))
 
 
 def without(state: SlamState, which: Collection[int]) -> SlamState:
@@ -98,6 +96,6 @@ def without(state: SlamState, which: Collection[int]) -> SlamState:
     if not which:
         return state
     kept = np.repeat([i not in which for i in range(len(state.points))], [p.size for p in state.points])
-    rows: Integers = np.concatenate((np.arange(ROBOT), ROBOT + np.flatnonzero(kept)))
+    rows: Integers = np.concatenate((np.arange(state.base), state.base + np.flatnonzero(kept)))
     points = tuple(p for i, p in enumerate(state.points) if i not in which)
     return replace(state, covariance=state.covariance[np.ix_(rows, rows)], points=points, values=state.values[kept])

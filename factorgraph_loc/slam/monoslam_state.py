@@ -46,18 +46,25 @@ class MapPoint:
 
 @dataclass(frozen=True)
 class SlamState:
-    """``robot``, and ``values`` (D,) of ``points`` one after the other; ``covariance`` (12 + D, 12 + D) of the error state.
+    """``robot``, corrections ``constants`` (P,) of the odometry's constants, and ``values`` (D,) of ``points`` one after the other;
+    ``covariance`` (12 + P + D, 12 + P + D) of the error state.
 
     ``tracks``: in the newest image; ``met``: number of points so far; ``lost``: consecutive images without a match.
     """
 
     robot: RobotState
+    constants: Array
     covariance: Array
     points: tuple[MapPoint, ...] = ()
     values: Array = field(default_factory=lambda: np.zeros(0))
     tracks: frozenset[int] = frozenset()
     met: int = 0
     lost: int = 0
+
+    @property
+    def base(self) -> int:
+        """The number of error values before those of the points."""
+        return ROBOT + len(self.constants)
 
     def starts(self) -> Integers:
         """The index of each point's first value in ``values``."""
@@ -68,17 +75,19 @@ class SlamState:
         return replace(
             self,
             robot=self.robot.plus(error[:ROBOT]),
-            values=self.values + error[ROBOT : ROBOT + len(self.values)],
+            constants=self.constants + error[ROBOT : self.base],
+            values=self.values + error[self.base :],
             covariance=covariance,
         )
 
     def moved(self, step: Step) -> SlamState:
         """The state after a prediction, which changes the robot only."""
-        carried = step.transition @ self.covariance[:ROBOT]
+        known = step.transition.shape[1]
+        carried = step.transition @ self.covariance[:known]
         covariance = self.covariance.copy()
         covariance[:ROBOT] = carried
         covariance[ROBOT:, :ROBOT] = carried[:, ROBOT:].T
-        corner = carried[:, :ROBOT] @ step.transition.T + step.noise
+        corner = carried[:, :known] @ step.transition.T + step.noise
         covariance[:ROBOT, :ROBOT] = 0.5 * (corner + corner.T)
         return replace(self, robot=step.robot, covariance=covariance)
 
@@ -180,7 +189,7 @@ class Eye:
             depths[rows] = ahead @ rotation[:, 2]
         noise = np.broadcast_to(self.model.sigma**2 * np.eye(2), (count, 2, 2))
         sizes = np.where(rays, inverse_depth.SIZE, 3)
-        return Sights(pixels, depths, by_camera @ self.lift, by_point, starts + ROBOT, sizes, noise)
+        return Sights(pixels, depths, by_camera @ self.lift, by_point, starts + state.base, sizes, noise)
 
     def all(self, state: SlamState, which: Sequence[int], points: Array, spreads: Array | None) -> Sights:
         """Predicted pixels of points of the state, then of the map."""

@@ -128,7 +128,7 @@ class SpaceBatch(Monoslam):
         return self._conclusion
 
     def _solution(self, diagnostics: Diagnostics) -> Trajectory3:
-        past = {t: robot for t, robot, _ in self._past()}
+        past = {record.t: record.robot for record in self._past()}
         t = np.array(sorted(past))
         values = gtsam.Values()
         for i, stamp in enumerate(t.tolist()):

@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import bisect
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import gtsam
 import numpy as np
 
 from factorgraph_loc.sensors.twist.settings import TwistSettings
-from factors.motion import Increment
 from factors.se2 import Array
 
 ROBOT = 12  # values of the error state
@@ -62,7 +61,9 @@ class RobotState:
 
 @dataclass(frozen=True)
 class Step:
-    """A prediction: the resulting ``robot``, the ``transition`` (12, 12) of the error and the added ``noise`` (12, 12)."""
+    """A prediction: the resulting ``robot``, the ``transition`` (12, 12 + P) of its error and that of the odometry's P constants,
+    and the added ``noise`` (12, 12).
+    """
 
     robot: RobotState
     transition: Array
@@ -76,12 +77,13 @@ class Step:
 @dataclass(frozen=True)
 class Displacement:
     """Motion in space: ``rotation`` (3, 3) and ``shift`` (3,) of the end in the frame of the start, with ``covariance`` (6, 6) of
-    a perturbation at the end, rotation first.
+    a perturbation at the end, rotation first, and the derivative ``by_constants`` (6, P) of that perturbation by constants.
     """
 
     rotation: Array
     shift: Array
     covariance: Array
+    by_constants: Array = field(default_factory=lambda: np.zeros((6, 0)))
 
 
 @dataclass(frozen=True)
@@ -142,15 +144,20 @@ def measured(robot: RobotState, motion: Displacement, dt: float) -> Step:
     by_noise[RATE, TURN] = np.eye(3) / dt
     way = robot.rotation @ motion.shift
     moved = RobotState(robot.position + way, rotation, way / dt, log(motion.rotation) / dt)
-    return Step(moved, transition, by_noise @ motion.covariance @ by_noise.T)
+    return Step(
+        moved, np.hstack((transition, by_noise @ motion.by_constants)), by_noise @ motion.covariance @ by_noise.T
+    )
 
 
-def planar(increment: Increment) -> Displacement:
-    """Odometry of a robot on the floor, as motion in space."""
-    x, y, heading = increment.delta.tolist()
-    covariance = np.zeros((6, 6))
-    covariance[np.ix_(PLANAR, PLANAR)] = increment.covariance
-    return Displacement(about_z(heading), np.array((x, y, 0.0)), covariance)
+def planar(delta: Array, covariance: Array, by_constants: Array) -> Displacement:
+    """Odometry of a robot on the floor, as motion in space: ``delta`` (3,) with ``covariance`` (3, 3) and the derivative
+    ``by_constants`` (3, P).
+    """
+    x, y, heading = delta.tolist()
+    spread, derivative = np.zeros((6, 6)), np.zeros((6, by_constants.shape[1]))
+    spread[np.ix_(PLANAR, PLANAR)] = covariance
+    derivative[PLANAR] = by_constants
+    return Displacement(about_z(heading), np.array((x, y, 0.0)), spread, derivative)
 
 
 def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float) -> Step:

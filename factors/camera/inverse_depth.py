@@ -29,6 +29,14 @@ def directions(rays: Array) -> tuple[Array, Array]:
     return np.column_stack((ce * ca, ce * sa, se)), by_angles
 
 
+def turned(angles: Array) -> Array:
+    """The derivative (2, 3) of azimuth and elevation, ``angles`` (2,), by a rotation of the world."""
+    azimuth, elevation = angles.tolist()
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    slope = np.tan(elevation)
+    return np.array(((-c * slope, -s * slope, 1.0), (s, -c, 0.0)))
+
+
 def positions(rays: Array) -> tuple[Array, Array]:
     """Positions (K, 3) of ``rays`` (K, 6) with positive inverse depths, and their Jacobian (K, 3, 6)."""
     ahead, by_angles = directions(rays)

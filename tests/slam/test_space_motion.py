@@ -6,7 +6,6 @@ import pytest
 from factorgraph_loc.sensors.twist.settings import TwistSettings
 from factorgraph_loc.slam import space_motion
 from factorgraph_loc.slam.space_motion import Displacement, Origin, RobotState, TwistChain, exp
-from factors.motion import Increment
 
 ROBOT = RobotState(
     np.array((1.0, -2.0, 0.3)), exp(np.array((0.2, -0.1, 0.7))), np.array((0.3, 0.1, -0.2)), np.array((0.5, -0.4, 0.6))
@@ -48,12 +47,27 @@ def test_the_floor_carries_the_error_of_a_level_robot_as_stated():
     np.testing.assert_allclose(step(LEVEL).transition, numerical(lambda r: step(r).robot, LEVEL), atol=2e-6)
 
 
-MOTION_ON_FLOOR = space_motion.planar(Increment(np.array((0.1, 0.02, 0.05)), np.diag((1e-4, 2e-4, 3e-4)), DT))
+MOTION_ON_FLOOR = space_motion.planar(np.array((0.1, 0.02, 0.05)), np.diag((1e-4, 2e-4, 3e-4)), np.zeros((3, 0)))
+
+
+def test_constants_move_a_robot_as_stated():
+    def moved(change):
+        delta = MOTION_ON_FLOOR.shift[:2].tolist()
+        by = np.array(((0.1, 0.0), (0.02, 0.0), (0.0, 0.05)))
+        return space_motion.planar(np.array((*delta, 0.05)) + rotated(by @ change), np.eye(3), by)
+
+    def rotated(local):  # a perturbation at the end, in the frame of the start
+        return np.array((*(exp(np.array((0.0, 0.0, 0.05))) @ np.array((*local[:2], 0.0)))[:2], local[2]))
+
+    transition = space_motion.measured(LEVEL, moved(np.zeros(2)), DT).transition
+    for i, unit in enumerate(1e-6 * np.eye(2)):
+        ahead, back = (space_motion.measured(LEVEL, moved(s * unit), DT).robot for s in (1, -1))
+        np.testing.assert_allclose(transition[:, 12 + i], ahead.minus(back) / 2e-6, atol=1e-6)
 
 
 def test_odometry_replaces_the_noise_of_what_it_measures_and_the_floor_holds_the_rest():
     """After long at rest with perfect odometry, height and tilt have the floor's deviations, and nothing else is uncertain."""
-    still = space_motion.planar(Increment(np.zeros(3), np.zeros((3, 3)), DT))
+    still = space_motion.planar(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 0)))
     robot, covariance = LEVEL, np.zeros((12, 12))
     for _ in range(100):
         step = space_motion.on_the_floor(space_motion.measured(robot, still, DT), DT, 0.02, 0.03)
