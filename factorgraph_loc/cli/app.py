@@ -19,6 +19,7 @@ from factorgraph_loc.cli import (
     lookups,
     manifest,
     mapping,
+    rigs,
     running,
     scoring,
     show,
@@ -96,6 +97,7 @@ app.command("map")(mapping.map_)
 app.command()(images.images)
 app.command()(simulating.simulate)
 app.command()(active.active)
+app.add_typer(rigs.app, name="rigs")
 app.add_typer(experimenting.app, name="experiment")
 app.add_typer(features.app, name="features")
 

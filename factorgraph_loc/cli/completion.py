@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
-from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.files.shipped import manifests, rigs
 from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
 
 # repeated here, because the module that defines them is slow to import; a test compares them
@@ -59,6 +59,11 @@ def sensors(incomplete: str) -> list[str]:
 def sensor(incomplete: str) -> list[str]:
     """The name of a sensor."""
     return [name for name in SENSORS if name.startswith(incomplete)]
+
+
+def rig(incomplete: str) -> list[str]:
+    """The name of a rig; without a match the shell completes file names."""
+    return [name for name in ("default", *rigs(), *PRESETS) if name.startswith(incomplete)]
 
 
 def reader(incomplete: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Locations of the shipped manifests. Importable without numerical libraries, for shell completion."""
+"""Locations of the shipped manifests and rigs. Importable without numerical libraries, for shell completion."""
 
 import sysconfig
 from pathlib import Path
@@ -15,6 +15,14 @@ def manifests() -> dict[str, Path]:
             if not file.name.endswith((".rig.toml", ".world.toml"))
         }
         if found:
+            return found
+    return {}
+
+
+def rigs() -> dict[str, Path]:
+    """The shipped rigs: name -> file, sorted by name."""
+    for folder in manifest_folders():
+        if found := {file.name.removesuffix(".rig.toml"): file for file in sorted(folder.glob("*.rig.toml"))}:
             return found
     return {}
 

@@ -189,7 +189,7 @@ class RfidSettings(SensorSettings):
     preset: Literal["rackham"] | None = None
     """instead of antennas: eight antennas 1 to 8 around the body, 1 to the front, the others counter-clockwise"""
     preset_z: Offset = 1.0
-    """height of these antennas"""
+    """height of the antennas of the preset"""
     antennas: dict[str, AntennaSettings] = Field(default_factory=dict)
     """antennas by their names in the reads"""
     models: dict[str, ModelSettings] = Field(default_factory=default_models)

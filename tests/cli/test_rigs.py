@@ -1,0 +1,153 @@
+"""Rigs are listed, printed with the meaning of their keys, and written for a robot of one's own."""
+
+import json
+import math
+import os
+import pty
+import subprocess
+import sys
+
+import pytest
+
+from factorgraph_loc import read_rig
+from factorgraph_loc.cli import completion
+from factorgraph_loc.files.models import parse_model, parse_toml
+from factorgraph_loc.io.native.rig_text import rig_text
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.rfid.settings import rackham
+from factorgraph_loc.simulation import PRESETS, preset
+
+FGLOC = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
+
+
+def test_the_list_has_shipped_rigs_and_those_of_simulations(fgloc):
+    listed = json.loads(fgloc("rigs", "--json").stdout)
+    names = [one["name"] for one in listed]
+    assert {"default", "plaza", "rfid-aisle", *PRESETS} <= set(names)
+    assert names == completion.rig("")
+    assert "fgloc simulate" in fgloc("rigs").stdout
+
+
+@pytest.mark.parametrize("name", [name for name in completion.rig("") if name != "rfid-aisle"])
+def test_a_rig_that_is_printed_can_be_used(fgloc, tmp_path, name):
+    file = tmp_path / "a.rig.toml"
+    file.write_text(fgloc("rigs", "show", name).stdout)
+    printed = json.loads(fgloc("rigs", "show", name, "--json").stdout)
+    assert read_rig(file).model_dump(mode="json", exclude_none=True) == printed
+    assert fgloc("rigs", "show", file).stdout == file.read_text()
+
+
+def test_keys_have_their_meaning(fgloc):
+    printed = fgloc("rigs", "show", "office").stdout
+    assert "round_gap = 0.05  # gap between reads that ends an inventory round, if the log has no rounds [s]" in printed
+    assert "r_max = 4.5  # beam: distance at which it has fallen to a half [m]" in printed
+
+
+def test_any_name_can_be_written():
+    antennas = {'le"ft [1]': {"yaw": 1e-7}, "é": {"yaw": 1.0}}
+    rig = parse_model(Rig, {"name": 'a "b"\n\\ \x07', "rfid": {"antennas": antennas}}, "a rig")
+    assert parse_model(Rig, parse_toml(rig_text(rig), "text"), "text") == rig
+
+
+def test_a_wrong_name_is_told_with_the_nearest(fgloc):
+    done = fgloc("rigs", "show", "plazza")
+    assert (done.exit_code, done.stderr) == (2, "error: no rig is called 'plazza': did you mean plaza?\n")
+
+
+def test_a_new_rig_has_the_sensors_that_are_named(fgloc, tmp_path):
+    file = tmp_path / "cart.rig.toml"
+    options = ("--odometry", "omnidirectional", "--imu", "--landmarks", 0.2, "--antennas", 2, "--camera", "640x480")
+    made = json.loads(fgloc("rigs", "new", *options, "-o", file, "--json").stdout)
+    rig = read_rig(file)
+    assert made["rig"] == rig.model_dump(mode="json", exclude_none=True)
+    assert rig.name == "cart"
+    assert rig.sensors == ("odometry", "imu", "bearing_range", "rfid", "camera")
+    assert rig.odometry.noise.lateral == rig.odometry.noise.along
+    assert rig.bearing_range.range_sigma == 0.2
+    assert [antenna.yaw for antenna in rig.rfid.antennas.values()] == pytest.approx([math.pi / 2.0, -math.pi / 2.0])
+    assert (rig.camera.width, rig.camera.cx) == (640, 319.5)
+    assert fgloc("rigs", "new", "-o", file).stderr.endswith("exists already; choose another name or give --overwrite\n")
+    assert fgloc("rigs", "new", "-o", file, "--overwrite").exit_code == 0
+    assert read_rig(file).sensors == ("odometry",)
+
+
+def test_eight_antennas_stand_as_on_the_robot_of_the_paper(fgloc, tmp_path):
+    fgloc("rigs", "new", "--antennas", 8, "-o", tmp_path / "a.toml")
+    made, published = read_rig(tmp_path / "a.toml").rfid.antennas, rackham()
+    assert list(made) == list(published)
+    for name, antenna in made.items():
+        expected = published[name].model_dump()
+        assert antenna.model_dump() == {
+            k: v if k == "model" else pytest.approx(v, abs=1e-4) for k, v in expected.items()
+        }
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ((), "--out is missing, expected the file to write, such as robot.rig.toml"),
+        (("-o", "a.txt"), "--out is 'a.txt', expected the file to write"),
+        (("--odometry", "tracks"), "--odometry is 'tracks', expected one of differential, omnidirectional, none"),
+        (("--antennas", "-1"), "--antennas is '-1', expected a whole number from 0 to 64"),
+        (("--camera", "640"), "--camera is '640', expected a size such as 640x480, or none"),
+        (("--camera", "8x480", "-o", "a.toml"), "the new rig: camera.width is 8: input should be greater"),
+        (("--landmarks", "near"), "--landmarks is 'near', expected the noise of a range in m, or none"),
+        (("--landmarks", "inf", "-o", "a.toml"), "the new rig: bearing_range.range_sigma is inf"),
+        (("--odometry", "none", "-o", "a.toml"), "the new rig has no sensors, expected odometry"),
+    ],
+)
+def test_wrong_options_are_one_line(fgloc, tmp_path, monkeypatch, options, why):
+    monkeypatch.chdir(tmp_path)
+    done = fgloc("rigs", "new", *options)
+    assert done.exit_code == 2
+    assert done.stderr.startswith(f"error: {why}")
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_questions_are_asked_at_a_terminal(tmp_path):
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(
+        [*FGLOC, "rigs", "new", "--imu"], stdin=theirs, stdout=theirs, stderr=theirs, cwd=tmp_path
+    ) as process:
+        os.close(theirs)
+        os.write(ours, b"\n0.3\nmany\n4\n\nhall.rig.toml\n")  # a wrong answer is asked for again
+        told = b""
+        try:
+            while part := os.read(ours, 4096):
+                told += part
+        except OSError:  # the end
+            pass
+        os.close(ours)
+    assert process.returncode == 0
+    assert b"odometry: differential, omnidirectional, none [differential]: " in told
+    assert b"gyro" not in told
+    assert b"--antennas is 'many', expected a whole number" in told
+    assert read_rig(tmp_path / "hall.rig.toml").sensors == ("odometry", "imu", "bearing_range", "rfid")
+    assert len(read_rig(tmp_path / "hall.rig.toml").rfid.antennas) == 4
+
+
+def test_a_run_uses_the_new_rig(fgloc, short_log, tmp_path):
+    fgloc("rigs", "new", "--landmarks", 0.3, "-o", tmp_path / "mower.rig.toml")
+    done = fgloc("run", short_log, "-e", "ekf", "--rig", tmp_path / "mower.rig.toml", "-o", tmp_path / "out", "--json")
+    assert done.exit_code == 0
+    assert json.loads(done.stdout)["nis.bearing_range.count"] > 10
+    assert json.loads(done.stdout)["causal.position_rmse"] < 10.0
+
+
+def test_a_run_with_tags_uses_the_new_rig(fgloc, tmp_path):
+    assert preset("office").rig.rfid is not None
+    fgloc("simulate", "office", "-o", tmp_path / "log", "--duration", 10)
+    fgloc("rigs", "new", "--antennas", 8, "-o", tmp_path / "cart.rig.toml")
+    rig = ("--rig", tmp_path / "cart.rig.toml")
+    done = fgloc("run", tmp_path / "log", "-e", "ekf", *rig, "-o", tmp_path / "out", "--json")
+    assert done.exit_code == 0
+    assert json.loads(done.stdout)["causal.position_rmse"] < 1.0
+
+
+def test_a_run_with_images_uses_the_new_rig(fgloc, gallery_on_disk, tmp_path):
+    fgloc("rigs", "new", "--camera", "320x240", "-o", tmp_path / "cart.rig.toml")
+    rig = ("--rig", tmp_path / "cart.rig.toml")
+    chosen = ("--set", "smoother.landmarks=unknown")
+    done = fgloc("run", gallery_on_disk(), "-e", "smoother", *rig, *chosen, "-o", tmp_path / "out", "--json")
+    assert done.exit_code == 0, done.stderr
