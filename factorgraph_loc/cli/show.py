@@ -75,7 +75,8 @@ def rich_table(content: Table, least: int | None = None) -> None:
     lines but truncates nothing."""
     from rich.console import Console
 
-    console = Console(markup=False, emoji=False, highlight=False, width=1000)
+    # with a height, as rich takes a dumb terminal for 80 columns otherwise
+    console = Console(markup=False, emoji=False, highlight=False, width=1000, height=1000)
     if sys.stdout.isatty():
         console.width = max(_terminal_width(), console.measure(content).maximum if least is None else least)
     console.print(content)

@@ -1,6 +1,14 @@
 """What there is to choose from, and its settings."""
 
+import fcntl
 import json
+import os
+import pty
+import struct
+import subprocess
+import sys
+import termios
+from collections import Counter
 
 import pytest
 
@@ -77,3 +85,25 @@ def test_the_list_of_readers(fgloc):
     assert [one["name"] for one in found] == list(READERS)
     assert all(one["about"] in fgloc("readers").stdout for one in found)
     assert "did you mean rosbag?" in fgloc("readers", "rosbags").stderr
+
+
+@pytest.mark.parametrize("columns", [90, 140])
+def test_a_terminal_wraps_long_texts_and_loses_none(fgloc, columns):
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
+    code = "from factorgraph_loc.cli.main import main; main()"
+    environment = {name: value for name, value in os.environ.items() if name != "COLUMNS"} | {"TERM": "dumb"}
+    with subprocess.Popen([sys.executable, "-c", code, "sensors", "rfid"], stdout=theirs, env=environment):
+        os.close(theirs)
+        told = b""
+        try:
+            while part := os.read(ours, 4096):
+                told += part
+        except OSError:  # the end
+            pass
+    os.close(ours)
+    lines = told.decode().splitlines()
+    assert columns - 20 < max(map(len, lines)) <= columns
+    words = [line.split() for line in lines]
+    expected = fgloc("sensors", "rfid").stdout.split()
+    assert Counter(word for line in words for word in line) == Counter(expected)
