@@ -12,6 +12,7 @@ __all__ = [
     "odometry",
     "positive",
     "rfid",
+    "robust",
     "rts_kernels",
     "se2",
     "se2_kernels",

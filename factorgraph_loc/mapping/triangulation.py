@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera.model import CameraModel, huber_weight, linearize_in_space, undistorted
+from factors.camera.model import CameraModel, linearize_in_space, undistorted
+from factors.robust import huber_weight
 from factors.se2 import Array
 
 Integers = NDArray[np.int64]

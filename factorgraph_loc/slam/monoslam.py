@@ -53,8 +53,9 @@ from factorgraph_loc.slam.space_motion import (
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import FLOATS, TILTS
 from factors import se2
-from factors.camera.model import carrier, huber_weight
+from factors.camera.model import carrier
 from factors.motion import Increment
+from factors.robust import huber_weight
 from factors.se2 import Array
 
 SETTLED = 1e-3  # m, rad: step of the iterated update below which it has converged

@@ -28,7 +28,7 @@ from factorgraph_loc.slam.monoslam_sighting import Match
 from factorgraph_loc.slam.monoslam_state import Eye, squared
 from factorgraph_loc.slam.space_motion import RobotState, TwistChain
 from factors import positive
-from factors.camera.model import huber_loss, huber_weight
+from factors.robust import huber_loss, huber_weight
 from factors.se2 import Array
 
 MAX_ITERATIONS = 50

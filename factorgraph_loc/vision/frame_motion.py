@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import se2
-from factors.camera.model import CameraModel, huber_weight
+from factors.camera.model import CameraModel
 from factors.camera.visual_odometry import RayPairs, from_epipole, nearness, sampson, translation
 from factors.motion import Increment
+from factors.robust import huber_weight
 from factors.se2 import Array
 
 MIN_MATCHES = 8

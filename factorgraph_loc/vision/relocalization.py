@@ -16,7 +16,8 @@ from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths
 from factors import positive, se2
 from factors.camera import model as reprojection
 from factors.camera.factor import ReprojectionFactor
-from factors.camera.model import CameraModel, huber_weight
+from factors.camera.model import CameraModel
+from factors.robust import huber_weight
 from factors.se2 import Array
 
 REACH = 3.0  # standard deviations of a pixel for inliers

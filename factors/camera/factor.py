@@ -15,8 +15,6 @@ from factors.camera.model import (
     PARAMETERS,
     TIME_OFFSET,
     CameraModel,
-    huber_loss,
-    huber_weight,
     in_camera,
     lens_of,
     linearize,
@@ -24,6 +22,7 @@ from factors.camera.model import (
     recalibrated,
 )
 from factors.displaced import carried, common_error, delayed, displaced
+from factors.robust import huber_loss, huber_weight
 from factors.se2 import Array
 
 NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))

@@ -5,6 +5,7 @@ import math
 import numba
 import numpy as np
 
+from factors.robust import huber_loss
 from factors.se2 import Array
 
 NEAREST = 0.05  # m in front of the camera
@@ -78,22 +79,6 @@ def in_camera(
     ly = down[0] * ax + down[1] * ay + down[2] * az
     lz = ahead[0] * ax + ahead[1] * ay + ahead[2] * az
     return (ax, ay, az), (lx, ly, lz)
-
-
-@numba.njit(cache=True, inline="always")
-def _huber(squared: float, scale: float) -> float:
-    """The loss of Huber (1964): half the square up to ``scale``, linear beyond."""
-    size = math.sqrt(squared)
-    return 0.5 * squared if size <= scale else scale * (size - 0.5 * scale)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def huber_losses(squared: Array, scale: float) -> Array:
-    """Huber losses of squared residuals (K,)."""
-    losses = np.empty_like(squared)
-    for i in range(len(squared)):
-        losses[i] = _huber(squared[i], scale)
-    return losses
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -214,5 +199,5 @@ def log_likelihood(
                 _, (lx, ly, lz) = in_camera(place, bc[n], bs[n], x - bx[n], y - by[n], z)
                 u, v, _, _ = pixel(k, lx, ly, lz)
                 a, b = uu * (u - seen_u) + uv * (v - seen_v), vu * (u - seen_u) + vv * (v - seen_v)
-                total[n] -= _huber(a * a + b * b, scale)
+                total[n] -= huber_loss(a * a + b * b, scale)
     return out

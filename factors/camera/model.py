@@ -219,16 +219,6 @@ def log_likelihood(
     )
 
 
-def huber_loss(squared: Array, scale: float) -> Array:
-    """Huber's loss of squared whitened residuals: half of them up to ``scale`` standard deviations, linear beyond."""
-    return np.asarray(reprojection_kernels.huber_losses(np.ravel(squared), scale)).reshape(np.shape(squared))
-
-
-def huber_weight(squared: Array, scale: float) -> Array:
-    """The weight of squared whitened residuals in iteratively reweighted least squares."""
-    return np.asarray(scale / np.maximum(np.sqrt(squared), scale))
-
-
 def lens_of(model: CameraModel) -> Lens:
     """The camera's constants for the kernels: :meth:`CameraModel.intrinsics`, and the reciprocal of the x^2 + y^2 up to which the
     polynomial is used: where the radial part stops growing, at most :data:`WIDEST`; 0 without distortion, for no limit."""

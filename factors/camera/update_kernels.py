@@ -11,6 +11,7 @@ import numba
 import numpy as np
 
 from factors.camera.kernels import Lens, in_camera, mounting, pixel
+from factors.robust import huber_weight
 from factors.se2 import Array
 from factors.se2_kernels import exp
 
@@ -150,8 +151,8 @@ def _product(matrix: Array, p: Row, q: Row) -> float:
 
 @numba.njit(cache=True, inline="always")
 def _weight(seen: Seen, squared: float) -> float:
-    """The robust weight of a squared whitened residual, tempered (Huber, 1964)."""
-    return seen.tempering * seen.robust / max(math.sqrt(squared), seen.robust)
+    """The robust weight of a squared whitened residual, tempered."""
+    return float(seen.tempering * huber_weight(squared, seen.robust))
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -19,11 +19,10 @@ from factors.landmarks.model import (
     log_likelihood,
     packed,
     recalibrated,
-    robust_loss,
-    robust_weight,
     whitened_all,
 )
 from factors.landmarks.stack import BearingRangeStack
+from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array, Integers
 
 _NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # for a look without offset or without its covariance
@@ -63,7 +62,7 @@ class BearingRangeFactor:
             error, *blocks = self._of_values(*found)
             return error.ravel(), [block.reshape(-1, block.shape[2]) for block in blocks]
         error, blocks = self.whitened(values)
-        weight = np.sqrt(robust_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
+        weight = np.sqrt(geman_mcclure_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
         weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
         return (weight[:, None] * error).ravel(), weighted
 
@@ -113,7 +112,7 @@ class BearingRangeFactor:
     def cost(self, values: Sequence[Array]) -> float:
         """The robust loss."""
         error, _ = self.whitened(values)
-        return float(np.sum(robust_loss(np.sum(error**2, axis=-1), self.model.robust)))
+        return float(np.sum(geman_mcclure_loss(np.sum(error**2, axis=-1), self.model.robust)))
 
     def log_likelihood(self, poses: Array, parameters: Array | None = None) -> Array:
         """The log-likelihood (N,), up to a constant, of ``poses`` (N, 3) at the time of the measurement, each with its own
@@ -123,7 +122,7 @@ class BearingRangeFactor:
 
     def weight(self, squared: Array) -> Array:
         """The robust weight of squared whitened residuals."""
-        return robust_weight(squared, self.model.robust)
+        return geman_mcclure_weight(squared, self.model.robust)
 
     def widened(self, width: float) -> BearingRangeFactor:
         """The factor with a robust loss that is ``width`` times as wide."""

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from factors.landmarks.model import TIME_OFFSET, whitened_into
+from factors.robust import geman_mcclure_weight
 from factors.se2 import Array, Integers
 from factors.se2_kernels import exp, wrapped
 
@@ -88,7 +89,7 @@ def linearize(
 def weigh(error: Array, by_pose: Array, by_sensor: Array, robust: float) -> None:
     """Multiply what :func:`linearize` found by the roots of the robust weights."""
     for k in range(len(error)):
-        root = 1.0 / (1.0 + (error[k, 0] ** 2 + error[k, 1] ** 2) / robust**2)
+        root = math.sqrt(geman_mcclure_weight(error[k, 0] ** 2 + error[k, 1] ** 2, robust))
         error[k] *= root
         by_pose[k] *= root
         by_sensor[k] *= root

@@ -13,6 +13,7 @@ import numba
 import numpy as np
 
 from factors import se2
+from factors.robust import geman_mcclure_loss
 from factors.se2 import Array
 
 # the constants of a sensor that can be estimated: those of its model, and the time offset [s] of its timestamps
@@ -252,17 +253,6 @@ def _seen(
     return range_error, bearing_error, distance, vx, vy, weight
 
 
-def robust_weight(squared: Array, scale: float) -> Array:
-    """Weight of a squared whitened residual for the loss of Geman and McClure (1985)."""
-    return (1.0 + np.asarray(squared) / scale**2) ** -2
-
-
-def robust_loss(squared: Array, scale: float) -> Array:
-    """Loss of Geman and McClure of a squared whitened residual: half of it for small residuals, at most ``scale^2 / 2``, so that
-    gross outliers have no influence."""
-    return 0.5 * np.asarray(squared) / (1.0 + np.asarray(squared) / scale**2)
-
-
 def log_likelihood(
     model: BearingRangeModel,
     poses: Array,
@@ -284,11 +274,11 @@ def log_likelihood(
     sensor = (model.mounting[2], noise, model.depth)
     if point_covariances is None:
         _squared(poses, constants, *sensor, points, ranges, bearings, EXACT, squared, np.empty((0, 0)))
-        return -np.asarray(np.sum(robust_loss(squared, model.robust), axis=-1))
+        return -np.asarray(np.sum(geman_mcclure_loss(squared, model.robust), axis=-1))
     widths = np.empty_like(squared)
     spreads = np.ascontiguousarray(point_covariances, dtype=float)
     _squared(poses, constants, *sensor, points, ranges, bearings, spreads, squared, widths)
-    return -np.asarray(np.sum(robust_loss(squared, model.robust) + widths, axis=-1))
+    return -np.asarray(np.sum(geman_mcclure_loss(squared, model.robust) + widths, axis=-1))
 
 
 @numba.njit(cache=True)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from factors.landmarks import kernels
-from factors.landmarks.model import PARAMETERS, robust_loss
+from factors.landmarks.model import PARAMETERS
+from factors.robust import geman_mcclure_loss
 from factors.se2 import Array, Integers
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class BearingRangeStack:
     def cost(self, poses: Array, parameters: Array) -> float:
         """The robust loss of all."""
         error, _, _ = self._whitened(poses, parameters)
-        return float(np.sum(robust_loss(np.einsum("ki,ki->k", error, error), self._robust)))
+        return float(np.sum(geman_mcclure_loss(np.einsum("ki,ki->k", error, error), self._robust)))
 
     def _whitened(self, poses: Array, parameters: Array) -> tuple[Array, Array, Array]:
         changes, count = np.zeros(len(PARAMETERS)), self.rows // 2

@@ -10,6 +10,7 @@ import numpy as np
 
 from factors.landmarks.model import BEARING_SIGMA, DEPTH, PARAMETERS, RANGE_SIGMA, RELATIVE, ROBUST, TURN, whitened_into
 from factors.positive_kernels import inverse, root
+from factors.robust import geman_mcclure_weight
 from factors.se2 import Array, Integers
 from factors.se2_kernels import exp
 
@@ -73,7 +74,7 @@ def updated(
         moved[0], moved[1], moved[2] = pose[0] + c * dx - s * dy, pose[1] + s * dx + c * dy, pose[2] + turned
         _linearized(model, seen, moved, values + delta[columns[3:]], indices, now, jacobian)
         for k in range(count):
-            weights[k] = (1.0 + (now[k, 0] ** 2 + now[k, 1] ** 2) / model[ROBUST] ** 2) ** -2
+            weights[k] = geman_mcclure_weight(now[k, 0] ** 2 + now[k, 1] ** 2, model[ROBUST])
         there, delta, after, _ = _solved(prior, now, jacobian, columns, weights, before)
     there = there and bool(np.all(np.isfinite(delta))) and root(after)[1]
     return there, delta, after, residual, max(0.0, nis), measured

@@ -17,11 +17,10 @@ from factors.landmarks.model import (
     predict,
     recalibrated,
     residuals,
-    robust_loss,
-    robust_weight,
     sigmas,
     whitened_all,
 )
+from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 
 place = st.floats(-8.0, 8.0)
 poses = st.tuples(place, place, st.floats(-3.1, 3.1)).map(np.array)
@@ -242,10 +241,10 @@ def test_ranges_with_a_mounting_are_those_of_gtsams_factor(pose, point):
 @given(st.floats(0.0, 100.0), st.floats(0.5, 5.0))
 def test_the_weight_is_the_slope_of_the_loss(squared, scale):
     step = 1e-5
-    slope = (robust_loss(squared + step, scale) - robust_loss(max(squared - step, 0.0), scale)) / (
+    slope = (geman_mcclure_loss(squared + step, scale) - geman_mcclure_loss(max(squared - step, 0.0), scale)) / (
         squared + step - max(squared - step, 0.0)
     )
-    assert 2.0 * slope == pytest.approx(float(robust_weight(np.array(squared), scale)), rel=1e-3)
+    assert 2.0 * slope == pytest.approx(float(geman_mcclure_weight(np.array(squared), scale)), rel=1e-3)
 
 
 def test_the_likelihood_of_particles_is_the_cost_of_the_factor():
@@ -267,7 +266,7 @@ def test_each_particle_has_the_likelihood_of_its_own_sensor(model, seed):
     expected = []
     for particle, change in zip(particles, changes, strict=True):
         error = residuals(recalibrated(model, change), particle, seen, ranges, bearings)
-        expected.append(-np.sum(robust_loss(np.sum(error**2, axis=-1), model.robust)))
+        expected.append(-np.sum(geman_mcclure_loss(np.sum(error**2, axis=-1), model.robust)))
     found = log_likelihood(model, particles, seen, ranges, bearings, changes)
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
 
@@ -288,7 +287,7 @@ def test_the_likelihood_of_particles_knows_how_sure_the_map_is(model, seed):
         by_point[1, 0] = by_point[2, 1] = 0.0
         noise = np.eye(2) + by_point @ spreads @ by_point.transpose(0, 2, 1)
         squared = np.einsum("ki,kij,kj->k", error, np.linalg.inv(noise), error)
-        expected.append(-np.sum(robust_loss(squared, model.robust) + 0.5 * np.linalg.slogdet(noise)[1]))
+        expected.append(-np.sum(geman_mcclure_loss(squared, model.robust) + 0.5 * np.linalg.slogdet(noise)[1]))
     found = log_likelihood(model, particles, seen, ranges, bearings, None, spreads)
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)
 

@@ -18,8 +18,6 @@ from factors.camera.model import (
     CameraModel,
     camera_pose,
     carrier,
-    huber_loss,
-    huber_weight,
     in_camera,
     linearize,
     linearize_in_space,
@@ -29,6 +27,7 @@ from factors.camera.model import (
     predict,
     recalibrated,
 )
+from factors.robust import huber_loss, huber_weight
 
 STEP = 1e-6
 turn = st.floats(-0.5, 0.5)

@@ -22,8 +22,9 @@ from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.landmarks.window import Sighting, SightingWindow
 from factors import positive, se2
 from factors.landmarks.factor import BearingRangeFactor
-from factors.landmarks.model import BearingRangeModel, robust_loss
+from factors.landmarks.model import BearingRangeModel
 from factors.motion import ChainState
+from factors.robust import geman_mcclure_loss
 from factors.se2 import Array
 from factors.update import GATE
 
@@ -126,7 +127,9 @@ class Relocalizer:
         poses, _ = window.refined(poses, coarse, iterations=4, spread=grain)
         poses, covariances = window.refined(poses, fine, iterations=6)
         squared = window.squared(poses, fine)
-        logs = -robust_loss(squared, self._model.robust).sum(axis=1) + self._log_prior(window, poses, covariances)
+        logs = -geman_mcclure_loss(squared, self._model.robust).sum(axis=1) + self._log_prior(
+            window, poses, covariances
+        )
         self._hypotheses = self._weighed(window, poses, covariances, squared, logs)
         self._best = self._clear(window)
 
@@ -153,8 +156,8 @@ class Relocalizer:
         if self._hypotheses[0].share < REFUTING_SHARE or self._hypotheses[0].landmarks < REFUTING_LANDMARKS:
             return False
         window, scale = self._window, self._model.robust
-        track = robust_loss(window.squared(pose[None], window.whitener(covariance)), scale).sum()
-        other = robust_loss(window.squared(self._best.pose[None], window.whitener()), scale).sum()
+        track = geman_mcclure_loss(window.squared(pose[None], window.whitener(covariance)), scale).sum()
+        other = geman_mcclure_loss(window.squared(self._best.pose[None], window.whitener()), scale).sum()
         return bool(track - other > REFUTED * 0.5 * scale**2 * len(window.points))
 
     def _log_prior(self, window: SightingWindow, poses: Array, covariances: Array) -> Array:

@@ -10,8 +10,9 @@ import numpy as np
 from factorgraph_loc.model.motion import Motion
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import positive, se2
-from factors.landmarks.model import BearingRangeModel, jacobians, located, residuals, robust_loss, robust_weight, sigmas
+from factors.landmarks.model import BearingRangeModel, jacobians, located, residuals, sigmas
 from factors.motion import ChainState
+from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array
 
 RECENT = 6  # landmarks whose last sightings generate candidates
@@ -127,7 +128,7 @@ class SightingWindow:
 
     def losses(self, poses: Array, whitener: Array, spread: Array | None = None) -> Array:
         """Losses (N,) of present poses (N, 3): robust losses of the sightings plus the loss of the start."""
-        found: Array = robust_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
+        found: Array = geman_mcclure_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
         return found if self._start is None else found + self._start.loss(poses, self.now, spread)
 
     def refined(
@@ -158,7 +159,7 @@ class SightingWindow:
         common = covariances[np.maximum(rows[:, None], rows)]
         weight = np.ones(len(rows))
         first = len(rows) - len(self.points)
-        weight[first:] = robust_weight(self.squared(pose[None], whitener)[0], self._model.robust)
+        weight[first:] = geman_mcclure_weight(self.squared(pose[None], whitener)[0], self._model.robust)
         for _ in range(iterations):
             root = np.sqrt(np.maximum(weight, 1e-6))
             jacobian, error = self._jacobians(pose[None])[0], self._residuals(pose[None])[0]
@@ -173,7 +174,7 @@ class SightingWindow:
             step = -covariance @ (jacobian.T @ solved[:, 3])
             pose = se2.compose(pose, se2.exp(step))
             on_path = (solved[:, 3] + solved[:, :3] @ step).reshape(-1, 2) / root[:, None]
-            weight[first:] = robust_weight(np.sum(on_path[first:] ** 2, axis=1), self._model.robust)
+            weight[first:] = geman_mcclure_weight(np.sum(on_path[first:] ** 2, axis=1), self._model.robust)
         return pose, covariance
 
     def _recent(self) -> list[int]:
@@ -207,7 +208,7 @@ class SightingWindow:
         """Robustly weighted information (N, 3, 3), including that of a nearly flat prior or the start, and gradient (N, 3)."""
         jacobian = whitener @ self._jacobians(poses)
         error = (whitener @ self._residuals(poses)[..., None])[..., 0]
-        weight = robust_weight(np.sum(error**2, axis=-1), self._model.robust)
+        weight = geman_mcclure_weight(np.sum(error**2, axis=-1), self._model.robust)
         weighted = np.swapaxes(weight[..., None, None] * jacobian, -1, -2)
         information, gradient = np.sum(weighted @ jacobian, axis=1) + FLAT, np.sum(weighted @ error[..., None], axis=1)
         if self._start is None:
