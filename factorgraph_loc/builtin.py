@@ -36,6 +36,7 @@ READERS.own.update(
         "rosbag": "factorgraph_loc.io.bags.rosbag",
         "sevenscenes": "factorgraph_loc.io.readers.sevenscenes",
         "starry_night": "factorgraph_loc.io.readers.starry_night",
+        "trajectory": "factorgraph_loc.io.readers.trajectory",
         "tum_rgbd": "factorgraph_loc.io.readers.tum_rgbd",
         "utias_woods": "factorgraph_loc.io.readers.utias_woods",
     }

@@ -112,7 +112,7 @@ def _print(log: Log, found: Inspection) -> None:
     about = {
         "log": log.name,
         "span": f"{last - first:.1f} s",
-        "rig": f"{log.rig.name}, sensors {', '.join(log.rig.sensors)}",
+        "rig": f"{log.rig.name}, sensors {', '.join(log.rig.sensors) or 'none'}",
         "world": ", ".join([log.world.name, *(f"{count} {layer}" for layer, count in found.in_map.items())]),
         "start": "given by the log" if log.start is not None else "not given",
     }

@@ -20,7 +20,8 @@ LogName = Annotated[
     str,
     typer.Argument(
         metavar="LOG",
-        help="A name that `fgloc datasets` lists, a manifest, a folder in the native format, or any path with --reader.",
+        help="A name that `fgloc datasets` lists, a manifest, a folder in the native format, a file of poses, or any path with "
+        "--reader.",
         autocompletion=completion.logs,
     ),
 ]

@@ -57,7 +57,8 @@ class Inspection:
 def inspect(log: Log) -> Inspection:
     """Inspect a log: summaries of its streams, and problems as lines of text."""
     streams = {name: _summary(stream.t) for name, stream in log.streams.items()}
-    reference = _summary(log.reference.t) if log.reference is not None else None
+    known = log.reference3 if log.reference is None else log.reference
+    reference = None if known is None else _summary(known.t)
     problems = list(log.warnings)
     problems += [f"the log has no {sensor}, which the rig lists" for sensor in log.rig.sensors if sensor not in streams]
     problems += [f"{name} is empty" for name, summary in streams.items() if summary.rows == 0]

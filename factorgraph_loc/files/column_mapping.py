@@ -141,7 +141,7 @@ def read_mapped(
         raise InputError(f"{path}: there is no field {quoted(unknown[0])} to map{nearest(unknown[0], sorted(known))}")
     if not any(set(shape) <= given <= set(shape).union(optional) for shape in shapes):
         expected = " or ".join(", ".join(shape) for shape in shapes)
-        raise InputError(f"{path}: columns maps {listed(sorted(given))}, expected {expected}")
+        raise InputError(f"{path}: columns maps {listed(sorted(given)) or 'nothing'}, expected {expected}")
     if stray := sorted(set(mapping.units) - given):
         raise InputError(f"{path}: units.{stray[0]} belongs to no field of columns")
     needed = [column for field, column in mapping.columns.items() if field not in optional]

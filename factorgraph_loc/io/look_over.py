@@ -11,9 +11,9 @@ MAX_ODOMETRY_GAP = 5.0  # s
 
 
 def look_over(log: Log) -> list[str]:
-    """Warnings about a whole log; InputError if it has no odometry, which only a hand-held camera may lack."""
+    """Warnings about a whole log; InputError if it has no odometry, which only a hand-held camera and a bare trajectory lack."""
     odometry = log.streams.get("odometry")
-    if odometry is None and log.reference3 is not None:
+    if odometry is None and (log.reference3 is not None or (log.reference is not None and not log.streams)):
         return []
     if odometry is None or len(odometry.t) == 0:
         raise InputError(f"{log.name}: has no odometry, which every estimator needs")

@@ -50,8 +50,10 @@ class Log:
         object.__setattr__(self, "name", well_formed(self.name))  # it may come from a file name
 
     def span(self) -> tuple[float, float]:
-        """First and last timestamp of all streams [s]."""
+        """First and last timestamp of all streams [s], or of the reference of a log without any."""
         stamps = [(s.t.min(), s.t.max()) for s in self.streams.values() if len(s.t)]
+        if not self.streams:
+            stamps = [(r.t[0], r.t[-1]) for r in (self.reference, self.reference3) if r is not None and len(r)]
         if not stamps:
             return 0.0, 0.0
         return float(min(a for a, _ in stamps)), float(max(b for _, b in stamps))

@@ -135,11 +135,12 @@ units = {{ t = "s" }}
     assert any("1 of 2 images are missing" in line for line in log.warnings)
 
 
-@pytest.mark.parametrize("form", ["tum", "kitti"])
-def test_a_reference_of_a_data_set(hall, with_options, one, form):
+@pytest.mark.parametrize("form", ["tum", "kitti", "euroc"])
+def test_poses_of_a_data_set(hall, with_options, one, refused, form):
     folder = hall.parent / "run"
     (folder / "poses.txt").write_text(
         {
+            "euroc": "#timestamp,x,y,z,qw,qx,qy,qz,vx\n1000000000,0,0,0,1,0,0,0,5\n2000000000,3,1,0,0.7071068,0,0,0.7071068,5\n",
             "tum": "# t x y z q\n1 0 0 0 0 0 0 1\n2 3 1 0 0 0 0.7071068 0.7071068\n",
             # of a camera: x right, y down, z ahead; turned left by a quarter after 3 m ahead and 1 m to the left
             "kitti": "1 0 0 0 0 1 0 0 0 0 1 0\n0 0 -1 -1 0 1 0 0 1 0 0 3\n",
@@ -150,6 +151,13 @@ def test_a_reference_of_a_data_set(hall, with_options, one, form):
     log = one(with_options(f'{WHEELS}\n[options.reference]\nfile = "poses.txt"\nformat = "{form}"\n{times}'))
     np.testing.assert_allclose(log.reference.t, (0.0, 1.0))
     np.testing.assert_allclose(log.reference.poses, ((0, 0, 0), (3, 1, np.pi / 2)), atol=1e-6)
+    as_odometry = f'[options.odometry]\nfile = "poses.txt"\nformat = "{form}"\n{times}'
+    moved = one(with_options(as_odometry)).streams["odometry"]
+    np.testing.assert_allclose(moved.t, (0.0, 1.0))
+    np.testing.assert_allclose(np.stack((moved.dx, moved.dy, moved.dtheta))[:, 1], (3, 1, np.pi / 2), atol=1e-6)
+    refused(with_options(f"{as_odometry}track = 0.5\n"), f"format {form} has no wheels, expected no track")
+    other = 'times = "times.txt"\n' if not times else ""
+    refused(with_options(as_odometry.replace(times, "") + other), "format kitti and times, the file of the stamps, are")
 
 
 def test_stamps_keep_their_nanoseconds():

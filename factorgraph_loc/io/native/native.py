@@ -137,10 +137,12 @@ def write_native(log: Log, folder: str | Path, format: Literal["csv", "parquet"]
     """Write a log as a new folder atomically; InputError if ``folder`` is not empty.
 
     Timestamps are exact to the nanosecond, numbers to the last digit. Not written: covariances of the reference, and the smaller
-    one of a start's standard deviations in x and y. Images are copied. InputError for features of images, motion in space and a
-    second camera.
+    one of a start's standard deviations in x and y. Images are copied. InputError for features of images, motion in space, a second
+    camera, and a log without any measurements.
     """
     folder = Path(folder)
+    if not log.streams:
+        raise InputError(f"{log.name}: has no measurements, which a log needs: `fgloc export` writes trajectories")
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with temporary_folder(folder) as temporary:

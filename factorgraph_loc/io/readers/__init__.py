@@ -25,6 +25,7 @@ __all__ = [
     "rf_robot",
     "sevenscenes",
     "starry_night",
+    "trajectory",
     "tum_rgbd",
     "utias_woods",
     "verify",

@@ -20,6 +20,7 @@ from factorgraph_loc.io.native.world_file import read_world
 from factorgraph_loc.io.readers import registry as readers
 from factorgraph_loc.io.readers.bounds import require_bounds
 from factorgraph_loc.io.readers.manifests import Manifest, StartSettings, find_data_root, read_manifest
+from factorgraph_loc.io.readers.pose_file import is_pose_file
 from factorgraph_loc.maps.markers import MarkerSettings
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -57,7 +58,8 @@ def load(
 ) -> list[Log]:
     """The logs that ``log`` refers to.
 
-    ``log``: a manifest, a folder in the native format or its ``run.toml``, a name in ``manifests()``, or any path with ``reader``.
+    ``log``: a manifest, a folder in the native format or its ``run.toml``, a name in ``manifests()``, a file of poses in TUM, KITTI
+    or EuRoC format, or any path with ``reader``.
     ``options``: of the reader, overriding those of a manifest; a list, or text with commas, gives one log per value. ``rig`` and
     ``world`` replace those of the log. ``data_root``: folder of data files outside of the manifest's folder, by default the
     environment's FGLOC_DATA. InputError describes what is invalid in one line.
@@ -126,19 +128,25 @@ def _find(log: str, data_root: str | Path | None, reader: str | None) -> _Source
     if path.exists() and is_bag(path):
         raise InputError(f"{log}: is a ROS bag: `fgloc manifest {log} > run.toml` proposes how to read it")
     if path.is_file():
-        if path.name == RUN_FILE and "reader" not in read_toml(path):  # a manifest may have this name too
-            return _Source("native", path.parent)
-        if path.suffix == ".toml":
-            return _from_manifest(path, data_root)
-        if path.suffix.lower() in TABLES:
-            raise InputError(f"{log}: is a table: describe its columns in a manifest with the reader mapped")
-        raise InputError(f"{log}: is not a manifest (.toml); name the reader of this format")
+        return _from_file(log, path, data_root)
     known = manifests()
     if log in known:
         return _from_manifest(known[log], data_root)
     if path.is_dir():
         raise InputError(f"{log}: has no {RUN_FILE}, so it is not in the native format; name the reader of its format")
     raise InputError(f"{log}: is neither a file, nor a folder, nor a known data set{nearest(log, list(known))}")
+
+
+def _from_file(log: str, path: Path, data_root: str | Path | None) -> _Source:
+    if path.name == RUN_FILE and "reader" not in read_toml(path):  # a manifest may have this name too
+        return _Source("native", path.parent)
+    if path.suffix == ".toml":
+        return _from_manifest(path, data_root)
+    if is_pose_file(path):
+        return _Source("trajectory", path)
+    if path.suffix.lower() in TABLES:
+        raise InputError(f"{log}: is a table: describe its columns in a manifest with the reader mapped")
+    raise InputError(f"{log}: is not a manifest (.toml); name the reader of this format")
 
 
 def _name(path: Path) -> str:

@@ -17,6 +17,7 @@ from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
 from factorgraph_loc.io.readers.mapped_poses import (
     OdometryFile,
     Offset,
+    PosesFile,
     ReferenceFile,
     odometry_stream,
     read_odometry,
@@ -84,7 +85,8 @@ def read(path: Path | None, options: Options) -> Log:
         raise InputError(f"{path}: odometry is missing in [options], which every estimator needs")
     warnings: list[str] = []
     odometry_path = inside(path, options.odometry.file, path)
-    odometry_t_ns, moves, increments = read_odometry(odometry_path, options.odometry, warnings)
+    times = _times(path, options.odometry)
+    odometry_t_ns, moves, increments = read_odometry(odometry_path, times, options.odometry, warnings)
     tables = {
         name: _table(inside(path, mapping.file, path), native_tables()[name][1][0], mapping, warnings)
         for name in ("imu", "camera", *OTHERS)
@@ -102,8 +104,7 @@ def read(path: Path | None, options: Options) -> Log:
         streams["rfid"] = rounds.stream(t0_ns)
     reference = None
     if (told := options.reference) is not None:
-        times = None if told.times is None else inside(path, told.times, path)
-        reference = read_reference(inside(path, told.file, path), times, told, t0_ns, warnings)
+        reference = read_reference(inside(path, told.file, path), _times(path, told), told, t0_ns, warnings)
         if reference.t[0] > (stamps[0][-1] - t0_ns) / 1e9 or reference.t[-1] < (stamps[0][0] - t0_ns) / 1e9:
             warnings.append(
                 f"{told.file}: the reference and the odometry do not overlap: t = {reference.t[0]:.3f} s and "
@@ -119,6 +120,11 @@ def read(path: Path | None, options: Options) -> Log:
         t0_ns=t0_ns,
         warnings=tuple(warnings),
     )
+
+
+def _times(folder: Path, told: PosesFile) -> Path | None:
+    """The file of the stamps of poses in KITTI's format."""
+    return None if told.times is None else inside(folder, told.times, folder)
 
 
 def _table(path: Path, table: Table, mapping: SensorFile, warnings: list[str]) -> TableRows:

@@ -13,7 +13,8 @@ from factorgraph_loc.files.columns import LENGTH
 from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.io import motions
-from factorgraph_loc.io.readers.space_poses import read_kitti
+from factorgraph_loc.io.readers import euroc
+from factorgraph_loc.io.readers.space_poses import read_kitti, read_poses
 from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows
 from factorgraph_loc.sensors.odometry.columns import INCREMENTS, VELOCITIES, WAYS
@@ -30,33 +31,43 @@ LEAST_AROUND = 300.0  # rad between rows, which no robot can rotate
 COLUMNS = {c.name: c for table in (VELOCITIES, INCREMENTS, WAYS, POSE_COLUMNS) for c in table.columns}
 
 
-class OdometryFile(ColumnMapping, Turned):
+class PosesFile(ColumnMapping, Turned):
+    """A file with poses."""
+
+    format: Literal["columns", "tum", "kitti", "euroc"] = "columns"
+    """columns by a mapping, a TUM or EuRoC file, or a KITTI file with its times"""
+    columns: dict[str, str] = Field(default_factory=dict)
+    """column of the file for each field, if the format is columns"""
+    times: str | None = None
+    """file of the times of a KITTI file"""
+    clock_offset: Offset = 0.0
+    """added to all timestamps"""
+
+
+class OdometryFile(PosesFile):
     """``columns``: t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the row before); x, y, heading or a
     quaternion (poses, of which only the relative motion is used); left, right (distances of the wheels, with their ``track``)."""
 
     track: Annotated[float, Field(gt=0.0, le=10.0), InUnit("m")] | None = None
     """distance between the wheels, for columns left and right"""
-    clock_offset: Offset = 0.0
-    """added to all timestamps"""
 
 
-class ReferenceFile(ColumnMapping, Turned):
+class ReferenceFile(PosesFile):
     """The reference."""
 
-    format: Literal["columns", "tum", "kitti"] = "columns"
-    """columns by a mapping, a TUM file, or a KITTI file with its times"""
-    columns: dict[str, str] = Field(default_factory=dict)
-    """column of the file for each field, if the format is columns"""
-    times: str | None = None
-    """file of the times of a KITTI file"""
     has_heading: bool = True
     """whether the headings mean anything"""
-    clock_offset: Offset = 0.0
-    """added to all timestamps"""
 
 
-def read_odometry(path: Path, options: OdometryFile, warnings: list[str]) -> tuple[Integers, Array, bool]:
+def read_odometry(
+    path: Path, times: Path | None, options: OdometryFile, warnings: list[str]
+) -> tuple[Integers, Array, bool]:
     """Timestamps (N,), velocities (N, 2) or increments (N, 3), and whether these are increments. InputError names file and row."""
+    if options.format != "columns" or times is not None:
+        if options.track is not None:
+            raise InputError(f"{path}: format {options.format} has no wheels, expected no track")
+        t_ns, poses = _in_format(path, times, options, warnings)
+        return t_ns, after_rest(motions.between_poses(path, t_ns, poses, warnings)), True
     mapped = read_mapped(path, options, ODOMETRY)
     if ("left" in mapped.fields) != (options.track is not None):
         raise InputError(f"{path}: columns left and right, and track [m between the wheels], are needed together")
@@ -74,9 +85,9 @@ def read_odometry(path: Path, options: OdometryFile, warnings: list[str]) -> tup
         scales = np.array([_scale(options, name) for name in ("left", "right")])
         left, right = motions.between_ways(path, t_ns, ways, scales, warnings).T
         arc, turn = (left + right) / 2.0, (right - left) / options.track
-        return t_ns, _after_rest(se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn)))), True
+        return t_ns, after_rest(se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn)))), True
     poses = _planar(path, mapped.rows[keep], kept, options, warnings)
-    return t_ns, _after_rest(motions.between_poses(path, t_ns, poses, warnings)), True
+    return t_ns, after_rest(motions.between_poses(path, t_ns, poses, warnings)), True
 
 
 def odometry_stream(t_ns: Integers, values: Array, increments: bool, t0_ns: int) -> IncrementStream | VelocityStream:
@@ -88,30 +99,39 @@ def read_reference(
     path: Path, times: Path | None, options: ReferenceFile, t0_ns: int, warnings: list[str]
 ) -> Trajectory:
     """The reference in seconds after ``t0_ns``; InputError names file and row of an invalid value."""
-    if options.format != "columns" and (options.columns or options.units):
+    if options.format != "columns" or times is not None:
+        t_ns, poses = _in_format(path, times, options, warnings)
+        return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=options.has_heading)
+    mapped = read_mapped(path, options, (*POSES, ("t", "x", "y")))
+    if "heading" not in mapped.fields and "qw" not in mapped.fields and options.has_heading:
+        raise InputError(f"{path}: columns maps no heading: set has_heading = false if there is none")
+    t_ns, columns = _columns(mapped, options.clock_offset)
+    poses = _planar(path, mapped.rows, columns, options, warnings)
+    keep = checks.in_order(path, mapped.rows, t_ns, warnings)
+    return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=options.has_heading)
+
+
+def _in_format(path: Path, times: Path | None, options: PosesFile, warnings: list[str]) -> tuple[Integers, Array]:
+    """Timestamps (N,) and planar poses (N, 3) of a file in the format of another program."""
+    if options.columns or options.units:
         raise InputError(f"{path}: format {options.format} has no columns or units to map")
     if (options.format == "kitti") != (times is not None):
         raise InputError(f"{path}: format kitti and times, the file of the stamps, are needed together")
-    shift = round(options.clock_offset * 1e9)
-    if options.format == "tum":
-        rows, t_ns, table = read_tum_rows(path)
-        poses = on_floor(path, table[:, :3], rotations_of(path, rows, table[:, 3:]), warnings, options)
-        t_ns = t_ns + shift
-    elif times is not None:
+    turned: Turned = options
+    if times is not None:
         rows, t_ns, space = read_kitti(path, times)
-        known = (
-            options if options.axes else Turned(axes="body", mounting=options.mounting)
-        )  # the format defines the axes
-        t_ns, poses = t_ns + shift, on_floor(path, space.positions, space.rotations, warnings, known)
+        positions, rotations = space.positions, space.rotations
+        if not options.axes:
+            turned = Turned(axes="body", mounting=options.mounting)  # the format defines the axes
+    elif options.format == "euroc":
+        t_ns, space = read_poses(path, euroc.STATE, unit="ns", separator=",", warnings=warnings)
+        rows, positions, rotations = np.arange(1, len(t_ns) + 1), space.positions, space.rotations
     else:
-        mapped = read_mapped(path, options, (*POSES, ("t", "x", "y")))
-        if "heading" not in mapped.fields and "qw" not in mapped.fields and options.has_heading:
-            raise InputError(f"{path}: columns maps no heading: set has_heading = false if there is none")
-        rows = mapped.rows
-        t_ns, columns = _columns(mapped, options.clock_offset)
-        poses = _planar(path, rows, columns, options, warnings)
+        rows, t_ns, table = read_tum_rows(path)
+        positions, rotations = table[:, :3], rotations_of(path, rows, table[:, 3:])
+    poses = on_floor(path, positions, rotations, warnings, turned)
     keep = checks.in_order(path, rows, t_ns, warnings)
-    return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=options.has_heading)
+    return t_ns[keep] + round(options.clock_offset * 1e9), poses[keep]
 
 
 def _columns(mapped: Mapped, offset: float) -> tuple[Integers, dict[str, Array]]:
@@ -140,6 +160,6 @@ def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turne
     return np.column_stack((columns["x"], columns["y"], se2.wrap(heading)))
 
 
-def _after_rest(moves: Array) -> Array:
+def after_rest(moves: Array) -> Array:
     """Motions (N - 1, 3) as increments (N, 3): the first row only defines the start."""
     return np.vstack((np.zeros((1, 3)), moves))

@@ -1,6 +1,7 @@
 """Files of poses alone: TUM, KITTI and EuRoC, told apart by their first row."""
 
 from pathlib import Path
+from typing import Literal
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
@@ -11,6 +12,7 @@ from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.trajectory import read_tum_rows
 
+Format = Literal["tum", "kitti", "euroc"]
 EXPECTED = (
     "8 values (TUM: t x y z qx qy qz qw), 12 (KITTI), or 8 or more with commas (EuRoC: t, x, y, z, qw, qx, qy, qz)"
 )
@@ -18,21 +20,46 @@ EXPECTED = (
 
 def read_pose_file(path: Path) -> PosePath:
     """The poses in a file of TUM, KITTI or EuRoC format. InputError names file and row."""
-    warnings: list[str] = []
     row, first = _first_row(path)
-    cells = first.split(",") if "," in first else first.split()
-    if "," in first and len(cells) >= len(euroc.STATE):
+    kind = _format(first)
+    warnings: list[str] = []
+    if kind is None:
+        raise bad_field(path, "row", first, EXPECTED, row=row)
+    if kind == "euroc":
         t_ns, poses = read_poses(path, euroc.STATE, unit="ns", separator=",", warnings=warnings)
         return PosePath(str(path), poses.positions, poses.rotations, t_ns, warnings=tuple(warnings))
-    if "," not in first and len(cells) == len(MATRIX):
+    if kind == "kitti":
         _, matrices = read_matrices(path)
         return PosePath(str(path), matrices[:, :, 3], matrices[:, :, :3], None)
-    if "," in first or len(cells) != len(tum_rgbd.POSES):
-        raise bad_field(path, "row", first, EXPECTED, row=row)
     rows, t_ns, table = read_tum_rows(path)
     rotations = rotations_of(path, rows, table[:, 3:])
     keep = checks.in_order(path, rows, t_ns, warnings)
     return PosePath(str(path), table[:, :3], rotations, t_ns, warnings=tuple(warnings)).rows(keep)
+
+
+def is_pose_file(path: Path) -> bool:
+    """Whether the first row of a file has numbers alone, as many as one of the formats has."""
+    try:
+        _, first = _first_row(path)
+        return _format(first) is not None and all(map(_is_number, first.replace(",", " ").split()))
+    except InputError:
+        return False
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _format(first: str) -> Format | None:
+    """The format of a file whose first row this is."""
+    if "," in first:
+        return "euroc" if first.count(",") + 1 >= len(euroc.STATE) else None
+    count = len(first.split())
+    return "tum" if count == len(tum_rgbd.POSES) else "kitti" if count == len(MATRIX) else None
 
 
 def _first_row(path: Path) -> tuple[int, str]:

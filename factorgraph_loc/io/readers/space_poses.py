@@ -29,13 +29,18 @@ def read_kitti(path: Path, times: Path) -> tuple[Integers, Integers, Trajectory3
     ready for autonomous driving?", CVPR 2012). They are converted to x forward and z up. InputError names file and row.
     """
     rows, matrices = read_matrices(path)
-    stamps = read_times(times)
-    if len(stamps) < len(rows):
-        raise bad_field(times, "number of rows", len(stamps), f"at least {len(rows)}, one for each pose of {path.name}")
+    t_ns = stamps_of(path, len(rows), times)
     u, _, vt = np.linalg.svd(matrices[:, :, :3])
     ahead = reprojection.FORWARD
-    t_ns = stamps[: len(rows)]
     return rows, t_ns, Trajectory3((t_ns - t_ns[0]) / 1e9, matrices[:, :, 3] @ ahead.T, ahead @ (u @ vt) @ ahead.T)
+
+
+def stamps_of(path: Path, count: int, times: Path) -> Integers:
+    """The timestamps (N,) [ns] of the ``count`` poses of ``path``, the first lines of ``times``; InputError if it has fewer."""
+    stamps = read_times(times)
+    if len(stamps) < count:
+        raise bad_field(times, "number of rows", len(stamps), f"at least {count}, one for each pose of {path.name}")
+    return stamps[:count]
 
 
 def read_matrices(path: Path) -> tuple[Integers, Array]:
