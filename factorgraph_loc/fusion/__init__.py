@@ -9,6 +9,7 @@ __all__ = [
     "graph_parts",
     "guarded",
     "kld",
+    "least_squares",
     "mapping",
     "marginals",
     "particle_filter",

@@ -5,24 +5,17 @@ copy all of them. A row of poses is solved by compiled code, anything else with 
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
 
 import gtsam
-import numpy as np
 
 from factorgraph_loc.fusion.chained import Chained
+from factorgraph_loc.fusion.least_squares import MAX_ITERATIONS, damped_step, optimum
 from factorgraph_loc.fusion.marginals import Covariances, covariances
-from factorgraph_loc.fusion.variables import Values, gather, gtsam_errors, retract, to_gtsam
+from factorgraph_loc.fusion.variables import Values, gather, retract, to_gtsam
 from factors.graph import Factor, jacobian_factor
-
-MAX_ITERATIONS = 100
-CONVERGED_GAIN = 1e-6  # of the cost
-INITIAL_DAMPING = 1e-4
-MAX_DAMPING = 1e8
-UNITS = {size: gtsam.noiseModel.Unit.Create(size) for size in range(1, 10)}
 
 
 @dataclass(frozen=True)
@@ -60,22 +53,16 @@ class Problem:
         chain = self._chain
         begin = None if chain is None else chain.begin(values)
         if chain is not None and begin is not None:
-            state, cost, iterations = _optimum(chain.cost, chain.moved, begin, max_iterations)
+            state, cost, iterations = optimum(chain.cost, chain.moved, begin, max_iterations)
             return Solution(values | chain.values(state), cost, iterations)
         if not math.isfinite(self.cost(values)) and len(self._natives):
             self._replace_natives()
-        return Solution(*_optimum(self.cost, self._moved, values, max_iterations))
+        return Solution(*optimum(self.cost, self._moved, values, max_iterations))
 
     def _moved(self, values: Values, damping: float) -> Values | None:
         """A step of Levenberg and Marquardt; None where the problem is nearly singular."""
-        graph = self.linearize(values)
-        for key, value in values.items():
-            size = len(value)
-            graph.add(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(size), np.zeros(size), UNITS[size]))
-        try:
-            with gtsam_errors():
-                step = graph.optimize()
-        except RuntimeError:
+        step = damped_step(self.linearize(values), {key: len(value) for key, value in values.items()}, damping)
+        if step is None:
             return None
         return {key: retract(key, value, step.at(key)) for key, value in values.items()}
 
@@ -113,25 +100,3 @@ class Problem:
         if found is not None:
             return found
         return covariances(self.linearize(values), {key: len(value) for key, value in values.items()}, list(keys))
-
-
-State = TypeVar("State")
-
-
-def _optimum(
-    cost_of: Callable[[State], float], moved: Callable[[State, float], State | None], state: State, max_iterations: int
-) -> tuple[State, float, int]:
-    """The optimum by Levenberg and Marquardt's steps, its cost, and how many there were."""
-    damping, cost, iteration = INITIAL_DAMPING, cost_of(state), 0
-    while iteration < max_iterations and damping < MAX_DAMPING:
-        iteration += 1
-        new = moved(state, damping)
-        new_cost = math.inf if new is None else cost_of(new)
-        if new is None or not (math.isfinite(new_cost) and new_cost <= cost):
-            damping *= 10.0
-            continue
-        gained = cost - new_cost
-        state, cost, damping = new, new_cost, damping / 10.0
-        if gained < CONVERGED_GAIN * cost:
-            break
-    return state, cost, iteration

@@ -4,16 +4,16 @@ One ``gtsam.Pose3`` per stamp; between-factors of the measured motion (``twist``
 image the points that the monoSLAM filter matched, with Huber loss. That filter runs along and provides initial values; its causal
 estimates are not the batch's and are never ``localized``. Points that the map lacks are not used.
 
-Levenberg-Marquardt in Python: point factors are linearised here, as in :mod:`.problem`, and GTSAM solves.
+Point factors are linearised here, as in :mod:`~factorgraph_loc.fusion.problem`, and GTSAM solves.
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.fusion.least_squares import damped_step, optimum
 from factorgraph_loc.fusion.marginals import IndeterminateError, covariances, damped
 from factorgraph_loc.model.belief import PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -31,9 +31,6 @@ from factors import positive
 from factors.robust import huber_loss, huber_weight
 from factors.se2 import Array
 
-MAX_ITERATIONS = 50
-CONVERGED_GAIN = 1e-6  # relative decrease of the cost at convergence
-INITIAL_DAMPING, MAX_DAMPING = 1e-6, 1e6
 RANDOM_WALK = (1.0, 1.0, 1.0)  # m and rad per sqrt(s), without measured motion
 
 
@@ -192,7 +189,7 @@ def _solved(
 ) -> tuple[gtsam.Values, gtsam.GaussianFactorGraph]:
     """The optimum, and the problem linearised there."""
     units = {2 * len(image.pixels): gtsam.noiseModel.Unit.Create(2 * len(image.pixels)) for _, image in images}
-    held = gtsam.noiseModel.Unit.Create(6)
+    sizes = dict.fromkeys(range(values.size()), 6)
 
     def cost(at: gtsam.Values) -> float:
         return float(motion.error(at)) + sum(image.cost(at.atPose3(key)) for key, image in images)
@@ -204,28 +201,12 @@ def _solved(
             graph.add(gtsam.JacobianFactor(key, jacobian, -residual, units[len(residual)]))
         return graph
 
-    best, damping = cost(values), INITIAL_DAMPING
-    linear = linearized(values)
-    for _ in range(MAX_ITERATIONS):
-        damped = gtsam.GaussianFactorGraph()
-        damped.push_back(linear)
-        for key in range(values.size()):
-            damped.add(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(6), np.zeros(6), held))
-        try:
-            moved = values.retract(damped.optimize())
-            found = cost(moved)
-        except RuntimeError:  # the system is too ill-conditioned to be solved
-            found = math.inf
-        if not (math.isfinite(found) and found <= best):
-            damping *= 10.0
-            if damping > MAX_DAMPING:
-                break
-            continue
-        gained, best, values, damping = best - found, found, moved, damping / 10.0
-        linear = linearized(values)
-        if gained < CONVERGED_GAIN * best:
-            break
-    return values, linear
+    def moved(at: gtsam.Values, damping: float) -> gtsam.Values | None:
+        step = damped_step(linearized(at), sizes, damping)
+        return None if step is None else at.retract(step)
+
+    found, _, _ = optimum(cost, moved, values)
+    return found, linearized(found)
 
 
 def _robot(pose: gtsam.Pose3) -> RobotState:
