@@ -215,6 +215,22 @@ def kitti(folder: Path) -> None:
     (folder / "poses/00.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {0.5 * i}\n" for i in range(4)))
 
 
+POSES = ("a.tum", "b.csv", "c.kitti")
+
+
+def poses(folder: Path) -> None:
+    bend = [(0.3 * i, 0.02 * i * i, 0.1) for i in range(20)]
+    tum, euroc, kitti = (folder / name for name in POSES)
+    tum.write_text(
+        "# t x y z q\n"
+        + "".join(f"{1305031102 + 0.1 * i:.4f} {x} {y} {z} 0 0 0 1\n" for i, (x, y, z) in enumerate(bend))
+    )
+    euroc.write_text(
+        "#t\n" + "".join(f"{13050311020 + i}00000000,{x},{y},{z},1,0,0,0,9\n" for i, (x, y, z) in enumerate(bend))
+    )
+    kitti.write_text("".join(f"1 0 0 {x} 0 1 0 {y} 0 0 1 {z}\n" for x, y, z in bend))
+
+
 def mrclam(folder: Path) -> None:
     t = 1248444187.1
     (folder / "Barcodes.dat").write_text("# comment\n  1 \t 5\n  2 \t 14\n  6 \t 63\n  7 \t 81\n")

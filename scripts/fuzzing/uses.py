@@ -22,6 +22,7 @@ from factorgraph_loc.exports.rerun_scene import write_rrd
 from factorgraph_loc.exports.runs import find_runs, read_runs
 from factorgraph_loc.exports.trajectories import write_kitti
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.scoring import ALIGNMENTS, ASSOCIATIONS
 from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.simulation import named_settings
 from factorgraph_loc.vision.images import read_image
@@ -49,6 +50,19 @@ def a_log(path: str, folder: Path, rng: Generator, *, reader: str | None = None,
     for log in fgloc.load(str(folder / path), reader=reader, options=options):
         check_log(log)
         look_at(log, folder / "made", rng)
+
+
+def a_score(folder: Path, rng: Generator) -> None:
+    """Score two files of poses, and read one of them as a log."""
+    estimate, reference = (folder / pick(rng, foreign_seeds.POSES) for _ in range(2))
+    has_stamps = ".kitti" not in (estimate.suffix, reference.suffix)
+    associate = pick(rng, ASSOCIATIONS) if has_stamps else "nearest"
+    found = fgloc.score(
+        estimate, reference, align=pick(rng, ALIGNMENTS), associate=associate, max_diff=0.1, max_gap=2.0
+    )
+    if not all(value is None or np.isfinite(value) for value in found.figures.values()):
+        raise WrongResultError("a figure is not finite")
+    a_log(estimate.name, folder, rng, reader="trajectory", use=pick(rng, ("reference", "odometry")))
 
 
 def check_log(log: Log) -> None:
@@ -183,6 +197,7 @@ FORMATS: dict[str, Format] = {
     "tum": Format(foreign_seeds.tum, partial(a_log, "", reader="tum_rgbd")),
     "euroc": Format(foreign_seeds.euroc, partial(a_log, "", reader="euroc")),
     "kitti": Format(foreign_seeds.kitti, partial(a_log, "", reader="kitti_odometry")),
+    "poses": Format(foreign_seeds.poses, a_score),
     "mrclam": Format(foreign_seeds.mrclam, partial(a_log, "", reader="mrclam", robot=1)),
     "plaza": Format(foreign_seeds.plaza, partial(a_log, "p.mat", reader="plaza", run=1)),
     "woods": Format(foreign_seeds.woods, partial(a_log, "w.mat", reader="utias_woods")),
