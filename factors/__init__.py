@@ -4,6 +4,7 @@ files."""
 __all__ = [
     "camera",
     "chain",
+    "chi_squared",
     "compressed",
     "graph",
     "landmarks",

@@ -10,13 +10,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend
 from factorgraph_loc.evaluation.figures import Track, mark_events, with_pauses
 from factorgraph_loc.evaluation.metrics import CONFIDENCE, errors
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
+from factors import chi_squared
 from factors.se2 import Array
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def _nees(axis: Axes, kind: str, trajectory: Trajectory | None, reference: Traje
     axis.set_title(f"{kind} poses")
     axis.set_ylabel("NEES of x, y, heading" if dof == 3 else "NEES of x, y")
     axis.set_yscale("log")
-    low, high = chi2.ppf(_TAILS, dof)
+    low, high = chi_squared.quantile(_TAILS, dof)
     axis.axhspan(low, high, **_BAND)
     axis.axhline(dof, **_IDEAL)
     e = None if trajectory is None else errors(trajectory, reference, max_gap)
@@ -107,7 +107,7 @@ def _nis(axis: Axes, sensor: str, rows: Array) -> None:
     axis.set_ylabel("NIS per degree of freedom")
     axis.set_yscale("log")
     mean[np.diff(t, append=t[-1]) > WINDOW] = np.nan  # no line across a gap
-    low, high = (np.where(np.isnan(mean), np.nan, chi2.ppf(tail, total) / total) for tail in _TAILS)
+    low, high = (np.where(np.isnan(mean), np.nan, chi_squared.quantile(tail, total) / total) for tail in _TAILS)
     axis.fill_between(t, low, high, **_BAND)
     axis.axhline(1.0, **_IDEAL)
     _draw(axis, t, nis / dof, (t, mean), 0.1)

@@ -18,10 +18,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2, norm, rankdata
+from scipy.special import ndtr
+from scipy.stats import rankdata
 
 from factorgraph_loc.evaluation.metrics import CONFIDENCE
 from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS, bounds, draw_pooled, pair_seeds
+from factors import chi_squared
 from factors.se2 import Array
 
 SIGNIFICANT = 1.0 - CONFIDENCE
@@ -137,7 +139,7 @@ def signed_rank(differences: Array) -> float:
     if len(doubled) > _EXACT:
         # the continuity correction is half a step of the rank sum, which is doubled here
         z = (extreme + 1.0 - total / 2.0) / math.sqrt(float(np.sum(np.square(doubled.astype(float)))) / 4.0)
-        return min(1.0, 2.0 * float(norm.cdf(z)))
+        return min(1.0, 2.0 * float(ndtr(z)))
     ways = np.zeros(total + 1)
     ways[0] = 1.0
     for rank in doubled.tolist():
@@ -194,7 +196,8 @@ def mean_nees_band(counts: Sequence[float], dof: float) -> tuple[float, float]:
     """
     matched = dof * len(counts) ** 2 / float(np.sum(1.0 / np.asarray(counts, dtype=float)))
     tail = (1.0 - CONFIDENCE) / 2.0
-    return float(chi2.ppf(tail, matched) / matched), float(chi2.ppf(1.0 - tail, matched) / matched)
+    low, high = chi_squared.quantile((tail, 1.0 - tail), matched) / matched
+    return float(low), float(high)
 
 
 def _ranks(differences: Array) -> Array:

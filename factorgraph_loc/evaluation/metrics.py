@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from factorgraph_loc.evaluation import alignment, pieces, space
 from factorgraph_loc.evaluation.alignment import rms
@@ -24,7 +23,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult, Timings
 from factorgraph_loc.model.scoring import MAX_GAP, RULE
 from factorgraph_loc.model.trajectory import Trajectory
-from factors import positive, se2
+from factors import chi_squared, positive, se2
 from factors.se2 import Array, Integers
 
 FEWEST_SCORED = 10  # least number of poses for meaningful figures
@@ -162,8 +161,10 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
     if len(nees):
         tail = (1.0 - CONFIDENCE) / 2.0
         figures["anees"] = float(np.mean(nees))
-        figures["nees_bounds"] = [float(chi2.ppf(p, len(nees) * e.dof) / len(nees)) for p in (tail, 1.0 - tail)]
-        inside = e.nees_position[np.isfinite(e.nees_position)] <= chi2.ppf(CONFIDENCE, 2)
+        figures["nees_bounds"] = [
+            float(chi_squared.quantile(p, len(nees) * e.dof) / len(nees)) for p in (tail, 1.0 - tail)
+        ]
+        inside = e.nees_position[np.isfinite(e.nees_position)] <= chi_squared.quantile(CONFIDENCE, 2)
         figures["coverage_95"] = float(np.mean(inside))
     figures["invalid_covariances"] = int(np.sum(e.invalid))
     figures["scored"] = int(np.sum(np.isfinite(e.position)))
@@ -243,7 +244,9 @@ def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
             told = (dof > 0.0) & np.isfinite(nis)
             nis, dof = nis[told], dof[told]
             figures[f"nis.{sensor}.mean_per_dof"] = float(nis.sum() / dof.sum()) if len(nis) else None
-            figures[f"nis.{sensor}.beyond_95"] = float(np.mean(nis > chi2.ppf(CONFIDENCE, dof))) if len(nis) else None
+            figures[f"nis.{sensor}.beyond_95"] = (
+                float(np.mean(nis > chi_squared.quantile(CONFIDENCE, dof))) if len(nis) else None
+            )
         figures[f"nis.{sensor}.count"] = len(rows)
     for name, errors in sorted(diagnostics.residuals.items()):
         if errors:

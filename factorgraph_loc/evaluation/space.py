@@ -4,13 +4,12 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from factorgraph_loc.evaluation.alignment import rms
 from factorgraph_loc.evaluation.pairing import pairs_in_space
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory3 import Trajectory3
-from factors import positive
+from factors import chi_squared, positive
 from factors.se2 import Array
 
 DOF = 6
@@ -50,7 +49,7 @@ def accuracy(found: Trajectory3 | None, reference: Trajectory3 | None, max_gap: 
         if good.any():
             nees = np.einsum("ni,ni->n", errors[good], positive.solve(spread[good], errors[good, :, None])[..., 0])
             figures["space_anees"] = float(nees.mean())
-            figures["space_coverage_95"] = float(np.mean(nees < chi2.ppf(CONFIDENCE, DOF)))
+            figures["space_coverage_95"] = float(np.mean(nees < chi_squared.quantile(CONFIDENCE, DOF)))
     return figures
 
 

@@ -11,8 +11,8 @@ from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
+from factors import chi_squared
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.se2 import Array
@@ -146,7 +146,7 @@ def agreed(
     """
     seen, places = list(seen), list(places)
     found = _triangulate(model, seen, places, spread)
-    while found is not None and not found.squared.sum() < chi2.ppf(GATE, 2 * len(seen) - 3):
+    while found is not None and not found.squared.sum() < chi_squared.quantile(GATE, 2 * len(seen) - 3):
         if len(seen) <= FEWEST:
             return None
         best: tuple[float, int, TriangulatedPoint] | None = None

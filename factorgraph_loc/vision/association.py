@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.vision import association_kernels as kernels
@@ -20,6 +19,7 @@ from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.keypoints import Descriptors, Integers
 from factorgraph_loc.vision.matching import distance_matrix
 from factorgraph_loc.vision.relocalization import located
+from factors import chi_squared
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.se2 import Array
@@ -27,7 +27,7 @@ from factors.se2 import Array
 RATIO, GLOBAL_RATIO = 0.85, 0.8
 NEAREST, FARTHEST = 0.2, 50.0  # m, of points that are searched
 TURNED, ZOOMED = math.radians(50.0), 2.0  # bounds between views: angle, ratio of distances
-GATE = float(chi2.ppf(0.99, 2))
+GATE = float(chi_squared.quantile(0.99, 2))
 CELL = 20.0  # px, cells for sorting features
 # px, radius: added for errors of the prediction, and the largest gate
 SMALLEST_GATE, LARGEST_GATE = 3.0, 150.0

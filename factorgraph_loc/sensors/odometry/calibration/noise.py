@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.stats import chi2
 
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.odometry.calibration.windows import Windows, cut
+from factors import chi_squared
 from factors.odometry.model import MINIMUM_HEADING_VARIANCE, MINIMUM_POSITION_VARIANCE, Growth, OdometryModel
 from factors.se2 import Array
 
@@ -22,7 +22,7 @@ BLACKOUT = 30.0  # s
 MIN_BLACKOUTS = 10
 ERRORS = ("along", "lateral", "heading")
 STUDENT = 5.0  # degrees of freedom of the robust initial fit
-GATE = chi2.ppf(0.9999, 3)  # squared error above which a window is an outlier
+GATE = chi_squared.quantile(0.9999, 3)  # squared error above which a window is an outlier
 _SMALLEST = 1e-8  # variance per unit below which a component is zero
 # Lower bounds for wheels, by error and driver. A reference that depends on the odometry gives lower values.
 FLOOR = np.array(((0.01, 0.0, 0.0), (0.005, 0.0, 0.0), (0.003, 0.005, 0.0)))
@@ -79,7 +79,7 @@ def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
         return 1.0
     covariances = np.concatenate([one.covariances(model) for one in windows])
     squared = np.einsum("mi,mi->m", residuals, np.linalg.solve(covariances, residuals[..., None])[..., 0])
-    return max(1.0, float(np.sqrt(np.median(squared) / chi2.ppf(0.5, 3))))
+    return max(1.0, float(np.sqrt(np.median(squared) / chi_squared.quantile(0.5, 3))))
 
 
 def _growth(sigmas: Array) -> dict[str, Growth]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from factorgraph_loc.sensors.rfid.calibration.choice import Kind, fit
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor
@@ -162,7 +162,7 @@ def _clear(found: Placing) -> tuple[MountingConstant, ...]:
     """The significant constants, including the error by the detection model. The level allows one false positive among all
     constants in twenty calibrations."""
     blind = np.array([BLIND[p.name] for p in found.places])
-    clear = np.abs(found.changes) > norm.isf(0.025 / len(blind)) * np.hypot(found.errors, blind)
+    clear = np.abs(found.changes) > -ndtri(0.025 / len(blind)) * np.hypot(found.errors, blind)
     return tuple(p for p, c in zip(found.places, clear, strict=True) if c)
 
 

@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.stats import chi2
 
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor
 from factorgraph_loc.sensors.rfid.calibration.pairs import REACH, terms
 from factorgraph_loc.sensors.rfid.calibration.rounds import Integers, Rounds
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
-from factors import se2
+from factors import chi_squared, se2
 from factors.rfid.model import DetectionModel, logits
 from factors.se2 import Array
 
@@ -59,8 +58,8 @@ def misplaced(
         return ()
     found = [_moved(_reads(*tag, settings, survey), models, which, floor) for tag in tags.values()]
     ratios = np.array([ratio for ratio, _ in found])
-    scale = max(1.0, float(np.median(ratios)) / float(chi2.ppf(0.5, 2)))
-    p = np.minimum(1.0, len(tags) * chi2.sf(ratios / scale, 2))
+    scale = max(1.0, float(np.median(ratios)) / float(chi_squared.quantile(0.5, 2)))
+    p = np.minimum(1.0, len(tags) * chi_squared.survival(ratios / scale, 2))
     doubts = [
         TagDoubt(name, (float(shift[0]), float(shift[1])), float(one))
         for name, (_, shift), one in zip(tags, found, p, strict=True)
