@@ -54,12 +54,14 @@ class ColumnMapping(FileModel):
 
 @dataclass(frozen=True)
 class Mapped:
-    """N rows of a file by ``fields``; ``passed``: number of skipped JSON objects, which have none of the fields."""
+    """N rows of a file by ``fields``; ``passed``: number of skipped JSON objects, which have none of the fields; ``left_out``:
+    columns of the file that are not mapped."""
 
     cells: Cells
     mapping: ColumnMapping
     fields: tuple[str, ...]
     passed: int = 0
+    left_out: tuple[str, ...] = ()
 
     @property
     def path(self) -> Path:
@@ -146,12 +148,14 @@ def read_mapped(
         raise InputError(f"{path}: units.{stray[0]} belongs to no field of columns")
     needed = [column for field, column in mapping.columns.items() if field not in optional]
     if path.suffix.lower() in JSON_SUFFIXES:
-        cells, passed = _read_json_lines(path, mapping, needed)
+        cells, there, passed = _read_json_lines(path, mapping, needed)
     else:
-        cells, passed = _read_csv(path, mapping, needed), 0
+        cells, there = _read_csv(path, mapping, needed)
+        passed = 0
     if not cells.rows:
         raise InputError(f"{path}: contains no rows")
-    return Mapped(cells, mapping, tuple(f for f, column in mapping.columns.items() if column in cells.columns), passed)
+    fields = tuple(field for field, column in mapping.columns.items() if column in cells.columns)
+    return Mapped(cells, mapping, fields, passed, tuple(name for name in there if name not in cells.columns))
 
 
 def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
@@ -173,7 +177,8 @@ def iso_nanoseconds(text: str) -> int:
     return int(moment.timestamp()) * 10**9 + int((digits + "0" * 9)[:9])
 
 
-def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> Cells:
+def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> tuple[Cells, Sequence[str]]:
+    """The mapped cells, and the names of all columns."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = _split_comments(numbered)
     if not content:
@@ -196,7 +201,7 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> Cell
         rows.append(row)
         table.append(parts)
     wanted = [column for column in mapping.columns.values() if column in header]
-    return Cells(path, rows, {column: [parts[header.index(column)] for parts in table] for column in wanted})
+    return Cells(path, rows, {column: [parts[header.index(column)] for parts in table] for column in wanted}), header
 
 
 def _split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
@@ -227,12 +232,14 @@ def _require_columns(path: Path, needed: Sequence[str], header: Sequence[str], r
             raise InputError(f"{path}:{row}: has the column {quoted(column)} more than once")
 
 
-def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> tuple[Cells, int]:
-    """The objects of JSON lines (one object or a list of them per line) that have all ``needed`` columns."""
+def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> tuple[Cells, Collection[str], int]:
+    """The objects of JSON lines (one object or a list of them per line) that have all ``needed`` columns, all columns of these
+    objects, and the number of the others."""
     rows: list[int] = []
     columns: dict[str, list[str]] = {column: [] for column in mapping.columns.values()}
     passed, seen = 0, dict.fromkeys(columns, False)
     keys: list[str] = []
+    there: dict[str, None] = {}
     for row, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
@@ -244,6 +251,7 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) 
                 passed += 1
                 continue
             rows.append(row)
+            there |= dict.fromkeys(_paths(entry))
             for column, value in found.items():
                 if isinstance(value, (dict, list)):
                     raise bad_field(path, column, value, "a number or a text", row=row)
@@ -251,7 +259,7 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) 
     for column in needed:
         if passed and not seen[column]:
             raise InputError(f"{path}: no object has {quoted(column)}, the first has {listed(keys)}")
-    return Cells(path, rows, {column: values for column, values in columns.items() if seen[column]}), passed
+    return Cells(path, rows, {column: values for column, values in columns.items() if seen[column]}), there, passed
 
 
 def _objects(path: Path, row: int, line: str) -> list[dict[str, Any]]:

@@ -22,7 +22,7 @@ KINDS = {"stamp": pl.Int64, "whole": pl.Int64, "number": pl.Float64, "name": pl.
 class TableRows:
     """N rows of a table: ``t_ns`` (N,) integers; ``numbers`` by column (N,), NaN if empty; ``names`` by column, N texts.
 
-    ``rows`` (N,): line numbers in ``path`` (Parquet: rows from 1).
+    ``rows`` (N,): line numbers in ``path`` (Parquet: rows from 1). ``left_out``: other columns of the file.
     """
 
     path: Path
@@ -30,6 +30,7 @@ class TableRows:
     t_ns: Integers
     numbers: dict[str, Array]
     names: dict[str, list[str]]
+    left_out: tuple[str, ...] = ()
 
     def rows_at(self, which: Integers) -> Self:
         """The rows with indices ``which`` (M,), in that order."""
@@ -73,6 +74,7 @@ def _read_csv(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]
         _stamps(path, cells.rows, cells.columns[STAMP.name]),
         {c.name: cells.numbers(c.name, c) for c in told if c.kind in NUMBERS},
         {c.name: _texts(path, cells.rows, c, cells.columns[c.name]) for c in told if c.kind in NAMES},
+        tuple(name for name in cells.columns if name not in shape),
     )
 
 
@@ -130,4 +132,4 @@ def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Sh
         columns[name].require(path, rows, numbers[name])
     texts = [columns[name] for name in shape if columns[name].kind in NAMES]
     names = {c.name: _texts(path, rows.tolist(), c, text_column(frame, c.name, path)) for c in texts}
-    return TableRows(path, rows, t_ns, numbers, names)
+    return TableRows(path, rows, t_ns, numbers, names, tuple(name for name in frame.columns if name not in shape))

@@ -20,6 +20,7 @@ def test_events_of_an_r700_as_json_lines(hall, with_options, one):
     np.testing.assert_allclose((rfid.rssi[0], rfid.phase[0], rfid.frequency[0]), (-52.34, np.pi / 2, 866.3e6))
     assert list(rfid.antenna) == ["1", "2"]
     assert any("1 objects that are not reads are skipped" in line for line in log.warnings)
+    assert not any("columns" in line for line in log.warnings)  # of the objects that are read
 
 
 def test_reports_of_sllurp_with_several_reads_in_a_row(hall, with_options, one):
@@ -98,6 +99,9 @@ def test_reads_in_several_files(hall, one, refused):
     found = one(hall).streams["rfid"]
     assert found.epc == expected.epc
     np.testing.assert_array_equal(found.t, expected.t)
+    assert (
+        sum("reads-a.csv and 1 more files: columns that are not read: TID" in line for line in one(hall).warnings) == 1
+    )
     (folder / "reads-c.csv").write_text(READS + "soon,e2001,,1,-60,866.3,r,1,0,\n")
     refused(hall, "reads-c.csv:6", "soon")
     hall.write_text(MANIFEST.replace("reads.csv", "log-*.csv"))

@@ -39,6 +39,14 @@ def test_what_is_read(native, one):
     np.testing.assert_allclose(log.reference.poses, ((0, 0, 0), (0.25, 0, 0)))
 
 
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_columns_that_are_not_read_are_told(native, one, suffix):
+    table = pl.read_csv(native / "odometry.csv").with_columns(slip=0.0, note=pl.lit("ok"))
+    (native / "odometry.csv").unlink()
+    getattr(table, f"write_{suffix}")(native / f"odometry.{suffix}")
+    assert one(native).warnings == (f"{native}/odometry.{suffix}: columns that are not read: slip, note",)
+
+
 def test_the_run_file_names_the_log_too(native, one):
     assert one(native / "run.toml").name == "hall"
 

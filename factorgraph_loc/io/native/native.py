@@ -101,6 +101,8 @@ def read_tables(folder: Path, warnings: list[str]) -> dict[str, TableRows]:
             raise InputError(f"{folder}: holds both {files[0].name} and {files[1].name}, expected one of them")
         for file in files:
             rows = read_table(inside(folder, file.name, folder), descriptions)
+            if rows.left_out:
+                warnings.append(f"{file}: columns that are not read: {listed(rows.left_out)}")
             if len(rows.rows):
                 tables[name] = rows
             else:

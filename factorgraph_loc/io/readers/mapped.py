@@ -24,6 +24,7 @@ from factorgraph_loc.io.readers.mapped_poses import (
     read_reference,
 )
 from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_reads, read_inventories
+from factorgraph_loc.io.readers.unread import Unread
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.planar import Turned, about_z
 from factorgraph_loc.model.stream import Stream
@@ -84,15 +85,16 @@ def read(path: Path | None, options: Options) -> Log:
     if options.odometry is None:
         raise InputError(f"{path}: odometry is missing in [options], which every estimator needs")
     warnings: list[str] = []
+    unread = Unread()
     odometry_path = inside(path, options.odometry.file, path)
     times = _times(path, options.odometry)
-    odometry_t_ns, moves, increments = read_odometry(odometry_path, times, options.odometry, warnings)
+    odometry_t_ns, moves, increments = read_odometry(odometry_path, times, options.odometry, warnings, unread)
     tables = {
-        name: _table(inside(path, mapping.file, path), native_tables()[name][1][0], mapping, warnings)
+        name: _table(inside(path, mapping.file, path), native_tables()[name][1][0], mapping, warnings, unread)
         for name in ("imu", "camera", *OTHERS)
         if (mapping := getattr(options, name)) is not None
     }
-    rounds = _rounds(path, options, warnings)
+    rounds = _rounds(path, options, warnings, unread)
     stamps = [odometry_t_ns, *(table.t_ns for table in tables.values()), *([rounds.end_ns] if rounds else [])]
     t0_ns = min(int(t_ns.min()) for t_ns in stamps)
     streams: dict[str, Stream] = {"odometry": odometry_stream(odometry_t_ns, moves, increments, t0_ns)}
@@ -104,7 +106,7 @@ def read(path: Path | None, options: Options) -> Log:
         streams["rfid"] = rounds.stream(t0_ns)
     reference = None
     if (told := options.reference) is not None:
-        reference = read_reference(inside(path, told.file, path), _times(path, told), told, t0_ns, warnings)
+        reference = read_reference(inside(path, told.file, path), _times(path, told), told, t0_ns, warnings, unread)
         if reference.t[0] > (stamps[0][-1] - t0_ns) / 1e9 or reference.t[-1] < (stamps[0][0] - t0_ns) / 1e9:
             warnings.append(
                 f"{told.file}: the reference and the odometry do not overlap: t = {reference.t[0]:.3f} s and "
@@ -118,7 +120,7 @@ def read(path: Path | None, options: Options) -> Log:
         streams=streams,
         reference=reference,
         t0_ns=t0_ns,
-        warnings=tuple(warnings),
+        warnings=(*warnings, *unread.warnings()),
     )
 
 
@@ -127,12 +129,13 @@ def _times(folder: Path, told: PosesFile) -> Path | None:
     return None if told.times is None else inside(folder, told.times, folder)
 
 
-def _table(path: Path, table: Table, mapping: SensorFile, warnings: list[str]) -> TableRows:
+def _table(path: Path, table: Table, mapping: SensorFile, warnings: list[str], unread: Unread) -> TableRows:
     """A file as a table of the native format."""
     shapes, columns = _shapes(table), {column.name: column for column in table.columns}
     if isinstance(mapping, ImuFile):
         shapes, columns = (*shapes, ("t", *RATES)), columns | {name: replace(RATE, name=name) for name in RATES}
     mapped = read_mapped(path, mapping, shapes)
+    unread.note(mapped)
     if mapped.passed:
         warnings.append(f"{path}: {mapped.passed} objects without the columns of {table.name} are skipped")
     known = [columns[name] for name in mapped.fields if name != "t"]
@@ -162,7 +165,7 @@ def _about_z(mapped: Mapped, mapping: ImuFile, numbers: dict[str, Array]) -> Arr
     return numbers["w"]
 
 
-def _rounds(folder: Path, options: Options, warnings: list[str]) -> ReadsByRound | None:
+def _rounds(folder: Path, options: Options, warnings: list[str], unread: Unread) -> ReadsByRound | None:
     files = [options.rfid] if options.rfid else list(options.readers.values())
     if options.rfid and options.readers:
         raise InputError(f"{folder}: [options] has rfid and readers, expected one of them")
@@ -170,7 +173,7 @@ def _rounds(folder: Path, options: Options, warnings: list[str]) -> ReadsByRound
         if options.inventories is not None:
             raise InputError(f"{folder}: [options] has inventories without rfid")
         return None
-    tables = [read_all_reads(folder, told, warnings) for told in files]
+    tables = [read_all_reads(folder, told, warnings, unread) for told in files]
     reads = tables[0] if len(tables) == 1 else joined(folder, tables)
     gaps = {told.round_gap for told in files if told.round_gap is not None}
     inventories = None
@@ -179,7 +182,7 @@ def _rounds(folder: Path, options: Options, warnings: list[str]) -> ReadsByRound
             raise InputError(f"{folder}: round_gap has no effect with inventories, which define the rounds")
         antennas = {name: given for told in files for name, given in told.antennas.items()}
         path = inside(folder, mapping.file, folder)
-        inventories = read_inventories(path, mapping, mapping.clock_offset, antennas)
+        inventories = read_inventories(path, mapping, mapping.clock_offset, antennas, unread)
     if len(gaps) > 1:
         raise InputError(
             f"{folder}: readers have round_gap {', '.join(f'{gap:g}' for gap in sorted(gaps))}, expected one"

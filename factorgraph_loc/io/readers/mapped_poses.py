@@ -15,6 +15,7 @@ from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.readers import euroc
 from factorgraph_loc.io.readers.space_poses import read_kitti, read_poses
+from factorgraph_loc.io.readers.unread import Unread
 from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows
 from factorgraph_loc.sensors.odometry.columns import INCREMENTS, VELOCITIES, WAYS
@@ -60,7 +61,7 @@ class ReferenceFile(PosesFile):
 
 
 def read_odometry(
-    path: Path, times: Path | None, options: OdometryFile, warnings: list[str]
+    path: Path, times: Path | None, options: OdometryFile, warnings: list[str], unread: Unread
 ) -> tuple[Integers, Array, bool]:
     """Timestamps (N,), velocities (N, 2) or increments (N, 3), and whether these are increments. InputError names file and row."""
     if options.format != "columns" or times is not None:
@@ -69,6 +70,7 @@ def read_odometry(
         t_ns, poses = _in_format(path, times, options, warnings)
         return t_ns, after_rest(motions.between_poses(path, t_ns, poses, warnings)), True
     mapped = read_mapped(path, options, ODOMETRY)
+    unread.note(mapped)
     if ("left" in mapped.fields) != (options.track is not None):
         raise InputError(f"{path}: columns left and right, and track [m between the wheels], are needed together")
     t_ns, columns = _columns(mapped, options.clock_offset)
@@ -96,13 +98,14 @@ def odometry_stream(t_ns: Integers, values: Array, increments: bool, t0_ns: int)
 
 
 def read_reference(
-    path: Path, times: Path | None, options: ReferenceFile, t0_ns: int, warnings: list[str]
+    path: Path, times: Path | None, options: ReferenceFile, t0_ns: int, warnings: list[str], unread: Unread
 ) -> Trajectory:
     """The reference in seconds after ``t0_ns``; InputError names file and row of an invalid value."""
     if options.format != "columns" or times is not None:
         t_ns, poses = _in_format(path, times, options, warnings)
         return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=options.has_heading)
     mapped = read_mapped(path, options, (*POSES, ("t", "x", "y")))
+    unread.note(mapped)
     if "heading" not in mapped.fields and "qw" not in mapped.fields and options.has_heading:
         raise InputError(f"{path}: columns maps no heading: set has_heading = false if there is none")
     t_ns, columns = _columns(mapped, options.clock_offset)

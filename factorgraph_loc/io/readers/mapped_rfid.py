@@ -14,6 +14,7 @@ from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, Mapped,
 from factorgraph_loc.files.columns import PURE, Column
 from factorgraph_loc.files.models import FileModel, InUnit, inside
 from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.io.readers.unread import Unread
 from factorgraph_loc.sensors.rfid.columns import INVENTORIES, RFID
 from factorgraph_loc.sensors.rfid.tables import check_reads
 from factorgraph_loc.text import quoted
@@ -117,10 +118,10 @@ class RfidFile(ColumnMapping):
         return {**content, "columns": columns, "units": units}
 
 
-def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> TableRows:
+def read_all_reads(folder: Path, options: RfidFile, warnings: list[str], unread: Unread) -> TableRows:
     """The reads of the file in ``folder``, or of all files that match a name with ``*``."""
     if "*" not in options.file:
-        return read_reads(inside(folder, options.file, folder), options, warnings)
+        return read_reads(inside(folder, options.file, folder), options, warnings, unread)
     inside(folder, options.file.replace("*", "x"), folder)
     with bounded.foreign(folder, f"rfid.file is {options.file[:80]!r}"):  # patterns that pathlib rejects
         files = sorted(file for file in folder.glob(options.file) if file.is_file())
@@ -128,7 +129,10 @@ def read_all_reads(folder: Path, options: RfidFile, warnings: list[str]) -> Tabl
         raise InputError(f"{folder}: rfid.file is {quoted(options.file)}, expected the names of existing files")
     return joined(
         folder / options.file,
-        [read_reads(inside(folder, str(file.relative_to(folder)), folder), options, warnings) for file in files],
+        [
+            read_reads(inside(folder, str(file.relative_to(folder)), folder), options, warnings, unread)
+            for file in files
+        ],
     )
 
 
@@ -148,7 +152,7 @@ def _together(path: Path, tables: Sequence[TableRows]) -> TableRows:
     )
 
 
-def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> TableRows:
+def read_reads(path: Path, options: RfidFile, warnings: list[str], unread: Unread) -> TableRows:
     """The reads as the table ``rfid`` of the native format. InputError names file, row and column.
 
     A row that summarizes several reads gives two, the first one with the measured values; the times of the others are unknown.
@@ -161,6 +165,7 @@ def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> TableRows:
         raise InputError(f"{path}: columns maps frequency and channel, expected one of them")
     shape = REQUIRED[0] if options.antenna is None else REQUIRED[1]
     mapped = read_mapped(path, options, (shape,), OPTIONAL)
+    unread.note(mapped)
     if mapped.passed:
         warnings.append(f"{path}: {mapped.passed} objects that are not reads are skipped")
     t_ns = mapped.stamps("t", options.clock_offset)
@@ -179,9 +184,12 @@ def read_reads(path: Path, options: RfidFile, warnings: list[str]) -> TableRows:
     return joined(path, [_with_last(table, mapped, options, warnings)])
 
 
-def read_inventories(path: Path, mapping: ColumnMapping, offset: float, antennas: Mapping[str, str]) -> TableRows:
+def read_inventories(
+    path: Path, mapping: ColumnMapping, offset: float, antennas: Mapping[str, str], unread: Unread
+) -> TableRows:
     """The rounds as the table ``inventories`` of the native format; ``antennas`` as for the reads."""
     mapped = read_mapped(path, mapping, (("t", "antenna", "duration"),))
+    unread.note(mapped)
     names = [antennas.get(name, name) for name in mapped.names(RFID["antenna"])]
     duration = mapped.numbers("duration", INVENTORIES["duration"])
     return TableRows(path, mapped.rows, mapped.stamps("t", offset), {"duration": duration}, {"antenna": names})
