@@ -32,6 +32,7 @@ MOST_DIGITS = 20  # of a timestamp before its decimal point
 LEAST_UNIT = 1e-12  # minimum factor to our unit; the maximum is its reciprocal
 
 EpcCase = Literal["as written", "upper", "lower"]
+Alternatives = tuple[str, ...]  # columns of which one must be there
 
 
 class ColumnMapping(FileModel):
@@ -131,11 +132,16 @@ class Mapped:
 
 
 def read_mapped(
-    path: Path, mapping: ColumnMapping, shapes: Sequence[Collection[str]], optional: Collection[str] = ()
+    path: Path,
+    mapping: ColumnMapping,
+    shapes: Sequence[Collection[str]],
+    optional: Collection[str] = (),
+    either: Collection[str] = (),
 ) -> Mapped:
     """Read the rows of a file whose mapped fields are those of one of ``shapes``, and perhaps some of ``optional``.
 
-    The column of an optional field may be missing. InputError names file, row and column of invalid values.
+    The column of an optional field may be missing, but not those of all mapped fields of ``either``. InputError names file, row and
+    column of invalid values.
     """
     given = set(mapping.columns)
     known = set(optional).union(*shapes)
@@ -146,7 +152,11 @@ def read_mapped(
         raise InputError(f"{path}: columns maps {listed(sorted(given)) or 'nothing'}, expected {expected}")
     if stray := sorted(set(mapping.units) - given):
         raise InputError(f"{path}: units.{stray[0]} belongs to no field of columns")
-    needed = [column for field, column in mapping.columns.items() if field not in optional]
+    needed: list[Alternatives] = [
+        (column,) for field, column in mapping.columns.items() if field not in (*optional, *either)
+    ]
+    if either:
+        needed.append(tuple(mapping.columns[field] for field in either if field in given))
     if path.suffix.lower() in JSON_SUFFIXES:
         cells, there, passed = _read_json_lines(path, mapping, needed)
     else:
@@ -177,7 +187,7 @@ def iso_nanoseconds(text: str) -> int:
     return int(moment.timestamp()) * 10**9 + int((digits + "0" * 9)[:9])
 
 
-def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> tuple[Cells, Sequence[str]]:
+def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> tuple[Cells, Sequence[str]]:
     """The mapped cells, and the names of all columns."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = _split_comments(numbered)
@@ -190,7 +200,7 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> tupl
     else:
         named = next(_cells_of(path, comments[-1:], mapping.separator), (0, []))[1]
         # a comment with as many names as there are columns is the header, unless the first row contains the names
-        in_comment = set(needed) <= set(named) or (len(named) == len(first) and not set(needed) <= set(first))
+        in_comment = _has(named, needed) or (len(named) == len(first) and not _has(first, needed))
         header = named if in_comment else first
     _require_columns(path, needed, header, first_row)
     rows, table = [], []
@@ -224,15 +234,21 @@ def _cells_of(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> I
         raise InputError(f"{path}:{lines[reader.line_num - 1][0]}: is not CSV: {told(error)}") from error
 
 
-def _require_columns(path: Path, needed: Sequence[str], header: Sequence[str], row: int) -> None:
-    for column in needed:
-        if column not in header:
-            raise InputError(f"{path}:{row}: has no column {quoted(column)}, it has {listed(header)}")
-        if list(header).count(column) > 1:
-            raise InputError(f"{path}:{row}: has the column {quoted(column)} more than once")
+def _has(names: Collection[str], needed: Sequence[Alternatives]) -> bool:
+    return all(any(column in names for column in columns) for columns in needed)
 
 
-def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) -> tuple[Cells, Collection[str], int]:
+def _require_columns(path: Path, needed: Sequence[Alternatives], header: Sequence[str], row: int) -> None:
+    for columns in needed:
+        if not _has(header, [columns]):
+            raise InputError(f"{path}:{row}: has no column {quoted(columns[0])}, it has {listed(header)}")
+        if twice := [column for column in columns if list(header).count(column) > 1]:
+            raise InputError(f"{path}:{row}: has the column {quoted(twice[0])} more than once")
+
+
+def _read_json_lines(
+    path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
+) -> tuple[Cells, Collection[str], int]:
     """The objects of JSON lines (one object or a list of them per line) that have all ``needed`` columns, all columns of these
     objects, and the number of the others."""
     rows: list[int] = []
@@ -247,7 +263,7 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) 
             found = {column: _at(entry, column) for column in columns}
             keys = keys or sorted(_paths(entry))
             seen |= {column: True for column, value in found.items() if value is not None}
-            if any(found[column] is None for column in needed):
+            if not _has([column for column, value in found.items() if value is not None], needed):
                 passed += 1
                 continue
             rows.append(row)
@@ -256,9 +272,9 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[str]) 
                 if isinstance(value, (dict, list)):
                     raise bad_field(path, column, value, "a number or a text", row=row)
                 columns[column].append("" if value is None else well_formed(str(value)))
-    for column in needed:
-        if passed and not seen[column]:
-            raise InputError(f"{path}: no object has {quoted(column)}, the first has {listed(keys)}")
+    for alternatives in needed:
+        if passed and not any(seen[column] for column in alternatives):
+            raise InputError(f"{path}: no object has {quoted(alternatives[0])}, the first has {listed(keys)}")
     return Cells(path, rows, {column: values for column, values in columns.items() if seen[column]}), there, passed
 
 

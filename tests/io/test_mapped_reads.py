@@ -23,6 +23,58 @@ def test_events_of_an_r700_as_json_lines(hall, with_options, one):
     assert not any("columns" in line for line in log.warnings)  # of the objects that are read
 
 
+def test_events_of_an_r700_with_epcs_in_base64(hall, with_options, one, refused):
+    """The fields of an event as the reader's IoT device interface writes it."""
+    event = {
+        "timestamp": "1970-01-01T00:00:01.277766184Z",
+        "hostname": "impinj-14-2f-f4",
+        "eventType": "tagInventory",
+        "tagInventoryEvent": {
+            "epc": "4sRRo6UBH6APNUaT",
+            "tidHex": "E2C451A32000269379AAFD00",
+            "antennaPort": 2,
+            "peakRssiCdbm": -5750,
+            "frequency": 921625,
+            "transmitPowerCdbm": 1000,
+            "lastSeenTime": "1970-01-01T00:00:01.225324Z",
+            "phaseAngle": 208.82,
+        },
+    }
+
+    def manifest(*epcs):
+        lines = [json.dumps(event | {"tagInventoryEvent": event["tagInventoryEvent"] | epc}) for epc in epcs]
+        (hall.parent / "run" / "events.json").write_text("\n".join(lines))
+        return with_options(f'{WHEELS}\n[options.rfid]\nfile = "events.json"\npreset = "impinj_iot"\n')
+
+    log = one(manifest({}))
+    rfid = log.streams["rfid"]
+    assert rfid.epc == ["E2C451A3A5011FA00F354693"]
+    np.testing.assert_allclose(rfid.t - rfid.age, 0.277766184, rtol=0, atol=1e-9)
+    np.testing.assert_allclose((rfid.phase[0], rfid.frequency[0]), (np.radians(208.82), 921.625e6))
+    (told,) = (line for line in log.warnings if "not read" in line)
+    for name in ("hostname", "tagInventoryEvent.lastSeenTime", "tagInventoryEvent.transmitPowerCdbm"):
+        assert name in told
+    assert one(manifest({"epc": "-_8"}, {"epc": "+/8="}, {"epcHex": "AB"})).streams["rfid"].epc == [
+        "FBFF",
+        "FBFF",
+        "AB",
+    ]
+    refused(manifest({"epc": "a"}), "events.json:1", "tagInventoryEvent.epc is 'a', expected an EPC in base64")
+    refused(manifest({}, {"epc": ""}), "events.json:2", "tagInventoryEvent.epc is '', expected the EPC of a tag")
+    refused(manifest({"epc": None}), "no object has 'tagInventoryEvent.epcHex', the first has eventType, hostname")
+
+
+def test_phases_and_channels_in_rows_of_sllurp(hall, with_options, one):
+    rows = "timestamp,reader,antenna,rssi,epc,phase_angle,channel_index\n1.15,r:5084,1,-60,aa,1024,3\n1.2,r:5084,1,-60,aa,,\n"
+    (hall.parent / "run" / "log.csv").write_text(rows)
+    options = f'{WHEELS}\n[options.rfid]\nfile = "log.csv"\npreset = "sllurp_log"\n'
+    plain = one(with_options(options))
+    np.testing.assert_allclose(plain.streams["rfid"].phase, (np.pi / 2, np.nan))
+    assert any("columns that are not read: reader, channel_index" in line for line in plain.warnings)
+    tuned = one(with_options(options + "channels = { first = 902.75, step = 0.5 }\n"))
+    np.testing.assert_allclose(tuned.streams["rfid"].frequency, (903.75e6, np.nan))
+
+
 def test_reports_of_sllurp_with_several_reads_in_a_row(hall, with_options, one):
     report = {
         "EPC": "b'e2001'",

@@ -1,5 +1,6 @@
 """RFID reads from mapped CSV or JSON lines of readers and their tools, with presets."""
 
+import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,10 +22,12 @@ from factorgraph_loc.text import quoted
 from factors.se2 import Array
 
 SIGNALS = ("rssi", "phase", "frequency")
-OPTIONAL = (*SIGNALS, "channel", "last", "count")
+EPCS = ("epc", "epc_base64")
+OPTIONAL = (*SIGNALS, *EPCS, "channel", "last", "count")
 CHANNEL = Column("channel", "whole", PURE, 1.0, 1000.0, True, "the number of a channel")
 COUNT = Column("count", "number", PURE, 0.0, 1e9, True, "number of reads in the row")
-REQUIRED = (("t", "epc", "antenna"), ("t", "epc"))
+REQUIRED = tuple(tuple(("t", epc, *antenna) for epc in EPCS) for antenna in (("antenna",), ()))
+STANDARD = str.maketrans("-_", "+/")  # from the alphabet of base64 for addresses
 
 # Formats of tools. ``impinj_itemtest``: CSV of ItemTest; ``impinj_iot``: event stream of an R700; ``sllurp_log``: output of
 # ``sllurp log``; ``sllurp_reports``: its tag reports as JSON, with timestamps and phases of LLRP.
@@ -44,6 +47,7 @@ PRESETS: dict[str, dict[str, dict[str, str]]] = {
         "columns": {
             "t": "timestamp",
             "epc": "tagInventoryEvent.epcHex",
+            "epc_base64": "tagInventoryEvent.epc",
             "antenna": "tagInventoryEvent.antennaPort",
             "rssi": "tagInventoryEvent.peakRssiCdbm",
             "phase": "tagInventoryEvent.phaseAngle",
@@ -52,8 +56,15 @@ PRESETS: dict[str, dict[str, dict[str, str]]] = {
         "units": {"t": "iso", "rssi": "cdBm", "phase": "deg", "frequency": "kHz"},
     },
     "sllurp_log": {
-        "columns": {"t": "timestamp", "epc": "epc", "antenna": "antenna", "rssi": "rssi"},
-        "units": {"t": "s"},
+        "columns": {
+            "t": "timestamp",
+            "epc": "epc",
+            "antenna": "antenna",
+            "rssi": "rssi",
+            "phase": "phase_angle",
+            "channel": "channel_index",
+        },
+        "units": {"t": "s", "phase": "turn/4096"},
     },
     "sllurp_reports": {
         "columns": {
@@ -81,8 +92,8 @@ class Channels(FileModel):
 
 
 class RfidFile(ColumnMapping):
-    """``columns``: t (or the first of several reads), epc, antenna, rssi, phase, frequency or channel, and, if a row summarizes
-    several reads, ``last`` and ``count``."""
+    """``columns``: t (or the first of several reads), epc or epc_base64, antenna, rssi, phase, frequency or channel, and, if a row
+    summarizes several reads, ``last`` and ``count``."""
 
     columns: dict[str, str] = Field(default_factory=dict)
     """column of the file for each field, besides those of the preset"""
@@ -163,8 +174,8 @@ def read_reads(path: Path, options: RfidFile, warnings: list[str], unread: Unrea
         raise InputError(f"{path}: columns.channel and channels, the frequencies [MHz], are needed together")
     if {"channel", "frequency"} <= set(options.columns):
         raise InputError(f"{path}: columns maps frequency and channel, expected one of them")
-    shape = REQUIRED[0] if options.antenna is None else REQUIRED[1]
-    mapped = read_mapped(path, options, (shape,), OPTIONAL)
+    shapes = REQUIRED[0] if options.antenna is None else REQUIRED[1]
+    mapped = read_mapped(path, options, shapes, OPTIONAL, EPCS)
     unread.note(mapped)
     if mapped.passed:
         warnings.append(f"{path}: {mapped.passed} objects that are not reads are skipped")
@@ -200,9 +211,25 @@ def _signal(mapped: Mapped, name: str) -> Array:
 
 
 def _epcs(mapped: Mapped, case: EpcCase) -> list[str]:
-    """EPCs in the notation of the map: without the Python bytes marks of some sllurp versions."""
-    plain = [text[2:-1] if text.startswith("b'") and text.endswith("'") else text for text in mapped.names(RFID["epc"])]
+    """EPCs in the notation of the map: hexadecimal, without the Python bytes marks of some sllurp versions."""
+    texts = list(mapped.texts("epc")) if "epc" in mapped.fields else [""] * len(mapped.rows)
+    if "epc_base64" in mapped.fields:
+        coded = mapped.texts("epc_base64")
+        texts = [text or _from_base64(mapped, i, coded[i]) for i, text in enumerate(texts)]
+    if "" in texts:
+        column = mapped.mapping.columns["epc" if "epc" in mapped.fields else "epc_base64"]
+        raise bad_field(mapped.path, column, "", RFID["epc"].doc, row=mapped.cells.rows[texts.index("")])
+    plain = [text[2:-1] if text.startswith("b'") and text.endswith("'") else text for text in texts]
     return in_case(plain, case)
+
+
+def _from_base64(mapped: Mapped, i: int, text: str) -> str:
+    """The EPC in row ``i`` in hexadecimal, in upper case as Impinj's readers write it."""
+    try:
+        return base64.b64decode(text.translate(STANDARD) + "=" * (-len(text) % 4), validate=True).hex().upper()
+    except ValueError:
+        column = mapped.mapping.columns["epc_base64"]
+        raise bad_field(mapped.path, column, text, "an EPC in base64", row=mapped.cells.rows[i]) from None
 
 
 def _frequencies(mapped: Mapped, channels: tuple[float, ...] | Channels | None) -> Array:
