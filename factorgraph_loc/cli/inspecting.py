@@ -21,6 +21,7 @@ from factorgraph_loc.cli.options import (
     RigFile,
     WorldFile,
 )
+from factorgraph_loc.errors import InputError
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.inspect import Inspection, StreamSummary
@@ -53,6 +54,10 @@ def info(
     data_root: DataRoot = None,
     rig: RigFile = None,
     world: WorldFile = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="Picture (PNG) of the log from above; not of a ROS bag."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Summarize a log, with warnings about its content; for a ROS bag, its topics."""
@@ -69,6 +74,8 @@ def info(
         for fault in verify(read_manifest(known[log]), data_root):
             show.note(f"warning: {fault}")
     logs = LogOptions(reader, reader_option, data_root, rig, world).load([log])
+    if out is not None:
+        _draw(logs, out)
     inspections = [inspect(loaded) for loaded in logs]
     if json:
         documents = [_document(loaded, found) for loaded, found in zip(logs, inspections, strict=True)]
@@ -78,6 +85,9 @@ def info(
         if i:
             show.line()
         _print(loaded, found)
+    if out is not None:
+        show.line()
+        show.line(f"wrote {out}")
 
 
 def convert(
@@ -105,6 +115,25 @@ def convert(
         show.document({"log": loaded.name, "folder": str(files[0].parent), "files": names})
     else:
         show.line(f"wrote {out}")
+
+
+def _draw(logs: list[Log], path: Path) -> None:
+    """Write the picture of the only log. Raises InputError for several, and for a path that is no PNG file."""
+    from factorgraph_loc.drawing.figures import save
+    from factorgraph_loc.evaluation.plots import overview
+    from factorgraph_loc.experiments.run import RunConfig, run
+    from factorgraph_loc.files.models import replacing
+    from factorgraph_loc.sensors.registry import moving
+
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path}: expected a name that ends in .png")
+    if len(logs) != 1:
+        raise InputError(f"-o: there are {len(logs)} logs, expected one to draw")
+    (log,) = logs
+    odometry = run(log, RunConfig("dead_reckoning")).final if moving(tuple(log.streams), "floor") else None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        save(overview(log, odometry), temporary)
 
 
 def _print(log: Log, found: Inspection) -> None:

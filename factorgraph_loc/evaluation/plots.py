@@ -15,7 +15,7 @@ from factorgraph_loc.evaluation.metrics import Errors, errors
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.marks import marks
+from factorgraph_loc.sensors.marks import Marks, marks
 from factors.se2 import Array
 
 if TYPE_CHECKING:
@@ -87,33 +87,31 @@ def _write(figures: Mapping[str, Figure], folder: Path, name: str) -> list[Path]
 
 def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
     """Causal and final trajectories with walls, map objects and reference; the axes fit map and reference."""
-    walls, layers = np.array(log.world.walls).reshape(-1, 2, 2), [m for m in marks(log) if not m.dense]
-    view = _view(np.concatenate((*(m.positions[:, :2] for m in layers), walls.reshape(-1, 2))), log.reference)
-    height = 8.5 if view is None else float(np.clip(7.0 * np.divide(*(view[1] - view[0])[::-1]) + 1.5, 5.0, 14.0))
+    view, height = _room(log)
     figure, axes = grid(1, 2, height, f"{log.name}: trajectories")
     for i, axis in enumerate(axes[0]):
-        if log.reference is not None:
-            axis.plot(*way(log.reference).T, color="0.75", linewidth=4.0, label="reference", zorder=1)
-        if len(walls):
-            axis.plot(*_joined(walls).T, color="0.45", linewidth=1.0, label="walls", zorder=1)
-        for m in sorted(layers, key=lambda m: m.order):
-            if len(m.positions):
-                look: dict[str, Any] = {"markersize": m.size, "label": m.layer, "zorder": m.order}
-                axis.plot(*m.positions[:, :2].T, f"k{m.marker}", markerfacecolor="none", **look)
+        _map(axis, log, view)
         for (estimator, track), style in zip(tracks.items(), styles(), strict=False):
             kind, trajectory = track.kinds()[i]
             if trajectory is not None:
                 axis.plot(*way(trajectory).T, label=estimator, linewidth=1.2, zorder=3, **style)
                 axis.plot(*trajectory.poses[0, :2], "o", color=style["color"], markersize=5, zorder=4)
             axis.set_title(f"{kind} (dot: start)")
-        axis.set_aspect("equal", adjustable="box")
-        axis.set_xlabel("x [m]")
-        axis.set_ylabel("y [m]")
-        if view is not None:
-            axis.set_xlim(view[0, 0], view[1, 0])
-            axis.set_ylim(view[0, 1], view[1, 1])
     legend(figure, axes[0])
     lay_out(figure)  # the first layout changes the axes, and their labels would overlap the legend
+    return figure
+
+
+def overview(log: Log, odometry: Trajectory | None) -> Figure:
+    """A log from above: its map and reference, and where the ``odometry`` alone leads from the start, if there is any."""
+    view, height = _room(log)
+    figure, axes = grid(1, 1, height, log.name)
+    _map(axes[0, 0], log, view)
+    if odometry is not None and len(odometry):
+        axes[0, 0].plot(*way(odometry).T, label="odometry", linewidth=1.2, zorder=3, color=COLOURS[0])
+        axes[0, 0].plot(*odometry.poses[0, :2], "o", label="start", color=COLOURS[0], markersize=5, zorder=4)
+    legend(figure, axes[0])
+    lay_out(figure)
     return figure
 
 
@@ -178,6 +176,37 @@ def update_times(log: Log, tracks: Mapping[str, Track]) -> Figure:
     axis.set_ylabel("share of updates below")
     legend(figure, axes[0])
     return figure
+
+
+def _map(axis: Axes, log: Log, view: Array | None) -> None:
+    """Draw walls, map objects and reference; ``view`` (2, 2): lower and upper corner of the axes, None for all that is drawn."""
+    if log.reference is not None:
+        axis.plot(*way(log.reference).T, color="0.75", linewidth=4.0, label="reference", zorder=1)
+    walls = np.array(log.world.walls).reshape(-1, 2, 2)
+    if len(walls):
+        axis.plot(*_joined(walls).T, color="0.45", linewidth=1.0, label="walls", zorder=1)
+    for m in sorted(_layers(log), key=lambda m: m.order):
+        if len(m.positions):
+            look: dict[str, Any] = {"markersize": m.size, "label": m.layer, "zorder": m.order}
+            axis.plot(*m.positions[:, :2].T, f"k{m.marker}", markerfacecolor="none", **look)
+    axis.set_aspect("equal", adjustable="box")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    if view is not None:
+        axis.set_xlim(view[0, 0], view[1, 0])
+        axis.set_ylim(view[0, 1], view[1, 1])
+
+
+def _layers(log: Log) -> list[Marks]:
+    """The map objects that are drawn one by one."""
+    return [m for m in marks(log) if not m.dense]
+
+
+def _room(log: Log) -> tuple[Array | None, float]:
+    """The part of the plane that is drawn, and the height of the figure."""
+    places = (*(m.positions[:, :2] for m in _layers(log)), np.array(log.world.walls).reshape(-1, 2))
+    view = _view(np.concatenate(places), log.reference)
+    return view, 8.5 if view is None else float(np.clip(7.0 * np.divide(*(view[1] - view[0])[::-1]) + 1.5, 5.0, 14.0))
 
 
 def _joined(segments: Array) -> Array:

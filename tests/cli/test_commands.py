@@ -9,6 +9,7 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import polars as pl
 import pytest
@@ -383,3 +384,14 @@ def test_info_says_when_a_file_is_not_the_one_of_the_manifest(fgloc, data_root, 
     assert result.exit_code == 0
     assert "Barcodes.dat: is not the file that the manifest describes" in result.stderr
     assert "sha256" not in fgloc("info", "mrclam6-robot1", "--data-root", str(data_root)).stderr
+
+
+def test_info_draws_a_log(fgloc, short_log, tmp_path):
+    picture = tmp_path / "new" / "log.png"
+    result = fgloc("info", short_log, "-o", picture)
+    assert result.exit_code == 0
+    assert result.stdout.endswith(f"wrote {picture}\n")
+    assert cv2.imread(str(picture)).shape[1] == 1600
+    refused = fgloc("info", short_log, "-o", tmp_path / "log.pdf")
+    assert refused.exit_code == 2
+    assert "log.pdf: expected a name that ends in .png" in refused.stderr

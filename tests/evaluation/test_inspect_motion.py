@@ -125,6 +125,30 @@ def test_a_reference_that_is_shorter_than_the_log_is_told(log):
     assert "the reference has no pose while there is odometry" in motion_problems(beside)
 
 
+@pytest.mark.parametrize(("factors", "what"), [((1.3, 1.0), "travels 1.30"), ((1.0, 0.8), "turns 0.80")])
+def test_a_scale_that_is_off_is_told(log, factors, what):
+    moved = log.streams["odometry"]
+    scaled = replace(moved, v=moved.v / factors[0], w=moved.w / factors[1])
+    off = replace(log, streams={"odometry": scaled})
+    (line,) = motion_problems(off)
+    assert line.startswith(f"the reference {what} times as much as the odometry (scale_")
+    scales = OdometrySettings(scale_distance=factors[0], scale_rotation=factors[1])
+    assert motion_problems(replace(off, rig=Rig(odometry=scales))) == []
+
+
+def test_the_scales_of_a_log_that_fits_are_one(log):
+    found = inspect(log).found
+    assert found["odometry.travels_ratio"] == pytest.approx(1.0, abs=0.01)
+    assert found["odometry.turns_ratio"] == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_reference_that_stands_still_meanwhile_is_told(log):
+    poses = log.reference.poses.copy()
+    poses[(log.reference.t > 43.0) & (log.reference.t < 53.0), :] = poses[430]
+    lines = motion_problems(replace(log, reference=Trajectory(log.reference.t, poses)))
+    assert "the reference stands still at 43.0 s, where the odometry drives" in lines[-1]
+
+
 def test_noise_at_rest_tells_nothing(log):
     rng = np.random.default_rng(2)
     t = log.streams["odometry"].t

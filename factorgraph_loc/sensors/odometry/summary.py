@@ -3,6 +3,7 @@
 Turn rates, or speeds if the reference has no headings, are compared at various time shifts.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,13 +15,21 @@ from factorgraph_loc.sensors.clock_shift import BETTER, FEWEST, LARGE, SHIFTS, S
 from factorgraph_loc.sensors.odometry.calibration.windows import integrated
 from factorgraph_loc.sensors.odometry.model import odometry_model
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
-from factorgraph_loc.sensors.summary import Summary
+from factorgraph_loc.sensors.summary import Paragraph, Summary
+from factors import se2
 from factors.se2 import Array
 
 WINDOW = 0.2  # s; minimum time over which a rate is averaged
 MOVES = 0.03  # rad/s and m/s: minimum root mean square of rates
 ALIKE = 0.6  # minimum correlation of equal motion
 DEGREES = (20.0, 150.0)  # range of the slope if one rate is in degrees
+CHORD = 2.0  # s over which distances and turns are compared
+SCALED = 0.1  # relative difference above which a scale is doubtful
+STANDS, DRIVES = (
+    0.02,
+    0.5,
+)  # m of a reference that stands still and of odometry that drives meanwhile, in a window of STILL
+STILL = 5.0  # s
 COVERED = 0.9  # minimum share of a log that the reference should cover
 
 
@@ -33,8 +42,66 @@ class RateMatch:
 
 
 def summarize(log: Log) -> Summary:
-    """Warnings about the odometry of a log."""
-    return Summary(problems=motion_problems(log))
+    """Warnings about the odometry of a log, and its scales against the reference."""
+    ratios, still = against_reference(log)
+    problems = [*motion_problems(log), *still]
+    text = [
+        Paragraph(f"the reference {what} {ratio:.3f} times as much as the odometry") for what, ratio in ratios.items()
+    ]
+    found = {f"odometry.{what}_ratio": ratio for what, ratio in ratios.items()}
+    return Summary(found=found, problems=problems or _doubtful(ratios), text=text)
+
+
+def against_reference(log: Log) -> tuple[dict[str, float], list[str]]:
+    """How much more the reference ``travels`` and ``turns`` than the odometry, as the rig corrects it, by least squares over
+    intervals of :data:`CHORD`; and a warning if the reference stands still meanwhile. Nothing without motion.
+    """
+    stream, reference = log.streams.get("odometry"), log.reference
+    if reference is None or not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
+        return {}, []
+    begin, end = _longest(stream.t)
+    pause = float(np.median(np.diff(reference.t))) if len(reference.t) > 1 else np.inf
+    if pause > SLOWEST or end - begin < STILL:
+        return {}, []
+    t = np.arange(begin, end, CHORD / 4.0) + log.rig.time_offset("odometry")
+    states, poses = integrated(log, odometry_model(log.rig)).states(t), reference.at(t, max_gap=3.0 * pause)
+    ratios = {"travels": _ratio(_chords(poses[:, :2], 4), _chords(states[:, 1:3], 4))}
+    if reference.has_heading:
+        ratios["turns"] = _ratio(se2.wrap(poses[4:, 2] - poses[:-4, 2]), se2.wrap(states[4:, 3] - states[:-4, 3]))
+    known = {what: ratio for what, ratio in ratios.items() if ratio is not None}
+    return known, _standstill(t, states[:, 1:3], poses[:, :2])
+
+
+def _ratio(theirs: Array, ours: Array) -> float | None:
+    """The least-squares ratio of ``theirs`` (N,), NaN where unknown, to ``ours`` (N,), None without motion."""
+    known = np.isfinite(theirs)
+    moved = float(ours[known] @ ours[known])
+    return float(ours[known] @ theirs[known]) / moved if moved > 1.0 else None
+
+
+def _doubtful(ratios: Mapping[str, float]) -> list[str]:
+    """Warnings about scales that differ; a sign or a unit that is wrong is told by the rates."""
+    keys = {"travels": "scale_distance", "turns": "scale_rotation"}
+    return [
+        f"the reference {what} {ratio:.2f} times as much as the odometry ({keys[what]}, or fgloc calibrate)"
+        for what, ratio in ratios.items()
+        if 0.5 < ratio < 1.0 - SCALED or 1.0 + SCALED < ratio < 2.0
+    ]
+
+
+def _standstill(t: Array, ours: Array, theirs: Array) -> list[str]:
+    """A warning if the reference stands still while the odometry drives, at places (N, 2) each."""
+    steps = round(STILL / (CHORD / 4.0))
+    stuck = np.flatnonzero((_chords(theirs, steps) < STANDS) & (_chords(ours, steps) > DRIVES))
+    if not len(stuck):
+        return []
+    first, far = float(t[stuck[0]]), float(np.max(_chords(ours, steps)[stuck]))
+    return [f"the reference stands still at {first:.1f} s, where the odometry drives {far:.1f} m in {STILL:g} s"]
+
+
+def _chords(places: Array, steps: int) -> Array:
+    """Distances (N - steps,) between places (N, 2) that many ``steps`` apart."""
+    return np.asarray(np.hypot(*(places[steps:] - places[:-steps]).T))
 
 
 def motion_problems(log: Log) -> list[str]:
