@@ -15,7 +15,7 @@ STATES = {"particle filter": RunConfig("particle_filter"), "smoother": RunConfig
 BOTH = STATES | {
     label + NOISE: RunConfig(config.estimator, {"self_calibration": False}) for label, config in STATES.items()
 }
-PRESETS = {"office": (25, BOTH), "sparse": (25, BOTH), "bursty": (10, STATES)}  # number of worlds, runs in each
+PRESETS = {"office": (5, BOTH), "sparse": (5, BOTH), "bursty": (3, STATES)}  # number of worlds, runs in each
 # causal RMSE m, heading degrees, final RMSE m, heading degrees, final p95 m of a reference implementation
 ANCHORS = {
     ("office", "with the constants as states"): ("0.089", "2.2", "0.052", "1.3", "0.092"),
