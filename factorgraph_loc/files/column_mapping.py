@@ -33,6 +33,7 @@ LEAST_UNIT = 1e-12  # minimum factor to our unit; the maximum is its reciprocal
 
 EpcCase = Literal["as written", "upper", "lower"]
 Alternatives = tuple[str, ...]  # columns of which one must be there
+Value = bool | int | str
 
 
 class ColumnMapping(FileModel):
@@ -51,18 +52,28 @@ class ColumnMapping(FileModel):
     """decimal mark"""
     header: bool = True
     """whether the first row has the names of the columns"""
+    where: dict[str, Value | tuple[Value, ...]] = Field(default_factory=dict)
+    """value, or possible values, that columns of the file have in the rows to read"""
+
+    def chosen(self) -> dict[str, set[str]]:
+        """The values of ``where`` as the text of cells."""
+        return {
+            column: {_text(value) for value in (values if isinstance(values, tuple) else (values,))}
+            for column, values in self.where.items()
+        }
 
 
 @dataclass(frozen=True)
 class Mapped:
     """N rows of a file by ``fields``; ``passed``: number of skipped JSON objects, which have none of the fields; ``left_out``:
-    columns of the file that are not mapped."""
+    columns of the file that are not mapped; ``unwanted``: number of other rows than those of ``where``."""
 
     cells: Cells
     mapping: ColumnMapping
     fields: tuple[str, ...]
     passed: int = 0
     left_out: tuple[str, ...] = ()
+    unwanted: int = 0
 
     @property
     def path(self) -> Path:
@@ -158,14 +169,15 @@ def read_mapped(
     if either:
         needed.append(tuple(mapping.columns[field] for field in either if field in given))
     if path.suffix.lower() in JSON_SUFFIXES:
-        cells, there, passed = _read_json_lines(path, mapping, needed)
+        cells, there, passed, unwanted = _read_json_lines(path, mapping, needed)
     else:
-        cells, there = _read_csv(path, mapping, needed)
+        cells, there, unwanted = _read_csv(path, mapping, needed)
         passed = 0
     if not cells.rows:
-        raise InputError(f"{path}: contains no rows")
+        raise InputError(f"{path}: contains no rows{' as chosen by where' if mapping.where else ''}")
     fields = tuple(field for field, column in mapping.columns.items() if column in cells.columns)
-    return Mapped(cells, mapping, fields, passed, tuple(name for name in there if name not in cells.columns))
+    left_out = tuple(name for name in there if name not in cells.columns and name not in mapping.where)
+    return Mapped(cells, mapping, fields, passed, left_out, unwanted)
 
 
 def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
@@ -187,8 +199,8 @@ def iso_nanoseconds(text: str) -> int:
     return int(moment.timestamp()) * 10**9 + int((digits + "0" * 9)[:9])
 
 
-def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> tuple[Cells, Sequence[str]]:
-    """The mapped cells, and the names of all columns."""
+def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> tuple[Cells, Sequence[str], int]:
+    """The mapped cells of the chosen rows, the names of all columns, and the number of the other rows."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = _split_comments(numbered)
     if not content:
@@ -202,16 +214,21 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
         # a comment with as many names as there are columns is the header, unless the first row contains the names
         in_comment = _has(named, needed) or (len(named) == len(first) and not _has(first, needed))
         header = named if in_comment else first
-    _require_columns(path, needed, header, first_row)
-    rows, table = [], []
+    _require_columns(path, [*needed, *((column,) for column in mapping.where)], header, first_row)
+    chosen = {header.index(column): values for column, values in mapping.chosen().items()}
+    rows, table, unwanted = [], [], 0
     body = parsed if header is first else chain([(first_row, first)], parsed)
     for row, parts in body:
         if len(parts) != len(header):
             raise bad_field(path, "row", ",".join(parts), f"{len(header)} values: {','.join(header)}", row=row)
+        if any(parts[i] not in values for i, values in chosen.items()):
+            unwanted += 1
+            continue
         rows.append(row)
         table.append(parts)
     wanted = [column for column in mapping.columns.values() if column in header]
-    return Cells(path, rows, {column: [parts[header.index(column)] for parts in table] for column in wanted}), header
+    columns = {column: [parts[header.index(column)] for parts in table] for column in wanted}
+    return Cells(path, rows, columns), header, unwanted
 
 
 def _split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
@@ -248,18 +265,22 @@ def _require_columns(path: Path, needed: Sequence[Alternatives], header: Sequenc
 
 def _read_json_lines(
     path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
-) -> tuple[Cells, Collection[str], int]:
-    """The objects of JSON lines (one object or a list of them per line) that have all ``needed`` columns, all columns of these
-    objects, and the number of the others."""
+) -> tuple[Cells, Collection[str], int, int]:
+    """The chosen objects of JSON lines (one object or a list of them per line) that have all ``needed`` columns, all columns of
+    these objects, the number of those that lack some, and of those not chosen."""
     rows: list[int] = []
     columns: dict[str, list[str]] = {column: [] for column in mapping.columns.values()}
-    passed, seen = 0, dict.fromkeys(columns, False)
+    chosen = mapping.chosen()
+    passed, unwanted, seen = 0, 0, dict.fromkeys(columns, False)
     keys: list[str] = []
     there: dict[str, None] = {}
     for row, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
         for entry in _objects(path, row, line):
+            if any(_text(_at(entry, column)) not in values for column, values in chosen.items()):
+                unwanted += 1
+                continue
             found = {column: _at(entry, column) for column in columns}
             keys = keys or sorted(_paths(entry))
             seen |= {column: True for column, value in found.items() if value is not None}
@@ -271,11 +292,23 @@ def _read_json_lines(
             for column, value in found.items():
                 if isinstance(value, (dict, list)):
                     raise bad_field(path, column, value, "a number or a text", row=row)
-                columns[column].append("" if value is None else well_formed(str(value)))
+                columns[column].append(_text(value))
     for alternatives in needed:
         if passed and not any(seen[column] for column in alternatives):
             raise InputError(f"{path}: no object has {quoted(alternatives[0])}, the first has {listed(keys)}")
-    return Cells(path, rows, {column: values for column, values in columns.items() if seen[column]}), there, passed
+    return (
+        Cells(path, rows, {column: values for column, values in columns.items() if seen[column]}),
+        there,
+        passed,
+        unwanted,
+    )
+
+
+def _text(value: Any) -> str:
+    """A value of JSON or TOML as the text of a cell."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "" if value is None else well_formed(str(value))
 
 
 def _objects(path: Path, row: int, line: str) -> list[dict[str, Any]]:

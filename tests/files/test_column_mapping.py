@@ -94,6 +94,18 @@ def test_optional_columns_may_be_missing(read):
     assert found.fields == ("a",)
 
 
+@pytest.mark.parametrize("where", [{"kind": "tag"}, {"kind": ("tag", "none"), "n": (1, 2)}, {"ok": True}])
+@pytest.mark.parametrize("form", ["csv", "jsonl"])
+def test_rows_with_values_of_other_columns(read, form, where):
+    entries = [("tag", 1, "true", 3.5), ("gpi", 1, "false", 4.5), ("tag", 2, "true", 5.5)]
+    lines = [f'{{"kind": "{kind}", "n": {n}, "ok": {ok}, "x": {x}}}' for kind, n, ok, x in entries]
+    table = ["kind,n,ok,x", *(f"{kind},{n},{ok},{x}" for kind, n, ok, x in entries)]
+    found = read("\n".join(table if form == "csv" else lines), f"a.{form}", columns={"a": "x"}, where=where)
+    np.testing.assert_array_equal(found.numbers("a", POSES["x"]), (3.5, 5.5))
+    assert found.unwanted == 1
+    assert set(found.left_out) == {"kind", "n", "ok"} - set(where)
+
+
 def test_json_lines_of_several_kinds(read):
     lines = '{"p": {"x": 1}}\n\n[{"p": {"x": 2, "y": null}}, {"other": 3}]\n{"p": {"x": 3, "y": "4"}}\n'
     found = read(lines, "a.jsonl", optional=("b",), columns={"a": "p.x", "b": "p.y"})
@@ -111,6 +123,8 @@ def test_json_lines_of_several_kinds(read):
         ('x,y\n1,"2\n', {"columns": {"a": "x"}}, ("a.csv:2", "is not CSV")),
         ("// x, y\n1,2\n", {"columns": {"a": "z"}}, ("a.csv:2", "no column 'z', it has x, y")),
         ("# only this\n", {"columns": {"a": "x"}}, ("a.csv: contains no rows",)),
+        ("x,y\n1,2\n", {"columns": {"a": "x"}, "where": {"z": "2"}}, ("a.csv:1", "no column 'z', it has x, y")),
+        ("x,y\n1,2\n", {"columns": {"a": "x"}, "where": {"y": "3"}}, ("a.csv: contains no rows as chosen by where",)),
     ],
 )
 def test_wrong_tables(read, content, mapping, fragments):

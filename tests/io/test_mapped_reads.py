@@ -75,6 +75,62 @@ def test_phases_and_channels_in_rows_of_sllurp(hall, with_options, one):
     np.testing.assert_allclose(tuned.streams["rfid"].frequency, (903.75e6, np.nan))
 
 
+WIDE = """
+[options.rfid]
+file = "wide.csv"
+separator = ";"
+decimal = ","
+columns = {{ t = "t", {columns} }}
+units = {{ t = "s" }}
+{more}
+"""
+
+
+@pytest.mark.parametrize(
+    ("head", "columns", "more", "reads"),
+    [
+        (
+            "tag;rssi_1;rssi_2",
+            'epc = "tag", rssi = "rssi_*"',
+            "",
+            [("A", "1", -60.5), ("A", "2", -61), ("B", "2", -70)],
+        ),
+        ("port;A;B", 'antenna = "port", rssi = "*"', "", [("A", "A", -60.5), ("B", "A", -61), ("B", "B", -70)]),
+        ("A [dBm];B [dBm]", 'rssi = "* [dBm]"', 'antenna = "l"', [("A", "l", -60.5), ("B", "l", -61), ("B", "l", -70)]),
+    ],
+    ids=["a column per antenna", "a column per tag", "a column per tag of one antenna"],
+)
+def test_strengths_in_columns(hall, with_options, one, refused, head, columns, more, reads):
+    names = ("A;", "B;") if head.count(";") == 2 else ("", "")
+    text = f"t;{head}\n1,1;{names[0]}-60,5;-61\n1,2;{names[1]};-70\n"
+    (hall.parent / "run" / "wide.csv").write_text(text)
+    rfid = one(with_options(WHEELS + WIDE.format(columns=columns, more=more))).streams["rfid"]
+    assert sorted(zip(rfid.epc, rfid.antenna, rfid.rssi.tolist(), strict=True)) == sorted(reads)
+    np.testing.assert_allclose(sorted(rfid.t - rfid.age), (0.1, 0.1, 0.2))
+    (hall.parent / "run" / "wide.csv").write_text(text.replace("-70", "weak"))
+    refused(with_options(WHEELS + WIDE.format(columns=columns, more=more)), "wide.csv:3", "'weak', expected a number")
+    refused(with_options(WHEELS + WIDE.format(columns=columns.replace("*", "*x"), more=more)), "has no column '")
+
+
+def test_strengths_in_columns_that_are_no_reads(hall, with_options, refused):
+    (hall.parent / "run" / "wide.csv").write_text("t;tag;1;2\n1;A;;\n")
+    refused(with_options(WHEELS + WIDE.format(columns='epc = "tag", rssi = "*"', more="")), "contains no reads")
+    neither = WIDE.format(columns='rssi = "*"', more="")
+    refused(with_options(WHEELS + neither), "with rssi = '*' columns maps t, expected t and one of epc, antenna")
+
+
+def test_rows_of_one_kind(hall, with_options, one):
+    rows = "kind,timestamp,antenna,rssi,epc\nread,1.1,1,-60,aa\nkeepalive,1.2,,,\nread,1.3,1,-61,bb\n"
+    (hall.parent / "run" / "log.csv").write_text(rows)
+    log = one(
+        with_options(
+            f'{WHEELS}\n[options.rfid]\nfile = "log.csv"\npreset = "sllurp_log"\nwhere = {{ kind = "read" }}\n'
+        )
+    )
+    assert log.streams["rfid"].epc == ["aa", "bb"]
+    assert any(line.endswith("log.csv: 1 of 3 rows have another kind than where says") for line in log.warnings)
+
+
 def test_reports_of_sllurp_with_several_reads_in_a_row(hall, with_options, one):
     report = {
         "EPC": "b'e2001'",

@@ -16,6 +16,7 @@ from factorgraph_loc.files.columns import PURE, Column
 from factorgraph_loc.files.models import FileModel, InUnit, inside
 from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.io.readers.unread import Unread
+from factorgraph_loc.io.readers.wide_reads import read_wide
 from factorgraph_loc.sensors.rfid.columns import INVENTORIES, RFID
 from factorgraph_loc.sensors.rfid.tables import check_reads
 from factorgraph_loc.text import quoted
@@ -92,8 +93,8 @@ class Channels(FileModel):
 
 
 class RfidFile(ColumnMapping):
-    """``columns``: t (or the first of several reads), epc or epc_base64, antenna, rssi, phase, frequency or channel, and, if a row
-    summarizes several reads, ``last`` and ``count``."""
+    """``columns``: t (or the first of several reads), epc or epc_base64, antenna, rssi (with ``*``: a column per tag or antenna),
+    phase, frequency or channel, and, if a row summarizes several reads, ``last`` and ``count``."""
 
     columns: dict[str, str] = Field(default_factory=dict)
     """column of the file for each field, besides those of the preset"""
@@ -168,14 +169,15 @@ def read_reads(path: Path, options: RfidFile, warnings: list[str], unread: Unrea
 
     A row that summarizes several reads gives two, the first one with the measured values; the times of the others are unknown.
     """
-    if ("antenna" in options.columns) == (options.antenna is not None):
+    wide = "*" in options.columns.get("rssi", "")
+    if not wide and ("antenna" in options.columns) == (options.antenna is not None):
         raise InputError(f"{path}: expected either columns.antenna, or antenna, the name of the only one")
     if ("channel" in options.columns) != (options.channels is not None):
         raise InputError(f"{path}: columns.channel and channels, the frequencies [MHz], are needed together")
     if {"channel", "frequency"} <= set(options.columns):
         raise InputError(f"{path}: columns maps frequency and channel, expected one of them")
     shapes = REQUIRED[0] if options.antenna is None else REQUIRED[1]
-    mapped = read_mapped(path, options, shapes, OPTIONAL, EPCS)
+    mapped = read_wide(path, options, options.antenna) if wide else read_mapped(path, options, shapes, OPTIONAL, EPCS)
     unread.note(mapped)
     if mapped.passed:
         warnings.append(f"{path}: {mapped.passed} objects that are not reads are skipped")
