@@ -84,9 +84,14 @@ def info(log: LogLike) -> Inspection:
     return inspect(_one(log))
 
 
-def convert(log: LogLike, out: str | Path, *, format: Literal["csv", "parquet"] = "csv") -> None:
-    """Write a log as a new folder in the native format, or as a ROS bag if ``out`` ends with .bag, .mcap or .db3."""
-    write_log(_one(log), out, format=format)
+def convert(
+    log: LogLike, out: str | Path, *, format: Literal["csv", "parquet"] = "csv", overwrite: bool = False
+) -> None:
+    """Write a log as a new folder in the native format, or as a ROS bag if ``out`` ends with .bag, .mcap or .db3.
+
+    ``overwrite`` replaces a log that ``out`` is.
+    """
+    write_log(_one(log), out, format=format, overwrite=overwrite)
 
 
 def run(

@@ -101,6 +101,7 @@ def convert(
     data_root: DataRoot = None,
     rig: RigFile = None,
     world: WorldFile = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the log that OUT is.")] = False,
     json: Json = False,
 ) -> None:
     """Write a log as a folder in the native format, or as a ROS bag."""
@@ -109,7 +110,7 @@ def convert(
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
     for warning in loaded.warnings:
         show.note(f"warning: {warning}")
-    files = write_log(loaded, out, format=format.value)
+    files = write_log(loaded, out, format=format.value, overwrite=overwrite)
     if json:
         names = sorted(path.name for path in files)
         show.document({"log": loaded.name, "folder": str(files[0].parent), "files": names})

@@ -9,14 +9,17 @@ from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.model.log import Log
 
 
-def write_log(log: Log, out: str | Path, format: Literal["csv", "parquet"] = "csv") -> list[Path]:
+def write_log(
+    log: Log, out: str | Path, format: Literal["csv", "parquet"] = "csv", *, overwrite: bool = False
+) -> list[Path]:
     """Write a log to ``out`` atomically, and return the files.
 
     A bag (:func:`~factorgraph_loc.io.bags.export.write_bag`) if the name is that of one, else a folder in the native format with
-    tables of ``format`` (:func:`~factorgraph_loc.io.native.native.write_native`). InputError if ``out`` exists.
+    tables of ``format`` (:func:`~factorgraph_loc.io.native.native.write_native`). InputError if ``out`` exists, unless it
+    is a log to ``overwrite``.
     """
     out = Path(out)
     if out.suffix in SUFFIXES:
-        return write_bag(log, out)
-    write_native(log, out, format=format)
+        return write_bag(log, out, overwrite=overwrite)
+    write_native(log, out, format=format, overwrite=overwrite)
     return sorted(out.iterdir())

@@ -76,6 +76,7 @@ def test_a_log_as_a_bag(short_log, fgloc, monkeypatch, tmp_path, suffix):
     again = fgloc("convert", short_log, f"short.{suffix}")
     assert again.exit_code == 2
     assert f"short.{suffix}: exists" in again.stderr
+    assert fgloc("convert", short_log, f"short.{suffix}", "--overwrite").exit_code == 0
 
 
 def test_what_is_no_bag(fgloc, tmp_path):

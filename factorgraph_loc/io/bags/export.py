@@ -42,11 +42,11 @@ LATEST = 2**31 * 10**9  # ns; maximum of 32-bit seconds
 Message = tuple[int, str, str, Any]  # time of receipt [ns], topic, type, content
 
 
-def write_bag(log: Log, path: Path) -> list[Path]:
+def write_bag(log: Log, path: Path, *, overwrite: bool = False) -> list[Path]:
     """Write a log as a bag atomically, with its rig and map next to it; returns the files.
 
-    InputError if a file exists, and for what a bag cannot hold: timestamps before 1970, features, and motion in space. Covariances
-    of a reference are not written.
+    InputError if a file exists that is not to ``overwrite``, and for what a bag cannot hold: timestamps before 1970, features, and
+    motion in space. Covariances of a reference are not written.
     """
     require_rosbags()
     if path.suffix not in SUFFIXES:
@@ -54,7 +54,7 @@ def write_bag(log: Log, path: Path) -> list[Path]:
     rig, world = path.with_suffix(".rig.toml"), path.with_suffix(".world.toml")
     sweep(path.parent)
     for file in (path, rig, world):
-        if file.exists():
+        if file.exists() and not (overwrite and file.is_file()):
             raise InputError(f"{file}: exists, expected a new file")
     path.parent.mkdir(parents=True, exist_ok=True)
     with temporary_folder(path) as temporary:

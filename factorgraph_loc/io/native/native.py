@@ -32,6 +32,8 @@ from factorgraph_loc.text import listed
 RUN_FILE = "run.toml"
 REFERENCE = "reference.tum"
 SUFFIXES = (".csv", ".parquet")
+OF_LOGS = (*SUFFIXES, ".toml", ".tum")
+_OR_LOG = ", or one with a log in the native format to overwrite"
 
 
 class Options(FileModel):
@@ -135,8 +137,10 @@ def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[str
     return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=has_heading)
 
 
-def write_native(log: Log, folder: str | Path, format: Literal["csv", "parquet"] = "csv") -> None:
-    """Write a log as a new folder atomically; InputError if ``folder`` is not empty.
+def write_native(
+    log: Log, folder: str | Path, format: Literal["csv", "parquet"] = "csv", *, overwrite: bool = False
+) -> None:
+    """Write a log as a new folder atomically; InputError if ``folder`` is not empty, unless it holds a log to ``overwrite``.
 
     Timestamps are exact to the nanosecond, numbers to the last digit. Not written: covariances of the reference, and the smaller
     one of a start's standard deviations in x and y. Images are copied. InputError for features of images, motion in space, a second
@@ -145,20 +149,29 @@ def write_native(log: Log, folder: str | Path, format: Literal["csv", "parquet"]
     folder = Path(folder)
     if not log.streams:
         raise InputError(f"{log.name}: has no measurements, which a log needs: `fgloc export` writes trajectories")
-    require_new(folder)
+    require_new(folder, overwrite=overwrite)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with temporary_folder(folder) as temporary:
         content = temporary / "log"  # with the permissions of a new folder; the temporary one is private
         content.mkdir()
         write_files(log, content, format)
+        if overwrite and folder.exists():
+            folder.replace(temporary / "before")
         content.replace(folder)
 
 
-def require_new(folder: Path) -> None:
-    """InputError if ``folder`` is not empty; removes remains of earlier attempts to write it."""
+def require_new(folder: Path, *, overwrite: bool = False) -> None:
+    """InputError if ``folder`` is not empty, or with ``overwrite`` if it holds anything but a log in the native format; removes
+    remains of earlier attempts to write it."""
     sweep(folder.parent)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: exists and is not an empty folder, expected a new one")
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    if not overwrite or not (folder / RUN_FILE).is_file():
+        raise InputError(
+            f"{folder}: exists and is not an empty folder, expected a new one{_OR_LOG if overwrite else ''}"
+        )
+    if others := sorted(f.name for f in folder.iterdir() if f.suffix not in OF_LOGS and f.name != "camera"):
+        raise InputError(f"{folder}: holds {listed(others)} beside its log, which would be lost: expected a log alone")
 
 
 def write_files(log: Log, folder: Path, format: str) -> None:
