@@ -26,8 +26,10 @@ IMAGE = 2**28  # bytes of an image's file
 GRID = 2**26  # bytes of a grid, unpacked
 PIXELS = 2**26  # of an image; the limit of OpenCV is 2^30
 CELLS = 2**27  # rows times columns of a Parquet file
+LARGEST_POINTER = 1024  # bytes, as its specification says
 RATIO = 1000  # maximum cells per byte of a Parquet file
 
+POINTER = b"version https://git-lfs.github.com/spec/v1"  # first line of what Git LFS leaves in place of a file
 _FICLONE = 0x40049409  # Linux ioctl: share the content of another file until either is written
 _KINDS = {
     stat.S_IFREG: "a file",
@@ -83,6 +85,8 @@ def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
         now = os.fstat(file.fileno())
         _require_file(path, _kind(now))
         require_size(path, "its size in bytes", now.st_size, limit)
+        if now.st_size < LARGEST_POINTER and os.pread(file.fileno(), len(POINTER), 0) == POINTER:
+            raise InputError(f"{plain(path)}: is a pointer of Git LFS, not the file: `git lfs pull` fetches it")
         yield file
 
 

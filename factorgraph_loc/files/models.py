@@ -226,11 +226,11 @@ def nearest(word: str, known: list[str]) -> str:
     return f"; known: {listed(sorted(known), 2 * LISTED)}" if known else ""
 
 
-def inside(root: Path, name: str, source: object) -> Path:
+def inside(root: Path, name: str, source: object, expected: str = "") -> Path:
     """The path ``name`` below ``root``, with links resolved; it need not exist. All paths in files are resolved by this function.
 
-    InputError if it leaves ``root`` (by dots, as an absolute path or by a link) or is neither a regular file nor a folder;
-    NoFileNameError if no file can have that name.
+    InputError if it leaves ``root`` (by dots, as an absolute path or by a link), which says what is ``expected``, or is neither a
+    regular file nor a folder; NoFileNameError if no file can have that name.
     """
     try:
         path = Path(os.path.realpath(root / name))
@@ -238,7 +238,8 @@ def inside(root: Path, name: str, source: object) -> Path:
     except (OSError, ValueError) as error:  # NUL, or a lone UTF-16 surrogate
         raise bounded.NoFileNameError(f"{source}: path {quoted(name)} cannot be the name of a file") from error
     if leaves:
-        raise InputError(f"{source}: path {quoted(name)} leaves its folder {root}")
+        told = f", expected {expected}" if expected else ""
+        raise InputError(f"{source}: path {quoted(name)} leaves its folder {root}{told}")
     kind = bounded.kind(path, source)
     if kind not in ("", "a file", "a folder"):
         raise InputError(f"{source}: path {quoted(name)} is {kind}, expected a regular file")

@@ -233,6 +233,13 @@ def test_what_another_library_raises_is_one_line():
     refused(lambda: fail(Panic("index out of range")), "index out of range")
 
 
+def test_a_pointer_of_git_lfs_is_named_as_such(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    with pytest.raises(InputError, match=r"a\.csv: is a pointer of Git LFS, not the file: `git lfs pull` fetches it"):
+        read_text(path)
+
+
 def test_a_file_without_a_size_is_read():
     assert "processor" in read_text(Path("/proc/cpuinfo"))
     refused(lambda: read_text(Path("/proc/cpuinfo"), 100), "its size in bytes is", "expected at most 100")

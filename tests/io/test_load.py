@@ -100,8 +100,13 @@ def test_rig_and_world_replace_those_of_the_log(native, tmp_path):
 
 BAD_MANIFESTS = {
     "path outside": (MANIFEST.replace('"set"', '"../../etc"'), "", "path '../../etc' leaves its folder"),
-    "absolute path": (MANIFEST.replace('"set"', '"/etc"'), "", "path '/etc' leaves its folder"),
-    "rig outside": (MANIFEST, 'rig = "../x.rig.toml"\n', "path '../x.rig.toml' leaves its folder"),
+    "absolute path": (MANIFEST.replace('"set"', '"/etc/nothing"'), "", "its data /etc/nothing does not exist"),
+    "rig outside": (
+        MANIFEST,
+        'rig = "../x.rig.toml"\n',
+        "leaves its folder",
+        "expected one below it, an absolute one, or",
+    ),
     "no data": (MANIFEST.replace('"set"', '"sat"'), "", "small.toml: its data", "does not exist"),
     "no title": (MANIFEST.replace("title", "titel"), "", "unknown key titel", "did you mean title?"),
     "no reader": (MANIFEST.replace('"mrclam"', '"mrclan"'), "", "no reader 'mrclan'", "did you mean mrclam?"),
@@ -118,6 +123,20 @@ BAD_MANIFESTS = {
 )
 def test_bad_manifests(manifest, tmp_path, refused, text, more, fragments):
     refused(manifest(more, text), *fragments, data_root=tmp_path)
+
+
+def test_absolute_paths_of_a_manifest(manifest, mrclam, tmp_path, one, refused):
+    away = tmp_path / "away"
+    away.mkdir()
+    (away / "cart.rig.toml").write_text('name = "away"\n')
+    (away / "hall.world.toml").write_text('name = "away"\n')
+    more = f'rig = "{away}/cart.rig.toml"\nworld = "{away}/hall.world.toml"\n[options]\nrobot = 1\n'
+    file = manifest(more, MANIFEST.replace('"set"', f'"{mrclam}"'))
+    log = one(file)
+    assert (log.rig.name, log.world.name) == ("away", "away")
+    file = file.rename(away / "run.toml")  # one that comes with the folder of a log
+    for named in (file, away):
+        refused(named, "absolute ones only if it is not named run.toml")
 
 
 def test_a_link_that_leaves_the_data_root(manifest, mrclam, tmp_path, refused):

@@ -240,6 +240,18 @@ def test_an_unknown_compression(tmp_path, bag_maker, refuse):
     refuse(path, "Compression 'zpaq' is not supported")
 
 
+def test_a_bag_without_its_metadata(mcap, refused, refuse):
+    (mcap / "metadata.yaml").unlink()
+    refused(mcap, "is a ROS 2 bag without metadata.yaml: `ros2 bag reindex", "drive.mcap, can be read without")
+    refuse(mcap, "is a ROS 2 bag without metadata.yaml")
+
+
+def test_a_pointer_in_place_of_a_bag(mcap, refuse):
+    (mcap / "drive.mcap").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    refuse(mcap, "drive.mcap: is a pointer of Git LFS")
+    refuse(mcap / "drive.mcap", "drive.mcap: is a pointer of Git LFS")
+
+
 def test_no_bag_at_all(tmp_path, refuse):
     (tmp_path / "drive.txt").write_text("x")
     refuse(

@@ -6,6 +6,7 @@ Messages are read one by one; only the index and the current chunk of a bag are 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.bounded import DEFINITION, require_size
+from factorgraph_loc.files.bounded import DEFINITION, opened, require_size
 from factorgraph_loc.files.models import inside, nearest
 from factorgraph_loc.io.bags import unpacking as bag_unpacking
 from factorgraph_loc.text import quoted, told
@@ -138,16 +139,30 @@ def is_bag(path: Path) -> bool:
     return (path / METADATA).is_file() if path.is_dir() else path.suffix in SUFFIXES
 
 
+def require_metadata(folder: Path) -> None:
+    """InputError if ``folder`` has the files of a version 2 bag, but not its metadata."""
+    files = sorted(file.name for file in folder.iterdir() if file.suffix in SUFFIXES[1:]) if folder.is_dir() else []
+    if files and not (folder / METADATA).is_file():
+        advice = f"`ros2 bag reindex {folder}` writes it; a single file, {folder / files[0]}, can be read without"
+        raise InputError(f"{folder}: is a ROS 2 bag without {METADATA}: {advice}")
+
+
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
     """Open the bag at ``path``; InputError if it cannot be read, or ``rosbags`` is not installed."""
     if not path.exists():
         raise InputError(f"{path}: does not exist")
+    require_metadata(path)
     if not is_bag(path):
         expected = f"a file {', '.join(SUFFIXES)}, or a folder with {METADATA}"
         raise InputError(f"{path}: is not a ROS bag, expected {expected}")
-    for file in path.iterdir() if path.is_dir() else ():
-        inside(path, file.name, path)  # rejects links to the outside, and FIFOs, which would block
+    files = (
+        [inside(path, file.name, path) for file in path.iterdir()] if path.is_dir() else [path]
+    )  # no links to the outside
+    for file in files:
+        if not file.is_dir():
+            with opened(file, sys.maxsize):  # no FIFO, which would block, and no pointer of Git LFS
+                pass
     require_rosbags()
     bag_unpacking.bound()
     from rosbags.rosbag1 import Reader as Reader1  # noqa: PLC0415 - an optional library

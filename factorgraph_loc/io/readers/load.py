@@ -13,7 +13,7 @@ from factorgraph_loc.files.column_mapping import JSON_SUFFIXES
 from factorgraph_loc.files.models import inside, nearest, parse_model, read_toml
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.io import look_over
-from factorgraph_loc.io.bags.file import is_bag
+from factorgraph_loc.io.bags.file import is_bag, require_metadata
 from factorgraph_loc.io.native import default_rig
 from factorgraph_loc.io.native.rig_file import read_rig
 from factorgraph_loc.io.native.world_file import read_world
@@ -133,6 +133,7 @@ def _find(log: str, data_root: str | Path | None, reader: str | None) -> _Source
     if log in known:
         return _from_manifest(known[log], data_root)
     if path.is_dir():
+        require_metadata(path)
         raise InputError(f"{log}: has no {RUN_FILE}, so it is not in the native format; name the reader of its format")
     raise InputError(f"{log}: is neither a file, nor a folder, nor a known data set{nearest(log, list(known))}")
 
@@ -157,8 +158,8 @@ def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
     manifest: Manifest = read_manifest(file)
     path = None
     if manifest.path is not None:
-        path = inside(file.parent, manifest.path, file)  # the user's own manifest, next to its log
-        if not path.exists():
+        path = _of_manifest(file, manifest.path)
+        if not path.exists() and not Path(manifest.path).is_absolute():
             missing = file if file in manifests().values() else f"{file} (which has no {manifest.path} beside it)"
             path = inside(find_data_root(data_root, missing), manifest.path, file)
         if not path.exists():
@@ -168,12 +169,25 @@ def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
         path=path,
         name=None if file.name == RUN_FILE else file.stem,
         options=manifest.options,
-        rig=None if manifest.rig is None else read_rig(inside(file.parent, manifest.rig, file)),
-        world=None if manifest.world is None else read_world(inside(file.parent, manifest.world, file)),
+        rig=None if manifest.rig is None else read_rig(_of_manifest(file, manifest.rig)),
+        world=None if manifest.world is None else read_world(_of_manifest(file, manifest.world)),
         start=manifest.start,
         markers=manifest.markers,
         metadata={"title": manifest.title, "licence": manifest.licence, "origin": manifest.origin},
     )
+
+
+def _of_manifest(file: Path, name: str) -> Path:
+    """The path ``name`` below the folder of the manifest ``file``, or an absolute one.
+
+    A manifest is the user's own, but one with the name of ``run.toml`` comes with its folder, out of which no log may lead.
+    """
+    if file.name == RUN_FILE:
+        expected = f"one below it, or below the data folder for path; absolute ones only if it is not named {RUN_FILE}"
+        return inside(file.parent, name, file, expected)
+    if Path(name).is_absolute():
+        return inside(Path(Path(name).anchor), name, file)
+    return inside(file.parent, name, file, "one below it, an absolute one, or for path one below the data folder")
 
 
 def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log:

@@ -38,9 +38,9 @@ class StartSettings(FileModel):
 
 
 class Manifest(FileModel):
-    """A manifest. ``path`` and the files of ``checksums`` (sha256) are relative to the data root, ``rig`` and ``world`` to the
-    manifest's folder. ``options``: of the reader; a list of values gives several logs. ``markers``: detected in the log's
-    images."""
+    """A manifest. ``path``, ``rig`` and ``world`` are absolute or relative to its folder, ``path`` and the files of ``checksums``
+    (sha256) also to the data root. ``options``: of the reader; a list of values gives several logs. ``markers``: detected in the
+    log's images."""
 
     title: str
     reader: str
