@@ -18,7 +18,9 @@ class Unread:
         if mapped.unwanted:
             names = listed(mapped.mapping.where)
             count = mapped.unwanted + mapped.passed + len(mapped.rows)
-            self._rows.append(f"{mapped.path}: {mapped.unwanted} of {count} rows have another {names} than where says")
+            self._rows.append(
+                f"{mapped.path.name}: {mapped.unwanted} of {count} rows have another {names} than where says"
+            )
         before = self._columns.get(mapped.path, mapped.left_out)
         self._columns[mapped.path] = tuple(name for name in before if name in mapped.left_out)
 
@@ -28,7 +30,7 @@ class Unread:
         for path, names in self._columns.items():
             files.setdefault(names, []).append(path)
         return self._rows + [
-            f"{paths[0]}{f' and {len(paths) - 1} more files' if paths[1:] else ''}: columns that are not read: {listed(names)}"
+            f"{paths[0].name}{f' and {len(paths) - 1} more files' if paths[1:] else ''}: columns that are not read: {listed(names)}"
             for names, paths in files.items()
             if names
         ]
