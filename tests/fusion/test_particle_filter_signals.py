@@ -109,10 +109,17 @@ def test_kidnapped():
 
 
 def test_start_three_metres_and_sixty_degrees_off():
-    log = office(0)
-    off = replace(log, start=replace(log.start, pose=log.start.pose + np.array((2.1, 2.1, np.radians(60.0)))))
-    result = run(off, config("rssi", "phase"))
-    assert position_errors(result, off)[result.t > 15.0].max() < 0.5
+    """Most runs notice within seconds and search; one that does not is drawn to the right place by what it reads."""
+    after_15, after_25 = [], []
+    for seed in range(4):
+        log = office(seed)
+        off = replace(log, start=replace(log.start, pose=log.start.pose + np.array((2.1, 2.1, np.radians(60.0)))))
+        result = run(off, config("rssi", "phase"))
+        found = position_errors(result, off)
+        after_15.append(found[result.t > 15.0].max())
+        after_25.append(found[result.t > 25.0].max())
+    assert np.median(after_15) < 0.2
+    assert max(after_25) < 0.5
 
 
 def scan(t, *reads, rssi=np.nan, phase):
