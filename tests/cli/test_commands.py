@@ -9,7 +9,6 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import polars as pl
 import pytest
@@ -61,41 +60,6 @@ def test_datasets(fgloc):
         assert name in result.stdout
     names = [entry["name"] for entry in json.loads(fgloc("datasets", "--json").stdout)]
     assert "plaza2" in names
-
-
-def test_info(fgloc, short_log):
-    result = fgloc("info", short_log)
-    assert result.exit_code == 0
-    for word in ("odometry", "bearing_range", "reference", "landmarks"):
-        assert word in result.stdout
-    content = json.loads(fgloc("info", short_log, "--json").stdout)
-    assert content["streams"]["odometry"]["rows"] > 100
-    assert content["suspects"] == []
-
-
-def test_info_names_landmarks_that_are_swapped(fgloc, data_root, tmp_path):
-    root = tmp_path / "root"
-    shutil.copytree(data_root / "mrclam6", root / "mrclam6")
-    path = root / "mrclam6" / "Landmark_Groundtruth.dat"
-    lines = path.read_text().splitlines()
-    rows = {line.split()[0]: i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")}
-    a, b = rows["6"], rows["15"]
-    lines[a], lines[b] = (
-        " ".join(["6", *lines[b].split()[1:]]),
-        " ".join(["15", *lines[a].split()[1:]]),
-    )
-    path.write_text("\n".join(lines) + "\n")
-    content = json.loads(
-        fgloc("info", root / "mrclam6", "--reader", "mrclam", "--reader-option", "robot=3", "--json").stdout
-    )
-    assert {(s["landmark"], s["swapped_with"]) for s in content["suspects"]} == {("6", "15"), ("15", "6")}
-
-
-@pytest.mark.parametrize("robot", [1, 3, 5])
-def test_info_suspects_no_landmark_of_a_right_map(fgloc, data_root, robot):
-    content = json.loads(fgloc("info", f"mrclam6-robot{robot}", "--data-root", data_root, "--json").stdout)
-    assert content["suspects"] == []
-    assert content["unseen"] == []
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
@@ -391,24 +355,3 @@ def test_a_narrow_terminal_cuts_nothing_off(columns, capsys, monkeypatch):
     assert "…" not in text
     line = next(line for line in text.splitlines() if "plaza2" in line).split()
     assert line == ["plaza2", "dead_reckoning", *comparison_cells([row])[1][0][2:]]
-
-
-def test_info_says_when_a_file_is_not_the_one_of_the_manifest(fgloc, data_root, tmp_path):
-    shutil.copytree(data_root / "mrclam6", tmp_path / "mrclam6")
-    with (tmp_path / "mrclam6" / "Barcodes.dat").open("a") as file:
-        file.write("# changed\n")
-    result = fgloc("info", "mrclam6-robot1", "--data-root", str(tmp_path))
-    assert result.exit_code == 0
-    assert "Barcodes.dat: is not the file that the manifest describes" in result.stderr
-    assert "sha256" not in fgloc("info", "mrclam6-robot1", "--data-root", str(data_root)).stderr
-
-
-def test_info_draws_a_log(fgloc, short_log, tmp_path):
-    picture = tmp_path / "new" / "log.png"
-    result = fgloc("info", short_log, "-o", picture)
-    assert result.exit_code == 0
-    assert result.stdout.endswith(f"wrote {picture}\n")
-    assert cv2.imread(str(picture)).shape[1] == 1600
-    refused = fgloc("info", short_log, "-o", tmp_path / "log.pdf")
-    assert refused.exit_code == 2
-    assert "log.pdf: expected a name that ends in .png" in refused.stderr
