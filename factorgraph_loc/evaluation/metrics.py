@@ -236,7 +236,7 @@ def _constants(learnt: Learnt) -> dict[str, float]:
 
 def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
     """Diagnostics as figures: NIS by sensor (total NIS over total degrees of freedom, ideally 1; fraction above the 95 % bound),
-    residuals at the prediction (m, rad), numbers of unused measurements, and tags believed dead with their probability."""
+    residuals at the prediction (m, rad), numbers of unused measurements, and tags believed dead or moved with their probability."""
     figures: dict[str, Any] = {}
     for sensor, rows in sorted(diagnostics.nis.items()):
         if rows:
@@ -257,8 +257,10 @@ def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
         counts: dict[str, int] = getattr(diagnostics, kind)
         figures[f"{kind}.total"] = sum(counts.values())
         figures |= {f"{kind}.{reason}": count for reason, count in sorted(counts.items())}
-    figures["dead_tags.total"] = len(diagnostics.dead_tags)
-    figures |= {f"dead_tags.{name}": dead for name, dead in sorted(diagnostics.dead_tags.items())}
+    for kind in ("dead_tags", "moved_tags"):
+        tags: dict[str, float] = getattr(diagnostics, kind)
+        figures[f"{kind}.total"] = len(tags)
+        figures |= {f"{kind}.{name}": probability for name, probability in sorted(tags.items())}
     figures["events"] = len(diagnostics.events)
     return figures
 

@@ -36,8 +36,9 @@ class Diagnostics:
 
     ``residuals``: by sensor and quantity (``bearing_range.range`` in m), measurement minus prediction before the update. ``nis``:
     by sensor, rows of (t, normalised innovation squared, degrees of freedom). ``ignored``, ``rejected``, ``late``: counts by
-    reason. ``events``: (t, description), for example a rebuilt graph. ``dead_tags``: tags of the map believed to be dead, with
-    that probability.
+    reason. ``events``: (t, description), for example a rebuilt graph. ``dead_tags``: tags of the map that were never read and
+    are believed to be dead, or moved out of sight, with that probability; ``moved_tags``: tags that were read and are believed
+    to be elsewhere.
     """
 
     nis: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
@@ -47,6 +48,7 @@ class Diagnostics:
     late: dict[str, int] = field(default_factory=dict)
     events: list[tuple[float, str]] = field(default_factory=list)
     dead_tags: dict[str, float] = field(default_factory=dict)
+    moved_tags: dict[str, float] = field(default_factory=dict)
     # the latest mark, valid while nothing is added
     _mark: Mark | None = field(default=None, init=False, repr=False, compare=False)
 
@@ -93,6 +95,7 @@ class Diagnostics:
             dict(self.late),
             list(self.events),
             dict(self.dead_tags),
+            dict(self.moved_tags),
         )
 
     def mark(self) -> Mark:

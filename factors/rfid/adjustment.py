@@ -46,6 +46,7 @@ def score(
     rounds: NDArray[np.int64],
     hits: NDArray[np.int64],
     odds: Array,
+    elsewhere: Array,
     tempering: float,
     gradient: Array,
     information: Array,
@@ -79,18 +80,17 @@ def score(
             )
             continue
         slope[:], curve[:] = 0.0, 0.0
-        here = silent = mean = spread = 0.0
+        here = mean = spread = 0.0
         for k in range(looks):
             x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
             z, by_p, by_q, by_heading, by_range = of_tag(packed, antennas[k], x, y, c, s, points[t], normals[t])
             if z == NEGLIGIBLE_LOGIT and hits[k, t] == 0:
-                here, silent, mean, spread = here + far[k, 0], silent + far[k, 0], mean + far[k, 1], spread + far[k, 2]
+                here, mean, spread = here + far[k, 0], mean + far[k, 1], spread + far[k, 2]
                 continue
             m = packed.which[antennas[k]]
             rate = packed.rate[m]
             e, _, _, one_mean, one_spread = terms(packed, z, rate, hits[k, t], rounds[k])
             here, mean, spread = here + e, mean + one_mean, spread + one_spread
-            silent += e if hits[k, t] == 0 else terms(packed, z, rate, 0, rounds[k])[0]
             q, by_z, by_rate = detection(packed, z, rate)
             by[0] = by_z * (at[k, 5] * by_q - at[k, 4] * by_p)
             by[1] = -by_z * (at[k, 5] * by_p + at[k, 4] * by_q)
@@ -104,7 +104,7 @@ def score(
                 slope[place[i]] += g * by[i]
                 for j in range(5):
                     curve[place[i], place[j]] += f * by[i] * by[j]
-        share, e, mean, spread = counted(odds[t], heard, here, silent, mean, spread, none, tempering)
+        share, e, mean, spread = counted(odds[t], elsewhere[t], here, mean, spread, none, tempering)
         nll, expected, variance = nll + e, expected + mean, variance + spread
         for i in range(size):
             gradient[i] += share * slope[i]

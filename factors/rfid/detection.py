@@ -2,15 +2,15 @@
 
 An antenna reads a tag in k of n inventory rounds with probability q each (:mod:`factors.rfid.model`), so the negative
 log-likelihood is ``-tempering * sum(k log q + (n - k) log(1 - q))``. Its Hessian is replaced by the Fisher information, which is
-positive semi-definite. A tag that may be dead has a mixture likelihood (:mod:`factors.rfid.tag_states`): gradient and information
-are those of an alive tag times the probability that it is alive given its silence, which neglects the information lost by the
-unknown state (Louis, JRSS B 44(2), 1982, eq. 3.2').
+positive semi-definite. A tag that may be dead or moved has a mixture likelihood (:mod:`factors.rfid.tag_states`): gradient and
+information are those of a tag as surveyed times the probability that it is so given what was seen, which neglects the information
+lost by the unknown state (Louis, JRSS B 44(2), 1982, eq. 3.2').
 """
 
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -55,7 +55,9 @@ class TagReadCounts:
 
     ``offsets`` (K, 3): the robot's pose at the measurement, in the frame of the likelihood's pose; ``antennas`` (K,): indices in
     the model; ``rounds`` (K,): inventory rounds; ``hits`` (K, T): number of rounds that read each tag. ``odds`` (T,): prior
-    log-odds that each tag is dead (:class:`~factors.rfid.tag_states.TagStates`), ``-inf`` for alive, the default.
+    log-odds that each tag is dead or moved (:class:`~factors.rfid.tag_states.TagStates`), ``-inf`` for as surveyed, the default.
+    ``elsewhere`` (T,): tempered log-likelihood of what was seen of the tag if so, relative to a silence out of reach; by default
+    that of a dead tag: 0, or ``-inf`` if it was read.
     """
 
     offsets: Array
@@ -63,18 +65,21 @@ class TagReadCounts:
     rounds: NDArray[np.int64]
     hits: NDArray[np.int64]
     odds: Array = field(default_factory=lambda: np.empty(0))
+    elsewhere: Array = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         if not len(self.odds):
             object.__setattr__(self, "odds", np.full(self.hits.shape[1], -np.inf))
+        if not len(self.elsewhere):
+            object.__setattr__(self, "elsewhere", np.where(self.hits.any(axis=0), -np.inf, 0.0))
 
     def moved(self, offset: Array) -> TagReadCounts:
         """The counts relative to the pose that lies ``offset`` (3,) before theirs."""
-        return TagReadCounts(rfid_kernels.moved(offset, self.offsets), self.antennas, self.rounds, self.hits, self.odds)
+        return replace(self, offsets=rfid_kernels.moved(offset, self.offsets))
 
 
 def together(parts: list[TagReadCounts]) -> TagReadCounts:
-    """Merge counts relative to one pose, in order of time; the odds are those of the first."""
+    """Merge counts relative to one pose, in order of time; the odds are those of the first, what they tell of tags adds up."""
     if len(parts) == 1:
         return parts[0]
     return TagReadCounts(
@@ -83,6 +88,7 @@ def together(parts: list[TagReadCounts]) -> TagReadCounts:
         np.concatenate([p.rounds for p in parts]),
         np.concatenate([p.hits for p in parts]),
         parts[0].odds,
+        np.sum([p.elsewhere for p in parts], axis=0),
     )
 
 
@@ -128,11 +134,11 @@ class RfidLikelihood:
         and the ``parameters`` (2 M,) of the detection models."""
         size = 3 + len(parameters)
         gradient, information = np.empty(size), np.empty((size, size))
-        arrays = (self.tags.points, self.tags.normals, looks.offsets)
-        counts = (looks.antennas, looks.rounds, looks.hits)
+        tags = (self.tags.points, self.tags.normals)
+        where, seen, states = (looks.offsets, looks.antennas), (looks.rounds, looks.hits), (looks.odds, looks.elsewhere)
         packed, pose = adjustment.adjusted(self._unadjusted.packed, parameters), np.asarray(pose, dtype=float)
         tempering = self.model.tempering
-        told = adjustment.score(packed, pose, *arrays, *counts, looks.odds, tempering, gradient, information)
+        told = adjustment.score(packed, pose, *tags, *where, *seen, *states, tempering, gradient, information)
         nll, expected, variance = (np.array([value]) for value in told)
         return Score(nll, gradient[None], information[None], expected, variance)
 
@@ -142,20 +148,35 @@ class RfidLikelihood:
         n = len(poses)
         out = Score(np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n), np.empty(n))
         tags = (self.tags.points, self.tags.normals)
-        where, seen = (looks.offsets, looks.antennas), (looks.rounds, looks.hits)
-        rfid_kernels.score(self.packed, poses, *tags, *where, *seen, looks.odds, self.model.tempering, *out)
+        where, seen, states = (looks.offsets, looks.antennas), (looks.rounds, looks.hits), (looks.odds, looks.elsewhere)
+        rfid_kernels.score(self.packed, poses, *tags, *where, *seen, *states, self.model.tempering, *out)
         return out
 
-    def silence(self, pose: Array, covariance: Array, looks: TagReadCounts) -> Array:
-        """Tempered negative log-likelihood (T,) of the silence of uncertain tags if they are alive, at a pose (3,) with body-frame
-        ``covariance`` (3, 3), relative to a tag out of range; 0 for tags that were read or are certain."""
-        out = np.empty(len(self.tags.points))
-        pose, covariance = np.asarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
-        tags, where = (self.tags.points, self.tags.normals), (looks.offsets, looks.antennas)
-        seen = (looks.rounds, looks.hits)
-        tempering = self.model.tempering
-        rfid_kernels.silence(self.packed, pose, covariance, *tags, *where, *seen, looks.odds, tempering, out)
-        return out
+    def displaced(self, poses: Array, looks: TagReadCounts, tags: NDArray[np.int64], shifts: Array) -> Array:
+        """Tempered log-likelihood (U, K) of what was seen of U ``tags`` if each were ``shifts`` (K, 2) from where the map has it,
+        relative to a silence out of reach: the mean of the likelihood over poses (N, 3)."""
+        count = len(tags) * len(shifts)
+        points = np.repeat(self.tags.points[tags], len(shifts), axis=0)
+        points[:, :2] += np.tile(shifts, (len(tags), 1))
+        array = TagArray(points, np.repeat(self.tags.facing[tags], len(shifts)))
+        hits = np.repeat(looks.hits[:, tags], len(shifts), axis=1)
+        level = np.repeat(self._unadjusted._tables.level[:, tags], len(shifts), axis=1)
+        each = np.zeros((count, len(poses)), dtype=np.float32)
+        tables = self._unadjusted._tables._replace(level=level)
+        self._add(
+            poses,
+            replace(looks, hits=hits),
+            array,
+            tables,
+            np.arange(count),
+            np.zeros(len(poses)),
+            each,
+            self._of_poses(len(poses)),
+        )
+        found = self.model.tempering * each.astype(float)
+        most = found.max(axis=1)
+        mean = most + np.log(np.mean(np.exp(found - most[:, None]), axis=1))
+        return np.asarray(mean.reshape(len(tags), len(shifts)))
 
     def log_likelihood(self, poses: Array, looks: TagReadCounts, parameters: Array | None = None) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.tables`): for particles.
@@ -163,34 +184,52 @@ class RfidLikelihood:
         ``parameters`` (N, 2 M): of the detection models at each pose, by default its own.
         """
         poses = np.ascontiguousarray(poses, dtype=float)
-        certain, silent, which = self.by_silence(poses, looks, parameters)
+        certain, uncertain, which = self._by_certainty(poses, looks, parameters)
         if len(which):
-            add_mixed(silent, looks.odds[which], self.model.tempering, certain)
+            add_mixed(uncertain, looks.odds[which], looks.elsewhere[which], self.model.tempering, certain)
         return certain
 
-    def by_silence(
-        self, poses: Array, looks: TagReadCounts, parameters: Array | None = None
+    def _by_certainty(
+        self, poses: Array, looks: TagReadCounts, parameters: Array | None
     ) -> tuple[Array, Array32, NDArray[np.int64]]:
-        """The log-likelihood at poses (N, 3) in two parts: tempered, of what is certain to live or was read, (N,); and untempered,
-        of the silence of U tags that may be dead, each by itself if it is alive, above what it is out of reach, (U, N), with the
-        places (U,) of these tags in the map."""
-        if parameters is None and self.parameters.any():
-            parameters = np.broadcast_to(self.parameters, (len(poses), len(self.parameters)))
+        """The log-likelihood at poses (N, 3) in two parts: tempered, of what is certain to be as surveyed, (N,); and untempered, of
+        U tags that may not be, each by itself if it is, above that of a silence out of reach, (U, N), with the places (U,) of these
+        tags in the map."""
+        if parameters is None:
+            parameters = self._of_poses(len(poses))
         largest = 1.0 if parameters is None else float(np.exp(parameters[:, 0::2].max(initial=0.0)))
         out = np.zeros(len(poses))
-        near = self._near(poses, looks, largest)
-        which = np.flatnonzero((looks.odds > -np.inf) & ~looks.hits.any(axis=0) & near)
+        near = self.near(poses, looks, largest) | looks.hits.any(axis=0)
+        which = np.flatnonzero((looks.odds > -np.inf) & (looks.elsewhere > -np.inf) & near)
         apart = np.full(len(looks.odds), -1, dtype=np.int64)
         apart[which] = np.arange(len(which))
-        silent = np.zeros((len(which), len(poses)), dtype=np.float32)
+        each = np.zeros((len(which), len(poses)), dtype=np.float32)
+        self._add(poses, looks, self.tags, self._unadjusted._tables, apart, out, each, parameters)
+        return self.model.tempering * out, each, which
+
+    def _add(
+        self,
+        poses: Array,
+        looks: TagReadCounts,
+        tags: TagArray,
+        tables: Tables,
+        apart: NDArray[np.int64],
+        out: Array,
+        each: Array32,
+        parameters: Array | None,
+    ) -> None:
+        """Add all looks at ``tags``, see :func:`~factors.rfid.tables.add_log_likelihood`."""
+        packed = self._unadjusted.packed
         for i in range(len(looks.antennas)):
             at = poses if not looks.offsets[i].any() else se2.compose(poses, looks.offsets[i])
-            tags = (self.tags.points, self.tags.normals, looks.hits[i], int(looks.rounds[i]))
+            seen = (tags.points, tags.normals, looks.hits[i], int(looks.rounds[i]))
             antenna = int(looks.antennas[i])
             changes = None if parameters is None else self._changes(parameters, antenna)
-            packed, tables = self._unadjusted.packed, self._unadjusted._tables
-            add_log_likelihood(packed, tables, antenna, at, *tags, apart, out, silent, changes)
-        return self.model.tempering * out, silent, which
+            add_log_likelihood(packed, tables, antenna, at, *seen, apart, out, each, changes)
+
+    def _of_poses(self, count: int) -> Array | None:
+        """The parameters (N, 2 M), the same at ``count`` poses; None where they change nothing."""
+        return np.broadcast_to(self.parameters, (count, len(self.parameters))) if self.parameters.any() else None
 
     def _changes(self, parameters: Array, antenna: int) -> Changes:
         """What ``parameters`` (N, 2 M) make of the tables of an antenna."""
@@ -203,10 +242,11 @@ class RfidLikelihood:
     def _adjusted_logs(self) -> list[Array32]:
         return [adjusted_logs(self.packed, peak) for peak in self.packed.peak]
 
-    def _near(self, poses: Array, looks: TagReadCounts, largest: float) -> NDArray[np.bool_]:
-        """Which tags (T,) may be in reach of an antenna from any of the poses; ``largest``: factor of all ranges."""
+    def near(self, poses: Array, looks: TagReadCounts, largest: float = 1.0, margin: float = 0.0) -> NDArray[np.bool_]:
+        """Which tags (T,) may be in reach of an antenna from any of the poses, within a ``margin`` [m]; ``largest``: factor of all
+        ranges."""
         packed = self._unadjusted.packed
-        way = float(np.max(np.hypot(looks.offsets[:, 0], looks.offsets[:, 1]), initial=0.0))
+        way = margin + float(np.max(np.hypot(looks.offsets[:, 0], looks.offsets[:, 1]), initial=0.0))
         reach = way + float(np.max(largest * packed.reach[packed.which] + np.hypot(*packed.antennas[:, :2].T)))
         low, high = poses[:, :2].min(axis=0), poses[:, :2].max(axis=0)
         return np.asarray(

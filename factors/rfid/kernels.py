@@ -117,7 +117,7 @@ def place_looks(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[n
 
 
 @numba.njit(cache=True, inline="always")
-def _alive(
+def _surveyed(
     packed: Packed,
     at: Array,
     antennas: NDArray[np.int64],
@@ -126,23 +126,21 @@ def _alive(
     point: Array,
     normal: Array,
     far: Array,
-) -> tuple[float, float, float, float, tuple[float, float, float], tuple[float, float, float, float, float, float]]:
-    """For one alive tag, over all measurements: negative log-likelihood, that of a silence, their mean and variance over all
-    outcomes; gradient, and information (upper triangle)."""
-    e_sum = silent = mean_sum = spread_sum = 0.0
+) -> tuple[float, float, float, tuple[float, float, float], tuple[float, float, float, float, float, float]]:
+    """For one tag as surveyed, over all measurements: negative log-likelihood, its mean and variance over all outcomes; gradient,
+    and information (upper triangle)."""
+    e_sum = mean_sum = spread_sum = 0.0
     g_x = g_y = g_a = 0.0
     xx = xy = xa = yy = ya = aa = 0.0
     for k in range(len(antennas)):
         x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
         z, by_p, by_q, by_heading, _ = of_tag(packed, antennas[k], x, y, c, s, point, normal)
         if z == NEGLIGIBLE_LOGIT and hits[k] == 0:  # out of reach and not read, as most are
-            e_sum, silent = e_sum + far[k, 0], silent + far[k, 0]
-            mean_sum, spread_sum = mean_sum + far[k, 1], spread_sum + far[k, 2]
+            e_sum, mean_sum, spread_sum = e_sum + far[k, 0], mean_sum + far[k, 1], spread_sum + far[k, 2]
             continue
         rate = packed.rate[packed.which[antennas[k]]]
         e, g, f, mean, spread = terms(packed, z, rate, hits[k], rounds[k])
         e_sum += e
-        silent += e if hits[k] == 0 else terms(packed, z, rate, 0, rounds[k])[0]
         mean_sum += mean
         spread_sum += spread
         # the antenna moves, the tag does not
@@ -157,44 +155,26 @@ def _alive(
         yy += f * by_y * by_y
         ya += f * by_y * by_a
         aa += f * by_a * by_a
-    return e_sum, silent, mean_sum, spread_sum, (g_x, g_y, g_a), (xx, xy, xa, yy, ya, aa)
-
-
-@numba.njit(cache=True, inline="always")
-def _mixed(
-    odds: float, silent: float, mean: float, spread: float, none: float, tempering: float
-) -> tuple[float, float, float, float]:
-    """For a tag that is dead with prior log-odds ``odds`` and is not read (:mod:`factors.rfid.tag_states`): the tempered negative
-    log-likelihood, the weight of the tag, and mean and variance of the likelihood over all outcomes. A read has the likelihood of a
-    tag that is known to be alive, as its state does not depend on the pose.
-
-    ``silent``: negative log-likelihood of the silence if the tag is alive; ``mean`` and ``spread``: mean and variance of that over
-    all outcomes; ``none``: that of a silence out of range.
-    """
-    alive, dead = 1.0 / (1.0 + math.exp(odds)), 1.0 / (1.0 + math.exp(-odds))
-    left = alive * math.exp(-tempering * (silent - none))
-    total = left + dead
-    nll = tempering * none - math.log(total)
-    # a silence costs nll whether the tag is dead or alive; the rest is an alive tag that is read
-    quiet = math.exp(-silent)
-    expected = (alive * quiet + dead) * nll + alive * tempering * (mean - quiet * silent)
-    squared = tempering**2 * (spread + mean * mean - quiet * silent * silent)
-    second = (alive * quiet + dead) * nll * nll + alive * squared
-    return nll, left / total, expected, max(second - expected * expected, 0.0) / tempering
+    return e_sum, mean_sum, spread_sum, (g_x, g_y, g_a), (xx, xy, xa, yy, ya, aa)
 
 
 @numba.njit(cache=True, inline="always")
 def counted(
-    odds: float, heard: int, e: float, silent: float, mean: float, spread: float, none: float, tempering: float
+    odds: float, elsewhere: float, e: float, mean: float, spread: float, none: float, tempering: float
 ) -> tuple[float, float, float, float]:
-    """How much a tag counts, ``heard`` so often, that may be dead: the factor of its derivatives, and its tempered negative
-    log-likelihood with mean and variance. ``e``, ``mean`` and ``spread``: the same if it is alive; see :func:`_mixed`."""
-    if odds == -np.inf:
+    """How much a tag counts that may not be where the map has it (:mod:`factors.rfid.tag_states`): the factor of its derivatives,
+    and its tempered negative log-likelihood with mean and variance. ``e``, ``mean`` and ``spread``: the same, untempered, of a tag
+    as surveyed; ``none``: that of a silence out of range. What a tag tells that is not as surveyed is never a surprise."""
+    if odds == -np.inf or elsewhere == -np.inf:
         return tempering, tempering * e, tempering * mean, tempering * spread
-    nll, counts, mean, spread = _mixed(odds, silent, mean, spread, none, tempering)
-    if heard > 0:
-        return tempering, tempering * e, mean, spread
-    return tempering * counts, nll, mean, spread
+    surveyed, other = tempering * (none - e), odds + elsewhere
+    most = max(surveyed, other)
+    own = math.exp(surveyed - most)
+    total = own + math.exp(other - most)
+    nll = tempering * none - most - math.log(total) + max(odds, 0.0) + math.log1p(math.exp(-abs(odds)))
+    usual = 1.0 / (1.0 + math.exp(odds))
+    expected = usual * tempering * mean + (1.0 - usual) * (tempering * none - elsewhere)
+    return tempering * own / total, nll, expected, usual * tempering * spread
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -208,6 +188,7 @@ def score(
     rounds: NDArray[np.int64],
     hits: NDArray[np.int64],
     odds: Array,
+    elsewhere: Array,
     tempering: float,
     nll: Array,
     gradient: Array,
@@ -239,12 +220,10 @@ def score(
             if heard[t] == 0 and dx * dx + dy * dy >= farthest * farthest:
                 beyond += 1
                 continue
-            tag_e, tag_silent, tag_mean, tag_spread, slope, curve = _alive(
+            tag_e, tag_mean, tag_spread, slope, curve = _surveyed(
                 packed, at, antennas, rounds, hits[:, t], points[t], normals[t], far
             )
-            share, e, mean, spread = counted(
-                odds[t], heard[t], tag_e, tag_silent, tag_mean, tag_spread, far_e, tempering
-            )
+            share, e, mean, spread = counted(odds[t], elsewhere[t], tag_e, tag_mean, tag_spread, far_e, tempering)
             e_sum, mean_sum, spread_sum = e_sum + e, mean_sum + mean, spread_sum + spread
             g_x, g_y, g_a = g_x + share * slope[0], g_y + share * slope[1], g_a + share * slope[2]
             xx, xy, xa = xx + share * curve[0], xy + share * curve[1], xa + share * curve[2]
@@ -257,56 +236,6 @@ def score(
         information[n, 0, 1] = information[n, 1, 0] = xy
         information[n, 0, 2] = information[n, 2, 0] = xa
         information[n, 1, 2] = information[n, 2, 1] = ya
-
-
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
-def silence(
-    packed: Packed,
-    pose: Array,
-    covariance: Array,
-    points: Array,
-    normals: Array,
-    offsets: Array,
-    antennas: NDArray[np.int64],
-    rounds: NDArray[np.int64],
-    hits: NDArray[np.int64],
-    odds: Array,
-    tempering: float,
-    out: Array,
-) -> None:
-    looks, tags = hits.shape
-    at = np.empty((looks, 8))
-    farthest = place_looks(packed, pose, offsets, antennas, at)
-    far = np.empty(looks)
-    for k in range(looks):
-        far[k] = terms(packed, NEGLIGIBLE_LOGIT, 1.0, 0, rounds[k])[0]
-    g = np.empty(3)
-    for t in range(tags):
-        out[t] = 0.0
-        dx, dy = points[t, 0] - pose[0], points[t, 1] - pose[1]
-        if odds[t] == -np.inf or dx * dx + dy * dy >= farthest * farthest:
-            continue
-        total, g[0], g[1], g[2] = 0.0, 0.0, 0.0, 0.0
-        for k in range(looks):
-            if hits[k, t] > 0:
-                total = -np.inf
-                break
-            x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
-            z, by_p, by_q, by_heading, _ = of_tag(packed, antennas[k], x, y, c, s, points[t], normals[t])
-            if z == NEGLIGIBLE_LOGIT:
-                continue
-            e, by_z, _, _, _ = terms(packed, z, packed.rate[packed.which[antennas[k]]], 0, rounds[k])
-            total += e - far[k]
-            by_x, by_y = at[k, 5] * by_q - at[k, 4] * by_p, -at[k, 5] * by_p - at[k, 4] * by_q
-            g[0] += by_z * by_x
-            g[1] += by_z * by_y
-            g[2] += by_z * (by_heading - by_x * at[k, 7] + by_y * at[k, 6])
-        # the mean of exp(-E) over a Gaussian for linear E; it exceeds the value at the mean
-        across = 0.0
-        for i in range(3):
-            for j in range(3):
-                across += g[i] * covariance[i, j] * g[j]
-        out[t] = max(tempering * total - 0.5 * tempering * tempering * across, 0.0)
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)

@@ -20,6 +20,7 @@ Array32 = NDArray[np.float32]
 
 CELL = 0.05  # m
 FACINGS = 9  # knots of the facing's cosine
+NEGLIGIBLE = 15.0  # log of the ratio of two likelihoods of which the smaller one does not count
 STEP = 0.01  # of the logit, in the tables of logarithms
 LEVEL = 0.04  # m: tags at the same height, to so much, share a table
 SHIFTS = np.linspace(-4.0, 4.0, 161)  # of a peak's logit, each with tables of logarithms of its own
@@ -119,7 +120,7 @@ def add_log_likelihood(
 ) -> None:
     """Add to ``out`` (N,) the log-likelihood, untempered, that one antenna at robot's poses (N, 3) reads each tag at ``points``
     (T, 3) with ``normals`` (T, 2) in ``hits`` (T,) of ``rounds`` rounds. ``apart`` (T,): in which row of ``each`` (U, N) a tag is
-    added by itself, above what it is out of reach, -1 of tags that go to ``out``. ``changes``: of the model, by pose."""
+    added by itself, above that of a silence out of reach, -1 of tags that go to ``out``. ``changes``: of the model, by pose."""
     arrays = (points, normals, hits, rounds, apart)
     if changes is None:
         changes = Changes(np.ones(len(poses)), np.empty(0, np.int32), np.empty((0, 0, 2), np.float32))
@@ -130,14 +131,18 @@ def add_log_likelihood(
 
 
 @numba.njit(cache=True, fastmath=FAST)
-def add_mixed(each: Array32, odds: Array, tempering: float, out: Array) -> None:
-    """Add to ``out`` (N,) the tempered log-likelihood of U silent tags with prior log-odds ``odds`` (U,) of being dead; ``each``
-    (U, N): that of alive tags (:mod:`factors.rfid.tag_states`)."""
+def add_mixed(each: Array32, odds: Array, elsewhere: Array, tempering: float, out: Array) -> None:
+    """Add to ``out`` (N,) the tempered log-likelihood of U tags that are, with prior log-odds ``odds`` (U,), not as surveyed, in
+    which case theirs is ``elsewhere`` (U,); ``each`` (U, N): that of tags as surveyed (:mod:`factors.rfid.tag_states`)."""
     for u in range(len(odds)):
-        dead = 1.0 / (1.0 + math.exp(-odds[u]))
+        other = odds[u] + elsewhere[u]
+        both = max(odds[u], 0.0) + math.log1p(math.exp(-abs(odds[u])))
         for n in range(len(out)):
-            if each[u, n] < 0.0:
-                out[n] += math.log((1.0 - dead) * math.exp(tempering * each[u, n]) + dead)
+            own = tempering * each[u, n]
+            if abs(own - other) > NEGLIGIBLE:
+                out[n] += max(own, other) - both
+            else:
+                out[n] += own + math.log1p(math.exp(other - own)) - both
 
 
 @numba.njit(cache=True)
@@ -209,7 +214,7 @@ def _add_tabled(
     certain = np.zeros(len(poses), np.float32)
     for t in range(len(points)):
         if far[t]:
-            constant += hits[t] * logs[0, 0] + (rounds - hits[t]) * logs[0, 1]
+            constant += _far(apart[t], hits[t], rounds, logs, each)
             continue
         total = certain
         if apart[t] >= 0:
@@ -238,6 +243,17 @@ def _add_tabled(
             total[n] += np.float32(_read(table[i * size + j], hits[t], rounds, logs, changes, n))
     for n in range(len(poses)):
         out[n] += constant + certain[n]
+
+
+@numba.njit(cache=True)
+def _far(row: int, hits: int, rounds: int, logs: Array, each: Array32) -> float:
+    """What a tag that is out of reach from all poses adds to each of them, besides what goes to its own row, if it has one."""
+    if row < 0:
+        return float(hits * logs[0, 0] + (rounds - hits) * logs[0, 1])
+    if hits > 0:
+        for n in range(each.shape[1]):
+            each[row, n] += np.float32(hits * (logs[0, 0] - logs[0, 1]))
+    return float(rounds * logs[0, 1])
 
 
 @numba.njit(cache=True)
@@ -346,7 +362,7 @@ def _add_direct(
     far[near] = False
     constant = 0.0
     for t in np.flatnonzero(far):
-        constant += hits[t] * none_hit + (rounds - hits[t]) * none_missed
+        constant += _far(apart[t], hits[t], rounds, logs, each)
     for n in range(len(poses)):
         ct, st = math.cos(poses[n, 2]), math.sin(poses[n, 2])
         x, y = poses[n, 0] + ct * ax - st * ay, poses[n, 1] + st * ax + ct * ay
@@ -357,7 +373,11 @@ def _add_direct(
             distance2 = ex * ex + ey * ey
             unit = changes.unit[n]
             if unit * unit * distance2 >= reach2:
-                total += hits[t] * none_hit + (rounds - hits[t]) * none_missed
+                total += rounds * none_missed
+                if apart[t] >= 0:
+                    each[apart[t], n] += np.float32(hits[t] * (none_hit - none_missed))
+                else:
+                    total += hits[t] * (none_hit - none_missed)
                 continue
             height = points[t, 2] - az
             along, across = unit * (cosine * ex + sine * ey), unit * (cosine * ey - sine * ex)
@@ -367,7 +387,7 @@ def _add_direct(
             w = 1.0 - u / r
             row = _index(logistic_value(b, r, w, z, c))
             if apart[t] >= 0:
-                each[apart[t], n] += np.float32(_read(row, 0, rounds, logs, changes, n) - rounds * none_missed)
+                each[apart[t], n] += np.float32(_read(row, hits[t], rounds, logs, changes, n) - rounds * none_missed)
                 total += rounds * none_missed
             else:
                 total += _read(row, hits[t], rounds, logs, changes, n)

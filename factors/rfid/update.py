@@ -17,7 +17,7 @@ from factors.rfid.model import Packed
 from factors.se2 import Array, Integers
 
 _Tags = tuple[Array, Array]  # points and normals
-_Seen = tuple[Array, Integers, Integers, Integers, Array]  # offsets, antennas, rounds, hits and odds
+_Seen = tuple[Array, Integers, Integers, Integers, Array, Array]  # offsets, antennas, rounds, hits, odds and elsewhere
 CONVERGED = 0.1  # of a standard deviation: a step of an update that is not worth another
 NOTHING = np.zeros(0)
 LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: how far a step may go before the likelihood is looked at again
@@ -66,7 +66,7 @@ def updated(
     likelihood, looks = factor.likelihood, factor.seen
     if factor.estimated or not isinstance(likelihood, RfidLikelihood) or not isinstance(looks, TagReadCounts):
         return scored_update(factor, pose, values, covariance, iterations)
-    tags, seen = likelihood.tags, (looks.offsets, looks.antennas, looks.rounds, looks.hits, looks.odds)
+    tags, seen = likelihood.tags, (looks.offsets, looks.antennas, looks.rounds, looks.hits, looks.odds, looks.elsewhere)
     arguments = (likelihood.packed, (tags.points, tags.normals), seen, float(likelihood.model.tempering))
     try:
         return TagUpdate(*_updated(*arguments, pose, covariance, iterations), values)
@@ -146,12 +146,26 @@ def _updated(
 def _score(packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Array) -> Score:
     """The score of one pose (3,), see :meth:`~factors.rfid.detection.RfidLikelihood.score`."""
     points, normals = tags
-    offsets, antennas, rounds, hits, odds = seen
+    offsets, antennas, rounds, hits, odds, elsewhere = seen
     nll, gradient, information = np.empty(1), np.empty((1, 3)), np.empty((1, 3, 3))
     told = np.empty(1), np.empty(1)
     at = pose.copy().reshape(1, 3)
     rfid_kernels.score(
-        packed, at, points, normals, offsets, antennas, rounds, hits, odds, tempering, nll, gradient, information, *told
+        packed,
+        at,
+        points,
+        normals,
+        offsets,
+        antennas,
+        rounds,
+        hits,
+        odds,
+        elsewhere,
+        tempering,
+        nll,
+        gradient,
+        information,
+        *told,
     )
     return Score(nll, gradient, information, *told)
 

@@ -82,7 +82,9 @@ def optimal_filter(log: Log) -> Trajectory:
             grid.predict(motion.relative(before, state))
             before = state
             mean, covariance = grid.moments()
-            tags.miss(m.t, looks, mean, se2.world_to_body(mean, covariance), likelihood)
+            told = tags.told(looks, mean, se2.world_to_body(mean, covariance), likelihood)
+            looks = tags.with_states(looks, told)
+            tags.learn(m.t, told)
             grid.update(partial(_log_likelihood, likelihood, looks))
             mean, covariance = grid.moments()
             t.append(m.t)

@@ -144,10 +144,15 @@ def test_factor_has_the_cost_gradient_and_curvature_of_the_likelihood() -> None:
 
 
 def doubtful(seed: int, name: str = "beam") -> tuple[RfidLikelihood, TagReadCounts, TagReadCounts]:
-    """A scene in which most tags are silent: all of them certain to live, and with odds from certain to nearly given up."""
+    """A scene in which most tags are silent: all of them as surveyed, and with odds from certain to nearly given up."""
     likelihood, looks = scene(MODELS[name], seed, tempering=0.3)
     looks.hits[:, 4:] = 0
-    return likelihood, looks, replace(looks, odds=np.resize(np.array((-np.inf, -3.0, 0.5, 8.0)), 15))
+    elsewhere = np.where(looks.hits.any(axis=0), -1.5, np.resize(np.array((0.0, -0.2)), 15))
+    return (
+        likelihood,
+        looks,
+        replace(looks, odds=np.resize(np.array((-np.inf, -3.0, 0.5, 8.0)), 15), elsewhere=elsewhere),
+    )
 
 
 def out_of_reach(likelihood: RfidLikelihood, looks: TagReadCounts) -> float:
@@ -157,27 +162,22 @@ def out_of_reach(likelihood: RfidLikelihood, looks: TagReadCounts) -> float:
     return -model.tempering * float(looks.rounds.sum()) * math.log1p(-floor)
 
 
-def mixture(likelihood: RfidLikelihood, looks: TagReadCounts, odds: np.ndarray, pose: np.ndarray) -> float:
-    """The negative log-likelihood of tags that may be dead, tag by tag; a tag that is read lives, which is not counted."""
-    total, none = 0.0, out_of_reach(likelihood, looks)
+def mixture(likelihood: RfidLikelihood, looks: TagReadCounts, pose: np.ndarray) -> float:
+    """The negative log-likelihood of tags that may be dead or moved, tag by tag."""
+    none = out_of_reach(likelihood, looks)
     each, _, _ = likelihood.by_tag(pose, looks)
-    for tag, own in enumerate(odds):
-        dead = 0.0 if own == -np.inf else 1.0 / (1.0 + math.exp(-own))
-        if looks.hits[:, tag].any():
-            total += each[tag]
-        else:
-            total -= math.log((1.0 - dead) * math.exp(-each[tag]) + dead * math.exp(-none))
-    return total
+    other = 1.0 / (1.0 + np.exp(-looks.odds))
+    return float(-np.log((1.0 - other) * np.exp(-each) + other * np.exp(looks.elsewhere - none)).sum())
 
 
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("seed", range(4))
-def test_a_tag_that_may_be_dead_counts_as_a_mixture(name: str, seed: int) -> None:
+def test_a_tag_that_may_not_be_as_surveyed_counts_as_a_mixture(name: str, seed: int) -> None:
     likelihood, looks, mixed = doubtful(seed, name)
     found = likelihood.score(POSE, mixed)
-    assert found.nll[0] == pytest.approx(mixture(likelihood, looks, mixed.odds, POSE), rel=1e-6)
+    assert found.nll[0] == pytest.approx(mixture(likelihood, mixed, POSE), rel=1e-6)
     for k, step in enumerate(1e-5 * np.eye(3)):
-        low, high = (mixture(likelihood, looks, mixed.odds, se2.compose(POSE, se2.exp(s * step))) for s in (-1, 1))
+        low, high = (mixture(likelihood, mixed, se2.compose(POSE, se2.exp(s * step))) for s in (-1, 1))
         assert found.gradient[0, k] == pytest.approx((high - low) / 2e-5, abs=1e-3, rel=1e-3)
     assert np.all(np.linalg.eigvalsh(found.information[0]) > -1e-9)
     assert np.trace(found.information[0]) < np.trace(likelihood.score(POSE, looks).information[0])
@@ -188,30 +188,30 @@ def test_a_tag_that_may_be_dead_counts_as_a_mixture(name: str, seed: int) -> Non
     assert np.abs(tabled - exact).mean() < 0.05 * np.abs(exact).mean()
 
 
-def test_expectation_over_what_a_tag_that_may_be_dead_can_do() -> None:
-    """One antenna, two rounds: all that can be read, each as likely as the states make it."""
-    tags = TagArray(np.array(((2.0, 0.5, 1.0),)), np.full(1, np.nan))
-    likelihood = RfidLikelihood(RfidModel((Antenna(z=1.0),), (BeamModel(p0=0.7),), 0.0, 0.0), tags)
-    q, dead = float(likelihood.probabilities(np.zeros((1, 3)), 0)[0, 0]), 0.3
-    odds = np.array((math.log(dead / (1.0 - dead)),))
-    values, chances = [], []
-    for k, ways in enumerate((1.0, 2.0, 1.0)):
-        looks = TagReadCounts(np.zeros((1, 3)), np.zeros(1, np.int64), np.full(1, 2), np.array(((k,),)), odds)
-        score = likelihood.score(np.zeros(3), looks)
-        values.append(score.nll[0])
-        chances.append((1.0 - dead) * ways * q**k * (1.0 - q) ** (2 - k) + (dead if k == 0 else 0.0))
-        mean, variance = score.expected[0], score.variance[0]
-    assert mean == pytest.approx(np.dot(chances, values), rel=1e-6)
-    assert variance == pytest.approx(np.dot(chances, np.square(values)) - mean**2, rel=1e-6)
-
-
-def test_silence_tells_less_where_the_pose_is_uncertain() -> None:
+def test_a_tag_that_is_not_as_surveyed_is_no_surprise() -> None:
     likelihood, looks, mixed = doubtful(1)
-    at_once = likelihood.silence(POSE, np.zeros((3, 3)), mixed)
-    each, _, _ = likelihood.by_tag(POSE, looks)
-    silent = np.isfinite(mixed.odds) & ~mixed.hits.any(axis=0)
-    assert at_once[silent] == pytest.approx(each[silent] - out_of_reach(likelihood, looks), abs=1e-6)
-    assert not at_once[~silent].any()
-    uncertain = likelihood.silence(POSE, np.diag((0.2, 0.2, 0.1)) ** 2, mixed)
-    assert np.all(uncertain <= at_once)
-    assert uncertain.sum() < 0.99 * at_once.sum()
+    plain, given_up = (likelihood.score(POSE, replace(mixed, odds=np.full(15, odds))) for odds in (-50.0, 50.0))
+    usual = likelihood.score(POSE, looks)
+    for found, expected in zip(plain, usual, strict=True):
+        assert found == pytest.approx(expected)
+    assert given_up.nll == pytest.approx(15 * out_of_reach(likelihood, looks) - mixed.elsewhere.sum())
+    assert given_up.expected == pytest.approx(given_up.nll)
+    assert given_up.variance == pytest.approx(0.0, abs=1e-12)
+    assert not np.any(np.abs(given_up.gradient) > 1e-12)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_likelihood_of_a_tag_that_was_moved(name: str) -> None:
+    """Tag by tag, at each place, as the likelihood of a map that has it there, and its mean over poses."""
+    likelihood, looks, _ = doubtful(2, name)
+    poses = POSE + np.random.default_rng(2).normal(size=(4, 3)) * 0.2
+    shifts, tags = np.array(((0.0, 0.0), (1.0, -0.5), (40.0, 0.0))), np.array((0, 2, 7, 11))
+    found = likelihood.displaced(poses, looks, tags, shifts)
+    assert found.shape == (4, 3)
+    for k, shift in enumerate(shifts):
+        points = likelihood.tags.points + np.append(shift, 0.0)
+        there = RfidLikelihood(likelihood.model, replace(likelihood.tags, points=points))
+        each = np.array([there.by_tag(pose, looks)[0][tags] for pose in poses]) - out_of_reach(likelihood, looks)
+        expected = np.log(np.mean(np.exp(-each), axis=0))
+        assert found[:, k] == pytest.approx(expected, abs=0.15 + 0.05 * np.abs(expected).max())
+    assert found[2:, 2] == pytest.approx(0.0, abs=1e-5)

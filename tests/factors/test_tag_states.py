@@ -1,52 +1,96 @@
-"""The states of tags: what reads and silences tell, and what is taken back."""
+"""The states of tags: what scans tell of them, and what is taken back."""
 
 import numpy as np
 import pytest
 
-from factors.rfid.tag_states import TagStates, log_odds
+from factors.rfid.tag_states import FARTHEST, PITCH, TagStates, displacements
+
+PLACES = len(displacements())
+TAG = np.zeros(1, dtype=np.int64)
 
 
-def test_silences_add_up_and_one_read_revives() -> None:
-    states = TagStates(3, 0.03)
-    assert states.dead == pytest.approx(np.full(3, 0.03))
-    for t in range(4):
-        states.miss(float(t), np.array((2.0, 0.1, 0.0)))
-    # Bayes' rule by hand: an alive tag is silent with exp(-2) each time
-    assert states.dead[0] == pytest.approx(0.03 / (0.03 + 0.97 * np.exp(-8.0)))
-    assert states.dead[1] == pytest.approx(0.03 / (0.03 + 0.97 * np.exp(-0.4)))
-    assert states.dead[2] == pytest.approx(0.03)
-    assert states.believed_dead.tolist() == [0]
-    states.hear(4.0, np.array((0,)))
-    assert states.dead[0] == 0.0
-    states.miss(5.0, np.array((2.0, 0.0, 0.0)))
-    assert states.odds[0] == -np.inf
+def told(surveyed: float, *moved: float) -> np.ndarray:
+    """Log-likelihoods (1, 1 + K): of a tag as surveyed, and at the first places; elsewhere as out of reach."""
+    out = np.zeros((1, 1 + PLACES))
+    out[0, 0], out[0, 1 : 1 + len(moved)] = surveyed, moved
+    return out
+
+
+def test_displacements_are_a_disc_around_the_surveyed_place() -> None:
+    places = displacements()
+    assert np.hypot(*places.T).min() == pytest.approx(PITCH)
+    assert np.hypot(*places.T).max() == pytest.approx(FARTHEST)
+    assert places.sum(axis=0) == pytest.approx((0.0, 0.0))
+    assert len(np.unique(places, axis=0)) == len(places) == 28
+
+
+def test_scans_add_up_by_the_rule_of_bayes() -> None:
+    states = TagStates(2, 0.03, 0.05)
+    assert np.exp(states.odds) == pytest.approx(np.full(2, 0.08 / 0.92))
+    for t in range(3):
+        states.learn(float(t), TAG, told(-2.0, -1.0))
+    other = 0.03 + 0.05 / PLACES * (PLACES - 1 + np.exp(-3.0))
+    assert np.exp(states.odds) == pytest.approx((other / (0.92 * np.exp(-6.0)), 0.08 / 0.92), rel=1e-6)
+    assert states.suspects == {0: pytest.approx(other / (other + 0.92 * np.exp(-6.0)))}
+
+
+def test_a_tag_that_was_read_is_not_dead_but_may_have_moved() -> None:
+    states = TagStates(1, 0.3, 0.2)
+    assert not states.was_read(0)
+    states.hear(4.0, TAG)
+    assert states.was_read(0)
     assert states.heard == 4.0
+    assert np.exp(states.odds) == pytest.approx(0.2 / 0.5)
+    states.learn(4.0, TAG, told(-7.0, -1.0))
+    assert list(states.suspects) == [0]
 
 
-def test_silences_are_taken_back_and_reads_are_not() -> None:
-    states = TagStates(2, 0.1)
-    states.miss(1.0, np.array((1.0, 1.0)))
+def test_what_is_expected_elsewhere_is_what_the_odds_change_by() -> None:
+    states, rng = TagStates(1, 0.03, 0.1), np.random.default_rng(1)
+    for t in range(5):
+        scan, before = rng.normal(size=(1, 1 + PLACES)), states.odds
+        expected = states.expect(TAG, scan)
+        states.learn(float(t), TAG, scan)
+        assert states.odds == pytest.approx(before + expected - scan[:, 0], abs=1e-6)
+
+
+@pytest.mark.parametrize(("read", "expected"), [(False, 0.0), (True, -np.inf)])
+def test_where_no_tag_moves_a_tag_that_was_read_is_as_surveyed(read: bool, expected: float) -> None:
+    states = TagStates(1, 0.1, 0.0)
+    if read:
+        states.hear(0.0, TAG)
+    assert states.expect(TAG, told(-3.0, -1.0)) == expected
+    states.learn(0.0, TAG, told(-3.0, -1.0))
+    assert states.odds == pytest.approx(-np.inf if read else np.log(0.1 / 0.9) + 3.0)
+
+
+def test_what_was_learnt_is_taken_back_and_reads_are_not() -> None:
+    states = TagStates(2, 0.1, 0.1)
+    both = np.arange(2)
+    states.learn(1.0, both, np.concatenate((told(-1.0), told(-1.0, -0.5))))
     before = states.odds
-    states.miss(2.0, np.array((3.0, 3.0)))
-    states.hear(2.5, np.array((1,)))
-    states.miss(3.0, np.array((4.0, 0.0)))
+    states.learn(2.0, both, np.concatenate((told(-3.0), told(-3.0))))
+    states.hear(2.5, both[1:])
+    states.learn(3.0, TAG, told(-4.0))
     states.forget(2.0)
-    assert states.odds == pytest.approx((before[0], -np.inf))
-    states.miss(2.0, np.array((3.0, 0.0)))  # it comes again, and counts once
+    assert states.odds[0] == pytest.approx(before[0])
+    assert states.odds[1] < before[1]
+    states.learn(2.0, TAG, told(-3.0))  # it comes again, and counts once
     assert states.odds[0] == pytest.approx(before[0] + 3.0)
 
 
-def test_where_no_tag_is_dead_none_is_given_up() -> None:
-    states = TagStates(1, 0.0)
-    states.miss(1.0, np.array((1e3,)))
-    assert states.dead[0] == 0.0
-    assert log_odds(0.0) == -np.inf
+def test_where_all_tags_are_as_surveyed_none_is_suspected() -> None:
+    states = TagStates(1, 0.0, 0.0)
+    states.learn(1.0, TAG, told(-1e3))
+    assert states.odds == -np.inf
+    assert not states.suspects
+    assert states.was_read(0)
 
 
 def test_memory_is_bounded() -> None:
-    states = TagStates(1, 0.1)
+    states = TagStates(1, 0.1, 0.0)
     for i in range(10_000):
-        states.miss(0.1 * i, np.array((0.1,)))
+        states.learn(0.1 * i, TAG, told(-0.1))
     states.forget(-np.inf)
     # what is older than is kept is not taken back
-    assert states.odds[0] == pytest.approx(log_odds(0.1) + 0.1 * (10_000 - 2000), abs=1.0)
+    assert states.odds[0] == pytest.approx(np.log(0.1 / 0.9) + 0.1 * (10_000 - 2000), abs=1.0)

@@ -199,7 +199,7 @@ def test_scans_that_come_again_make_no_silence():
     world = World(tags={"a": Tag(x=1.0, y=0.0)})
     # and the tag lives, and the antenna is as the rig says: else both would be doubted before the reader is
     exact = {"default": BeamSettings(prior=PriorSettings(range_scale=0.0, read_rate=0.0))}
-    settings = RfidSettings(antennas={"ahead": AntennaSettings()}, models=exact, dead_tags=0.0)
+    settings = RfidSettings(antennas={"ahead": AntennaSettings()}, models=exact, dead_tags=0.0, moved_tags=0.0)
     particles = alone(world, settings, 500)
     particles.initialize(PosePrior(0.0, np.zeros(3), 1e-4 * np.eye(3)))
     for t in (0.3, 0.2, 0.1):

@@ -13,7 +13,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.variable import NOTHING, Estimated
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
-from factorgraph_loc.sensors.rfid.known_tags import KnownTags
+from factorgraph_loc.sensors.rfid.known_tags import KnownTags, TagEvidence
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.monitor import ScanMonitor, SilenceMonitor
 from factorgraph_loc.sensors.rfid.signals import TagSignals
@@ -40,6 +40,7 @@ class TagObservation:
     here: TagReadCounts | None = None  # reads and misses, relative to the pose at the scan's time
     rounds: int = 0  # antenna rounds, for reads and misses
     blocks: tuple[str, ...] = ()
+    told: TagEvidence | None = None  # of the states of tags
     iterations: ClassVar[int] = rfid_update.ITERATIONS
 
     @property
@@ -126,7 +127,11 @@ class TagSensor(Sensor):
         if looks is None or likelihood is None:
             return
         here = looks if view.offset is None else looks.moved(view.offset.delta)
-        yield self._detection(m, here, looks)
+        told = None
+        if view.localized:
+            told = self.tags.told(here, view.pose, view.covariance, self._estimated(likelihood, view))
+            looks, here = self.tags.with_states(looks, told), self.tags.with_states(here, told)
+        yield replace(self._detection(m, here, looks), told=told)
         if self._silence.lasts and view.newest:
             return
         strengths = self._signals.strengths(m)
@@ -147,8 +152,7 @@ class TagSensor(Sensor):
         return TagObservation(m.t, factor, int(looks.hits.sum()), looks, len(m.antennas), self._blocks)
 
     def judge(self, observation: TagObservation, correction: Correction, view: View) -> bool:
-        looks, t = observation.factor.seen, observation.t
-        assert isinstance(looks, TagReadCounts)
+        t = observation.t
         assert correction.evidence is not None
         self._diagnostics.innovation("rfid", t, correction.nis, correction.dof)
         if view.newest and not self._is_evidence(observation, correction.evidence):
@@ -156,11 +160,16 @@ class TagSensor(Sensor):
             return False
         if view.newest:
             self._monitor.add(t, correction.excess_nll, correction.variance)
-        if view.localized and self.suspicious_since is None:
-            values = [value for name in observation.blocks if (value := view.value(name)) is not None]
-            factor = observation.factor.fixed(values[0]) if values else observation.factor
-            self.tags.miss(t, looks, view.pose, view.covariance, cast(RfidLikelihood, factor.likelihood))
+        if observation.told is not None and self.suspicious_since is None:
+            self.tags.learn(t, observation.told)
         return True
+
+    def _estimated(self, likelihood: RfidLikelihood, view: View) -> RfidLikelihood:
+        """The likelihood with the detection models as they are estimated to be."""
+        value = view.value(self.modality) if self._blocks else None
+        return (
+            likelihood if value is None else likelihood.adjusted(self.constants.full(value, len(likelihood.parameters)))
+        )
 
     def _is_evidence(self, observation: TagObservation, evidence: float) -> bool:
         # a scan without reads that is repeated after going back in time counts once

@@ -1,7 +1,7 @@
 """Descriptions of what a run can do with RFID tags."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -30,8 +30,8 @@ def mappable(log: Log) -> str | None:
 
 
 def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
-    """That an estimator takes no tags, that none is read, which are believed dead at the end, the surest first, and how the
-    antennas differ from the rig's models."""
+    """That an estimator takes no tags, that none is read, which are believed dead or moved at the end, the surest first, and how
+    the antennas differ from the rig's models."""
     log, rounds = use.log, diagnostics.ignored.get("rfid", 0)
     if rounds and use.estimator != "dead_reckoning":  # obvious from its name
         yield f"{log.name}: {use.estimator} does not use RFID: all {rounds} inventory rounds are ignored"
@@ -41,17 +41,25 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
     if isinstance(stream, RfidStream) and tags and not any(epc in tags for epc in stream.epc):
         yield f"{log.name}: none of the {len(tags)} tags of the map is read"
         return
-    found = sorted(diagnostics.dead_tags.items(), key=lambda row: -row[1])
-    if found:
-        names = ", ".join(f"{name} ({_percent(dead)})" for name, dead in found[:SHOWN])
-        more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
-        yield (
-            f"{log.name}: {len(found)} of {len(tags)} tags of the map are believed dead, as they were not read from where "
-            f"they should have been: {names}{more}"
-        )
+    for suspects, why in (
+        (diagnostics.dead_tags, "are believed dead, as they were not read from where they should have been"),
+        (
+            diagnostics.moved_tags,
+            "are believed to have moved, as they were read from elsewhere than they should have been",
+        ),
+    ):
+        if suspects:
+            yield f"{log.name}: {len(suspects)} of {len(tags)} tags of the map {why}: {suspected(suspects)}"
     settings = log.rig.find(RfidSettings)
     if settings is not None:
         yield from (f"{log.name}: {line}" for line in _differences(settings, learnt))
+
+
+def suspected(tags: Mapping[str, float]) -> str:
+    """Tags with their probabilities, the surest first."""
+    found = sorted(tags.items(), key=lambda row: -row[1])
+    names = ", ".join(f"{name} ({_percent(probability)})" for name, probability in found[:SHOWN])
+    return names + (f" and {len(found) - SHOWN} more" if len(found) > SHOWN else "")
 
 
 def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """Reads and misses of the tags of the map."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,10 +9,12 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.tag_map import TagMap, tag_map
+from factors import positive, se2
 from factors.rfid.detection import RfidLikelihood, TagReadCounts
-from factors.rfid.tag_states import TagStates
+from factors.rfid.tag_states import FARTHEST, TagStates
 from factors.se2 import Array, Integers
 
+REACHING = 1.5  # times the reach of the antennas: tags that a longer range than the rig's might bring into reach
 EXACT = 0.2  # a survey is exact if its sigma is below this share of `pass_sigma`
 
 
@@ -26,11 +28,19 @@ def trust(sigmas: Array, pass_sigma: float) -> float:
     return float(np.mean(1.0 / (1.0 + (counted / pass_sigma) ** 2))) if len(sigmas) else 1.0
 
 
+@dataclass(frozen=True, eq=False)
+class TagEvidence:
+    """What a scan tells of the states of U ``tags`` (U,), see :meth:`~factors.rfid.tag_states.TagStates.expect`."""
+
+    tags: Integers
+    told: Array
+
+
 class KnownTags:
     """Turns scans into read counts of the map's tags. Tags and antennas that map or rig lack are counted as ignored.
 
-    It also tracks the ``states`` of the tags: reads show at once that a tag works; misses are used only with a known pose
-    (:meth:`miss`). Tags that are believed dead are listed in the diagnostics.
+    It also tracks the ``states`` of the tags: reads show at once that a tag is not dead; else a scan tells of them only with a
+    known pose (:meth:`told`, :meth:`learn`). Tags that are believed dead or moved are listed in the diagnostics.
     """
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
@@ -43,7 +53,8 @@ class KnownTags:
         if settings is not None:
             model, self.trust = settings.model(), trust(self.map.sigmas, settings.pass_sigma)
             self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
-        self.states = TagStates(len(self.map.names), 0.0 if settings is None else settings.dead_tags)
+        dead, moved = (0.0, 0.0) if settings is None else (settings.dead_tags, settings.moved_tags)
+        self.states = TagStates(len(self.map.names), dead, moved)
 
     def looks(self, m: RfidScan, *, count: bool = True) -> TagReadCounts | None:
         """Reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time. Without ``count``,
@@ -57,7 +68,7 @@ class KnownTags:
             diagnostics.ignore("antenna that the rig lacks", rows.count(-1))
         if not len(used) or not self.map.names:
             return None
-        hits, odds = np.zeros((len(used), len(self.map.names)), dtype=np.int64), self.states.odds
+        hits = np.zeros((len(used), len(self.map.names)), dtype=np.int64)
         unknown = 0
         # count a tag once per round
         for number, name in dict.fromkeys(zip(m.antenna.tolist(), m.tags, strict=True)):
@@ -68,30 +79,50 @@ class KnownTags:
                 hits[rows[number], place] += 1
         if unknown:
             diagnostics.ignore("tag not in the map", unknown)
-        self.states.hear(m.t, np.flatnonzero(hits.any(axis=0)))
+        heard = hits.any(axis=0)
+        self.states.hear(m.t, np.flatnonzero(heard))
         self._tell()
-        return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds)
+        odds = self.states.odds
+        # what is read of a tag that is believed to have moved tells nothing of an unknown pose
+        elsewhere = np.where(heard & (odds <= 0.0), -np.inf, 0.0)
+        return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere)
 
-    def miss(self, t: float, looks: TagReadCounts, pose: Array, covariance: Array, likelihood: RfidLikelihood) -> None:
-        """Learn of the tags that were not read at ``t``. ``pose`` (3,) with body-frame ``covariance`` (3, 3): that of the looks, as
-        it was predicted before them. ``likelihood``: with the detection models as they are estimated to be."""
-        self.states.miss(t, likelihood.silence(pose, covariance, looks))
+    def told(self, looks: TagReadCounts, pose: Array, covariance: Array, likelihood: RfidLikelihood) -> TagEvidence:
+        """What looks tell of the tags in reach at a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3); ``likelihood``:
+        with the detection models as they are estimated to be."""
+        root = math.sqrt(3.0) * positive.root(covariance)
+        poses = se2.compose(pose, se2.exp(np.concatenate((root.T, -root.T))))
+        near = likelihood.near(poses, looks, REACHING, FARTHEST) | looks.hits.any(axis=0)
+        tags = np.flatnonzero(near & (looks.odds > -np.inf))
+        shifts = np.concatenate((np.zeros((1, 2)), self.states.shifts))
+        return TagEvidence(tags, likelihood.displaced(poses, looks, tags, shifts))
+
+    def with_states(self, looks: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
+        """The looks at tags that may be dead or moved, of which they tell ``evidence``."""
+        elsewhere = looks.elsewhere.copy()
+        elsewhere[evidence.tags] = self.states.expect(evidence.tags, evidence.told)
+        return replace(looks, elsewhere=elsewhere)
+
+    def learn(self, t: float, evidence: TagEvidence) -> None:
+        """Learn of the tags that were seen, or not, at ``t``."""
+        self.states.learn(t, evidence.tags, evidence.told)
         self._tell()
 
     def forget(self, since: float) -> None:
-        """Undo the updates by misses since ``since``."""
+        """Take back what was learnt since ``since``."""
         self.states.forget(since)
         self._tell()
 
     def silent(self) -> None:
-        """Ignore misses since the last read, because the reader or all tags have failed."""
+        """Take back what was learnt since the last read, because the reader or all tags have failed."""
         self.forget(math.nextafter(self.states.heard, math.inf))
 
     def _tell(self) -> None:
-        believed, told = self.states.believed_dead, self._diagnostics.dead_tags
-        told.clear()
-        if len(believed):
-            told.update(zip((self.map.names[i] for i in believed), self.states.dead[believed].tolist(), strict=True))
+        dead, moved = self._diagnostics.dead_tags, self._diagnostics.moved_tags
+        dead.clear()
+        moved.clear()
+        for i, p in self.states.suspects.items():
+            (moved if self.states.was_read(i) else dead)[self.map.names[i]] = p
 
     def _listening(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
         """The active antennas: row of each, -1 if the rig lacks it; antenna index and number of rounds of each row. Cached, because
@@ -105,9 +136,12 @@ class KnownTags:
         return self._rounds[names]
 
     def places(self, m: RfidScan) -> tuple[Integers, Integers]:
-        """Antenna and tag indices of each read of a scan, -1 if the rig or the map lacks them."""
+        """Antenna and tag indices of each read of a scan, -1 if the rig or the map lacks them, or if the tag is believed not to be
+        where the map has it."""
         antennas = np.array([self._antennas.get(name, -1) for name in m.antennas], dtype=np.int64)
         tags = np.array([self.map.index.get(name, -1) for name in m.tags], dtype=np.int64)
+        # the last one stands for those that the map lacks
+        tags[np.append(self.states.odds, -np.inf)[tags] > 0.0] = -1
         return antennas[m.antenna], tags
 
 

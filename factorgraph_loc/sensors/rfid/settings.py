@@ -206,6 +206,8 @@ class RfidSettings(SensorSettings):
     """accuracy of the pose from one pass of a tag, for tags with an inexact survey"""
     dead_tags: Share = 0.03
     """prior share of broken, hidden or missing tags of a map"""
+    moved_tags: Share = 0.03
+    """prior share of tags that are half a metre or more from where the map has them"""
     rssi: RssiSettings | None = None
     """model of the strength of a read, for the sensor rssi"""
     phase: PhaseSettings | None = None

@@ -217,6 +217,9 @@ def _of_diagnostics(diagnostics: Diagnostics) -> tuple[dict[str, Any], dict[str,
         "events.t": np.array([t for t, _ in diagnostics.events]),
         "dead_tags.probabilities": np.array([p for _, p in sorted(diagnostics.dead_tags.items())]),
     }
+    if diagnostics.moved_tags:
+        exact["moved_tags"] = sorted(diagnostics.moved_tags)
+        numbers["moved_tags.probabilities"] = np.array([p for _, p in sorted(diagnostics.moved_tags.items())])
     for sensor, rows in sorted(diagnostics.nis.items()):
         table = np.array([(t, nis) for t, nis, _ in rows])
         which = _some(len(table), SUMS)

@@ -1,0 +1,59 @@
+"""Tags that are not where the map has them, as a robot can know of them on its way."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.model.log import Log, cut, join
+from factorgraph_loc.simulation import preset, simulate
+
+
+@cache
+def office(seed: int, misplaced: float) -> Log:
+    """Two minutes, with some tags 1 m off in the map."""
+    return simulate(preset("office", {"drive": {"duration": 120.0}, "faults": {"misplaced": misplaced}}), seed)
+
+
+def truth(seed: int, misplaced: float) -> Log:
+    """The same log with the right map."""
+    return replace(office(seed, misplaced), world=office(seed, 0.0).world)
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "smoother"])
+def test_hardly_worse_than_with_the_right_map(estimator: str) -> None:
+    """A quarter of the tags moved, two logs pooled: what is named did move, and most of what did is named."""
+    errors, sure, moved, named = [], [], set(), set()
+    for seed in (12, 13):
+        log = office(seed, 0.25)
+        found, told = (run(one, RunConfig(estimator)) for one in (log, truth(seed, 0.25)))
+        figures = score(found, log), score(told, log)
+        errors.append([one["causal.position_rmse"] ** 2 for one in figures])
+        sure.append(figures[0]["causal.anees"])
+        moved |= {(seed, name) for name in log.metadata["misplaced"].split(", ")}
+        named |= {(seed, name) for name in found.diagnostics.moved_tags}
+        assert figures[0]["moved_tags.total"] == len(found.diagnostics.moved_tags) > 0
+        assert any("tags of the map are believed to have moved" in warning for warning in found.warnings)
+    found_rms, told_rms = np.sqrt(np.mean(errors, axis=0))
+    assert found_rms < 1.3 * told_rms
+    assert np.mean(sure) < 4.5
+    assert named <= moved
+    assert len(named) >= 0.6 * len(moved)  # some of them the robot hardly passes in two minutes
+
+
+def test_in_a_right_map_no_tag_has_moved() -> None:
+    result = run(office(12, 0.0), RunConfig("smoother"))
+    assert not result.diagnostics.moved_tags
+    assert not any("moved" in warning for warning in result.warnings)
+
+
+def test_what_a_lost_track_made_of_the_tags_is_taken_back() -> None:
+    """The robot is carried elsewhere: the tags that it reads there, where it is not thought to be, have not moved."""
+    log = office(12, 0.0)
+    carried = join(cut(log, 0.0, 40.0), cut(log, 70.0, 110.0))
+    result = run(carried, RunConfig("smoother"))
+    assert any(what.startswith("lost") for _, what in result.diagnostics.events)
+    assert len(result.diagnostics.moved_tags) <= 1
