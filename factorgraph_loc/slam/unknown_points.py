@@ -46,7 +46,7 @@ OPEN = np.full(3, 30.0)  # m: weak prior of a point, about the size of a buildin
 LOST = 10.0  # s for which a lost point is searched: after that, too many others in a building look like it
 AGREED = 0.5  # fraction of inliers required of points not seen for longer: similar descriptors agree by chance
 RECENT = 5.0  # s: the error of a point seen since is correlated with that of the track
-REVISITED = 6  # points not seen for longer that are accepted together, whatever the others say
+REVISITED = 6  # features of points not seen for longer that are accepted together, whatever the others say
 HORIZON, BUNDLE = 60, 8  # keyframes for which sightings are kept, and keyframes that are adjusted together
 
 
@@ -119,7 +119,8 @@ class UnknownPoints:
         old = [old[i] for i in few]
         points = [self._points[names[i]] for i in old]
         known = np.array([rows[i] in certain for i in old], dtype=bool)
-        guess, right = self._placed(model, points, pixels[old], keyframe.t, guess, graph, known)
+        fewest = REVISITED if m.names is None else 2  # a name needs one other to confirm it
+        guess, right = self._placed(model, points, pixels[old], keyframe.t, guess, graph, known, fewest)
         if m.frame is not None:
             seen_from = lifted(model, *guess).position
             self._remember(
@@ -257,10 +258,12 @@ class UnknownPoints:
         guess: Guess,
         graph: GraphView,
         known: Truths,
+        fewest: int,
     ) -> tuple[Guess, Truths]:
         """The pose corrected by points of the graph, and which of these are inliers.
 
-        Points not seen for long need to agree with each other but not with the rest, as the track has drifted since.
+        Points not seen for long need to agree with each other, at least ``fewest`` of them, but not with the rest, as the track has
+        drifted since.
         """
         if not points:
             return guess, np.zeros(0, dtype=bool)
@@ -272,7 +275,7 @@ class UnknownPoints:
         recent = np.array([t - point.last < RECENT for point in points])
         right = known.copy()
         placed = guess
-        revisited = max(REVISITED, math.ceil(AGREED * np.count_nonzero(~recent & ~known)))
+        revisited = max(fewest, math.ceil(AGREED * np.count_nonzero(~recent & ~known)))
         for which, enough in ((recent, FEWEST), (~recent & ~known, revisited)):
             agrees = np.zeros(len(points), dtype=bool)
             if which.any():

@@ -88,6 +88,13 @@ def test_images_need_points_that_look_like_something(blank):
     assert run(named, RunConfig("ekf", sensors=("odometry", "sightings"))).warnings == ()
 
 
+def test_who_takes_the_points_of_the_map_as_they_are_says_so_where_they_should_be_unknown(blank):
+    named, unknown, used = with_points(blank, 0), {"landmarks": "unknown"}, ("odometry", "sightings")
+    told = "straight: ekf does not estimate points: those of the map are used as they are"
+    assert run(named, RunConfig("ekf", unknown, used)).warnings == (told,)
+    assert run(named, RunConfig("smoother", unknown, used)).warnings == ()
+
+
 def test_why_a_start_stayed_unknown_is_told_by_the_sensors_that_were_used(blank, log):
     def why(log, *sensors):
         result = run(log, RunConfig("smoother", sensors=("odometry", *sensors), prior="unknown"))

@@ -24,12 +24,14 @@ def mappable(log: Log) -> str | None:
 
 
 def doubts(use: Use, _diagnostics: Diagnostics, _learnt: Learnt) -> Iterator[str]:
-    """A map without points that the camera could find, where the estimator needs them."""
+    """A map without points that the camera could find, where the estimator needs them; a known map that was not wanted."""
     used = [name for name in NAMES if name in use.sensors]
     points = use.log.world.points
     if not used or "camera" not in use.modalities:
         return
     if points is not None and len(points.owners if used == ["camera"] else points):
+        if getattr(use.settings, "landmarks", "known") == "unknown" and not use.estimates_points:
+            yield f"{use.log.name}: {use.estimator} does not estimate points: those of the map are used as they are"
         return
     if getattr(use.settings, "visual_odometry", False):
         return
