@@ -10,6 +10,7 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -60,7 +61,7 @@ class Column:
     field: str = ""
     left_out_below: float = -math.inf
 
-    @property
+    @cached_property
     def measured(self) -> Column:
         """The column as in a stream or a measurement."""
         return replace(self, name=self.field or self.name, low=max(self.low, self.left_out_below))

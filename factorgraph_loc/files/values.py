@@ -15,10 +15,13 @@ from factorgraph_loc.files.columns import SECONDS, Column
 from factors.se2 import Array
 
 NUMBER = (int, float, np.integer, np.floating)
+FEW = 30  # numbers, for which a loop is faster than NumPy
 
 
 def seconds_of(where: str, value: object, name: str = "t") -> float:
     """A time [s]; InputError if it is not a number or out of range."""
+    if type(value) is float and SECONDS.low <= value <= SECONDS.high:
+        return value
     found = math.nan
     if isinstance(value, NUMBER) and not isinstance(value, bool):
         with contextlib.suppress(OverflowError):
@@ -49,6 +52,9 @@ def within(where: str, column: Column, value: object, shape: tuple[int, ...]) ->
     found = numbers(where, field, value)
     if found.shape != shape:
         raise InputError(f"{where}: {field} has shape {found.shape}, expected {shape}")
+    low, high = column.low, column.high
+    if column.kind != "whole" and found.size <= FEW and all(low <= one <= high for one in found.ravel().tolist()):
+        return found if shape else float(found)
     if (bad := column.outside(found)).any():
         lack = ", or NaN where not measured" if column.may_lack else ""
         raise bad_field(where, field, float(found[bad].flat[0]), column.expected + lack)

@@ -22,7 +22,7 @@ from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.learnt import Learnt
-from factorgraph_loc.model.measurement import Measurement, Tick
+from factorgraph_loc.model.measurement import Measurement, Tick, named
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.ticks import Ticks
 from factorgraph_loc.model.trajectory import Trajectory
@@ -75,6 +75,7 @@ class Localizer:
         default = {"lag": LAG} if estimator == "smoother" else {}
         self._settings = registry.settings_of(estimator, default | dict(settings or {}))
         self._sensors = usable_sensors(rig, sensors)
+        self._offsets = {name: rig.time_offset(name) for name in self._sensors}  # s
         self._history, self._seed = history, seed
         self._lock = threading.Lock()
         self._image_lock = threading.Lock()
@@ -221,11 +222,13 @@ class Localizer:
         return self._estimator
 
     def _take(self, m: Measurement) -> None:
-        estimator = self._begun(f"{type(m).__name__} at {m.t:.3f} s")
-        if m.sensor not in self._sensors:
+        if (estimator := self._estimator) is None or self._failure is not None:
+            estimator = self._begun(named(m))
+        if (offset := self._offsets.get(m.sensor)) is None:
             estimator.diagnostics.ignore(f"{m.sensor} is not among the sensors")
             return
-        m = _moved(m, self._rig.time_offset(m.sensor))
+        if offset:
+            m = _moved(m, offset)
         self._check_stamp(m)
         self._newest, self._last = max(self._newest, m.t), None
         try:
@@ -254,14 +257,13 @@ class Localizer:
         self._guard.process(estimator, m)
 
     def _check_stamp(self, m: Measurement) -> None:
-        where = f"{type(m).__name__} at {m.t:.3f} s"
-        if math.isfinite(self._newest) and m.t > self._newest + AHEAD:
+        if m.t > self._newest + AHEAD and math.isfinite(self._newest):
             raise InputError(
-                f"{where}: is {m.t - self._newest:.0f} s ahead of all others, expected the same clock, or initialize() "
+                f"{named(m)}: is {m.t - self._newest:.0f} s ahead of all others, expected the same clock, or initialize() "
                 f"after a pause"
             )
-        if m.sensor in self._sequences:
-            self._sequences[m.sensor].require(m, where)
+        if (sequence := self._sequences.get(m.sensor)) is not None:
+            sequence.require(m)
 
     def _is_under_way(self, t: float) -> bool:
         """Whether ``t`` is not before the start or the first measurement."""

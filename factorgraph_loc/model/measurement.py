@@ -26,6 +26,11 @@ class Measurement(Protocol):
     def is_motion(self) -> bool: ...
 
 
+def named(m: Measurement) -> str:
+    """The measurement in an error: ``BearingRange at 1.500 s``."""
+    return f"{type(m).__name__} at {m.t:.3f} s"
+
+
 @dataclass(frozen=True, slots=True)
 class Tick:
     """A time at which the causal trajectory is evaluated."""

@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any, TypeVar
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.columns import Table
+from factorgraph_loc.files.columns import SECONDS, Table
 from factorgraph_loc.files.values import names, numbers, seconds_of, within
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.plugins import load
@@ -37,13 +37,34 @@ def channel_of(m: object) -> Channel:
 
 
 def checked(m: M) -> M:
-    """A validated copy of a measurement; InputError names the first invalid field, its value and the expected values."""
+    """A validated copy of a measurement, or itself if it consists of valid floats, which nobody can change; InputError names the
+    first invalid field, its value and the expected values."""
     channel = channel_of(m)
+    if (floats := _floats_of(type(m))) is not None:
+        for name, low, high in floats:
+            value = getattr(m, name)
+            if type(value) is not float or not low <= value <= high:
+                break
+        else:
+            return m
     t = seconds_of(type(m).__name__, m.t)
     where = f"{type(m).__name__} at {t:.3f} s"
     found = load(channel.check)(m, where) if channel.check else dict(_described(m, where, channel))
     copy: M = replace(m, t=t, **found)  # type: ignore[type-var]
     return copy
+
+
+@cache
+def _floats_of(kind: type[Measurement]) -> tuple[tuple[str, float, float], ...] | None:
+    """Name and inclusive bounds of each field of a class with numbers only, as rows of odometry have; None for others."""
+    channel = kinds()[kind]
+    if channel.check:
+        return None
+    table = _table_of(kind, channel)
+    columns = [column.measured for column in table.columns[1:]]
+    if table.rows_of_one_stamp == "one measurement" or any(c.kind != "number" or c.may_lack for c in columns):
+        return None
+    return ("t", SECONDS.low, SECONDS.high), *((c.name, c.low, c.high) for c in columns)
 
 
 def _described(m: Measurement, where: str, channel: Channel) -> Iterator[tuple[str, Any]]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.values import integers, names, numbers, truth, within
-from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.measurement import Measurement, named
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.columns import FEATURES, SIGHTINGS
@@ -64,11 +64,11 @@ class Widths:
         points = world.points
         self._known = {} if points is None or not points.feature else {points.feature: points.descriptors.shape[1]}
 
-    def require(self, m: Measurement, where: str) -> None:
+    def require(self, m: Measurement) -> None:
         """InputError if the descriptors have another length."""
         if not isinstance(m, CameraFrame) or not len(m.pixels):
             return
         width = m.descriptors.shape[1]
         if width != self._known.setdefault(m.feature, width) or not width:
             expected = f"{self._known[m.feature]} numbers each, as in earlier {plain(m.feature)}"
-            raise bad_field(where, "length of descriptors", width, expected)
+            raise bad_field(named(m), "length of descriptors", width, expected)

@@ -3,7 +3,7 @@
 import math
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.measurement import Measurement, named
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
@@ -15,10 +15,10 @@ class Increments:
     def __init__(self, rig: Rig, world: World) -> None:
         self._newest = -math.inf
 
-    def require(self, m: Measurement, where: str) -> None:
+    def require(self, m: Measurement) -> None:
         """InputError for an increment that goes back in time."""
         if not isinstance(m, IncrementOdometry):
             return
         if m.t < self._newest:
-            raise InputError(f"{where}: follows one at {self._newest:.3f} s, expected increments in order of time")
+            raise InputError(f"{named(m)}: follows one at {self._newest:.3f} s, expected increments in order of time")
         self._newest = m.t
