@@ -70,8 +70,8 @@ def calibrate(
 
     ``evaluate`` runs an estimator on a log, with the sensors of the log's rig, and returns its scores. ``progress`` is called
     with the number of steps done and of all steps. ``grids``: path prefix of the files of learnt detection grids; needed for
-    logs with tag reads. Raises InputError if a log lacks a reference, odometry, or exteroceptive measurements, is too short, or
-    differs in kind from the others.
+    logs with tag reads. Raises InputError if a log lacks a reference or odometry, has neither exteroceptive measurements nor a
+    reference with headings, is too short, or differs in kind from the others.
     """
     check(logs)
     report = progress or (lambda _done, _total: None)
@@ -265,9 +265,10 @@ def check(logs: Sequence[Log]) -> None:
             raise InputError(f"{log.name}: has no reference, expected one to calibrate against")
         if not any(_has(log, name) for name in moving(log.streams, "floor")):
             raise InputError(f"{log.name}: has no odometry, expected one in every log to calibrate from")
-        if not any(_has(log, sensor) for sensor in senses()):
+        if not any(_has(log, sensor) for sensor in senses()) and not has_heading(log):
             lacking = " and ".join(f"no {sensor}" for sensor in senses())
-            raise InputError(f"{log.name}: has {lacking}, expected one of them to calibrate from")
+            expected = "one of them, or headings in the reference, from which wheels alone are calibrated"
+            raise InputError(f"{log.name}: has {lacking}, expected {expected}")
         for sensor in senses():
             kinds = tuple(load(place) for place in channels()[sensor].streams)
             if sensor in log.streams and not isinstance(log.streams[sensor], kinds):

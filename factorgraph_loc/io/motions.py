@@ -48,6 +48,20 @@ def between_ways(source: object, t_ns: Integers, ways: Array, scales: Array, war
     return steps
 
 
+def between_wheels(
+    source: object, t_ns: Integers, ways: Array, scales: Array, track: float, warnings: list[str]
+) -> Array:
+    """The motions (N - 1, 3) of a differential drive with a ``track`` [m]; for the others see :func:`between_ways`."""
+    arc, turn = velocities_of_wheels(between_ways(source, t_ns, ways, scales, warnings), track).T
+    return se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn)))
+
+
+def velocities_of_wheels(speeds: Array, track: float) -> Array:
+    """Speed and turn rate (N, 2) of a differential drive from the speeds (N, 2) of its left and right wheel; or so for ways."""
+    left, right = speeds.T
+    return np.column_stack(((left + right) / 2.0, (right - left) / track))
+
+
 def _unwound(ways: Array, scale: float) -> Array:
     """Steps (N - 1,) of one wheel, assuming less than half a counter range between rows."""
     steps: Array = np.diff(ways)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc import api
+from factorgraph_loc.api import learning
 from factorgraph_loc.calibration import report
 from factorgraph_loc.calibration.calibrate import calibrate
 from factorgraph_loc.model.rig import Rig
@@ -36,7 +36,7 @@ def skewed(simulate):
 @pytest.fixture(scope="module")
 def calibrated(skewed):
     log = skewed(1)
-    return log, calibrate([log], api._score)
+    return log, calibrate([log], learning._score)
 
 
 def test_skewed_ranges_make_no_estimator_worse(skewed, calibrated):
@@ -45,7 +45,7 @@ def test_skewed_ranges_make_no_estimator_worse(skewed, calibrated):
     assert found.rig.bearing_range.range_scale == 1.0
     assert found.rig.bearing_range.range_sigma == 0.1
     for one in (log, skewed(2)):
-        before, after = (api._score(replace(one, rig=rig)) for rig in (log.rig, found.rig))
+        before, after = (learning._score(replace(one, rig=rig)) for rig in (log.rig, found.rig))
         for key in KEYS:
             assert after[key] < 1.02 * before[key]
 

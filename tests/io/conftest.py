@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mapped_hall import hall, with_options  # noqa: F401 - fixtures
 from rosbag_drive import maker, read_drive, refuse_drive  # noqa: F401 - fixtures
+from rosbag_reads import bag, mcap, read, refuse  # noqa: F401 - fixtures
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 

@@ -7,7 +7,8 @@ import pytest
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.io.bags.file import open_bag
-from factorgraph_loc.io.bags.manifest import manifest_of, manifest_text, propose, read_fields, remarks
+from factorgraph_loc.io.bags.manifest import propose, read_fields
+from factorgraph_loc.io.bags.proposed import manifest_of, manifest_text, remarks
 
 T0 = 1_700_000_000_000_000_000
 
@@ -53,6 +54,32 @@ def test_an_estimate_is_not_taken_for_the_truth_without_a_word(proposal):
     found, _, text = proposal(fill)
     assert found.options["reference"] == {"topic": "/robot_pose"}
     assert "# /robot_pose is used as the reference: remove it if it is an estimate, not the truth" in text
+
+
+def test_what_nothing_uses_is_called_by_its_name(proposal, tmp_path):
+    def fill(made):
+        made.odometry("/odom", T0, (0.0, 0.0, 0.0))
+        made.write("/depth", T0, "sensor_msgs/msg/Range", **range_of(made))
+        made.write("/note", T0, "std_msgs/msg/String", data="x")
+
+    found, _, text = proposal(fill)
+    assert found.options == {"odometry": {"topic": "/odom"}}
+    assert (
+        "# not used: /depth (sensor_msgs/msg/Range, 1 messages), sonar or infrared range: nothing here uses it\n"
+        in text
+    )
+    assert "# not used: /note (std_msgs/msg/String, 1 messages)\n" in text
+    topics = {one.topic: (one.use, one.unused) for one in fgloc.manifest(tmp_path / "drive.bag").topics}
+    assert topics == {
+        "/odom": ("odometry", None),
+        "/depth": (None, "sonar or infrared range"),
+        "/note": (None, None),
+    }
+
+
+def range_of(made):
+    numbers = dict.fromkeys(("field_of_view", "min_range", "max_range", "range"), 1.0)
+    return {"header": made.header(T0), "radiation_type": 0, **numbers}
 
 
 def test_commands_are_taken_last(proposal):

@@ -8,8 +8,6 @@ from rosbag_drive import COUNT, MS, T0, add_frames, transform
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
-from factors import se2
-
 MARKERS = """\
 std_msgs/Header header
 MarkerPose[] markers
@@ -49,60 +47,6 @@ def test_velocities_with_and_without_a_header(maker, read_drive, one):
     assert bare.t0_ns == T0
     assert bare.streams["odometry"].v.tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
     assert "as received: /cmd" in bare.metadata["clock"]
-
-
-def add_wheels(made, left, right, names=("arm", "l", "r")):
-    for i, (a, b) in enumerate(zip(left, right, strict=True)):
-        t = T0 + 100 * MS * i
-        made.write(
-            "/joints",
-            t,
-            "sensor_msgs/msg/JointState",
-            header=made.header(t),
-            name=list(names),
-            position=np.array((9.0, a, b)),
-            velocity=np.array((9.0, 2.0 * i, 4.0 * i)),
-            effort=np.zeros(0),
-        )
-
-
-WHEELS = {"left": "l", "right": "r", "radius": 0.1, "track": 0.4}
-
-
-def test_wheels_as_a_differential_drive(maker, read_drive, one):
-    turned = np.arange(COUNT)
-    add_wheels(maker, 2.0 * turned, 4.0 * turned)
-    moved = read_drive(maker, odometry={"topic": "/joints", "wheels": WHEELS}).streams["odometry"]
-    # an arc of 0.3 m with a turn of 0.5 rad: radius 0.6 m
-    expected = (0.6 * math.sin(0.5), 0.6 * (1.0 - math.cos(0.5)), 0.5)
-    np.testing.assert_allclose(np.column_stack((moved.dx, moved.dy, moved.dtheta))[1:], [expected] * 4, atol=1e-12)
-    options = {"odometry": {"topic": "/joints", "wheels": WHEELS, "use": "twist"}}
-    speeds = one(maker.path, reader="rosbag", options=options).streams["odometry"]
-    np.testing.assert_allclose(speeds.v, 0.3 * turned, atol=1e-12)
-    np.testing.assert_allclose(speeds.w, 0.5 * turned, atol=1e-12)
-
-
-def test_wheels_that_are_not_there(maker, refuse_drive, refused):
-    add_wheels(maker, [0.0, 1.0], [0.0, 1.0])
-    wheels = WHEELS | {"right": "rr"}
-    refuse_drive(maker, "no message with both wheels, 'rr'", odometry={"topic": "/joints", "wheels": wheels})
-    options = {"odometry": {"topic": "/joints"}}
-    refused(maker.path, "odometry.wheels is missing", reader="rosbag", options=options)
-
-
-def test_wheels_that_tell_their_speed_alone(maker, refuse_drive):
-    maker.write(
-        "/joints",
-        T0,
-        "sensor_msgs/msg/JointState",
-        header=maker.header(T0),
-        name=["l", "r"],
-        position=np.zeros(0),
-        velocity=np.ones(2),
-        effort=np.zeros(0),
-    )
-    options = {"topic": "/joints", "wheels": WHEELS}
-    refuse_drive(maker, "/joints:1: has 0 numbers of position for 2 joints", "odometry.use", odometry=options)
 
 
 def add_imu(maker, rates):
@@ -221,32 +165,6 @@ def test_antennas_by_their_frames(maker, read_drive):
     first, second = log.rig.rfid.antennas["1"], log.rig.rfid.antennas["2"]
     np.testing.assert_allclose((first.x, first.y, first.z, first.yaw), (0.1, 0.2, 0.7, math.pi / 2))
     assert (round(second.pitch, 9), second.z) == (0.5, 0.5)
-
-
-def test_a_reference_from_transforms(maker, read_drive):
-    """The correction of a map is slow, odometry is fast, and the robot's middle is not where odometry counts from."""
-    odometry = np.array([(0.2 * i, 0.0, 0.1 * i) for i in range(COUNT)])
-    for i, (x, y, heading) in enumerate(odometry):
-        t = T0 + 100 * MS * i
-        add_frames(maker, "/tf", t, transform(maker, t, "odom", "footprint", (x, y, 0.0), heading))
-        if i in {0, COUNT - 1}:
-            add_frames(maker, "/tf", t, transform(maker, t, "map", "odom", (5.0, i, 0.0), heading=math.pi / 2))
-    add_frames(maker, "/tf_static", T0, transform(maker, T0, "footprint", "base_link", (0.3, 0.0, 0.0)))
-    reference = read_drive(maker, reference={"topic": "/tf", "parent": "map", "child": "base_link"}).reference
-    np.testing.assert_allclose(reference.t, 0.1 * np.arange(COUNT), atol=1e-9)
-    corrections = np.column_stack((np.full(COUNT, 5.0), np.arange(COUNT), np.full(COUNT, math.pi / 2)))
-    expected = se2.compose(se2.compose(corrections, odometry), np.array((0.3, 0.0, 0.0)))
-    np.testing.assert_allclose(reference.poses, expected, atol=1e-9)
-
-
-def test_transforms_that_lead_nowhere(maker, refuse_drive, refused):
-    for i in range(2):
-        t = T0 + i * MS
-        add_frames(maker, "/tf", t, transform(maker, t, "odom", "base_link", (0.0, 0.0, 0.0)))
-    tf = {"topic": "/tf", "parent": "map", "child": "base_link"}
-    refuse_drive(maker, "no transforms connect base_link to map: there is no frame 'map'", reference=tf)
-    options = {"odometry": {"topic": "/odom"}, "reference": {"topic": "/tf"}}
-    refused(maker.path, "reference.parent and reference.child are missing", reader="rosbag", options=options)
 
 
 def test_a_rotation_that_is_none(maker, refuse_drive):

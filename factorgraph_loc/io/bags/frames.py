@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from array import array
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -71,12 +72,26 @@ class _Edge:
     values: array[float] = field(default_factory=lambda: array("d"))
 
 
-class FrameReference:
-    """Collects transforms, and composes the trajectory of the topic's ``child`` in its ``parent``."""
+class FramesTopic(Protocol):
+    """The options of a topic of transforms."""
 
-    def __init__(self, bag: Bag, topic: ReferenceTopic, stamper: Stamper) -> None:
-        self._source, self._turned = f"{bag.path} {topic.topic}", topic
-        self._parent, self._child = plain(topic.parent or ""), plain(topic.child or "")
+    @property
+    def topic(self) -> str: ...
+    @property
+    def parent(self) -> str | None: ...
+    @property
+    def child(self) -> str | None: ...
+
+
+class FrameReference:
+    """Collects transforms, and composes the trajectory of the topic's ``child`` in its ``parent``. InputError if one of these two
+    frames is missing."""
+
+    def __init__(self, bag: Bag, topic: FramesTopic, stamper: Stamper) -> None:
+        self._source = f"{bag.path} {topic.topic}"
+        if topic.parent is None or topic.child is None:
+            raise InputError(f"{self._source}: parent and child are missing: two frames, such as map and base_link")
+        self._parent, self._child = plain(topic.parent), plain(topic.child)
         self._stamper = stamper
         self._edges: dict[str, _Edge] = {}
 
@@ -89,11 +104,11 @@ class FrameReference:
             edge.t_ns.append(self._stamper.choose(transform.header.stamp, t_ns))
             edge.values.extend(seven(transform.transform, "translation", "rotation"))
 
-    def trajectory(self, static: StaticFrames, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory:
+    def trajectory(self, static: StaticFrames, t0_ns: int, topic: ReferenceTopic, warnings: list[str]) -> Trajectory:
         """The poses of :meth:`in_space` on the floor."""
         space = self.in_space(static, t0_ns, warnings)
-        flat = on_floor(self._source, space.positions, space.rotations, warnings, self._turned)
-        return Trajectory(space.t, flat, has_heading=has_heading)
+        flat = on_floor(self._source, space.positions, space.rotations, warnings, topic)
+        return Trajectory(space.t, flat, has_heading=topic.has_heading)
 
     def path(self, static: StaticFrames, warnings: list[str]) -> PosePath:
         """The poses of :meth:`in_space` with absolute times."""
@@ -113,11 +128,13 @@ class FrameReference:
             else:
                 before = static.parents[name][1] @ before
         if not moving:
-            raise InputError(
-                f"{self._source}: {self._child} does not move in {self._parent}, expected a reference that does"
-            )
+            raise InputError(f"{self._source}: {self._child} does not move in {self._parent}, expected frames that do")
         t = max(moving, key=len).t
         t = t[(t >= max(m.t[0] for m in moving)) & (t <= min(m.t[-1] for m in moving))]
+        if not len(t):
+            raise InputError(
+                f"{self._source}: the transforms from {self._child} to {self._parent} have no time in common"
+            )
         poses = np.broadcast_to(np.eye(4), (len(t), 4, 4))
         for i, fixed in steps:
             at = moving[i].at(t)

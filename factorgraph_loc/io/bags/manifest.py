@@ -3,10 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
-
-import tomli_w
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.bags.camera import COMPRESSED, INFO, RAW
@@ -16,12 +13,23 @@ from factorgraph_loc.io.bags.file import Bag, Topic
 from factorgraph_loc.io.bags.frames import STATIC
 from factorgraph_loc.io.bags.landmarks import CORNERS, DETECTIONS
 from factorgraph_loc.io.bags.messages import INITIAL_POSE, ROUND, tables_of_messages
-from factorgraph_loc.io.bags.motion import IMU, JOINTS, ODOMETRY, TWISTS
+from factorgraph_loc.io.bags.motion import IMU, ODOMETRY, TWISTS
 from factorgraph_loc.io.bags.poses import POINT, POSES
+from factorgraph_loc.io.bags.tree import ODOMETRY as ORIGINS
+from factorgraph_loc.io.bags.tree import ROBOT, WORLD, Tree, tree_of
+from factorgraph_loc.io.bags.wheels import JOINTS
+from factorgraph_loc.text import listed
 
 TRUTH = re.compile(
     r"truth|(^|[/_])gt($|[/_])|reference|mocap|vicon|optitrack|qualisys|total_station|leica", re.IGNORECASE
 )
+LEFT, RIGHT = re.compile("left", re.IGNORECASE), re.compile("right", re.IGNORECASE)
+WHEEL, SPEED = re.compile("wheel", re.IGNORECASE), re.compile("speed|vel|rate|rpm", re.IGNORECASE)
+SCALARS = {f"std_msgs/msg/{name}" for name in ("Float32", "Float64", "Int8", "Int16", "Int32", "Int64")}
+SCALARS |= {f"std_msgs/msg/{name}" for name in ("UInt8", "UInt16", "UInt32", "UInt64")}
+WHEELS = {"radius": 0.1, "track": 0.5}  # m
+NUMBERS = {"twist": "speeds of wheels [rad/s]", "pose": "angles of wheels [rad]"}
+MEASURE = "measure radius and track [m]: here, or as [odometry.wheels] in the rig, which comes first"
 NOT_MEASURED = re.compile(r"goal|cmd|command|target|plan|initialpose", re.IGNORECASE)
 
 # common names of the last part of a field's path, without underscores
@@ -76,78 +84,85 @@ def propose(bag: Bag) -> Proposal:
     """Propose uses of the topics. Of several topics for one sensor the most likely one is used, and a note lists the others."""
     out = Proposal()
     topics = [topic for topic in bag.topics.values() if topic.count]
-    _motion(out, topics)
-    _reference(out, topics)
+    tree = tree_of(bag, out.notes)
+    _motion(out, bag, topics, tree)
+    _reference(out, topics, tree)
     _one_of(out, "imu", [topic for topic in topics if topic.type == IMU])
     _camera(out, topics)
     _tables(out, topics)
     _rfid(out, bag, topics)
     if STATIC in bag.topics:
         out.uses[STATIC] = "sensor mounting"
-    if not any(has_header(bag, bag.topics[used["topic"]]) for used in out.options.values()):
+    used = [bag.topics[one["topic"]] for one in out.options.values()]
+    if not any(topic.type in TF or has_header(bag, topic) for topic in used):
         out.options["clock"] = "receive"
+    if (robot := tree.robot()) not in (None, ROBOT[0]):
+        out.options["base_frame"] = robot
+    if tree.topic and tree.topic not in out.uses:
+        frames = listed(f"{child} in {tree.parents[child]}" for child in sorted(tree.moving))
+        out.notes.append(f"{tree.topic} has the frames {frames}: parent and child of [options.reference] would use two")
     return out
 
 
-def manifest_of(proposal: Proposal, path: str, beside: Mapping[str, str]) -> dict[str, Any]:
-    """The manifest of the bag ``path``; ``beside``: names of existing rig and world files."""
-    return {
-        "title": f"The bag {Path(path).name}",
-        "reader": "rosbag",
-        "path": path,
-        **beside,
-        "licence": "none stated",
-        "origin": "your own recording",
-        "options": proposal.options,
-    }
-
-
-def remarks(bag: Bag, proposal: Proposal, beside: Mapping[str, str]) -> list[str]:
-    """Remarks on a proposed manifest for the user, and the unused topics."""
-    out = list(proposal.notes)
-    if "rig" not in beside:
-        out.append('no rig is given: set rig = "NAME.rig.toml" to a file next to this one that describes the robot')
-    if "world" not in beside:
-        out.append('no map is given: set world = "NAME.world.toml" to a file next to this one with tags and landmarks')
-    unused = [topic for topic in bag.topics.values() if topic.name not in proposal.uses]
-    return out + [f"not used: {topic.name} ({topic.type}, {topic.count} messages)" for topic in unused]
-
-
-def manifest_text(manifest: Mapping[str, Any], told: Sequence[str]) -> str:
-    """A manifest as TOML, with the lines ``told`` as comments."""
-    head = {key: value for key, value in manifest.items() if key != "options"}
-    options = dict(sorted(manifest["options"].items(), key=lambda item: isinstance(item[1], dict)))  # tables last
-    comments = "".join(f"# {line}\n" for line in told)
-    return f"{tomli_w.dumps(head)}{comments}\n{tomli_w.dumps({'options': options})}"
-
-
-def _motion(out: Proposal, topics: Sequence[Topic]) -> None:
-    """Prefer odometry, then measured velocities, then wheels, then commands."""
+def _motion(out: Proposal, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
+    """Prefer odometry, then transforms of its frame, then measured velocities, then wheels, then commands."""
+    robot = tree.robot()
+    origin = None if robot is None else tree.above(robot, ORIGINS)
+    frames = {} if origin is None else {"parent": origin, "child": robot}
+    pairs = _pairs(topics)
     ranked = [
         topic
         for kinds, measured in (
             ({ODOMETRY}, True),
+            (set(TF) if frames else set(), True),
             (set(TWISTS), True),
             ({JOINTS}, True),
+            ({topic.type for topic in topics if topic.name in pairs}, True),
             (set(TWISTS), False),
         )
         for topic in topics
-        if topic.type in kinds and not TRUTH.search(topic.name) and bool(NOT_MEASURED.search(topic.name)) != measured
+        if topic.type in kinds
+        and (topic.type not in TF or topic.name == tree.topic)
+        and (topic.type not in SCALARS or topic.name in pairs)
+        and not TRUTH.search(topic.name)
+        and bool(NOT_MEASURED.search(topic.name)) != measured
     ]
     if not ranked:
         out.notes.append("no topic looks like odometry, which every estimator needs: name one in [options.odometry]")
         return
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = frames if ranked[0].type in TF else {}
     if ranked[0].type == JOINTS:
-        settings = {"wheels": {"left": "left_wheel_joint", "right": "right_wheel_joint", "radius": 0.1, "track": 0.5}}
-        out.notes.append("wheels: name the joints of your robot, and measure radius and track [m]")
+        settings = _joints(bag, ranked[0], out.notes)
+    elif pair := pairs.get(ranked[0].name):
+        settings = {"use": "twist" if SPEED.search(ranked[0].name) else "pose"}
+        settings["wheels"] = {"left": "data", "right": "data", "right_topic": pair} | WHEELS
+        out.uses[pair] = "odometry: right wheel"
+        out.notes.append(f"{ranked[0].name} and {pair} are taken for {NUMBERS[settings['use']]}; {MEASURE}")
     elif NOT_MEASURED.search(ranked[0].name):
         out.notes.append(f"{ranked[0].name} contains commanded velocities, not measured ones")
     out.take("odometry", ranked[0], **settings)
     _others(out, "odometry", ranked[1:])
 
 
-def _reference(out: Proposal, topics: Sequence[Topic]) -> None:
+def _pairs(topics: Sequence[Topic]) -> dict[str, str]:
+    """Topics of numbers that are of a left and a right wheel by their names: the right one of each left one."""
+    names = {topic.name for topic in topics if topic.type in SCALARS}
+    others = {name: LEFT.sub(lambda found: "Right" if found[0][0] == "L" else "right", name) for name in sorted(names)}
+    return {name: other for name, other in others.items() if other != name and other in names}
+
+
+def _joints(bag: Bag, topic: Topic, notes: list[str]) -> dict[str, Any]:
+    """The settings of wheels that are joints, by the names in the first message."""
+    first = next(bag.messages([topic.name]), None)
+    names = [name for name in getattr(first and first.message, "name", ()) if isinstance(name, str)]
+    wheels = [name for name in names if WHEEL.search(name)] or names
+    left = next((name for name in wheels if LEFT.search(name)), "left_wheel_joint")
+    right = next((name for name in wheels if RIGHT.search(name)), "right_wheel_joint")
+    notes.append(f"wheels: {left} and {right} are taken for them, of the joints {listed(names)}; {MEASURE}")
+    return {"wheels": {"left": left, "right": right} | WHEELS}
+
+
+def _reference(out: Proposal, topics: Sequence[Topic], tree: Tree) -> None:
     poses = [topic for topic in topics if topic.type in {*POSES, POINT} and topic.name not in out.uses]
     named = [topic for topic in poses if TRUTH.search(topic.name)]
     if named:
@@ -158,10 +173,16 @@ def _reference(out: Proposal, topics: Sequence[Topic]) -> None:
     if plain:
         out.take("reference", plain[0])
         out.notes.append(f"{plain[0].name} is used as the reference: remove it if it is an estimate, not the truth")
-    for topic in topics:
-        if topic.type in TF and topic.name != STATIC and not plain:
-            text = f'[options.reference] topic = "{topic.name}", parent = "map", child = "base_link" would use tf'
-            out.notes.append(text)
+    robot = tree.robot()
+    world = None if robot is None else tree.above(robot, WORLD)
+    if not plain and world is not None:
+        settings = {"topic": tree.topic, "parent": world, "child": robot}
+        out.options["reference"] = settings
+        out.uses[tree.topic] = ", ".join(dict.fromkeys((*filter(None, [out.uses.get(tree.topic)]), "reference")))
+        out.notes.append(
+            f"{robot} in {world}, of {tree.topic}, is used as the reference: remove it if it is an estimate, as of amcl or SLAM, "
+            "not the truth"
+        )
 
 
 def _camera(out: Proposal, topics: Sequence[Topic]) -> None:

@@ -1,53 +1,48 @@
 """Motion of the robot in a bag: poses or velocities of odometry, wheel angles, or the gyro of an IMU."""
 
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.models import FileModel, InUnit, nearest
 from factorgraph_loc.io import motions
-from factorgraph_loc.io.bags.clock import Clock
+from factorgraph_loc.io.bags.clock import TF, Clock, Stamper
 from factorgraph_loc.io.bags.file import Bag, Stamped
-from factorgraph_loc.io.bags.frames import StaticFrames
+from factorgraph_loc.io.bags.frames import FrameReference, StaticFrames
 from factorgraph_loc.io.bags.poses import POSES, Poses
 from factorgraph_loc.io.bags.rows import TopicRows
-from factorgraph_loc.model.planar import Turned, about_z
+from factorgraph_loc.io.bags.wheels import (
+    JOINTS,
+    JointRows,
+    OneWheel,
+    TwoWheels,
+    WheelSettings,
+    finite_columns,
+    wheel_motion,
+)
+from factorgraph_loc.model.planar import Turned, about_z, on_floor
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
-from factorgraph_loc.text import quoted
-from factors import se2
 from factors.se2 import Array, Integers
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 TWISTS = {"geometry_msgs/msg/Twist": "", "geometry_msgs/msg/TwistStamped": "twist"}
-JOINTS = "sensor_msgs/msg/JointState"
 IMU = "sensor_msgs/msg/Imu"
 
 
-class WheelSettings(FileModel):
-    """A differential drive."""
-
-    left: str
-    """name of the left wheel's joint"""
-    right: str
-    """name of the right wheel's joint"""
-    radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")]
-    """radius of the wheels"""
-    track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")]
-    """distance between the wheels"""
-
-
 class OdometryTopic(Turned):
-    """A topic of odometry or of wheel joints."""
+    """A topic of odometry, of tf with two frames, or of wheel joints."""
 
     topic: str
     """name of the topic"""
     use: Literal["pose", "twist"] = "pose"
-    """the pose of odometry, as motion between messages, or its twist; for wheels, position or velocity"""
+    """the pose of odometry, as motion between messages, or its twist; for wheels, how far they turned, or how fast"""
+    parent: str | None = None
+    """frame of the odometry's origin, for tf"""
+    child: str | None = None
+    """frame of the robot, for tf"""
     wheels: WheelSettings | None = None
-    """wheels of a topic of joints"""
+    """wheels of a topic of joints, or of two topics; topic is the one of the left wheel"""
     clock: Clock | None = None
     """timestamps of message headers or of receipt; by default as for the bag"""
 
@@ -79,6 +74,21 @@ class PoseMotion:
         return t_ns, increments(t_ns, motions.between_poses(self._poses.rows.source, t_ns, poses, warnings))
 
 
+class TransformMotion:
+    """Odometry from transforms: the motion of a frame in another one between consecutive transforms."""
+
+    def __init__(self, bag: Bag, options: OdometryTopic, stamper: Stamper, static: StaticFrames) -> None:
+        self._frames = FrameReference(bag, options, stamper)
+        self._source, self._turned, self._static = f"{bag.path} {options.topic}", options, static
+        self.add = self._frames.add
+
+    def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
+        path = self._frames.path(self._static, warnings)
+        assert path.t_ns is not None
+        poses = on_floor(self._source, path.positions, path.rotations, warnings, self._turned)
+        return path.t_ns, increments(path.t_ns, motions.between_poses(self._source, path.t_ns, poses, warnings))
+
+
 class TwistMotion:
     """Odometry from velocities, each held until the next."""
 
@@ -102,45 +112,29 @@ class TwistMotion:
 
 
 class WheelMotion:
-    """Odometry from the angles or angular velocities of two wheels."""
+    """Odometry from the angles or angular velocities of two wheels, of joints or with a topic each."""
 
-    def __init__(self, bag: Bag, options: OdometryTopic) -> None:
-        if options.wheels is None:
-            raise InputError(f"{bag.path} {options.topic}: odometry.wheels is missing: left, right, radius and track")
-        self._wheels = options.wheels
+    def __init__(self, bag: Bag, options: OdometryTopic, wheels: WheelSettings) -> None:
+        self._wheels = wheels
         self._column = "position" if options.use == "pose" else "velocity"
-        self._rows = TopicRows(f"{bag.path} {options.topic}", 2)
-        self._seen: set[str] = set()
+        self._rows: JointRows | TwoWheels
+        if wheels.right_topic is None:
+            self._rows = JointRows(bag, options.topic, wheels, self._column)
+        else:
+            left, right = OneWheel(bag, options.topic, wheels.left), OneWheel(bag, wheels.right_topic, wheels.right)
+            self._rows = TwoWheels(left, right)
+        self.add = self._rows.add
 
-    def add(self, item: Stamped, t_ns: int) -> None:
-        names, values = item.message.name, getattr(item.message, self._column)
-        self._seen.update(names)
-        if len(values) != len(names):
-            if self._wheels.left in names:
-                raise InputError(
-                    f"{self._rows.source}:{item.row}: has {len(values)} numbers of {self._column} for {len(names)} joints, "
-                    "expected one for each; select the other with odometry.use"
-                )
-            return
-        if self._wheels.left in names and self._wheels.right in names:  # other messages contain other joints
-            wheels = (values[names.index(self._wheels.left)], values[names.index(self._wheels.right)])
-            self._rows.append(item, t_ns, (float(wheels[0]), float(wheels[1])))
+    @property
+    def right(self) -> OneWheel | None:
+        """The collector of the right wheel's own topic, if there is one."""
+        return self._rows.right if isinstance(self._rows, TwoWheels) else None
 
     def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
-        if not len(self._rows):
-            wrong = next((n for n in (self._wheels.left, self._wheels.right) if n not in self._seen), self._wheels.left)
-            raise InputError(
-                f"{self._rows.source}: has no message with both wheels, {quoted(wrong)}{nearest(wrong, sorted(self._seen))}"
-            )
-        t_ns, (left, right) = finite_columns(self._rows, ("left wheel", "right wheel"), warnings)
-        radius, track = self._wheels.radius, self._wheels.track
-        if self._column == "velocity":
-            v, w = radius * (left + right) / 2.0, radius * (right - left) / track
-            return t_ns, VelocityStream(checks.seconds(t_ns, int(t_ns[0])), v, w)
-        ways, scales = radius * np.column_stack((left, right)), np.full(2, radius)
-        left, right = motions.between_ways(self._rows.source, t_ns, ways, scales, warnings).T
-        arc, turn = (left + right) / 2.0, (right - left) / track
-        return t_ns, increments(t_ns, se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn))))
+        t_ns, motion, moves = wheel_motion(self._rows, self._wheels, self._column, warnings)
+        if moves:
+            return t_ns, increments(t_ns, motion)
+        return t_ns, VelocityStream(checks.seconds(t_ns, int(t_ns[0])), *np.ascontiguousarray(motion.T))
 
 
 class YawRates:
@@ -170,22 +164,32 @@ class YawRates:
         return YawRateStream(checks.seconds(t_ns[keep], t0_ns), w[keep])
 
 
-OdometryRows = PoseMotion | TwistMotion | WheelMotion
+OdometryRows = PoseMotion | TransformMotion | TwistMotion | WheelMotion
 
 
-def odometry(bag: Bag, options: OdometryTopic) -> OdometryRows:
+def odometry(bag: Bag, options: OdometryTopic, stamper: Stamper, static: StaticFrames) -> OdometryRows:
     """The collector for an odometry topic, by message type."""
     kind = bag.topic(options.topic).type
+    if kind in TF:
+        return TransformMotion(bag, options, stamper, static)
+    if options.parent is not None or options.child is not None:
+        raise InputError(f"{bag.path} {options.topic}: odometry.parent and odometry.child are for tf, this is {kind}")
     poses = kind in POSES and not (kind == ODOMETRY and options.use == "twist")
     if options.is_given() and not poses:
         raise InputError(f"{bag.path} {options.topic}: axes and mounting are for odometry that comes as poses")
-    if kind == JOINTS:
-        return WheelMotion(bag, options)
+    if kind == JOINTS and options.wheels is None:
+        raise InputError(f"{bag.path} {options.topic}: odometry.wheels is missing: left, right, radius and track")
+    if options.wheels is not None:
+        if kind != JOINTS and options.wheels.right_topic is None:
+            raise InputError(
+                f"{bag.path} {options.topic}: odometry.wheels.right_topic is missing, as {kind} has no joints"
+            )
+        return WheelMotion(bag, options, options.wheels)
     if poses:
         return PoseMotion(bag, options)
     if kind in TWISTS or kind == ODOMETRY:
         return TwistMotion(bag, options)
-    known = ", ".join(sorted({*POSES, *TWISTS, JOINTS}))
+    known = ", ".join(sorted({*POSES, *TWISTS, JOINTS, TF[0]}))
     raise InputError(f"{bag.path}: topic {options.topic} is of type {kind}, expected one of {known}")
 
 
@@ -193,12 +197,3 @@ def increments(t_ns: Integers, moves: Array) -> IncrementStream:
     """The motions (N - 1, 3) between N timestamps as increments; the first row only defines the start."""
     dx, dy, dtheta = np.vstack((np.zeros((1, 3)), moves)).T
     return IncrementStream(checks.seconds(t_ns, int(t_ns[0])), dx, dy, dtheta)
-
-
-def finite_columns(rows: TopicRows, names: tuple[str, ...], warnings: list[str]) -> tuple[Integers, list[Array]]:
-    """Timestamps and columns of rows in order of time, all finite; InputError names the invalid message."""
-    number, t_ns, values = rows.rows, rows.t_ns, rows.values
-    for i, name in enumerate(names):
-        checks.require_finite(rows.source, number, name, values[:, i])
-    keep = checks.in_order(rows.source, number, t_ns, warnings)
-    return t_ns[keep], [values[keep, i] for i in range(len(names))]

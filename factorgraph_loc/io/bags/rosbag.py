@@ -18,7 +18,7 @@ from factorgraph_loc.io.bags.file import Bag, Stamped, open_bag
 from factorgraph_loc.io.bags.frames import STATIC, FrameReference, StaticFrames
 from factorgraph_loc.io.bags.landmarks import Landmarks, LandmarkTopic, PixelsOfPoints, PixelTopic
 from factorgraph_loc.io.bags.messages import tables_of_messages
-from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, YawRates, odometry
+from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, WheelMotion, YawRates, odometry
 from factorgraph_loc.io.bags.poses import Poses, ReferenceTopic, Start, StartTopic
 from factorgraph_loc.io.bags.rfid import Reads, RfidTopic
 from factorgraph_loc.io.bags.tables import DescribedRows, TableTopic
@@ -132,9 +132,12 @@ def read(path: Path | None, options: Options) -> Log:
 
 def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     listeners = Listeners(bag, options.clock)
-    motion = odometry(bag, options.odometry)
-    listeners.listen(options.odometry, motion)
     frames = static_frames(listeners)
+    stamper = listeners.stamper(options.odometry.topic, options.odometry.clock)
+    motion = odometry(bag, options.odometry, stamper, frames)
+    listeners.add(options.odometry.topic, motion, stamper)
+    if isinstance(motion, WheelMotion) and motion.right is not None:
+        listeners.add(motion.right.topic, motion.right, listeners.stamper(motion.right.topic, options.odometry.clock))
     gathered = _listen(listeners, options)
     if gathered.camera:
         stack.callback(gathered.camera.discard)
@@ -200,8 +203,6 @@ def _listen(listeners: Listeners, options: Options) -> Gathered:
         stamper = listeners.stamper(topic.topic, topic.clock)
         if bag.topic(topic.topic).type not in TF:
             out.reference = Poses(bag, topic.topic, topic)
-        elif topic.parent is None or topic.child is None:
-            raise InputError(f"{bag.path} {topic.topic}: reference.parent and reference.child are missing: two frames")
         else:
             out.reference = FrameReference(bag, topic, stamper)
         listeners.add(topic.topic, out.reference, stamper)
@@ -229,10 +230,11 @@ def _reference(
 ) -> Trajectory | None:
     if options.reference is None:
         return None
-    has_heading = options.reference.has_heading
     if isinstance(gathered.reference, FrameReference):
-        return gathered.reference.trajectory(frames, t0_ns, has_heading, warnings)
-    return None if gathered.reference is None else gathered.reference.trajectory(t0_ns, has_heading, warnings)
+        return gathered.reference.trajectory(frames, t0_ns, options.reference, warnings)
+    if gathered.reference is None:
+        return None
+    return gathered.reference.trajectory(t0_ns, options.reference.has_heading, warnings)
 
 
 def _rig(

@@ -21,6 +21,7 @@ from factorgraph_loc.io.readers import registry as readers
 from factorgraph_loc.io.readers.bounds import require_bounds
 from factorgraph_loc.io.readers.manifests import Manifest, StartSettings, find_data_root, read_manifest
 from factorgraph_loc.io.readers.pose_file import is_pose_file
+from factorgraph_loc.io.readers.wheels import with_wheels_in, with_wheels_of
 from factorgraph_loc.maps.markers import MarkerSettings
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -53,16 +54,16 @@ def load(
     data_root: str | Path | None = None,
     reader: str | None = None,
     options: Mapping[str, Any] | None = None,
-    rig: str | Path | None = None,
-    world: str | Path | None = None,
+    rig: Rig | str | Path | None = None,
+    world: World | str | Path | None = None,
 ) -> list[Log]:
     """The logs that ``log`` refers to.
 
     ``log``: a manifest, a folder in the native format or its ``run.toml``, a name in ``manifests()``, a file of poses in TUM, KITTI
     or EuRoC format, or any path with ``reader``.
     ``options``: of the reader, overriding those of a manifest; a list, or text with commas, gives one log per value. ``rig`` and
-    ``world`` replace those of the log. ``data_root``: folder of data files outside of the manifest's folder, by default the
-    environment's FGLOC_DATA. InputError describes what is invalid in one line.
+    ``world``, values or files, replace those of the log. ``data_root``: folder of data files outside of the manifest's folder, by
+    default the environment's FGLOC_DATA. InputError describes what is invalid in one line.
     """
     given = dict(options or {})
     source = _find(str(log), data_root, reader)
@@ -83,8 +84,8 @@ def load(
     ]
     replaced = replace(
         source,
-        rig=read_rig(rig) if rig is not None else source.rig,
-        world=read_world(world) if world is not None else source.world,
+        rig=read_rig(rig) if isinstance(rig, str | Path) else rig or source.rig,
+        world=read_world(world) if isinstance(world, str | Path) else world or source.world,
     )
     return [
         _read(replaced, dict(zip(choices, values, strict=True)), naming)
@@ -98,8 +99,8 @@ def read_log(
     data_root: str | Path | None = None,
     reader: str | None = None,
     options: Mapping[str, Any] | None = None,
-    rig: str | Path | None = None,
-    world: str | Path | None = None,
+    rig: Rig | str | Path | None = None,
+    world: World | str | Path | None = None,
 ) -> Log:
     """The log that ``log`` refers to, as in :func:`load`; InputError if there are several."""
     logs = load(log, data_root=data_root, reader=reader, options=options, rig=rig, world=world)
@@ -193,6 +194,7 @@ def _of_manifest(file: Path, name: str) -> Path:
 def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log:
     """One log; ``naming``: options that are appended to its name to make it unique."""
     chosen = readers.reader(source.reader)
+    options = with_wheels_of(source.rig, options)
     log = chosen.read(source.path, parse_model(chosen.options, options, f"options of reader {source.reader}"))
     name = "-".join([source.name or log.name, *(f"{key}{options[key]}" for key in naming)])
     log = replace(
@@ -216,4 +218,5 @@ def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log
             warnings.append("the gyro is not used, because the rig's sensors do not include imu")
     if log.rig.name == default_rig.DEFAULT_RIG.name:
         warnings.append("no rig is given: the default rig does not have this robot's noise and mounting")
+    log = replace(log, rig=with_wheels_in(log.rig, options))
     return replace(log, warnings=tuple(map(one_line, (*warnings, *look_over.look_over(log)))))

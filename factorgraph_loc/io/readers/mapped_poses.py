@@ -9,7 +9,6 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, read_mapped
-from factorgraph_loc.files.columns import LENGTH
 from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.io import motions
@@ -19,6 +18,7 @@ from factorgraph_loc.io.readers.unread import Unread
 from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows
 from factorgraph_loc.sensors.odometry.columns import INCREMENTS, VELOCITIES, WAYS
+from factorgraph_loc.sensors.odometry.columns import WHEELS as WHEEL_COLUMNS
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
 from factors import se2
 from factors.se2 import Array, Integers
@@ -27,9 +27,16 @@ Offset = Annotated[float, Field(ge=-1e10, le=1e10), InUnit("s")]
 
 QUATERNION = ("qx", "qy", "qz", "qw")
 POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION), ("t", "x", "y", "z", *QUATERNION))
-ODOMETRY = (("t", "v", "w"), ("t", "dx", "dy", "dtheta"), ("t", "left", "right"), *POSES)
+TURNS = {"left_angle": "rad", "left_rate": "rad/s"}  # of wheels, which need their radius
+WHEELS = ("left", "left_speed", *TURNS)
+ODOMETRY = (
+    ("t", "v", "w"),
+    ("t", "dx", "dy", "dtheta"),
+    *(("t", left, left.replace("left", "right")) for left in WHEELS),
+    *POSES,
+)
 LEAST_AROUND = 300.0  # rad between rows, which no robot can rotate
-COLUMNS = {c.name: c for table in (VELOCITIES, INCREMENTS, WAYS, POSE_COLUMNS) for c in table.columns}
+COLUMNS = {c.name: c for table in (VELOCITIES, INCREMENTS, WAYS, WHEEL_COLUMNS, POSE_COLUMNS) for c in table.columns}
 
 
 class PosesFile(ColumnMapping, Turned):
@@ -47,10 +54,14 @@ class PosesFile(ColumnMapping, Turned):
 
 class OdometryFile(PosesFile):
     """``columns``: t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the row before); x, y, heading or a
-    quaternion (poses, of which only the relative motion is used); left, right (distances of the wheels, with their ``track``)."""
+    quaternion (poses, of which only the relative motion is used); left, right (distances of the wheels), left_speed, right_speed
+    (their speeds), left_angle, right_angle (how far they turned), left_rate, right_rate (how fast they turn). ``radius`` and
+    ``track`` of the rig ([odometry.wheels]) come before those given here."""
 
-    track: Annotated[float, Field(gt=0.0, le=10.0), InUnit("m")] | None = None
-    """distance between the wheels, for columns left and right"""
+    track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")] | None = None
+    """distance between the wheels, for columns of wheels"""
+    radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")] | None = None
+    """radius of the wheels, for columns that tell how they turn"""
 
 
 class ReferenceFile(PosesFile):
@@ -65,14 +76,14 @@ def read_odometry(
 ) -> tuple[Integers, Array, bool]:
     """Timestamps (N,), velocities (N, 2) or increments (N, 3), and whether these are increments. InputError names file and row."""
     if options.format != "columns" or times is not None:
-        if options.track is not None:
-            raise InputError(f"{path}: format {options.format} has no wheels, expected no track")
+        if options.track is not None or options.radius is not None:
+            raise InputError(f"{path}: format {options.format} has no wheels, expected no track or radius")
         t_ns, poses = _in_format(path, times, options, warnings)
         return t_ns, after_rest(motions.between_poses(path, t_ns, poses, warnings)), True
     mapped = read_mapped(path, options, ODOMETRY)
     unread.note(mapped)
-    if ("left" in mapped.fields) != (options.track is not None):
-        raise InputError(f"{path}: columns left and right, and track [m between the wheels], are needed together")
+    side = next((name for name in WHEELS if name in mapped.fields), None)
+    _require_sizes(path, side, options)
     t_ns, columns = _columns(mapped, options.clock_offset)
     if "dx" in columns:
         moves = np.column_stack((columns["dx"], columns["dy"], columns["dtheta"]))
@@ -82,14 +93,26 @@ def read_odometry(
     kept = {name: values[keep] for name, values in columns.items()}
     if "v" in kept:
         return t_ns, np.column_stack((kept["v"], kept["w"])), False
-    if options.track is not None:
-        ways = np.column_stack((kept["left"], kept["right"]))
-        scales = np.array([_scale(options, name) for name in ("left", "right")])
-        left, right = motions.between_ways(path, t_ns, ways, scales, warnings).T
-        arc, turn = (left + right) / 2.0, (right - left) / options.track
-        return t_ns, after_rest(se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn)))), True
+    if side is not None and options.track is not None:
+        pair = (side, side.replace("left", "right"))
+        size = options.radius if side in TURNS and options.radius is not None else 1.0
+        wheels = size * np.column_stack([kept[name] for name in pair])
+        if side in ("left_speed", "left_rate"):
+            return t_ns, motions.velocities_of_wheels(wheels, options.track), False
+        scales = size * np.array([_scale(options, name) for name in pair])
+        return t_ns, after_rest(motions.between_wheels(path, t_ns, wheels, scales, options.track, warnings)), True
     poses = _planar(path, mapped.rows[keep], kept, options, warnings)
     return t_ns, after_rest(motions.between_poses(path, t_ns, poses, warnings)), True
+
+
+def _require_sizes(path: Path, side: str | None, options: OdometryFile) -> None:
+    """InputError if the size of wheels is missing, or is given without columns of wheels."""
+    if side is None and (options.track is not None or options.radius is not None):
+        raise InputError(f"{path}: track and radius are for columns of wheels, such as left and right")
+    needed = {"track": side is not None, "radius": side in TURNS}
+    for name, is_needed in needed.items():
+        if is_needed and getattr(options, name) is None:
+            raise InputError(f"{path}: {side} needs {name} [m], here or in [odometry.wheels] of the rig")
 
 
 def odometry_stream(t_ns: Integers, values: Array, increments: bool, t0_ns: int) -> IncrementStream | VelocityStream:
@@ -142,9 +165,9 @@ def _columns(mapped: Mapped, offset: float) -> tuple[Integers, dict[str, Array]]
 
 
 def _scale(options: OdometryFile, field: str) -> float:
-    """Metres per unit of a column, or per tick of an encoder."""
+    """Metres or radians per unit of a column, or per tick of an encoder."""
     unit = options.units.get(field, 1.0)
-    return LENGTH.get(unit, 1.0) if isinstance(unit, str) else float(unit)
+    return COLUMNS[field].units.get(unit, 1.0) if isinstance(unit, str) else float(unit)
 
 
 def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turned, warnings: list[str]) -> Array:

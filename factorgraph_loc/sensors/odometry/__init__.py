@@ -3,7 +3,7 @@
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
-__all__ = ["SENSOR", "calibration", "columns", "measurement", "model", "simulation", "stream", "whole"]
+__all__ = ["SENSOR", "calibration", "columns", "measurement", "model", "settings", "simulation", "stream", "whole"]
 
 SENSOR = SensorType(
     "odometry",
@@ -22,7 +22,10 @@ SENSOR = SensorType(
                 "factorgraph_loc.sensors.odometry.columns:VELOCITIES",
                 "factorgraph_loc.sensors.odometry.columns:INCREMENTS",
             ),
-            described=("factorgraph_loc.sensors.odometry.columns:WAYS",),
+            described=(
+                "factorgraph_loc.sensors.odometry.columns:WAYS",
+                "factorgraph_loc.sensors.odometry.columns:WHEELS",
+            ),
             assemble="factorgraph_loc.sensors.odometry.tables:assemble",
             sequence="factorgraph_loc.sensors.odometry.pushed:Increments",
             section="odometry",

@@ -53,3 +53,14 @@ WAYS = Table(
     ),
     "one each",
 )
+# wheels of which speeds or turns are told, which are converted to velocities or increments
+WHEELS = Table(
+    "odometry",
+    (
+        STAMP,
+        *(within(f"{side}_speed", SPEED, FASTEST, "speed of that wheel") for side in ("left", "right")),
+        *(within(f"{side}_angle", ANGLE, 1e9, "how far that wheel turned") for side in ("left", "right")),
+        *(within(f"{side}_rate", RATE, 1e4, "how fast that wheel turns") for side in ("left", "right")),
+    ),
+    "one each",
+)

@@ -48,6 +48,21 @@ class OdometryUncertainty(FileModel):
     """standard deviation of the constant"""
 
 
+class DifferentialDrive(FileModel):
+    """Two wheels, by whose turns or ways a log tells the motion. ``scale_distance`` and ``scale_rotation`` correct what these
+    values give: see :meth:`corrected`."""
+
+    radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")] | None = None
+    """radius of the wheels; not needed where the log tells the ways that they roll"""
+    track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")]
+    """distance between the wheels"""
+
+    def corrected(self, scale_distance: float, scale_rotation: float) -> tuple[float | None, float]:
+        """The true radius and track [m] with these scales of the odometry."""
+        radius = None if self.radius is None else self.radius * scale_distance
+        return radius, self.track * scale_distance / scale_rotation
+
+
 class OdometrySettings(SensorSettings):
     """Wheel odometry. See :class:`factors.odometry.model.OdometryModel` for the model."""
 
@@ -76,6 +91,8 @@ class OdometrySettings(SensorSettings):
     """growth of the error of the position while the motion is unknown"""
     unknown_rotation: Annotated[Noise, InUnit("rad per sqrt(s)")] = 0.2
     """growth of the error of the heading while the motion is unknown"""
+    wheels: DifferentialDrive | None = None
+    """two wheels, for logs that tell how these turn"""
     noise: OdometryNoise = OdometryNoise()
     """growth of the error of the odometry"""
     uncertainty: OdometryUncertainty = OdometryUncertainty()

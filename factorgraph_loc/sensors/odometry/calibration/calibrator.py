@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from factorgraph_loc.drawing.markup import image, number, table
+from factorgraph_loc.drawing.markup import Rows, image, number, table
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.fitting.robust import Constant, Fit, folds, gains
@@ -19,7 +19,7 @@ from factorgraph_loc.sensors.odometry.calibration.figures import odometry_figure
 from factorgraph_loc.sensors.odometry.calibration.noise import NoiseFit, fit_noise
 from factorgraph_loc.sensors.odometry.calibration.windows import Windows, cut, odometry_of
 from factorgraph_loc.sensors.odometry.model import odometry_model
-from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array
@@ -144,7 +144,15 @@ class OdometryCalibrator(ConstantsCalibrator):
         return {
             "odometry_outliers": None if noise is None else noise.outliers,
             "odometry_widened": None if noise is None else noise.widened,
+            "wheels": {name: calibrated for name, _, calibrated in _wheels(told.rig)} or None,
         }
+
+    def tables(self, told: Told) -> list[Rows]:
+        """Radius and track of the wheels, if the rig tells of any."""
+        rows: list[tuple[str, ...]] = [
+            (f"{name} [m]", number(given), number(found)) for name, given, found in _wheels(told.rig)
+        ]
+        return [(("wheels", "in the rig", "with its scales"), rows)] if rows else []
 
     def told_noise(self, told: Told) -> list[str]:
         """The growth of each error."""
@@ -160,6 +168,7 @@ class OdometryCalibrator(ConstantsCalibrator):
         ]
         header = ("error of the odometry [m, m, rad]", "per sqrt(m)", "per sqrt(rad)", "per sqrt(s)")
         out.append(table(header, rows))
+        out += [table(*one) for one in self.tables(told)]
         out.append(
             f"<p>{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise was multiplied by "
             f"{noise.widened:.2f}, so that it is valid for half a minute without landmarks.</p>"
@@ -172,6 +181,16 @@ class OdometryCalibrator(ConstantsCalibrator):
             return []
         figure = odometry_figure(told.found.parts, odometry_model(told.learnt))
         return ["<h2>Residuals of the odometry</h2>", image(figure)]
+
+
+def _wheels(rig: Rig) -> list[tuple[str, float, float]]:
+    """Name, value in the rig and calibrated value [m] of what is known of the wheels."""
+    settings = rig.of(OdometrySettings)
+    if (drive := settings.wheels) is None:
+        return []
+    radius, track = drive.corrected(settings.scale_distance, settings.scale_rotation)
+    known = [] if drive.radius is None or radius is None else [("radius", drive.radius, radius)]
+    return [*known, ("track", drive.track, track)]
 
 
 CALIBRATOR = OdometryCalibrator()

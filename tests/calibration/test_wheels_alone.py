@@ -1,0 +1,49 @@
+"""Wheels that are calibrated against a reference without another sensor, and what that says of their radius and track."""
+
+from dataclasses import replace
+
+import pytest
+
+import factorgraph_loc as fgloc
+from factorgraph_loc.calibration import report
+from factorgraph_loc.sensors.odometry.settings import DifferentialDrive
+
+RADIUS, TRACK = 0.1, 0.5  # m, as the log was converted
+
+
+@pytest.fixture(scope="module")
+def calibrated(simulate, tmp_path_factory):
+    """What is learnt of two drives with wheels alone: 6 % larger than the rig says, 4 % further apart."""
+    logs = []
+    for seed in (1, 2):
+        log = simulate(seed=seed, seconds=120.0, scale_distance=1.06, scale_rotation=1.06 / 1.04)
+        rig = log.rig.model_copy(update={"bearing_range": None, "sensors": ("odometry",)})
+        wheels = rig.odometry.model_copy(update={"wheels": DifferentialDrive(radius=RADIUS, track=TRACK)})
+        odometry = {"odometry": log.streams["odometry"]}
+        logs.append(replace(log, rig=rig.model_copy(update={"odometry": wheels}), streams=odometry))
+    return fgloc.calibrate(logs, tmp_path_factory.mktemp("wheels") / "cart.rig.toml")
+
+
+def test_radius_and_track_are_found(calibrated):
+    found = report.document(calibrated)["wheels"]
+    assert found["radius"] == pytest.approx(1.06 * RADIUS, rel=0.01)
+    assert found["track"] == pytest.approx(1.04 * TRACK, rel=0.015)
+    (table,) = report.sensor_tables(calibrated)
+    assert [row[0] for row in table[1]] == ["radius [m]", "track [m]"]
+    assert calibrated.rig.odometry.wheels == DifferentialDrive(radius=RADIUS, track=TRACK)
+    assert "radius [m]" in report.page(calibrated)
+
+
+def test_dead_reckoning_gains_by_it(calibrated):
+    before, after = (
+        sum(one["final.position_rmse"] for one in scores) for scores in (calibrated.before, calibrated.after)
+    )
+    assert after < 0.5 * before
+
+
+def test_a_reference_without_headings_calibrates_no_wheels(simulate, tmp_path):
+    log = simulate(seconds=60.0)
+    log = replace(log, streams={"odometry": log.streams["odometry"]})
+    log = replace(log, reference=replace(log.reference, has_heading=False))
+    with pytest.raises(fgloc.InputError, match="expected one of them, or headings in the reference, from which wheels"):
+        fgloc.calibrate(log, tmp_path / "cart.rig.toml")

@@ -1,0 +1,72 @@
+"""Columns of wheels in mapped tables: their ways, speeds and turns, and what the rig tells of their size."""
+
+import numpy as np
+import pytest
+
+import factorgraph_loc as fgloc
+
+ROWS = [(0.0, 0.0, 0.0), (1.0, 2.0, 4.0), (2.0, 4.0, 8.0)]
+
+
+@pytest.fixture
+def table(tmp_path):
+    """``table(columns, more)``: a manifest of a table with a time and two numbers of wheels."""
+
+    def make(column, more=""):
+        lines = [f"{t},{a},{b}" for t, a, b in ROWS]
+        (tmp_path / "wheels.csv").write_text("\n".join(["t,a,b", *lines, ""]))
+        (tmp_path / "cart.toml").write_text(
+            'title = "t"\nreader = "mapped"\nlicence = "l"\norigin = "o"\npath = "."\n[options.odometry]\n'
+            f'file = "wheels.csv"\n{more}\n'
+            f'[options.odometry.columns]\nt = "t"\nleft{column} = "a"\nright{column} = "b"\n'
+            '[options.odometry.units]\nt = "s"\n'
+        )
+        return tmp_path / "cart.toml"
+
+    return make
+
+
+@pytest.mark.parametrize(("column", "size"), [("_speed", 1.0), ("_rate", 0.1)])
+def test_speeds(table, column, size):
+    moved = fgloc.read_log(table(column, "track = 0.5" + ("\nradius = 0.1" if column == "_rate" else ""))).streams[
+        "odometry"
+    ]
+    assert moved.v.tolist() == pytest.approx([size * 0.0, size * 3.0, size * 6.0])
+    assert moved.w.tolist() == pytest.approx([size * 0.0, size * 4.0, size * 8.0])
+
+
+def test_turns_and_ways_are_alike(table):
+    turned = fgloc.read_log(table("_angle", "track = 0.5\nradius = 0.1"))
+    scaled = table("", "track = 5.0")
+    ways = fgloc.read_log(scaled).streams["odometry"]
+    assert turned.streams["odometry"].dtheta == pytest.approx([0.0, 0.4, 0.4])
+    assert np.hypot(ways.dx, ways.dy) == pytest.approx(10.0 * np.hypot(*_places(turned)))
+    assert turned.rig.odometry.wheels.model_dump() == {"radius": 0.1, "track": 0.5}
+
+
+def _places(log):
+    moved = log.streams["odometry"]
+    return moved.dx, moved.dy
+
+
+def test_the_rig_comes_first(table):
+    rig = fgloc.Rig(odometry={"wheels": {"radius": 0.2, "track": 1.0}})
+    for more in ("", "track = 0.5\nradius = 0.1"):
+        moved = fgloc.read_log(table("_rate", more), rig=rig).streams["odometry"]
+        assert moved.v.tolist() == pytest.approx([0.0, 0.6, 1.2])
+        assert moved.w.tolist() == pytest.approx([0.0, 0.4, 0.8])
+    ways = fgloc.read_log(table("_speed"), rig=rig).streams["odometry"]
+    assert ways.v.tolist() == pytest.approx([0.0, 3.0, 6.0])
+
+
+@pytest.mark.parametrize(
+    ("column", "more", "message"),
+    [
+        ("_rate", "track = 0.5", r"left_rate needs radius \[m\], here or in \[odometry.wheels\] of the rig"),
+        ("_speed", "", r"left_speed needs track \[m\]"),
+        ("_angle", "radius = 0.1", r"left_angle needs track \[m\]"),
+    ],
+)
+def test_sizes_that_are_missing(table, column, more, message):
+    with pytest.raises(fgloc.InputError, match=message):
+        fgloc.read_log(table(column, more))
