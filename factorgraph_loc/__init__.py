@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import warnings
 from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc import builtin as builtin
@@ -15,20 +16,13 @@ from factorgraph_loc.old_places import OldPlaces
 from factorgraph_loc.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from factorgraph_loc.api import (
-        calibrate,
-        compare,
-        convert,
-        datasets,
-        experiment,
-        features,
-        images,
-        info,
-        map,
-        report,
-        run,
-        simulate,
-    )
+    from factorgraph_loc.api.experimenting import active, experiment, report, status
+    from factorgraph_loc.api.images import features, images
+    from factorgraph_loc.api.learning import build_map, calibrate
+    from factorgraph_loc.api.logs import convert, datasets, info, manifest, simulate
+    from factorgraph_loc.api.lookups import known_estimators, known_readers, known_rigs, known_sensors, new_rig
+    from factorgraph_loc.api.results import export, view
+    from factorgraph_loc.api.running import Run, compare, run
     from factorgraph_loc.errors import FglocError, InputError, RunFailedError
     from factorgraph_loc.evaluation.inference import contrast
     from factorgraph_loc.experiments.index import load_results
@@ -88,6 +82,7 @@ __all__ = [
     "RfidStream",
     "Rig",
     "RightSightingStream",
+    "Run",
     "RunFailedError",
     "SightingStream",
     "StartPose",
@@ -102,18 +97,26 @@ __all__ = [
     "World",
     "YawRate",
     "YawRateStream",
+    "active",
+    "build_map",
     "calibrate",
     "compare",
     "contrast",
     "convert",
     "datasets",
     "experiment",
+    "export",
     "features",
     "images",
     "info",
+    "known_estimators",
+    "known_readers",
+    "known_rigs",
+    "known_sensors",
     "load",
     "load_results",
-    "map",
+    "manifest",
+    "new_rig",
     "read_grid",
     "read_log",
     "read_rig",
@@ -123,6 +126,8 @@ __all__ = [
     "run",
     "score",
     "simulate",
+    "status",
+    "view",
     "write_grid",
     "write_log",
     "write_native",
@@ -131,8 +136,15 @@ __all__ = [
     "write_world",
 ]
 
-# module of each public name; names that are not listed are in `api`. Tables can be read without importing the estimators
+# module of each public name
 _MODULES = {
+    "api.experimenting": ("active", "experiment", "report", "status"),
+    "api.images": ("features", "images"),
+    "api.learning": ("build_map", "calibrate"),
+    "api.logs": ("convert", "datasets", "info", "manifest", "simulate"),
+    "api.lookups": ("known_estimators", "new_rig", "known_readers", "known_rigs", "known_sensors"),
+    "api.results": ("export", "view"),
+    "api.running": ("Run", "compare", "run"),
     "errors": ("FglocError", "InputError", "RunFailedError"),
     "evaluation.inference": ("contrast",),
     "experiments.index": ("load_results",),
@@ -169,13 +181,19 @@ _MODULES = {
     "vision.frame": ("CameraFrame",),
 }
 sys.meta_path.insert(0, OldPlaces())  # first, because an upgrade may leave empty folders of old modules behind
-_ELSEWHERE = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
+_PLACES = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
+_OLD = {"map": "build_map"}  # until version 2.0
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
+    if name in _OLD:
+        told = f"factorgraph_loc.{name} is deprecated, and will be removed in 2.0: use factorgraph_loc.{_OLD[name]}"
+        warnings.warn(told, DeprecationWarning, stacklevel=2)
+        globals()[name] = __getattr__(_OLD[name])  # so that it is told once
+        return globals()[name]
+    if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_ELSEWHERE.get(name, f"{__name__}.api")), name)
+    return getattr(importlib.import_module(_PLACES[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -1,6 +1,6 @@
-"""The module paths of the sensors, estimators, mappers and readers of this project."""
+"""The module paths of the sensors, estimators, mappers and readers of this project, and of the functions for its files."""
 
-from factorgraph_loc.plugins import ESTIMATORS, MAPPERS, READERS, SENSORS
+from factorgraph_loc.plugins import ESTIMATORS, FILES, MAPPERS, READERS, SENSORS
 
 SENSORS.own.update(
     {
@@ -39,5 +39,19 @@ READERS.own.update(
         "trajectory": "factorgraph_loc.io.readers.trajectory",
         "tum_rgbd": "factorgraph_loc.io.readers.tum_rgbd",
         "utias_woods": "factorgraph_loc.io.readers.utias_woods",
+    }
+)
+FILES.update(
+    {
+        "read_rig": "factorgraph_loc.io.native.rig_file:read_rig",
+        "write_rig": "factorgraph_loc.io.native.rig_file:write_rig",
+        "read_world": "factorgraph_loc.io.native.world_file:read_world",
+        "write_world": "factorgraph_loc.io.native.world_file:write_world",
+        "read_trajectory": "factorgraph_loc.io.trajectories:read_trajectory",
+        "write_kitti": "factorgraph_loc.exports.trajectories:write_kitti",
+        "to_evo": "factorgraph_loc.io.exchange:to_evo",
+        "from_evo": "factorgraph_loc.io.exchange:from_evo",
+        "to_ros": "factorgraph_loc.io.exchange:to_ros",
+        "from_ros": "factorgraph_loc.io.exchange:from_ros",
     }
 )

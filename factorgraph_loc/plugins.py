@@ -90,3 +90,4 @@ SENSORS = Group("sensors", "channels", "settings", "layers")
 ESTIMATORS = Group("estimators", "process", "estimate")
 READERS = Group("readers", "Options", "read")
 MAPPERS = Group("mappers")
+FILES: dict[str, Place] = {}  # what reads, writes and converts the values of `model`, by the name of the function

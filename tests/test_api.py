@@ -110,6 +110,10 @@ def test_an_experiment_gives_its_table(tmp_path):
     assert table["duration"].to_list() == [6.0, 6.0]
     assert table.equals(done.rows)
     assert told == [(0, 2, 0), (1, 2, 0), (2, 2, 0)]
+    found = fgloc.status(
+        tmp_path / "drives.toml", changes={"simulation.drive.duration": 6.0}, out=tmp_path / "out", verify=True
+    )
+    assert found.labels == {"dead_reckoning": {"ok": 2, "failed": 0, "missing": 0, "damaged": 0}}
     page = fgloc.report(
         tmp_path / "drives.toml",
         changes={"simulation.drive.duration": 6.0},
@@ -120,12 +124,109 @@ def test_an_experiment_gives_its_table(tmp_path):
 
 
 def test_map_writes_a_world(office, tmp_path):
-    made = fgloc.map(office, tmp_path / "seen.world.toml", of="landmarks", estimator="ekf")
+    made = fgloc.build_map(office, tmp_path / "seen.world.toml", of="landmarks", estimator="ekf")
     assert set(fgloc.read_world(tmp_path / "seen.world.toml").landmarks) == set(made.world.landmarks) != set()
     assert (tmp_path / "seen.map.png").is_file()
     assert "the robot starts at" in made.frame  # few landmarks in common with the given map
     with pytest.raises(fgloc.InputError, match="exists already"):
-        fgloc.map(office, tmp_path / "seen.world.toml", of="landmarks", estimator="ekf")
+        fgloc.build_map(office, tmp_path / "seen.world.toml", of="landmarks", estimator="ekf")
+
+
+def test_the_old_name_of_build_map_is_told_once():
+    code = (
+        "import warnings\n"
+        "warnings.simplefilter('always')\n"
+        "import factorgraph_loc as fgloc\n"
+        "with warnings.catch_warnings(record=True) as told:\n"
+        "    assert fgloc.map is fgloc.map is fgloc.build_map\n"
+        "print([f'{one.category.__name__}: {one.message}' for one in told])\n"
+        "from factorgraph_loc import *\n"
+        "assert list(map(abs, [-1])) == [1]"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    message = "factorgraph_loc.map is deprecated, and will be removed in 2.0: use factorgraph_loc.build_map"
+    assert done.stdout == f"['DeprecationWarning: {message}']\n"
+
+
+def test_another_rig_and_map_are_values_or_files(office, tmp_path):
+    blind = office.rig.model_copy(update={"sensors": ("odometry",)})
+    blind.write(tmp_path / "blind.rig.toml")
+    moved = {
+        name: mark.model_copy(update={"x": mark.x + 1.0}) for name, mark in office.world.of(fgloc.Landmark).items()
+    }
+    world = office.world.model_copy(update={"landmarks": moved})
+    world.write(tmp_path / "moved.world.toml")
+    fgloc.convert(office, tmp_path / "log")
+    straight = fgloc.run(office, "ekf", sensors=["odometry"]).result.final.poses
+    used = {"sensors": ["odometry", "bearing_range"]}
+    shifted = fgloc.run(office, "ekf", world=world, **used).scores["final.position_rmse"]
+    assert shifted > 2.0 * fgloc.run(office, "ekf", **used).scores["final.position_rmse"]
+    for log in (office, tmp_path / "log"):
+        for rig in (blind, tmp_path / "blind.rig.toml"):
+            assert fgloc.run(log, "ekf", rig=rig).result.final.poses == pytest.approx(straight, abs=1e-6)
+        for map_ in (world, str(tmp_path / "moved.world.toml")):
+            found = fgloc.run(log, "ekf", world=map_, **used).scores["final.position_rmse"]
+            assert found == pytest.approx(shifted, abs=1e-6)
+    assert fgloc.load(tmp_path / "log", rig=blind, world=world)[0].rig == blind
+
+
+def test_stored_results_are_written_for_other_programs(office, tmp_path):
+    run = fgloc.run(office, "ekf", sensors=["odometry", "bearing_range"], out=tmp_path / "ekf")
+    files = fgloc.export([tmp_path / "ekf", office], tmp_path / "ekf.kitti")
+    assert files == [tmp_path / "ekf.kitti", tmp_path / "ekf.times.txt"]
+    assert all(file.is_file() for file in files)
+    assert fgloc.export([tmp_path / "ekf", office], tmp_path / "ekf.tum") == [tmp_path / "ekf.tum"]
+    read = fgloc.Trajectory.read(tmp_path / "ekf.tum", office.t0_ns)
+    assert read.poses == pytest.approx(run.result.final.poses, abs=1e-8)
+    with pytest.raises(fgloc.InputError, match=r"has the suffix '.csv', expected one of .mcap"):
+        fgloc.export(office, tmp_path / "ekf.csv")
+    with pytest.raises(fgloc.InputError, match="there are no results, expected folders of runs, or a log"):
+        fgloc.export([], tmp_path / "other.tum")
+    pytest.importorskip("rerun", reason="needs the extra viewer")
+    fgloc.view([tmp_path / "ekf", office], rrd=tmp_path / "ekf.rrd")
+    assert (tmp_path / "ekf.rrd").stat().st_size > 10_000
+
+
+def test_a_bag_gets_a_manifest(office, tmp_path):
+    pytest.importorskip("rosbags", reason="needs the extra ros")
+    fgloc.convert(office, tmp_path / "drive.bag")
+    found = fgloc.manifest(tmp_path / "drive.bag", tmp_path / "drive.toml")
+    assert {topic.use for topic in found.topics} >= {"odometry", "rfid", "reference"}
+    assert tomllib.loads(found.text) == found.content
+    assert fgloc.read_log(tmp_path / "drive.toml").rig == office.rig
+    with pytest.raises(fgloc.InputError, match=r"drive.toml: exists already, expected a new file"):
+        fgloc.manifest(tmp_path / "drive.bag", tmp_path / "drive.toml")
+    (tmp_path / "other").mkdir()
+    with pytest.raises(fgloc.InputError, match="expected a file there or in a folder above"):
+        fgloc.manifest(tmp_path / "drive.bag", tmp_path / "other/drive.toml")
+
+
+def test_what_there_is_to_choose_from(tmp_path):
+    settings = {one.name: {setting.key for setting in one.settings} for one in fgloc.known_estimators()}
+    assert "lag" in settings["smoother"]
+    assert "phase" in {column.name for column in fgloc.known_sensors()[2].tables["reads"]}
+    assert "topic" in {option.key.split(".")[-1] for one in fgloc.known_readers() for option in one.options}
+    assert fgloc.known_rigs()["plaza"] == fgloc.read_log("plaza2").rig
+    made = fgloc.new_rig("cart", antennas=2, out=tmp_path / "cart.rig.toml")
+    assert fgloc.Rig.read(tmp_path / "cart.rig.toml") == made
+    with pytest.raises(fgloc.InputError, match="exists already"):
+        fgloc.new_rig(out=tmp_path / "cart.rig.toml")
+
+
+def test_a_robot_seeks_its_place(tmp_path):
+    told = []
+    found = fgloc.active(
+        "symmetric",
+        tmp_path / "out",
+        policies=["random"],
+        changes={"max_metres": 1.0},
+        jobs=1,
+        progress=lambda *numbers: told.append(numbers),
+    )
+    assert [(row["policy"], row["status"]) for row in found.rows] == [("random", "ok")]
+    assert told == [(0, 1), (1, 1)]
+    with pytest.raises(fgloc.InputError, match="unknown key max_meters: did you mean max_metres"):
+        fgloc.active("symmetric", tmp_path / "other", changes={"max_meters": 1.0})
 
 
 def test_a_misspelt_name_of_a_log_is_told():

@@ -11,6 +11,7 @@ import pytest
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import old_places
+from factorgraph_loc.plugins import MOVED
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = [*sorted((ROOT / "scripts").glob("example_*")), ROOT / "scripts/ros2_node_example"]
@@ -121,6 +122,15 @@ def test_places_of_0_1_0_still_work_with_a_warning():
 @pytest.mark.parametrize("script", old_places._SCRIPTS.values())
 def test_what_is_not_installed_is_there_for_the_benchmarks(script):
     assert (ROOT / "scripts" / script).is_file()
+
+
+def test_the_changes_list_every_name_that_changed():
+    table = (ROOT / "CHANGELOG.md").read_text().partition("### Changed names\n")[2].partition("\n### ")[0]
+    listed = set(re.findall(r"^\| `([\w.]+)` \|", table, re.MULTILINE))
+    rigs = {f"Rig.{name}" for name in MOVED}
+    old = {f"factorgraph_loc.{name}" for name in fgloc._OLD}
+    assert listed == {*old_places._MODULES, *old_places._SCRIPTS, *rigs, *old}
+    assert all(f"`factorgraph_loc.{new}`" in table for new in fgloc._OLD.values())
 
 
 @pytest.mark.parametrize("places", old_places._MODULES.values(), ids=old_places._MODULES)

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import Json, Out, Overwrite, parse_list
-from factorgraph_loc.cli.simulating import nested_changes, settings_of
-from factorgraph_loc.errors import InputError
+from factorgraph_loc.cli.simulating import nested_changes
 from factorgraph_loc.experiments.seeds import parse_seeds
-
-if TYPE_CHECKING:
-    from factorgraph_loc.planning.settings import ActiveSettings
-    from factorgraph_loc.simulation import SimulationSettings
 
 
 def active(
@@ -49,11 +44,13 @@ def active(
     json: Json = False,
 ) -> None:
     """Drive simulated robots from an unknown start until they are localized, and compare policies on the same seeds."""
+    from factorgraph_loc.api.experimenting import active_settings
     from factorgraph_loc.evaluation.active import difference_cells, differences, summaries, summary_cells
     from factorgraph_loc.experiments.active import seek
 
     chosen = parse_seeds(seeds)
-    simulation, settings = _settings(world, nested_changes({"max_metres": max_metres}, set_ or []))
+    simulation, settings = active_settings(world, nested_changes({"max_metres": max_metres}, set_ or []))
+    show.first_use()
     with show.progress("runs", counted=True) as report:
         results = seek(
             simulation,
@@ -81,18 +78,3 @@ def active(
         show.line(f"results are in {out}: table.md, results.csv, results.parquet, differences.csv, plots/")
     if results.failures:
         raise typer.Exit(1)
-
-
-def _settings(world: str, changes: dict[str, Any]) -> tuple[SimulationSettings, ActiveSettings]:
-    """Split the changes into settings of the world and of the run; no key belongs to both."""
-    from factorgraph_loc.files.models import nearest, parse_model
-    from factorgraph_loc.planning.settings import ActiveSettings
-    from factorgraph_loc.simulation import SimulationSettings
-
-    of_run, of_world = ActiveSettings.model_fields, SimulationSettings.model_fields
-    for key in changes:
-        if key not in of_run and key not in of_world:
-            raise InputError(f"--set: unknown key {key}{nearest(key, [*of_run, *of_world])}")
-    simulation = settings_of(world, {key: value for key, value in changes.items() if key in of_world})
-    run = {key: value for key, value in changes.items() if key in of_run}
-    return simulation, parse_model(ActiveSettings, run, "the settings")

@@ -35,13 +35,14 @@ def calibrate(
     json: Json = False,
 ) -> None:
     """Calibrate a rig from logs with reference poses; write the rig and a report."""
-    from factorgraph_loc import api
+    from factorgraph_loc.api import learning
     from factorgraph_loc.calibration import report
 
-    page = api.report_beside(out, overwrite=overwrite)  # before the logs are read
+    page = learning.report_beside(out, overwrite=overwrite)  # before the logs are read
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load(logs)
+    show.first_use()
     with show.progress("calibrating", counted=True) as progress:
-        found = api.calibrate(loaded, out, overwrite=overwrite, progress=progress)
+        found = learning.calibrate(loaded, out, overwrite=overwrite, progress=progress)
     for doubt in found.doubts:
         show.note(f"warning: {doubt}")
     if json:

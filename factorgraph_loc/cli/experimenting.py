@@ -72,6 +72,7 @@ def run(
         _print_plan(prepared, jobs, retry_failed, json)
         return
     try:
+        show.first_use()
         with show.progress("runs", counted=True) as bar:
             done = run_experiment(
                 prepared,
@@ -110,28 +111,18 @@ def status(
     json: Json = False,
 ) -> None:
     """Show how many runs of an experiment are done, failed, missing or damaged."""
-    prepared = _prepared(file, set_, out, data_root, verify=verify)
-    labels = list(dict.fromkeys(run.label for run in prepared.runs))
-    states = ("ok", "failed", "missing", "damaged")
-    by_label = {
-        label: [sum(r.label == label and prepared.states[r.key] == state for r in prepared.runs) for state in states]
-        for label in labels
-    }
-    failed = [run for run in prepared.runs if prepared.states[run.key] == "failed"]
-    reasons = [
-        {"log": run.log, "label": run.label, "seed": run.seed, **dict(run.sweep), **prepared.store.row(run.key)}
-        for run in failed
-    ]
+    from factorgraph_loc.api.experimenting import STATES, status_of
+
+    found = status_of(_prepared(file, set_, out, data_root, verify=verify))
     if json:
-        counts = {label: dict(zip(states, numbers, strict=True)) for label, numbers in by_label.items()}
-        damaged = [run.shown for run in prepared.damaged()]
-        show.document({"folder": str(prepared.folder), "labels": counts, "failures": reasons, "damaged": damaged})
+        show.document(vars(found) | {"folder": str(found.folder)})
         return
+    by_label = {label: list(counts.values()) for label, counts in found.labels.items()}
     total = [sum(numbers) for numbers in zip(*by_label.values(), strict=True)]
     rows = [[label, *map(str, numbers)] for label, numbers in (*by_label.items(), ("(all)", total))]
-    show.table(["label", *states], rows)
-    _print_damaged([run.shown for run in prepared.damaged()], file)
-    for one in reasons:
+    show.table(["label", *STATES], rows)
+    _print_damaged(found.damaged, file)
+    for one in found.failures:
         show.line(f"failed: {one['log']}, {one['label']}, seed {one['seed']}: {one['kind']}: {one['reason']}")
 
 

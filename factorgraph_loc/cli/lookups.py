@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from factorgraph_loc.cli import completion, show
 from factorgraph_loc.cli.options import Json
-from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
 
 if TYPE_CHECKING:
+    from factorgraph_loc.api.lookups import SensorDescription
     from factorgraph_loc.files.columns import Column
     from factorgraph_loc.files.settings import Setting
     from factorgraph_loc.fusion.registry import Description
-    from factorgraph_loc.sensors.registry import SensorType
 
 
 def estimators(
@@ -27,14 +25,14 @@ def estimators(
     json: Json = False,
 ) -> None:
     """List the estimators, or the settings of one."""
-    from factorgraph_loc.files.settings import settings_in
-    from factorgraph_loc.fusion.registry import describe, settings_type
+    from factorgraph_loc.api.lookups import known_estimators
+    from factorgraph_loc.fusion.registry import describe
 
     if name is not None:
         found = describe(name)
-        settings = settings_in(settings_type(name))
+        settings = found.settings
         if json:
-            show.document({**asdict(found), "settings": settings})
+            show.document(found)
             return
         about = {"estimator": name, "what it is": found.about, "estimates": _estimates(found)}
         show.fields(about | {"sensors": ", ".join(found.sensors)})
@@ -44,7 +42,7 @@ def estimators(
             show.line()
             show.line(f"to change one: fgloc run LOG -e {name} --set {name}.{settings[0].key}=VALUE")
         return
-    known = [describe(one) for one in ESTIMATORS]
+    known = known_estimators()
     if json:
         show.document(known)
         return
@@ -60,27 +58,25 @@ def readers(
     json: Json = False,
 ) -> None:
     """List the readers of logs, or the options of one."""
-    from factorgraph_loc.files.settings import settings_in
-    from factorgraph_loc.io.readers import reader
+    from factorgraph_loc.api.lookups import describe_reader, known_readers
 
     if name is not None:
-        found = reader(name)
-        options = settings_in(found.options)
+        found = describe_reader(name)
         if json:
-            show.document({"name": name, "about": found.about, "options": options})
+            show.document(found)
             return
         show.fields({"reader": name, "format": found.about})
         show.line()
-        _print_settings(options, "option")
-        if options:
+        _print_settings(found.options, "option")
+        if found.options:
             show.line()
             show.line("options are in [options] of a manifest, or --reader-option KEY=VALUE")
         return
-    known = {one: reader(one).about for one in READERS}
+    known = known_readers()
     if json:
-        show.document([{"name": one, "about": about} for one, about in known.items()])
+        show.document(known)
     else:
-        show.table(("name", "format"), list(known.items()), wrapped=("format",))
+        show.table(("name", "format"), [(one.name, one.about) for one in known], wrapped=("format",))
 
 
 def sensors(
@@ -93,40 +89,32 @@ def sensors(
     json: Json = False,
 ) -> None:
     """List the sensors, or the tables and the rig's settings of one."""
-    from factorgraph_loc.sensors.registry import about
-    from factorgraph_loc.sensors.registry import sensor as registered
+    from factorgraph_loc.api.lookups import describe_sensor, known_sensors
 
     if name is not None:
-        sensor = registered(name)
+        sensor = describe_sensor(name)
         if json:
             show.document(_document(sensor))
         else:
             _print_sensor(sensor)
         return
-    known = [registered(one) for one in SENSORS]
+    known = known_sensors()
     if json:
         show.document([_summary(sensor) for sensor in known])
         return
-    rows = [(s.name, about(s.name), ", ".join(c.name for c in s.channels), _sections(s)) for s in known]
+    rows = [(s.name, s.about, ", ".join(s.channels), _sections(s)) for s in known]
     show.table(("name", "what it is", "--sensors", "rig"), rows, wrapped=("what it is", "--sensors"))
 
 
-def _summary(sensor: SensorType) -> dict[str, Any]:
-    from factorgraph_loc.sensors.registry import about
-
-    channels = [channel.name for channel in sensor.channels]
-    return {"name": sensor.name, "about": about(sensor.name), "channels": channels, "rig": list(sensor.settings)}
+def _summary(sensor: SensorDescription) -> dict[str, Any]:
+    return {"name": sensor.name, "about": sensor.about, "channels": sensor.channels, "rig": list(sensor.rig)}
 
 
-def _document(sensor: SensorType) -> dict[str, Any]:
-    from factorgraph_loc.sensors.registry import sections_of
-    from factorgraph_loc.sensors.tables import tables_of_sensor
-
+def _document(sensor: SensorDescription) -> dict[str, Any]:
     tables = [
-        {"name": table.name, "columns": [_column(column) for column in table.columns]}
-        for table in tables_of_sensor(sensor)
+        {"name": name, "columns": [_column(column) for column in columns]} for name, columns in sensor.tables.items()
     ]
-    return {**_summary(sensor), "tables": tables, "settings": sections_of(sensor)}
+    return {**_summary(sensor), "tables": tables, "settings": sensor.rig}
 
 
 def _column(column: Column) -> dict[str, Any]:
@@ -141,28 +129,24 @@ def _column(column: Column) -> dict[str, Any]:
     }
 
 
-def _print_sensor(sensor: SensorType) -> None:
-    from factorgraph_loc.sensors.registry import sections_of
-    from factorgraph_loc.sensors.tables import tables_of_sensor
-
-    found = _summary(sensor)
+def _print_sensor(sensor: SensorDescription) -> None:
     show.fields(
-        {"sensor": sensor.name, "what it is": found["about"], "--sensors": ", ".join(found["channels"])}
-        | ({"rig": _sections(sensor)} if sensor.settings else {})
+        {"sensor": sensor.name, "what it is": sensor.about, "--sensors": ", ".join(sensor.channels)}
+        | ({"rig": _sections(sensor)} if sensor.rig else {})
     )
-    for table in tables_of_sensor(sensor):
+    for name, columns in sensor.tables.items():
         show.line()
-        show.line(f"table {table.name}")
-        rows = [(column.name, column.values, column.doc) for column in table.columns]
+        show.line(f"table {name}")
+        rows = [(column.name, column.values, column.doc) for column in columns]
         show.table(("column", "values", "what it is"), rows, wrapped=("values", "what it is"))
-    for section, settings in sections_of(sensor).items():
+    for section, settings in sensor.rig.items():
         show.line()
         show.line(f"[{section}] of a rig")
         _print_settings(settings)
 
 
-def _sections(sensor: SensorType) -> str:
-    return ", ".join(f"[{section}]" for section in sensor.settings)
+def _sections(sensor: SensorDescription) -> str:
+    return ", ".join(f"[{section}]" for section in sensor.rig)
 
 
 def _print_settings(settings: Sequence[Setting], word: str = "setting") -> None:

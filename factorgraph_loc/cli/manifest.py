@@ -1,6 +1,5 @@
 """``fgloc manifest``, and the topics of a ROS bag for ``fgloc info``."""
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -14,54 +13,34 @@ BagPath = Annotated[Path, typer.Argument(metavar="BAG", help="A .bag, .mcap or .
 
 def manifest(bag: BagPath, json: Json = False) -> None:
     """Propose a manifest for a ROS bag: which topic is which sensor. Write it to a file and check it."""
-    from factorgraph_loc.io.bags.file import open_bag
-    from factorgraph_loc.io.bags.manifest import manifest_of, manifest_text, propose, remarks
+    from factorgraph_loc.io.bags.proposed import manifest_of_bag
 
-    path, here = Path(os.path.realpath(bag)), Path.cwd().resolve()
-    below = path.is_relative_to(here)
-    root = here if below else path.parent
-    with open_bag(path) as opened:
-        stem = path.with_suffix("") if path.is_file() else path
-        beside = {
-            kind: (file.relative_to(root)).as_posix()
-            for kind in ("rig", "world")
-            if (file := stem.with_name(f"{stem.name}.{kind}.toml")).is_file()
-        }
-        proposal = propose(opened)
-        content = manifest_of(proposal, path.relative_to(root).as_posix(), beside)
-        told = remarks(opened, proposal, beside)
-    if not below:
-        show.note(f"the manifest names {path.name} only: save it in {path.parent}, or give --data-root {path.parent}")
+    found = manifest_of_bag(bag, Path.cwd())
+    if found.folder != Path.cwd().resolve():
+        name = found.content["path"]
+        show.note(f"the manifest names {name} only: save it in {found.folder}, or give --data-root {found.folder}")
     if json:
-        show.document({"manifest": content, "remarks": told})
+        show.document({"manifest": found.content, "remarks": found.remarks})
     else:
-        show.lines(manifest_text(content, told).rstrip("\n"))
+        show.lines(found.text.rstrip("\n"))
 
 
 def info_of_bag(bag: Path, json: Json) -> None:
     """Print the topics of a bag."""
-    from factorgraph_loc.io.bags.file import open_bag
-    from factorgraph_loc.io.bags.manifest import propose
+    from factorgraph_loc.io.bags.proposed import manifest_of_bag
 
-    with open_bag(bag) as opened:
-        uses = propose(opened).uses
-        duration = opened.duration
-        topics = list(opened.topics.values())
-    rates = {t.name: (t.count - 1) / duration if duration > 0.0 and t.count > 1 else None for t in topics}
+    found = manifest_of_bag(bag, Path.cwd())
     if json:
-        rows = [
-            {"topic": t.name, "type": t.type, "messages": t.count, "rate": rates[t.name], "use": uses.get(t.name)}
-            for t in topics
-        ]
-        show.document({"bag": str(bag), "duration": duration, "topics": rows})
+        show.document({"bag": str(bag), "duration": found.duration, "topics": found.topics})
         return
-    show.fields({"bag": str(bag), "duration": f"{duration:.1f} s"})
+    show.fields({"bag": str(bag), "duration": f"{found.duration:.1f} s"})
     show.line()
     header = ("topic", "type", "messages", "rate [Hz]", "looks like")
-    show.table(header, [_row(t.name, t.type, t.count, rates[t.name], uses.get(t.name, "")) for t in topics])
+    show.table(header, [_row(t.topic, t.type, t.messages, t.rate, t.use, t.unused) for t in found.topics])
     show.line()
     show.line(f"`fgloc manifest {bag} > run.toml` proposes a manifest; then `fgloc info run.toml` shows the content")
 
 
-def _row(name: str, kind: str, count: int, rate: float | None, use: str) -> tuple[str, ...]:
-    return (name, kind, str(count), "" if rate is None else f"{rate:.1f}", use)
+def _row(name: str, kind: str, count: int, rate: float | None, use: str | None, unused: str | None) -> tuple[str, ...]:
+    told = use or (f"{unused}, not used" if unused else "")
+    return (name, kind, str(count), "" if rate is None else f"{rate:.1f}", told)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -14,9 +13,6 @@ from factorgraph_loc.cli import completion, show
 from factorgraph_loc.cli.options import Json, Overwrite
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import quoted
-
-if TYPE_CHECKING:
-    from factorgraph_loc.model.rig import Rig
 
 T = TypeVar("T")
 MOST_ANTENNAS = 64
@@ -29,7 +25,9 @@ def rigs(context: typer.Context, json: Json = False) -> None:
     """List the rigs that there are; print one; write a new one."""
     if context.invoked_subcommand is not None:
         return
-    known = [(name, source, make()) for name, (source, make) in _known().items()]
+    from factorgraph_loc.api.lookups import sources_of_rigs
+
+    known = [(name, source, make()) for name, (source, make) in sources_of_rigs().items()]
     if json:
         show.document([{"name": name, "of": source, "sensors": rig.sensors} for name, source, rig in known])
     else:
@@ -44,11 +42,12 @@ def show_(
     json: Json = False,
 ) -> None:
     """Print a rig as TOML, each key with its meaning."""
+    from factorgraph_loc.api.lookups import sources_of_rigs
     from factorgraph_loc.files.models import nearest
     from factorgraph_loc.io.native.rig_file import read_rig
     from factorgraph_loc.io.native.rig_text import rig_text
 
-    known = _known()
+    known = sources_of_rigs()
     if name not in known and not name.endswith(".toml"):
         raise InputError(f"no rig is called {quoted(name)}{nearest(name, list(known))}")
     rig = known[name][1]() if name in known else read_rig(name)
@@ -72,9 +71,8 @@ def new(
     json: Json = False,
 ) -> None:
     """Write the rig of a robot with some sensors, with comments. At a terminal, options that are not given are asked for."""
-    from factorgraph_loc.files.models import write_text
+    from factorgraph_loc.api.lookups import write_new_rig
     from factorgraph_loc.io.native.new_rig import RobotOptions, new_rig
-    from factorgraph_loc.io.native.rig_text import rig_text
 
     asks = not json and sys.stdin.isatty() and sys.stderr.isatty()
     robot = RobotOptions(
@@ -85,37 +83,14 @@ def new(
         _value("--camera", camera, "none", _size, asks and "camera: size of its images, such as 640x480, or none"),
     )
     file = _value("--out", None if out is None else str(out), "robot.rig.toml" if asks else "", _file, asks and "file")
-    if file.exists() and not overwrite:
-        raise InputError(f"{file}: exists already; choose another name or give --overwrite")
     rig, remarks = new_rig(file.name.removesuffix(".toml").removesuffix(".rig"), robot)
-    write_text(file, rig_text(rig, ["`fgloc sensors NAME` prints all keys of a sensor, with bounds.", *remarks]))
+    write_new_rig(rig, remarks, file, overwrite=overwrite)
     if json:
         show.document({"file": str(file), "rig": rig.model_dump(mode="json", exclude_none=True), "remarks": remarks})
         return
     for remark in remarks:
         show.line(remark)
     show.line(f"wrote {file}; use it by --rig {file}, or name it in run.toml of a log")
-
-
-def _known() -> dict[str, tuple[str, Callable[[], Rig]]]:
-    """The rigs by name: whose each is, and how it is made."""
-    from factorgraph_loc.files.shipped import rigs as shipped
-    from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
-    from factorgraph_loc.io.native.rig_file import read_rig
-    from factorgraph_loc.simulation import PRESETS
-
-    found: dict[str, tuple[str, Callable[[], Rig]]] = {"default": ("logs without a rig", lambda: DEFAULT_RIG)}
-    for name, file in shipped().items():
-        found[name] = "a known log", partial(read_rig, file)
-    for name in PRESETS:
-        found[name] = "fgloc simulate", partial(_of_preset, name)
-    return found
-
-
-def _of_preset(name: str) -> Rig:
-    from factorgraph_loc.simulation import preset
-
-    return preset(name).rig
 
 
 def _value(

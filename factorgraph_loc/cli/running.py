@@ -89,6 +89,7 @@ def run(
     config = experiment.RunConfig(
         estimator, settings, parse_list(sensors) if sensors else None, prior, seed, max_gap, tick_gap
     )
+    show.first_use()
     with show.progress(estimator, counted=False) as report:
         result = experiment.run(loaded, config, lambda share: report(share, 1.0))
     scores = write_run(result, loaded, out, overwrite=overwrite)
@@ -141,6 +142,7 @@ def compare(
     configs = [
         RunConfig(name, settings[name], used, prior, seed, max_gap, tick_gap) for name in names for seed in chosen
     ]
+    show.first_use()
     with show.progress("runs", counted=True) as report:
         comparison = experiment.compare(loaded, configs, out, jobs=jobs, overwrite=overwrite, progress=report)
     show.warnings(comparison.warnings)

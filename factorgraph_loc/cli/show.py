@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import is_dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from factorgraph_loc.text import MESSAGE, one_line, plain
@@ -88,6 +89,17 @@ def _terminal_width() -> int:
         return os.get_terminal_size(sys.stdout.fileno()).columns
     except OSError:
         return shutil.get_terminal_size().columns
+
+
+def first_use() -> None:
+    """Say at a terminal, before a run, that kernels have to be compiled, if none are yet."""
+    if not sys.stderr.isatty():
+        return
+    from factors.odometry.kernels import relative  # which every run needs
+
+    cache = relative.stats.cache_path
+    if cache is None or not any(Path(cache).glob("*.relative-*.nbi")):
+        note("the first use compiles for up to a minute; later ones do not")
 
 
 @contextmanager

@@ -62,7 +62,7 @@ def simulate(
 ) -> None:
     """Simulate logs with known ground truth: a world, a drive, and the measurements of odometry, RFID antennas and camera."""
     chosen = [seed] if seeds is None else list(parse_seeds(seeds))
-    from factorgraph_loc import api
+    from factorgraph_loc.api import logs
     from factorgraph_loc.files.models import file_name
     from factorgraph_loc.simulation import recorded_looks
 
@@ -78,7 +78,7 @@ def simulate(
     for number in chosen:
         folder = out if seeds is None else out / file_name(f"{settings.name}-{number}")
         with show.progress(folder.name, counted=True) as tell:
-            log = api.simulate(settings, number, recorded=looks, images=images, out=folder, progress=tell)
+            log = logs.simulate(settings, number, recorded=looks, images=images, out=folder, progress=tell)
         for warning in log.warnings:
             show.note(f"warning: {log.name}: {warning}")
         if not json:

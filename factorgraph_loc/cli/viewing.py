@@ -10,9 +10,6 @@ import typer
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, Reader, ReaderOption, RigFile, WorldFile
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.shipped import manifests
-from factorgraph_loc.text import listed
 
 if TYPE_CHECKING:
     from factorgraph_loc.exports.particles import Particles
@@ -46,14 +43,10 @@ def view(
     json: Json = False,
 ) -> None:
     """Show a log and its runs over time, in Rerun."""
-    from factorgraph_loc.exports import rerun_scene
+    from factorgraph_loc.api import results
 
-    log, runs = load_results(what, LogOptions(reader, reader_option, data_root, rig, world))
-    clouds = _particles(log, runs) if particles else {}
-    if rrd is None:
-        rerun_scene.show(log, runs, clouds)
-    else:
-        rerun_scene.write_rrd(log, runs, rrd, clouds)
+    log, runs = results.stored(what, LogOptions(reader, reader_option, data_root, rig, world).load_one)
+    results.show(log, runs, rrd, _particles(log, runs) if particles else {})
     if json:
         show.document(shown(log, runs) | {"file": None if rrd is None else str(rrd)})
     elif rrd is not None:
@@ -62,19 +55,17 @@ def view(
 
 def _particles(log: Log, runs: list[StoredRun]) -> dict[str, Particles]:
     """The particles of the runs that use particles, by name."""
-    from factorgraph_loc.experiments.particles import particles_of
+    from factorgraph_loc.api.results import clouds_of
 
-    found = {}
+    found: dict[str, Particles] = {}
     for run in runs:
         with show.progress(run.name, counted=False) as report:
-            cloud = particles_of(run, log, partial(report, total=1.0))
-        if cloud is not None:
-            found[run.name] = cloud
-            if cloud.difference > SAME:
-                show.note(
-                    f"warning: {run.folder.path}: repeated, it differs by up to {cloud.difference:.2g} m, so its particles "
-                    "differ too: did the rig, the map or the version change?"
-                )
+            found |= clouds_of(log, [run], partial(report, total=1.0))
+        if run.name in found and (difference := found[run.name].difference) > SAME:
+            show.note(
+                f"warning: {run.folder.path}: repeated, it differs by up to {difference:.2g} m, so its particles "
+                "differ too: did the rig, the map or the version change?"
+            )
     if not found:
         show.note("warning: no run has particles; only particle_filter and switching use them")
     return found
@@ -83,29 +74,3 @@ def _particles(log: Log, runs: list[StoredRun]) -> dict[str, Particles]:
 def shown(log: Log, runs: list[StoredRun]) -> dict[str, Any]:
     """The content of what is shown or written, for ``--json``."""
     return {"log": log.name, "runs": {run.name: str(run.folder.path) for run in runs}}
-
-
-def load_results(what: list[str], options: LogOptions) -> tuple[Log, list[StoredRun]]:
-    """The log named in ``what``, or else the common log of all runs there, and the runs.
-
-    InputError if there are several logs, or if the log of the runs is not known by its name.
-    """
-    from factorgraph_loc.exports.runs import find_runs, is_results, read_runs
-
-    places = [name for name in what if is_results(Path(name))]
-    logs = [name for name in what if name not in places]
-    if len(logs) > 1:
-        raise InputError(f"{listed(logs)} are {len(logs)} logs, expected one log and folders of its results")
-    folders = [run for name in places for run in find_runs(Path(name))]
-    named = sorted({folder.log for folder in folders})
-    if not logs and len(named) > 1:
-        raise InputError(f"{places[0]}: holds runs of {listed(named)}, expected one of these logs to be given too")
-    if not logs and named[0] not in manifests():
-        raise InputError(
-            f"{places[0]}: is of the log {named[0]}, which `fgloc datasets` does not list, expected that log to be given too"
-        )
-    log = options.load_one(logs[0] if logs else named[0])
-    of_log = [folder for folder in folders if folder.log == log.name]
-    if folders and not of_log:
-        raise InputError(f"{places[0]}: holds runs of {listed(named)}, expected some of the log {log.name}")
-    return log, read_runs(of_log, log)

@@ -18,11 +18,11 @@ from factorgraph_loc.evaluation.plots import plot_run, remove_plots
 from factorgraph_loc.files.models import file_name, write_text, write_toml
 from factorgraph_loc.files.results import require_free, writing
 from factorgraph_loc.files.temporary import sweep, temporary_folder
-from factorgraph_loc.io.results.layout import COVARIANCES, FILES
+from factorgraph_loc.io.results.layout import FILES
 from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
-from factorgraph_loc.model.trajectory import Trajectory, write_tum
+from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory, write_tum
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
 

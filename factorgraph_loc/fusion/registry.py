@@ -6,7 +6,7 @@ from typing import Any, cast
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, nearest, parse_model
-from factorgraph_loc.files.settings import first_sentence
+from factorgraph_loc.files.settings import Setting, first_sentence, settings_in
 from factorgraph_loc.fusion.base import EVERY, Estimator, SpaceEstimator
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.plugins import ESTIMATORS, load
@@ -17,13 +17,15 @@ from factorgraph_loc.text import quoted
 @dataclass(frozen=True)
 class Description:
     """What there is to know of an estimator. ``about``: one sentence; ``sensors``: channels that it takes; ``causal``: whether it
-    has estimates while it runs; ``smoothed``: whether its final trajectory uses all measurements."""
+    has estimates while it runs; ``smoothed``: whether its final trajectory uses all measurements; ``settings``: all its
+    settings."""
 
     name: str
     about: str
     sensors: tuple[str, ...]
     causal: bool
     smoothed: bool
+    settings: tuple[Setting, ...]
 
 
 def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
@@ -44,7 +46,12 @@ def describe(name: str) -> Description:
     kind = estimator_type(name)
     taken = tuple(channel.name for channel in channels().values() if _takes(kind, channel))
     return Description(
-        name, first_sentence(kind), taken, getattr(kind, "causal", True), getattr(kind, "smoothed", True)
+        name,
+        first_sentence(kind),
+        taken,
+        getattr(kind, "causal", True),
+        getattr(kind, "smoothed", True),
+        tuple(settings_in(settings_type(name))),
     )
 
 

@@ -3,6 +3,7 @@
 __all__ = [
     "belief",
     "diagnostics",
+    "exchange",
     "learnt",
     "log",
     "measurement",

@@ -16,7 +16,7 @@ from factorgraph_loc.files.models import FileModel, add_fields
 from factorgraph_loc.model.sections import sections, sections_of_channels
 from factorgraph_loc.model.settings import SensorSettings
 from factorgraph_loc.model.variable import NOTHING, Estimated
-from factorgraph_loc.plugins import MOVED, load
+from factorgraph_loc.plugins import FILES, MOVED, load
 
 S = TypeVar("S", bound=FileModel)
 
@@ -42,6 +42,16 @@ class Rig(FileModel):
                 return super().__getattr__(name)
             warnings.warn(f"Rig.{name} is deprecated: see {MOVED[name].__doc__}", DeprecationWarning, stacklevel=2)
             return partial(MOVED[name], self)
+
+    @classmethod
+    def read(cls, path: str | Path) -> Rig:
+        """Read ``NAME.rig.toml``; InputError names file, key and expected value."""
+        rig: Rig = load(FILES["read_rig"])(path)
+        return rig
+
+    def write(self, path: str | Path) -> None:
+        """Write ``NAME.rig.toml``, and its grids to the same folder."""
+        load(FILES["write_rig"])(self, path)
 
     def find(self, kind: type[S], section: str | None = None) -> S | None:
         """The settings of class ``kind``, or None; ``section`` selects one if several have the same class."""

@@ -1,7 +1,10 @@
 """Planar trajectories with covariances, interpolation, and the TUM text format."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,13 +12,28 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.columns import LATEST, POSES
 from factorgraph_loc.files.models import read_text, write_text
+from factorgraph_loc.model.exchange import Exchange, numbers
 from factorgraph_loc.model.planar import on_floor, rotations_of
 from factors import se2
 from factors.se2 import Array, Integers
 
+if TYPE_CHECKING:
+    import polars as pl
+
+    from factorgraph_loc.model.pose_path import PosePath
+
+COVARIANCES = {  # columns of tables: entries of a covariance of (x, y, heading)
+    "cov_xx": (0, 0),
+    "cov_xy": (0, 1),
+    "cov_xh": (0, 2),
+    "cov_yy": (1, 1),
+    "cov_yh": (1, 2),
+    "cov_hh": (2, 2),
+}
+
 
 @dataclass(frozen=True)
-class Trajectory:
+class Trajectory(Exchange):
     """A planar trajectory: ``t`` (N,) seconds, strictly increasing; ``poses`` (N, 3) of the robot in the world; ``covariances``
     (N, 3, 3) of (x, y, heading) in the world frame, or None. ``has_heading`` is False if the headings are meaningless."""
 
@@ -55,6 +73,51 @@ class Trajectory:
         before, after, fraction, valid = neighbours(self.t, t, max_gap)
         out[valid] = averaged(self.covariances, before, after, fraction)[valid]
         return out
+
+    def to_numpy(self) -> Array:
+        """The poses as an array (N, 4): t [s], x, y [m], heading [rad]."""
+        return np.column_stack((self.t, self.poses))
+
+    @classmethod
+    def from_polars(cls, table: pl.DataFrame) -> Self:
+        """A trajectory from the columns t [s], x, y [m], heading [rad], and those of covariances (cov_xx, cov_xy, cov_xh, cov_yy,
+        cov_yh, cov_hh) if there are any; others are ignored.
+
+        InputError if a column is missing, or has values that are no numbers.
+        """
+        found = super().from_polars(table)
+        if not any(name in table.columns for name in COVARIANCES):
+            return found
+        if missing := [name for name in COVARIANCES if name not in table.columns]:
+            raise InputError(f"the table has no column {missing[0]}, expected all or none of {', '.join(COVARIANCES)}")
+        covariances = np.empty((len(table), 3, 3))
+        for column, (i, j) in zip(numbers(table, COVARIANCES).T, COVARIANCES.values(), strict=True):
+            covariances[:, i, j] = covariances[:, j, i] = column
+        return replace(found, covariances=covariances)
+
+    def to_polars(self) -> pl.DataFrame:
+        """The poses as a table with the columns of :meth:`from_polars`, those of covariances if there are any."""
+        table, known = super().to_polars(), self.covariances
+        return (
+            table if known is None else table.with_columns(**{k: known[:, i, j] for k, (i, j) in COVARIANCES.items()})
+        )
+
+    @classmethod
+    def _columns(cls) -> tuple[str, ...]:
+        return "t", "x", "y", "heading"
+
+    @classmethod
+    def _of_rows(cls, rows: Array) -> Self:
+        return cls(rows[:, 0], rows[:, 1:])
+
+    @classmethod
+    def _of_path(cls, path: PosePath, t0_ns: int) -> Self:
+        assert path.t_ns is not None
+        poses = on_floor(path.name, path.positions, path.rotations if path.has_rotations else None, [])
+        return cls((path.t_ns - t0_ns) / 1e9, poses, has_heading=path.has_rotations)
+
+    def _write_tum(self, path: Path, t0_ns: int) -> None:
+        write_tum(self, path, t0_ns)
 
 
 def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integers, Array, NDArray[np.bool_]]:
@@ -125,11 +188,16 @@ def write_tum(trajectory: Trajectory, path: str | Path, t0_ns: int = 0) -> None:
     """Write a TUM file with absolute timestamps in decimal seconds."""
     rows = []
     for t, (x, y, heading) in zip(trajectory.t, trajectory.poses, strict=True):
-        t_ns = t0_ns + round(t * 1e9)
-        sign, (whole, fraction) = "-" if t_ns < 0 else "", divmod(abs(t_ns), 10**9)
         qz, qw = np.sin(heading / 2.0), np.cos(heading / 2.0)
-        rows.append(f"{sign}{whole}.{fraction:09d} {x:.9f} {y:.9f} 0 0 0 {qz:.12f} {qw:.12f}\n")
+        rows.append(f"{decimal_seconds(t, t0_ns)} {x:.9f} {y:.9f} 0 0 0 {qz:.12f} {qw:.12f}\n")
     write_text(Path(path), "".join(rows))
+
+
+def decimal_seconds(t: float, t0_ns: int) -> str:
+    """A time ``t`` [s] after ``t0_ns`` as absolute decimal seconds, to the nanosecond."""
+    t_ns = t0_ns + round(t * 1e9)
+    sign, (whole, fraction) = "-" if t_ns < 0 else "", divmod(abs(t_ns), 10**9)
+    return f"{sign}{whole}.{fraction:09d}"
 
 
 def nanoseconds(stamp: str) -> int:

@@ -13,7 +13,8 @@ from scipy.io import savemat
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.io.bags.file import open_bag
-from factorgraph_loc.io.bags.manifest import manifest_of, manifest_text, propose
+from factorgraph_loc.io.bags.manifest import propose
+from factorgraph_loc.io.bags.proposed import manifest_of, manifest_text
 from fuzzing.seeds import TAGS, WORLD_TABLES, drive, occupancy
 
 START = 1_700_000_000  # s since 1970

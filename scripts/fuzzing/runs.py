@@ -48,7 +48,7 @@ def run_with_faults(files: Mapping[str, bytes], folder: Path, rng: Generator) ->
     check(fgloc.run(log, estimator, settings=settings, sensors=sensors, prior=prior, seed=int(rng.integers(10))))
 
 
-def check(run: fgloc.api.Run) -> None:
+def check(run: fgloc.Run) -> None:
     result = run.result
     for t, pose, covariance, status in zip(result.t, result.poses, result.covariances, result.status, strict=True):
         if status != "unlocalized" or np.isfinite(pose).all():

@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarking.report import Options, Report
 
-from factorgraph_loc.api import run
+from factorgraph_loc.api.running import run
 from factorgraph_loc.errors import FglocError
 from recordings_benchmark.listed import RECORDINGS, Recording
 from recordings_benchmark.prepare import prepare

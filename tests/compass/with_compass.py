@@ -13,7 +13,8 @@ from compass.stream import HEADINGS, Heading, HeadingStream
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.io.bags.file import open_bag
-from factorgraph_loc.io.bags.manifest import manifest_of, manifest_text, propose
+from factorgraph_loc.io.bags.manifest import propose
+from factorgraph_loc.io.bags.proposed import manifest_of, manifest_text
 from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.sensors.registry import channels
 from factorgraph_loc.sensors.tables import all_tables

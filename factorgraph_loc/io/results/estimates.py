@@ -3,8 +3,7 @@
 import numpy as np
 import polars as pl
 
-from factorgraph_loc.io.results.layout import COVARIANCES
-from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory
 
 
 def trajectory_of(table: pl.DataFrame, t0_ns: int) -> Trajectory:

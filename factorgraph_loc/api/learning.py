@@ -1,0 +1,77 @@
+"""``fgloc calibrate`` and ``fgloc map`` as functions."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from factorgraph_loc.api.given import LogLike, Progress, RigLike, Settings, WorldLike, every, one
+from factorgraph_loc.api.running import run
+from factorgraph_loc.calibration import calibrate as calibration
+from factorgraph_loc.calibration import report as rig_report
+from factorgraph_loc.experiments import maps, output
+from factorgraph_loc.files.models import replacing
+from factorgraph_loc.files.results import writing
+from factorgraph_loc.files.temporary import of_system, temporary_folder
+from factorgraph_loc.io.native.rig_file import write_rig
+from factorgraph_loc.model.log import Log
+
+RIG = ".rig.toml"
+
+
+def calibrate(
+    logs: LogLike | Sequence[LogLike],
+    out: str | Path,
+    *,
+    rig: RigLike | None = None,
+    world: WorldLike | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> calibration.Calibration:
+    """Calibrate a rig from logs with reference poses. Writes ``out`` (``NAME.rig.toml``) and ``NAME.report.html`` next to it."""
+    file, page = Path(out), report_beside(Path(out), overwrite=overwrite)
+    loaded = every(logs, rig, world)
+    # learnt grids are kept here until the rig is written, so that a failed calibration leaves nothing behind
+    with temporary_folder(of_system("grids")) as folder:
+        grids = folder / file.name.removesuffix(RIG)
+        found = calibration.calibrate(loaded, _score, progress=progress, grids=grids)
+        with writing(file), replacing(page) as temporary:  # write both files or none
+            temporary.write_text(rig_report.page(found), encoding="utf-8")
+            write_rig(found.rig, file)
+    return found
+
+
+def report_beside(out: Path, *, overwrite: bool) -> Path:
+    """The path of the report of a rig; InputError if the rig's name is invalid or the file exists."""
+    return output.beside(out, RIG, ".report.html", overwrite=overwrite)
+
+
+def build_map(
+    log: LogLike,
+    out: str | Path,
+    *,
+    of: str | None = None,
+    estimator: str = maps.MAPPERS[0],
+    settings: Settings | None = None,
+    extend: bool = False,
+    poses: str | None = None,
+    tag_height: float | None = None,
+    prior: str | None = None,
+    drop_dead: bool = False,
+    rig: RigLike | None = None,
+    world: WorldLike | None = None,
+    overwrite: bool = False,
+) -> maps.MadeMap:
+    """Estimate a map of landmarks, RFID tags or points from a log. Writes ``out`` (``NAME.world.toml``) and a picture next to it.
+
+    For the arguments see :class:`~factorgraph_loc.experiments.maps.MapOptions`.
+    """
+    maps.picture_beside(Path(out), overwrite=overwrite)
+    options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead)
+    made = maps.make_map(one(log, rig, world), options)
+    made.write(Path(out), overwrite=overwrite)
+    return made
+
+
+def _score(log: Log) -> dict[str, Any]:
+    """Scores of the EKF, or of the smoother if the log has RFID, with the log's rig and its sensors."""
+    return run(log, calibration.estimator_for(log.rig)).scores

@@ -1,0 +1,109 @@
+"""``fgloc datasets``, ``info``, ``convert``, ``manifest`` and ``simulate`` as functions."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from factorgraph_loc.api.given import LogLike, Progress, RigLike, Settings, WorldLike, every, one
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.inspect import Inspection, inspect
+from factorgraph_loc.files.models import write_text
+from factorgraph_loc.files.results import writing
+from factorgraph_loc.files.temporary import temporary_folder
+from factorgraph_loc.io.bags.proposed import BagManifest, manifest_of_bag
+from factorgraph_loc.io.native.native import require_new, write_native
+from factorgraph_loc.io.readers import Dataset, describe
+from factorgraph_loc.io.write import write_log
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.recorded import RecordedLooks
+from factorgraph_loc.simulation import SimulationSettings, named_settings, recorded_looks, with_images
+from factorgraph_loc.simulation import simulate as make_log
+
+
+def datasets(data_root: str | Path | None = None) -> list[Dataset]:
+    """The logs that are known by name; ``present`` tells whether their files exist."""
+    return describe(data_root)
+
+
+def info(log: LogLike, *, rig: RigLike | None = None, world: WorldLike | None = None) -> Inspection:
+    """Summarize a log, with warnings about its content."""
+    return inspect(one(log, rig, world))
+
+
+def convert(
+    log: LogLike,
+    out: str | Path,
+    *,
+    format: Literal["csv", "parquet"] = "csv",
+    rig: RigLike | None = None,
+    world: WorldLike | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write a log as a new folder in the native format, or as a ROS bag if ``out`` ends with .bag, .mcap or .db3.
+
+    ``overwrite`` replaces a log that ``out`` is.
+    """
+    write_log(one(log, rig, world), out, format=format, overwrite=overwrite)
+
+
+def manifest(bag: str | Path, out: str | Path | None = None, *, overwrite: bool = False) -> BagManifest:
+    """Propose a manifest for a ROS bag: which topic is which sensor. ``out``: a file to write it to, in the folder of the bag or
+    one above, which can be read as a log once it is checked.
+
+    InputError if the bag cannot be read, or the file is elsewhere or exists.
+    """
+    if out is None:
+        return manifest_of_bag(Path(bag), Path.cwd())
+    file = Path(out)
+    if file.exists() and not overwrite:
+        raise InputError(f"{file}: exists already, expected a new file")
+    found = manifest_of_bag(Path(bag), file.parent)
+    if found.folder != file.parent.resolve():
+        raise InputError(f"{file}: the bag is in {found.folder}, expected a file there or in a folder above")
+    write_text(file, found.text)
+    return found
+
+
+def simulate(
+    what: str | Path | SimulationSettings = "office",
+    seed: int = 0,
+    *,
+    changes: Settings | None = None,
+    recorded: RecordedLooks | LogLike | Sequence[LogLike] | None = None,
+    images: bool = False,
+    out: str | Path | None = None,
+    progress: Progress = lambda _done, _total: None,
+) -> Log:
+    """Simulate a log with known ground truth. The same seed gives the same bytes.
+
+    ``what``: a preset, a TOML file, or settings. ``changes``: nested tables, such as ``{"drive": {"duration": 60.0}}``.
+    ``recorded``: logs whose RFID reads are resampled, or the reads extracted from them. ``out``: a new folder for the log in the
+    native format; required with ``images``, which are rendered into it.
+    """
+    if isinstance(what, SimulationSettings) and changes:
+        raise InputError("changes apply to a preset or a file, but settings are given")
+    settings = what if isinstance(what, SimulationSettings) else named_settings(str(what), changes)
+    if images and out is None:
+        raise InputError("images need out, a folder to write the log to")
+    if recorded is not None and not isinstance(recorded, RecordedLooks):
+        recorded = recorded_looks(every(recorded))
+    log = make_log(settings, seed, recorded)
+    if out is None:
+        return log
+    folder = Path(out)
+    with writing(folder):
+        if images:
+            _write_with_images(log, settings, seed, folder, progress)
+        else:
+            write_native(log, folder)
+    return one(folder) if images else log
+
+
+def _write_with_images(log: Log, settings: SimulationSettings, seed: int, folder: Path, progress: Progress) -> None:
+    """Render the images into a temporary folder first, so that the log is written completely or not at all."""
+    require_new(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with temporary_folder(folder) as beside:
+        workers = os.cpu_count() or 1
+        write_native(with_images(log, settings, seed, beside, workers=workers, tell=progress), folder)

@@ -1,0 +1,127 @@
+"""``fgloc estimators``, ``sensors``, ``readers`` and ``rigs`` as functions: what there is to choose from."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.columns import Column
+from factorgraph_loc.files.models import write_text
+from factorgraph_loc.files.settings import Setting, settings_in
+from factorgraph_loc.files.shipped import rigs as shipped
+from factorgraph_loc.fusion.registry import Description, describe
+from factorgraph_loc.io.native import new_rig as first
+from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
+from factorgraph_loc.io.native.rig_file import read_rig
+from factorgraph_loc.io.native.rig_text import rig_text
+from factorgraph_loc.io.readers import reader
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
+from factorgraph_loc.sensors.registry import about, sections_of, sensor
+from factorgraph_loc.sensors.tables import tables_of_sensor
+from factorgraph_loc.simulation import PRESETS, preset
+
+ADVICE = "`fgloc sensors NAME` prints all keys of a sensor, with bounds."
+
+
+@dataclass(frozen=True)
+class ReaderDescription:
+    """A reader of logs: one sentence on its format, and its options."""
+
+    name: str
+    about: str
+    options: tuple[Setting, ...]
+
+
+@dataclass(frozen=True)
+class SensorDescription:
+    """A sensor: one sentence on it, its names in ``sensors``, the columns of its tables, and the settings in its sections of the
+    rig."""
+
+    name: str
+    about: str
+    channels: tuple[str, ...]
+    tables: Mapping[str, tuple[Column, ...]]
+    rig: Mapping[str, tuple[Setting, ...]]
+
+
+def known_estimators() -> list[Description]:
+    """The estimators, each with the sensors that it takes and its settings."""
+    return [describe(name) for name in ESTIMATORS]
+
+
+def known_readers() -> list[ReaderDescription]:
+    """The readers of logs, each with its options."""
+    return [describe_reader(name) for name in READERS]
+
+
+def describe_reader(name: str) -> ReaderDescription:
+    """The description of a reader; InputError for an unknown one."""
+    found = reader(name)
+    return ReaderDescription(name, found.about, tuple(settings_in(found.options)))
+
+
+def known_sensors() -> list[SensorDescription]:
+    """The sensors, each with the columns of its tables and its settings in the rig."""
+    return [describe_sensor(name) for name in SENSORS]
+
+
+def describe_sensor(name: str) -> SensorDescription:
+    """The description of a sensor, by its name or that of a channel; InputError for an unknown one."""
+    found = sensor(name)
+    return SensorDescription(
+        found.name,
+        about(found.name),
+        tuple(channel.name for channel in found.channels),
+        {table.name: table.columns for table in tables_of_sensor(found)},
+        {section: tuple(settings) for section, settings in sections_of(found).items()},
+    )
+
+
+def known_rigs() -> dict[str, Rig]:
+    """The rigs of known logs and simulations by name, and the default one."""
+    return {name: make() for name, (_, make) in sources_of_rigs().items()}
+
+
+def sources_of_rigs() -> dict[str, tuple[str, Callable[[], Rig]]]:
+    """The rigs by name: whose each is, and how it is made."""
+    found: dict[str, tuple[str, Callable[[], Rig]]] = {"default": ("logs without a rig", lambda: DEFAULT_RIG)}
+    for name, file in shipped().items():
+        found[name] = "a known log", partial(read_rig, file)
+    for name in PRESETS:
+        found[name] = "fgloc simulate", partial(_of_preset, name)
+    return found
+
+
+def _of_preset(name: str) -> Rig:
+    return preset(name).rig
+
+
+def new_rig(
+    name: str = "robot",
+    *,
+    odometry: first.Drive = "differential",
+    imu: bool = False,
+    landmarks: float | None = None,
+    antennas: int = 0,
+    camera: tuple[int, int] | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+) -> Rig:
+    """A first rig of a robot with some sensors, written with comments to ``out`` if it is given.
+
+    ``landmarks``: standard deviation of ranges to landmarks [m]; ``antennas``: number of RFID antennas; ``camera``: width and
+    height of its images [px]. InputError if a value is out of bounds, or the file exists.
+    """
+    rig, remarks = first.new_rig(name, first.RobotOptions(odometry, imu, landmarks, antennas, camera))
+    if out is not None:
+        write_new_rig(rig, remarks, Path(out), overwrite=overwrite)
+    return rig
+
+
+def write_new_rig(rig: Rig, remarks: list[str], file: Path, *, overwrite: bool) -> None:
+    """Write a rig with remarks and the meaning of each key. InputError if the file exists, unless it is to ``overwrite``."""
+    if file.exists() and not overwrite:
+        raise InputError(f"{file}: exists already; choose another name or give --overwrite")
+    write_text(file, rig_text(rig, [ADVICE, *remarks]))

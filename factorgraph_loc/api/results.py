@@ -1,0 +1,139 @@
+"""``fgloc view`` and ``fgloc export`` as functions: stored results for viewers and other programs."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from factorgraph_loc.api.given import LogLike, RigLike, WorldLike, one
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.experiments.particles import particles_of
+from factorgraph_loc.exports import foxglove, rerun_scene
+from factorgraph_loc.exports.g2o import pose_graph, write_g2o
+from factorgraph_loc.exports.particles import Particles
+from factorgraph_loc.exports.runs import StoredRun, find_runs, is_results, read_runs
+from factorgraph_loc.exports.trajectories import TIMES_SUFFIX
+from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.text import listed, quoted
+
+FORMATS = (".mcap", ".tum", ".kitti", ".g2o")
+L = TypeVar("L", bound=LogLike)
+
+
+def view(
+    results: LogLike | Sequence[LogLike],
+    *,
+    rig: RigLike | None = None,
+    world: WorldLike | None = None,
+    rrd: str | Path | None = None,
+    particles: bool = False,
+) -> None:
+    """Show a log and its runs over time, in Rerun.
+
+    ``results``: folders of runs or comparisons, and their log if :func:`~factorgraph_loc.api.logs.datasets` does not list it; or
+    a log alone. ``rrd``: file to write for the viewer instead of opening it. ``particles``: repeat runs of particle filters to
+    show their particles. InputError if ``rerun-sdk`` is not installed.
+    """
+    log, runs = stored(_listed(results), lambda name: one(name, rig, world))
+    show(log, runs, None if rrd is None else Path(rrd), clouds_of(log, runs) if particles else {})
+
+
+def export(
+    results: LogLike | Sequence[LogLike],
+    out: str | Path,
+    *,
+    rig: RigLike | None = None,
+    world: WorldLike | None = None,
+) -> list[Path]:
+    """Write runs for Foxglove, or the final trajectory of a run or the reference of a log for other programs; return the files.
+
+    ``results``: as for :func:`view`. ``out``: its suffix selects the format: .mcap, .tum, .kitti or .g2o.
+    """
+    require_format(Path(out))
+    log, runs = stored(_listed(results), lambda name: one(name, rig, world))
+    return write(log, runs, Path(out))
+
+
+def _listed(results: LogLike | Sequence[LogLike]) -> list[LogLike]:
+    return [results] if isinstance(results, (Log, str, Path)) else list(results)
+
+
+def stored(results: Sequence[L], read: Callable[[L | str], Log]) -> tuple[Log, list[StoredRun]]:
+    """The log among ``results``, or else the common log of all runs there, and the runs.
+
+    InputError if there are several logs, or if the log of the runs is not known by its name.
+    """
+    places = [Path(name) for name in results if not isinstance(name, Log) and is_results(Path(name))]
+    logs = [name for name in results if isinstance(name, Log) or Path(name) not in places]
+    if len(logs) > 1:
+        names = [log.name if isinstance(log, Log) else log for log in logs]
+        raise InputError(f"{listed(names)} are {len(logs)} logs, expected one log and folders of its results")
+    folders = [run for place in places for run in find_runs(place)]
+    named = sorted({folder.log for folder in folders})
+    if not logs and not named:
+        raise InputError("there are no results, expected folders of runs, or a log")
+    if not logs and len(named) > 1:
+        raise InputError(f"{places[0]}: holds runs of {listed(named)}, expected one of these logs to be given too")
+    if not logs and named[0] not in manifests():
+        raise InputError(
+            f"{places[0]}: is of the log {named[0]}, which `fgloc datasets` does not list, expected that log to be given too"
+        )
+    log = read(logs[0] if logs else named[0])
+    of_log = [folder for folder in folders if folder.log == log.name]
+    if folders and not of_log:
+        raise InputError(f"{places[0]}: holds runs of {listed(named)}, expected some of the log {log.name}")
+    return log, read_runs(of_log, log)
+
+
+def clouds_of(
+    log: Log, runs: Sequence[StoredRun], progress: Callable[[float], None] | None = None
+) -> dict[str, Particles]:
+    """The particles of the runs that use particles, by the names of the runs."""
+    clouds = {run.name: particles_of(run, log, progress) for run in runs}
+    return {name: cloud for name, cloud in clouds.items() if cloud is not None}
+
+
+def show(log: Log, runs: list[StoredRun], rrd: Path | None, clouds: dict[str, Particles]) -> None:
+    """Open the viewer, or write a file for it."""
+    if rrd is None:
+        rerun_scene.show(log, runs, clouds)
+    else:
+        rerun_scene.write_rrd(log, runs, rrd, clouds)
+
+
+def require_format(out: Path) -> None:
+    """InputError if the suffix of a file is that of no format."""
+    if out.suffix not in FORMATS:
+        raise InputError(f"{out}: has the suffix {quoted(out.suffix)}, expected one of {', '.join(FORMATS)}")
+
+
+def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
+    """Write a log and its runs, or a trajectory, in the format of the suffix; return the files."""
+    if out.suffix == ".mcap":
+        foxglove.write_mcap(log, runs, out)
+    elif out.suffix == ".g2o":
+        run = _only(runs, out)
+        sensors = run.folder.config.sensors or log.rig.sensors
+        write_g2o(pose_graph(log, run.final, sensors, run.landmarks), out)
+    else:
+        _trajectory(log, runs, out).write(out, log.t0_ns)
+    return [out, out.with_name(out.stem + TIMES_SUFFIX)] if out.suffix == ".kitti" else [out]
+
+
+def _only(runs: list[StoredRun], out: Path) -> StoredRun:
+    if len(runs) != 1:
+        found = f"there are {len(runs)} ({listed(run.name for run in runs)})" if runs else "there is none"
+        raise InputError(f"{out}: holds one run, and {found}, expected the folder of one run")
+    return runs[0]
+
+
+def _trajectory(log: Log, runs: list[StoredRun], out: Path) -> Trajectory | Trajectory3:
+    """The final trajectory of the run, or the reference of a log without runs."""
+    if runs:
+        return _only(runs, out).final
+    reference = log.reference3 if log.reference is None else log.reference
+    if reference is None:
+        raise InputError(f"{log.name}: has no reference to write, expected the folder of a run too")
+    return reference

@@ -1,0 +1,98 @@
+"""``fgloc run`` and ``fgloc compare`` as functions."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from factorgraph_loc.api.given import LogLike, RigLike, Settings, WorldLike, every, one
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.experiments import compare as comparing
+from factorgraph_loc.experiments import output
+from factorgraph_loc.experiments import run as running
+from factorgraph_loc.experiments.run import RunConfig
+from factorgraph_loc.model.result import RunResult
+from factorgraph_loc.model.scoring import MAX_GAP
+from factorgraph_loc.model.ticks import TICK_GAP
+from factorgraph_loc.text import listed
+
+
+@dataclass(frozen=True)
+class Run:
+    """The outcome of a run: its ``result``, and its ``scores`` as in ``metrics.json``."""
+
+    result: RunResult
+    scores: dict[str, Any]
+
+
+def run(
+    log: LogLike,
+    estimator: str,
+    *,
+    settings: Settings | None = None,
+    sensors: Sequence[str] | None = None,
+    prior: str | None = None,
+    seed: int = 0,
+    rig: RigLike | None = None,
+    world: WorldLike | None = None,
+    max_gap: float = MAX_GAP,
+    tick_gap: float = TICK_GAP,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> Run:
+    """Run one estimator on one log and score the result.
+
+    For the arguments see :class:`~factorgraph_loc.experiments.run.RunConfig`. ``out``: folder for the files that ``fgloc run``
+    writes.
+    """
+    if out is not None:
+        output.check_free(Path(out), overwrite=overwrite)
+    loaded = one(log, rig, world)
+    config = RunConfig(
+        estimator, settings or {}, None if sensors is None else tuple(sensors), prior, seed, max_gap, tick_gap
+    )
+    result = running.run(loaded, config, progress)
+    if out is None:
+        return Run(result, score(result, loaded))
+    scores = output.write_run(result, loaded, Path(out), overwrite=overwrite)
+    output.write_plots(result, loaded, Path(out))
+    return Run(result, scores)
+
+
+def compare(
+    logs: LogLike | Sequence[LogLike],
+    estimators: Sequence[str],
+    out: str | Path,
+    *,
+    settings: Mapping[str, Settings] | None = None,
+    sensors: Sequence[str] | None = None,
+    prior: str | None = None,
+    seeds: Iterable[int] = (0,),
+    rig: RigLike | None = None,
+    world: WorldLike | None = None,
+    max_gap: float = MAX_GAP,
+    tick_gap: float = TICK_GAP,
+    jobs: int | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> comparing.Comparison:
+    """Run several estimators on several logs with each seed, in ``jobs`` processes, and write tables and plots to ``out``.
+
+    ``settings`` are given per estimator. See :func:`factorgraph_loc.experiments.compare.compare`.
+    """
+    comparing.check_free(Path(out), overwrite=overwrite)
+    named = settings or {}
+    if others := [name for name in named if name not in estimators]:
+        raise InputError(f"settings are given for {others[0]}, which is not run here; run: {listed(estimators)}")
+    used = None if sensors is None else tuple(sensors)
+    chosen = list(seeds)
+    configs = [
+        RunConfig(name, named.get(name, {}), used, prior, seed, max_gap, tick_gap)
+        for name in estimators
+        for seed in chosen
+    ]
+    return comparing.compare(
+        every(logs, rig, world), configs, Path(out), jobs=jobs, overwrite=overwrite, progress=progress
+    )

@@ -1,0 +1,163 @@
+"""Rigs, maps and trajectories as files, and trajectories as what other programs take."""
+
+import sys
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.spatial.transform import Rotation
+
+import factorgraph_loc as fgloc
+
+T0 = 1_700_000_000 * 10**9
+RNG = np.random.default_rng(8)
+T = np.cumsum(RNG.uniform(0.05, 0.2, 30)).round(9)
+FLAT = fgloc.Trajectory(T, RNG.uniform(-3.0, 3.0, (30, 3)))
+SPACE = fgloc.Trajectory3(T, RNG.uniform(-3.0, 3.0, (30, 3)), Rotation.random(30, random_state=1).as_matrix())
+BOTH = pytest.mark.parametrize("trajectory", [FLAT, SPACE], ids=["floor", "space"])
+
+
+def require_alike(found, trajectory, atol=1e-8):
+    assert type(found) is type(trajectory)
+    assert found.t == pytest.approx(trajectory.t, abs=1e-6)
+    if isinstance(found, fgloc.Trajectory):
+        assert found.poses == pytest.approx(trajectory.poses, abs=atol)
+    else:
+        assert found.positions == pytest.approx(trajectory.positions, abs=atol)
+        assert found.rotations == pytest.approx(trajectory.rotations, abs=atol)
+
+
+def test_rigs_and_maps_read_and_write_their_files(tmp_path):
+    rig = fgloc.Rig(name="cart", sensors=["odometry"])
+    rig.write(tmp_path / "cart.rig.toml")
+    assert fgloc.Rig.read(str(tmp_path / "cart.rig.toml")) == rig == fgloc.read_rig(tmp_path / "cart.rig.toml")
+    world = fgloc.World(name="hall", tags={"E2": fgloc.Tag(x=1, y=1)})
+    world.write(tmp_path / "hall.world.toml")
+    assert fgloc.World.read(tmp_path / "hall.world.toml") == world
+    assert (tmp_path / "hall.tags.csv").is_file()
+    with pytest.raises(fgloc.InputError, match=r"hall.world.toml: unknown key tags"):
+        fgloc.Rig.read(tmp_path / "hall.world.toml")
+
+
+@BOTH
+def test_a_trajectory_comes_back_from_its_file(tmp_path, trajectory):
+    trajectory.write(tmp_path / "poses.tum", T0)
+    require_alike(type(trajectory).read(tmp_path / "poses.tum", T0), trajectory)
+    trajectory.write(tmp_path / "poses.kitti")
+    assert (tmp_path / "poses.times.txt").is_file()
+    with pytest.raises(fgloc.InputError, match=r"poses.kitti: has poses without times, expected poses with times"):
+        type(trajectory).read(tmp_path / "poses.kitti")
+
+
+def test_a_floor_is_no_staircase(tmp_path):
+    SPACE.write(tmp_path / "poses.tum")
+    with pytest.raises(fgloc.InputError, match="the height of poses varies by"):
+        fgloc.Trajectory.read(tmp_path / "poses.tum")
+
+
+def test_the_reference_of_a_log_is_a_trajectory():
+    log = fgloc.read_log("plaza2")
+    read = fgloc.Trajectory.read("plaza2", log.t0_ns)
+    assert read.poses == pytest.approx(log.reference.poses, abs=1e-9)
+    assert read.t == pytest.approx(log.reference.t, abs=1e-9)
+    assert read.has_heading == log.reference.has_heading
+
+
+@BOTH
+def test_a_trajectory_comes_back_from_an_array_and_a_table(trajectory):
+    kind = type(trajectory)
+    require_alike(kind.from_numpy(trajectory.to_numpy()), trajectory)
+    table = trajectory.to_polars()
+    assert len(table) == 30
+    require_alike(kind.from_polars(table.with_columns(note=pl.lit("ours"))), trajectory)
+    with pytest.raises(
+        fgloc.InputError, match=r"the array has the shape \(30, 2\), expected \(N, [48]\): a row for each"
+    ):
+        kind.from_numpy(trajectory.to_numpy()[:, :2])
+    with pytest.raises(fgloc.InputError, match=r"the array: pose 2 has the time .* s, expected one after that"):
+        kind.from_numpy(trajectory.to_numpy()[::-1])
+    with pytest.raises(fgloc.InputError, match="the table has no column x, expected t, x, y"):
+        kind.from_polars(table.drop("x"))
+    with pytest.raises(fgloc.InputError, match="column y has values that are no numbers"):
+        kind.from_polars(table.with_columns(y=pl.lit("left")))
+
+
+def test_a_table_keeps_covariances():
+    half = RNG.normal(size=(30, 3, 3))
+    sure = fgloc.Trajectory(FLAT.t, FLAT.poses, half @ half.transpose(0, 2, 1))
+    table = sure.to_polars()
+    assert table.columns == ["t", "x", "y", "heading", "cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh"]
+    assert fgloc.Trajectory.from_polars(table).covariances == pytest.approx(sure.covariances, abs=0.0)
+    with pytest.raises(fgloc.InputError, match="the table has no column cov_xy, expected all or none of cov_xx"):
+        fgloc.Trajectory.from_polars(table.drop("cov_xy"))
+
+
+@BOTH
+def test_evo_takes_and_gives_a_trajectory(trajectory):
+    evo = pytest.importorskip("evo.core.trajectory")
+    made = trajectory.to_evo(T0)
+    assert isinstance(made, evo.PoseTrajectory3D)
+    assert made.check()[0]
+    require_alike(type(trajectory).from_evo(made, T0), trajectory)
+    alone = evo.PosePath3D(made.positions_xyz, made.orientations_quat_wxyz)
+    with pytest.raises(fgloc.InputError, match="the trajectory of evo: has poses without times"):
+        type(trajectory).from_evo(alone)
+    with pytest.raises(fgloc.InputError, match="expected one of evo"):
+        type(trajectory).from_evo([1, 2])
+
+
+def test_missing_evo_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "evo.core.trajectory", None)
+    with pytest.raises(fgloc.InputError, match="trajectories of evo need evo: pip install evo"):
+        FLAT.to_evo()
+
+
+@BOTH
+def test_ros_takes_and_gives_a_trajectory(trajectory):
+    typesys = pytest.importorskip("rosbags.typesys")
+    path = trajectory.to_ros("hall", T0)
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    again = store.deserialize_cdr(store.serialize_cdr(path, "nav_msgs/msg/Path"), "nav_msgs/msg/Path")
+    assert {pose.header.frame_id for pose in (again, *again.poses)} == {"hall"}
+    require_alike(type(trajectory).from_ros(again, T0), trajectory)
+    require_alike(type(trajectory).from_ros(again.poses, T0), trajectory)
+
+
+def test_messages_of_an_environment_of_ros_are_taken_where_there_are_any(monkeypatch):
+    for package in ("nav_msgs", "geometry_msgs", "std_msgs", "builtin_interfaces"):
+        messages = ModuleType(f"{package}.msg")
+        messages.__getattr__ = lambda _: SimpleNamespace
+        monkeypatch.setitem(sys.modules, f"{package}.msg", messages)
+        monkeypatch.setitem(sys.modules, package, SimpleNamespace(msg=messages))
+    made = FLAT.to_ros(t0_ns=T0)
+    assert isinstance(made, SimpleNamespace)
+    require_alike(fgloc.Trajectory.from_ros(made, T0), FLAT)
+
+
+def stamped(i, **content):
+    return SimpleNamespace(header=SimpleNamespace(stamp=SimpleNamespace(sec=1_700_000_000 + i, nanosec=5)), **content)
+
+
+def test_every_kind_of_message_has_a_pose():
+    place = SimpleNamespace(x=1.0, y=2.0, z=0.0)
+    turn = SimpleNamespace(x=0.0, y=0.0, z=np.sin(0.25), w=np.cos(0.25))
+    pose = SimpleNamespace(position=place, orientation=turn)
+    messages = [
+        stamped(1, pose=pose),
+        stamped(2, pose=SimpleNamespace(pose=pose, covariance=np.zeros(36))),
+        stamped(3, transform=SimpleNamespace(translation=place, rotation=turn)),
+    ]
+    found = fgloc.Trajectory.from_ros(messages, T0)
+    assert found.poses == pytest.approx(np.tile((1.0, 2.0, 0.5), (3, 1)))
+    assert found.t.tolist() == [1.000000005, 2.000000005, 3.000000005]
+    points = fgloc.Trajectory.from_ros([stamped(1, point=place)])
+    assert not points.has_heading
+    with pytest.raises(fgloc.InputError, match="message 2 is of type SimpleNamespace, expected PoseStamped"):
+        fgloc.Trajectory.from_ros([messages[0], stamped(2)])
+    with pytest.raises(
+        fgloc.InputError, match="the messages: pose 2 has the time 1700000001000000005 ns, expected one"
+    ):
+        fgloc.Trajectory.from_ros([messages[0], messages[0]])
+    with pytest.raises(fgloc.InputError, match="contains no poses"):
+        fgloc.Trajectory.from_ros([])
