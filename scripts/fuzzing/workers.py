@@ -16,9 +16,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
+from fuzzing.compilation import CompilationClock, Seconds, compiled
 from fuzzing.verdicts import Verdict
 
-SECONDS = 8.0  # of processor time, or of blocking
+SECONDS = 8.0  # of processor time, or of blocking; compilation does not count
 AT_MOST = 60.0  # s of wall-clock time, on a busy machine
 STARTING = 900.0  # s, for imports, compilation and seeds
 MEMORY = 2 * 10**9  # bytes, in addition to those of a process that is ready
@@ -38,7 +39,7 @@ class Worker:
         self._command, self._seconds = command, seconds
         self.case_folder = root / name
         self._process: subprocess.Popen[str] | None = None
-        self._said = root / f"{name}.stderr"
+        self._said, self._compiled = root / f"{name}.stderr", root / f"{name}.compiled"
 
     def try_cases(self, kind: str, seed: int, first: int, count: int) -> Iterator[tuple[int, Verdict]]:
         """The verdict of each case by number. The files of a case exist until the next is requested."""
@@ -70,6 +71,7 @@ class Worker:
             self.root.mkdir(parents=True, exist_ok=True)
             scripts = str(Path(__file__).parents[1])
             places = [scripts, str(Path(scripts).parent), os.environ.get("PYTHONPATH", "")]
+            self._compiled.unlink(missing_ok=True)
             environment = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(filter(None, places))}
             with self._said.open("a") as said:
                 self._process = subprocess.Popen(
@@ -94,7 +96,7 @@ class Worker:
     def _wait(self, process: subprocess.Popen[str], seconds: float) -> str | None:
         """Wait for a line; None once it has arrived, else the failure."""
         assert process.stdout is not None
-        began, used = time.monotonic(), _processor_seconds(process.pid)
+        began = self._times(process)
         while True:
             if select.select([process.stdout], [], [], 0.25)[0]:
                 self._line = process.stdout.readline()
@@ -102,7 +104,8 @@ class Worker:
                     return None
                 code = process.wait()
                 return f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
-            waited, worked = time.monotonic() - began, _processor_seconds(process.pid) - used
+            now = self._times(process)
+            waited, worked = now.wall - began.wall, now.processor - began.processor
             if (
                 worked > seconds
                 or waited > max(AT_MOST, seconds)
@@ -111,6 +114,12 @@ class Worker:
                 process.send_signal(signal.SIGUSR1)  # it prints its traceback
                 time.sleep(0.3)
                 return f"hangs for {waited:.0f} s"
+
+    def _times(self, process: subprocess.Popen[str]) -> Seconds:
+        """Time used until now, without that of compilation."""
+        used = _processor_seconds(process.pid)
+        compiling = compiled(self._compiled, used)
+        return Seconds(used - compiling.processor, time.monotonic() - compiling.wall)
 
     def _last_words(self) -> str:
         return self._said.read_text(errors="replace")[:3000] if self._said.exists() else ""
@@ -147,6 +156,7 @@ def _serve(root: Path, name: str, asked: IO[str], answers: IO[str]) -> None:
     """Serve requests: one line per case, and one line for each answer."""
     from fuzzing.cases import Bench, Case  # noqa: PLC0415
 
+    CompilationClock(root / f"{name}.compiled")  # numba keeps it
     bench = Bench(root, name)
     faulthandler.register(signal.SIGUSR1, all_threads=False)
     ready: set[str] = set()

@@ -97,6 +97,40 @@ def test_processes_that_die_or_wait_for_ever_are_reported_and_the_next_case_is_t
     assert hanging.startswith("hangs")
 
 
+COMPILING = """
+import sys, time
+from pathlib import Path
+from fuzzing.compilation import CompilationClock
+root, name = sys.argv[-2:]
+clock = CompilationClock(Path(root, f"{name}.compiled"))
+def work(seconds):
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        pass
+for line in sys.stdin:
+    print("ready", flush=True)
+    sys.stdin.readline()
+    if '"number": 0' in line:
+        clock.on_start(None)
+        clock.on_start(None)
+        work(1.0)
+        clock.on_end(None)
+        work(1.0)
+        clock.on_end(None)
+    else:
+        work(1000.0)
+    print('{"outcome": "read"}', flush=True)
+"""
+
+
+def test_the_time_of_compilation_does_not_count(tmp_path):
+    worker = Worker(tmp_path, command=("-c", COMPILING), seconds=0.5)
+    compiled, hanging = (verdict for _, verdict in worker.try_cases("toml", 0, 0, 2))
+    worker.close()
+    assert compiled.outcome == "read"
+    assert hanging.error.startswith("hangs")
+
+
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory):
     made = Worker(tmp_path_factory.mktemp("fuzz"))
