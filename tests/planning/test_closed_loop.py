@@ -148,17 +148,19 @@ def test_a_horizon_of_zero_is_an_error(horizon: float) -> None:
 
 def test_two_places_that_look_alike_are_told_apart() -> None:
     """Beside the tag in the middle of the corridors the robot may be at two places, turned by half. It has to go where the arms
-    differ to find out, and to say nothing before."""
+    differ to find out, and to say nothing before. Four runs in a hundred claim a wrong place (8 of seeds 1 to 200), so two of
+    these five would by chance in 1.5 % of all choices of seeds."""
     settings = ActiveSettings(start=(12.0, 12.0, 0.1))
-    run = run_active(preset("symmetric"), "information", "active_mcl", 3, settings)
-    assert run.localized
-    assert not run.claimed_wrong
-    early = [step for step in run.steps if 3.0 < step.metres < 6.0]
-    assert early
-    turned = se2.compose(np.array((30.0, 24.0, math.pi)), early[0].truth)
-    for place in (early[0].truth, turned):
-        assert np.mean(np.hypot(*(early[0].particles - place)[:, :2].T) < 2.0) > 0.1
-    assert run.metres > 8.0
+    runs = [run_active(preset("symmetric"), "information", "active_mcl", seed, settings) for seed in range(1, 6)]
+    assert all(run.localized for run in runs)
+    assert sum(run.claimed_wrong for run in runs) <= 1
+    assert min(run.metres for run in runs) > 8.0
+    for run in runs:
+        early = next(step for step in run.steps if step.metres > 3.0)
+        assert early.metres < 6.0
+        turned = se2.compose(np.array((30.0, 24.0, math.pi)), early.truth)
+        for place in (early.truth, turned):
+            assert np.mean(np.hypot(*(early.particles - place)[:, :2].T) < 2.0) > 0.1
 
 
 def test_modes_that_are_next_to_each_other_are_one_place() -> None:
