@@ -26,7 +26,7 @@ from factorgraph_loc.cli import (
     simulating,
     viewing,
 )
-from factorgraph_loc.cli.stopping import end
+from factorgraph_loc.cli.stopping import end, unwrapped
 from factorgraph_loc.cli.streams import OutputError, standard_streams
 from factorgraph_loc.errors import FglocError, unusable
 from factorgraph_loc.text import MESSAGE, plain
@@ -53,7 +53,8 @@ class Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            return super().invoke(ctx)
+            with unwrapped():
+                return super().invoke(ctx)
         except FglocError as error:
             if ctx.params.get("debug"):
                 raise
@@ -124,7 +125,7 @@ def run() -> None:
     """Run the command with the arguments of this process, then exit."""
     use_one_thread()
     try:
-        with standard_streams():
+        with unwrapped(), standard_streams():
             app()
     except OutputError as error:  # also for --help and --version
         show.note(f"error: {error}")

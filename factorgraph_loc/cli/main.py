@@ -6,9 +6,9 @@ import sys
 def main() -> None:
     """Run the command ``fgloc``, then exit."""
     try:
-        from factorgraph_loc.cli.stopping import stoppable
+        from factorgraph_loc.cli.stopping import stoppable, unwrapped
 
-        with stoppable():
+        with stoppable(), unwrapped():
             from factorgraph_loc.cli.app import run
 
             run()

@@ -35,6 +35,21 @@ def end(stop: KeyboardInterrupt) -> int:
 
 
 @contextmanager
+def unwrapped() -> Iterator[None]:
+    """Raise the :class:`Stop` that an exception was raised from in its place: compiled modules turn it into an ImportError where it
+    comes while they are loaded."""
+    try:
+        yield
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, Stop):
+            cause = cause.__cause__ or cause.__context__
+        if cause is None:
+            raise
+        raise cause from None
+
+
+@contextmanager
 def stoppable() -> Iterator[None]:
     """Raise the signals of :data:`WORDS` as :class:`Stop` in this block, except those that were ignored before.
 

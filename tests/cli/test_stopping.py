@@ -86,24 +86,38 @@ def test_a_signal_is_not_lost_in_a_destructor():
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
+IMPORTING = """
+import signal, sys
+class Finder:
+    def find_spec(self, name, *_):
+        if name == {module!r}:
+            sys.meta_path.remove(self)
+            {send}
+sys.modules.pop({module!r}, None)
+sys.meta_path.insert(0, Finder())
+from factorgraph_loc.cli.main import main
+sys.argv[1:] = ["datasets"]
+main()
+"""
+SEND = "signal.raise_signal(signal.SIGINT)"
+WRAP = """
+            try:
+                signal.raise_signal(signal.SIGINT)
+            except KeyboardInterrupt as stop:
+                raise ImportError("initialization failed") from stop
+"""
+
+
+MODULES = "factorgraph_loc.cli.app", "typer", "factorgraph_loc.cli.simulating", "numpy"
+
+
 @pytest.mark.parametrize(
-    "module", ["factorgraph_loc.cli.stopping", "factorgraph_loc.cli.app", "typer", "factorgraph_loc.cli.simulating"]
+    ("module", "send"),
+    [("factorgraph_loc.cli.stopping", SEND), *((module, send) for module in MODULES for send in (SEND, WRAP))],
 )
-def test_a_signal_while_modules_are_imported(module, processes):
+def test_a_signal_while_modules_are_imported(module, send, processes):
     """Of modules that the command imports itself: the interpreter sends the signal as it looks for one of them."""
-    code = (
-        "import signal, sys\n"
-        "class Finder:\n"
-        "    def find_spec(self, name, *_):\n"
-        f"        if name == {module!r}:\n"
-        "            sys.meta_path.remove(self)\n"
-        "            signal.raise_signal(signal.SIGINT)\n"
-        f"sys.modules.pop({module!r}, None)\n"
-        "sys.meta_path.insert(0, Finder())\n"
-        "from factorgraph_loc.cli.main import main\n"
-        "sys.argv[1:] = ['--version']\n"
-        "main()\n"
-    )
+    code = IMPORTING.format(module=module, send=send)
     running = processes.start(sys.executable, "-c", code, stderr=subprocess.PIPE)
     assert running.communicate(timeout=processes.PATIENCE)[1] == "interrupted\n"
     assert running.returncode == 130
