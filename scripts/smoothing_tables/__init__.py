@@ -1,0 +1,1 @@
+"""The tables and the picture of docs/smoother-or-filter.md, from the runs of the experiments in scripts/experiments/smoothing."""
