@@ -21,7 +21,7 @@ from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt, LearntPoint
+from factorgraph_loc.model.learnt import Learnt, learnt_landmarks
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
@@ -32,6 +32,7 @@ from factors.motion import Increment
 from factors.se2 import Array
 
 NOWHERE = slice(POSE, POSE)  # the columns of a block that there is not
+MOST = 150  # components of the error state from which on positions of the map with a sigma are no part of it, but add to the noise
 SKEW = 1e-7  # of two standard deviations: more asymmetry is not one of a few roundings
 
 
@@ -176,7 +177,7 @@ class Ekf(Filter):
         """The constants and landmarks that are estimated."""
         if self._state is None:
             return Learnt()
-        values, points = {}, {}
+        values = {}
         found, s = self._state.layout.values(self._state.rest), self._state
         for name, constants in self._blocks:
             if constants.names:
@@ -185,10 +186,9 @@ class Ekf(Filter):
                 prefix = "" if name == MOTION else f"{name}."
                 for label, value, sigma in zip(constants.names, found.pop(name), sigmas, strict=True):
                     values[prefix + label] = float(value), float(sigma)
-        for name, position in found.items():
-            part = s.layout.columns[name]
-            points[name.partition("/")[2]] = LearntPoint(position, s.covariance[part, part])
-        return Learnt(values, points)
+        columns = s.layout.columns
+        others = ((name, at, s.covariance[columns[name], columns[name]]) for name, at in found.items())
+        return Learnt(values, learnt_landmarks(others))
 
     def trajectory(self) -> Trajectory:
         """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones with ``smooth`` off."""
@@ -242,7 +242,8 @@ class Ekf(Filter):
         sensor, view = self._sensors[m.modality], _View(self)
         for seen in sensor.observe(m, view):
             if isinstance(seen, NewVariable):
-                self._state = self._state.with_block(seen)
+                if seen.sightings or len(self._state.covariance) < MOST:
+                    self._state = self._state.with_block(seen)
                 continue
             s = self._state
             correction = seen.correct(

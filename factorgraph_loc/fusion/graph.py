@@ -31,7 +31,7 @@ from factorgraph_loc.fusion.variables import (
 )
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt, LearntPoint
+from factorgraph_loc.model.learnt import Learnt, learnt_landmarks
 from factorgraph_loc.model.motion import Motion
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.variable import Estimated
@@ -152,10 +152,10 @@ class Graph:
     def learnt(self) -> Learnt:
         """The constants and landmarks that are estimated."""
         values: dict[str, tuple[float, float]] = {}
-        points = {}
+        blocks = [(name, self.values[key], self.spreads[key]) for name, key in self.keys.items() if is_landmark(key)]
+        landmarks = learnt_landmarks(blocks)
         for name, key in self.keys.items():
             if is_landmark(key):
-                points[name.partition("/")[2]] = LearntPoint(self.values[key], self.spreads[key])
                 continue
             prefix = "" if name == MOTION else f"{name}."
             sigmas = np.sqrt(np.diag(self.spreads[key]))
@@ -164,8 +164,8 @@ class Graph:
         for mapper in self.mappers:
             found = mapper.learnt(self.departed[0] | self.values, self.departed[1] | self.spreads)
             if found is not None:
-                return Learnt(values, points, found)
-        return Learnt(values, points)
+                return Learnt(values, landmarks, found)
+        return Learnt(values, landmarks)
 
     def problem(self, width: float = 1.0) -> Problem:
         """All that is known as one problem; the robust losses ``width`` times as wide as they are."""

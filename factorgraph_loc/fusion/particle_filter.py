@@ -31,7 +31,7 @@ from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings
 from factorgraph_loc.model.belief import Belief, Mode, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt, LearntPoint
+from factorgraph_loc.model.learnt import Learnt, learnt_landmarks
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
@@ -141,17 +141,17 @@ class ParticleFilter(Filter):
         """The constants that are estimated."""
         if self._state is None:
             return Learnt()
-        cloud, values, points = self._state, {}, {}
+        cloud, values, others = self._state, {}, []
         labels = {name: constants.names for name, constants in self._blocks}
         for name, part in cloud.parts.items():
             mean, covariance = vector_moments(cloud.constants[:, part], cloud.weights)
             if name not in labels:
-                points[name.partition("/")[2]] = LearntPoint(mean, covariance)
+                others.append((name, mean, covariance))
                 continue
             prefix = "" if name == MOTION else f"{name}."
             for label, value, sigma in zip(labels[name], mean, np.sqrt(np.diag(covariance)), strict=True):
                 values[prefix + label] = float(value), float(sigma)
-        return Learnt(values, points)
+        return Learnt(values, learnt_landmarks(others))
 
     def trajectory(self) -> Trajectory:
         """Mean and covariance of trajectories drawn backwards, or the causal estimates with ``smooth`` off."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -41,13 +41,14 @@ MarkerFamily = Literal[
 Turn = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi), InUnit("rad")]
 # right and up seen from the front, in the corner order of ArUco detectors
 CORNERS = np.array(((0.0, -0.5, 0.5), (0.0, 0.5, 0.5), (0.0, 0.5, -0.5), (0.0, -0.5, -0.5)))
+CORNER_NUMBERS = tuple(str(i) for i in range(len(CORNERS)))
 
 
 class Marker(FileModel):
     """A square marker: ``position`` of its centre [m] in the world, ``size`` [m] of the black square, and orientation.
 
     ``facing``: heading of its normal, as of a tag; ``pitch``: upward tilt of the normal, -pi/2 on a ceiling; ``roll``:
-    counter-clockwise rotation seen from the front. ``sigma`` [m]: standard deviation of each coordinate of a corner.
+    counter-clockwise rotation seen from the front. ``sigma`` [m]: standard deviation of each coordinate of its position.
     """
 
     x: Coordinate
@@ -73,7 +74,14 @@ class MarkerSettings(FileModel):
 
 def corner_names(marker: str) -> list[str]:
     """Return the names of a marker's corners as points of a map, in the order of :meth:`Marker.corners`."""
-    return [f"{marker}/{i}" for i in range(len(CORNERS))]
+    return [f"{marker}/{i}" for i in CORNER_NUMBERS]
+
+
+def marker_of(point: str) -> str | None:
+    """Return the marker that a point of a map is a corner of, by its name; None if it is none."""
+    marker, _, corner = point.rpartition("/")
+    is_corner = corner in CORNER_NUMBERS and marker.rpartition("-")[0] in get_args(MarkerFamily)
+    return marker if is_corner else None
 
 
 def corner_points(markers: Mapping[str, Marker]) -> PointMap:

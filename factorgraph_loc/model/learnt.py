@@ -1,6 +1,6 @@
 """Estimates besides the poses: constants of sensors, landmarks, points."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from factorgraph_loc.maps.points import PointMap
@@ -13,6 +13,11 @@ class LearntPoint:
 
     position: Array
     covariance: Array
+
+
+def learnt_landmarks(blocks: Iterable[tuple[str, Array, Array]]) -> dict[str, LearntPoint]:
+    """The landmarks among ``blocks``, each ``SENSOR/NAME`` with its mean and covariance, by name; points in space are none."""
+    return {name.partition("/")[2]: LearntPoint(mean, spread) for name, mean, spread in blocks if len(mean) == 2}
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Hashable, Mapping, Sequence
 
 from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe
 from factorgraph_loc.fusion.mapping import GraphView
-from factorgraph_loc.fusion.variables import Node, Values
+from factorgraph_loc.fusion.variables import Node, Values, is_point
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.base import Sensor
@@ -85,7 +85,7 @@ class PointMapper:
 
     def point(self, node: Node) -> int | None:
         free = isinstance(node.factor, ReprojectionFactor) and node.factor.free
-        return node.keys[-1] if free else None
+        return node.keys[-1] if free and is_point(node.keys[-1]) else None
 
     def leave(self, t: float) -> Sequence[int]:
         return [] if self._unknown is None else self._unknown.leave(t)

@@ -38,7 +38,9 @@ class ReprojectionFactor:
     covariance ``offset_covariance`` (3, 3) is added to the noise. ``twist`` (3,): the robot's velocity at that time.
 
     The values of the factor are the pose (3,); corrections (P,) of the constants with indices ``estimated`` in :data:`PARAMETERS`,
-    if any; and, if ``free``, the position (3,) of the one point, instead of ``points``.
+    if any; and, if ``free``, the displacement of the points from ``points``: one for all (3,), or one for each (K, 3), with the
+    Jacobian (K, 2, 3) of each residual by its own. ``in_image``: the number of points of the image, of which these are a part; by
+    default K.
     """
 
     model: CameraModel
@@ -50,6 +52,7 @@ class ReprojectionFactor:
     estimated: tuple[int, ...] = ()
     free: bool = False
     twist: Array | None = None
+    in_image: int | None = None
 
     @property
     def of_pose_alone(self) -> bool:
@@ -59,6 +62,8 @@ class ReprojectionFactor:
     def packed(self) -> pixel_kernels.Seen:
         """The arguments of the compiled code, for a factor :attr:`of_pose_alone`."""
         model, offset, noise, spreads = self.model, self.offset, self.offset_covariance, self.point_covariances
+        if noise is not None and self.in_image is not None:  # which the code multiplies by the number of points here
+            noise = self.in_image / max(1, len(self.points)) * noise
         return pixel_kernels.Seen(
             lens_of(model),
             model.position,
@@ -102,13 +107,12 @@ class ReprojectionFactor:
         at = values[0] if offset is None else se2.compose(values[0], offset)
         pixels, by_pose, by_point, by_parameters = linearize(here.model, at, here.points)
         error = (pixels - self.pixels) / self.model.sigma
-        if self.free and in_camera(here.model, at, here.points)[0, 2] < NEAREST:
+        if self.free:
             # a point behind the camera has a constant residual, as no gradient leads to its true position
-            error, by_pose, by_point, by_parameters = (
-                BEHIND + 0.0 * error,
-                0.0 * by_pose,
-                0.0 * by_point,
-                0.0 * by_parameters,
+            behind = in_camera(here.model, at, here.points)[:, 2] < NEAREST
+            error[behind] = BEHIND
+            by_pose, by_point, by_parameters = (
+                np.where(behind[:, None, None], 0.0, part) for part in (by_pose, by_point, by_parameters)
             )
         scale = 1.0 / self.model.sigma
         by_pose = scale * by_pose
@@ -125,21 +129,21 @@ class ReprojectionFactor:
         if self.point_covariances is not None:
             spread = carried(scale * by_point, self.point_covariances)
         if self.offset_covariance is not None:
-            common = common_error(by_pose, self.offset_covariance)
+            common = common_error(by_pose, self.offset_covariance, self.in_image)
             spread = common if spread is None else spread + common
         return displaced(error, blocks, offset, spread)
 
-    def is_astray(self, pose: Array, point: Array) -> bool:
-        """Whether a free ``point`` (3,) cannot be what a robot at the variable's ``pose`` (3,) saw: it is behind the camera, or
-        :data:`BEHIND` standard deviations away."""
+    def is_astray(self, pose: Array, displacement: Array) -> bool:
+        """Whether a free point, with this ``displacement`` (3,), cannot be what a robot at the variable's ``pose`` (3,) saw: it is
+        behind the camera, or :data:`BEHIND` standard deviations away."""
         at = pose if self.offset is None else se2.compose(pose, self.offset)
-        local = in_camera(self.model, at, point[None])
+        local = in_camera(self.model, at, self.points + displacement)
         error = (project(self.model, local) - self.pixels) / self.model.sigma
-        return bool(local[0, 2] < NEAREST or np.sum(error**2) > BEHIND**2)
+        return bool(np.any((local[:, 2] < NEAREST) | (np.sum(error**2, axis=1) > BEHIND**2)))
 
-    def fixed(self, parameters: Sequence[Array], point: Array | None) -> ReprojectionFactor:
-        """The factor on the pose only, at given constants (one array (P,), or none) and position (3,) of a free point."""
-        if not parameters and point is None:
+    def fixed(self, parameters: Sequence[Array], displacement: Array | None) -> ReprojectionFactor:
+        """The factor on the pose only, at given constants (one array (P,), or none) and ``displacement`` of free points."""
+        if not parameters and displacement is None:
             return self
         model, offset = self.model, self.offset
         if parameters:
@@ -147,7 +151,7 @@ class ReprojectionFactor:
             changes[list(self.estimated)] = parameters[0]
             model = recalibrated(model, changes)
             offset = delayed(offset, self.twist, float(changes[TIME_OFFSET]))
-        points = self.points if point is None else point[None]
+        points = self.points if displacement is None else self.points + displacement
         return replace(self, model=model, points=points, offset=offset, estimated=(), free=False)
 
     def dof(self) -> int:

@@ -173,6 +173,26 @@ def test_a_free_point_is_a_variable(model, pose, local):
     np.testing.assert_allclose(blocks[1][0], numerical, rtol=1e-4, atol=1e-2)
 
 
+@given(models, poses, st.lists(ahead, min_size=2, max_size=4))
+def test_free_points_are_displaced_together_or_each(model, pose, locals_):
+    points = np.array([in_world(model, pose, local) for local in locals_])
+    pixels, offset = np.full((len(points), 2), 250.0), np.array((0.1, -0.05, 0.2))
+    noise = np.diag((0.02, 0.01, 0.01)) ** 2
+    free = ReprojectionFactor(model, points, pixels, offset, noise, free=True)
+    by = np.array((0.02, -0.01, 0.03))
+    one, each = free.whitened([pose, by]), free.whitened([pose, np.tile(by, (len(points), 1))])
+    np.testing.assert_allclose(one[0], each[0], atol=1e-9)
+    np.testing.assert_allclose(one[1][1], each[1][1], atol=1e-9)
+    # with a noise that does not change with the points
+    free = replace(free, offset_covariance=None)
+    residual, (_, by_point) = free.whitened([pose, by])
+    moved = replace(free, points=points + by, free=False).whitened([pose])[0]
+    np.testing.assert_allclose(residual, moved, rtol=1e-9, atol=1e-7)
+    for row in range(len(points)):
+        numerical = derivative(lambda d, row=row: free.whitened([pose, by + d])[0][row], 3)
+        np.testing.assert_allclose(by_point[row], numerical, rtol=1e-4, atol=1e-2)
+
+
 @given(models, poses, st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(-9.0, 0.2)).map(np.array))
 def test_points_behind_the_camera_are_finite_and_never_throw(model, pose, local):
     point = in_world(model, pose, local)[None]

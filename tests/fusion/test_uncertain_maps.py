@@ -1,13 +1,22 @@
-"""Landmarks and tags whose places were surveyed with an error: it is the same at each look."""
+"""Landmarks, tags, points and markers whose places were surveyed with an error: it is the same at each look."""
 
+from dataclasses import replace
+
+import camera_world
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from factorgraph_loc import BearingRange, Localizer, Rig, VelocityOdometry, World
+from factorgraph_loc import BearingRange, Localizer, PixelSightings, Rig, VelocityOdometry, World, run
+from factorgraph_loc.fusion.ekf import MOST
+from factorgraph_loc.fusion.registry import create, settings_of
+from factorgraph_loc.maps.markers import Marker, corner_names, corner_points
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factorgraph_loc.sensors.rfid.known_tags import trust
+from factors.camera.model import predict
 
 STILL = GrowthSettings(per_time=1e-4)
 RIG = Rig(
@@ -74,6 +83,71 @@ def test_a_survey_that_is_much_better_than_the_sensor_is_exact(estimator):
     assert localizer.learnt().landmarks == {}
     exact, _ = looked(estimator, 0.0, 2)
     assert np.allclose(localizer.estimate(12.0).covariance, exact.estimate(12.0).covariance, rtol=0.2)
+
+
+MARKER = Marker(x=3.0, y=0.2, z=0.9, size=0.3, facing=np.pi, sigma=0.05)
+NAMES = tuple(corner_names("tag36h11-7"))
+
+
+def looked_at_a_marker(estimator, seed, settings=None):
+    """The squared error in two degrees of freedom after so many images of one marker from one place."""
+    rng = np.random.default_rng(seed)
+    rig = Rig(sensors=("odometry", "sightings"), odometry=RIG.odometry, camera=camera_world.CAMERA)
+    corners, sigmas = MARKER.corners() + MARKER.sigma * rng.standard_normal(3), np.array((0.2, 0.2, 0.03))
+    pose = sigmas * rng.standard_normal(3)
+    localizer = Localizer(
+        rig, World(points=corner_points({"tag36h11-7": MARKER})), estimator=estimator, settings=settings
+    )
+    localizer.initialize((0.0, 0.0, 0.0), np.diag(sigmas**2), t=0.0)
+    for k in range(1, LOOKS + 1):
+        localizer.push(VelocityOdometry(0.5 * k - 0.25, 0.0, 0.0))
+        pixels = predict(camera_world.CAMERA.model(), pose, corners)[0] + rng.standard_normal((4, 2))
+        localizer.push(PixelSightings(0.5 * k, NAMES, pixels))
+    found = localizer.estimate(0.5 * LOOKS)
+    error = found.pose[:2] - pose[:2]
+    return float(error @ np.linalg.solve(found.covariance[:2, :2], error))
+
+
+@pytest.mark.parametrize(("estimator", "settings"), [("ekf", {}), ("smoother", {}), ("smoother", {"lag": 5.0})])
+def test_the_corners_of_a_marker_have_the_error_of_its_survey_in_common(estimator, settings):
+    """Within what the mean of 30 such chi-squares is in all but 1 of 10,000 cases."""
+    low, high = chi2.ppf((5e-5, 1.0 - 5e-5), 2 * SEEDS) / SEEDS
+    assert low < np.mean([looked_at_a_marker(estimator, seed, settings) for seed in range(SEEDS)]) < high
+
+
+def test_particles_count_the_looks_at_a_marker():
+    assert 0.2 < np.mean([looked_at_a_marker("particle_filter", seed, {"particles": 3000}) for seed in range(12)]) < 5.0
+
+
+@pytest.mark.parametrize(
+    ("estimator", "most"), [("ekf", 5.0), ("smoother", 5.0), ("batch", 5.0), ("particle_filter", 6.0)]
+)
+def test_points_of_a_poor_survey_while_driving(estimator, most):
+    """Before, where the error was noise of each look, the mean was 11 to 15."""
+    found = []
+    for seed in range(6):
+        points = camera_world.room(40, seed)
+        log = camera_world.simulate(seed, 15.0, points=points)
+        error = 0.05 * np.random.default_rng(100 + seed).standard_normal(points.positions.shape)
+        spread = np.broadcast_to(0.05**2 * np.eye(3), (len(points), 3, 3))
+        surveyed = replace(points, positions=points.positions + error, covariances=spread)
+        scores = run(replace(log, world=World(points=surveyed)), estimator).scores
+        found += [scores[key] for key in ("causal.anees", "final.anees") if scores.get(key) is not None]
+    assert 1.0 < np.mean(found) < most
+
+
+def test_a_state_of_many_points_is_bounded():
+    points = camera_world.room(160, 1)
+    spread = np.broadcast_to(0.05**2 * np.eye(3), (len(points), 3, 3))
+    log = camera_world.simulate(1, 12.0, rate=2.0, points=points, limit=60)
+    setup = Setup(
+        log.rig, World(points=replace(points, covariances=spread)), ("odometry", "sightings"), np.random.default_rng(1)
+    )
+    ekf = create("ekf", setup, settings_of("ekf", {}))
+    ekf.initialize(PosePrior(0.0, log.reference.poses[0], 0.01 * np.eye(3)))
+    for m in log.measurements(setup.sensors):
+        ekf.process(m)
+    assert MOST <= len(ekf._state.covariance) < MOST + 3
 
 
 def test_tags_are_trusted_by_their_survey():

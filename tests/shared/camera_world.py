@@ -81,11 +81,11 @@ def sightings(truth, points, t, rng, camera=CAMERA, limit=20):
     return SightingStream(np.array(stamps), names, u, v)
 
 
-def simulate(seed=1, seconds=20.0, rate=5.0, limit=20, camera=CAMERA, speeds=circle):
+def simulate(seed=1, seconds=20.0, rate=5.0, limit=20, camera=CAMERA, speeds=circle, points=None):
     """A log; ``camera``: as it is in truth, which the log's rig need not know."""
     rng = np.random.default_rng(seed)
     odometry, truth = drive(seconds, rng, speeds)
-    points = room()
+    points = room() if points is None else points
     stream = sightings(truth, points, np.arange(0.13, seconds, 1.0 / rate), rng, camera, limit)
     return Log(
         name="room",

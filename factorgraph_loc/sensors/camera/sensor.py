@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from statistics import median
+from types import MappingProxyType
 
 import numpy as np
 
+from factorgraph_loc.maps.markers import marker_of
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.motion import Motion
@@ -35,10 +38,12 @@ FEW_SHARE = 0.3  # of named points: with fewer inliers, points are missing
 FEW, MANY = 6, 20  # of matched points: fewer than FEW inliers where MANY are expected means that points are missing
 UNSURE = 1.0  # m: a prediction with a larger standard deviation may miss the map
 MOST = 100  # points used per image; more add little, as errors of neighbouring points are correlated
+NEAR = 3.0  # m: from where `exact_survey` compares the survey of a point with a pixel
 EXACT = 0.1  # a map is treated as exact if its errors are below this share of a pixel's, seen from 1 m
 # Pixels are so precise that one step from a poor prediction does not reach the optimum
 ITERATIONS, SETTLED = 8, 1e-3  # m, rad: convergence limit of a step
 
+NOT_DISPLACED: Mapping[str, tuple[Array, Array]] = MappingProxyType({})
 Pixels = PixelSightings | CameraFrame  # measurements of a camera
 
 
@@ -77,6 +82,7 @@ class KnownPoints:
             self.map = setup.world.points
         self._others_matter = use != "known"
         self.used = np.empty(0, dtype=np.int64)  # features of the last image that match points of the map
+        self.names: tuple[str, ...] = ()  # of the points of the last factor, where they are named
         self._estimated = estimated
         self._diagnostics = diagnostics
         self.associator: Associator | None = None
@@ -87,9 +93,13 @@ class KnownPoints:
             self._clock = ClockCheck(motion, diagnostics)
         self.missed = False  # whether points of the map were missing in the last image
         self._map_matters = False
+        self._inexact = np.zeros(len(self.map), dtype=bool)
         if settings is not None and len(self.map):
-            worst = float(np.trace(self.map.covariances, axis1=1, axis2=2).max())
-            self._map_matters = worst > (EXACT * settings.pixel_sigma / settings.fx) ** 2
+            variances = np.trace(self.map.covariances, axis1=1, axis2=2)
+            worst = float(variances.max())
+            pixel = settings.pixel_sigma / settings.fx
+            self._map_matters = worst > (EXACT * pixel) ** 2
+            self._inexact = variances > 3.0 * (settings.exact_survey * NEAR * pixel) ** 2
 
     @property
     def known(self) -> bool:
@@ -100,6 +110,19 @@ class KnownPoints:
     def needs_twist(self) -> bool:
         """Whether the camera's time offset is estimated."""
         return TIME_OFFSET in self._estimated.indices
+
+    def inexact(self, m: Pixels) -> dict[str, tuple[list[str], Array]]:
+        """What is seen that was surveyed with an error. By name, of a point or of a marker, that of each of its points and the
+        covariance (3, 3) of their common displacement."""
+        found: dict[str, tuple[list[str], Array]] = {}
+        if self.model is None or not isinstance(m, PixelSightings) or not self._inexact.any():
+            return found
+        for name in dict.fromkeys(m.points):
+            place = self.map.index.get(name, -1)
+            if place >= 0 and self._inexact[place]:
+                names, _ = found.setdefault(marker_of(name) or name, ([], self.map.covariances[place]))
+                names.append(name)
+        return found
 
     def named(self, m: PixelSightings) -> ReprojectionFactor | None:
         """All named points of the map without outlier rejection, on the pose at their time."""
@@ -113,24 +136,38 @@ class KnownPoints:
             if not self._others_matter:
                 self._diagnostics.ignore("point not in the map", len(places) - len(rows))
             places, pixels = [places[i] for i in rows], pixels[rows]
+        self.names = tuple(self.map.names[place] for place in places)
         return self._factor(self.model, places, pixels) if places else None
 
     def factor(
-        self, m: Pixels, predicted: Predicted, offset: Increment | None = None, twist: Array | None = None
+        self,
+        m: Pixels,
+        predicted: Predicted,
+        offset: Increment | None = None,
+        twist: Array | None = None,
+        displaced: Mapping[str, tuple[Array, Array]] = NOT_DISPLACED,
     ) -> ReprojectionFactor | None:
         """The factor of the known points, on the pose at the image's time or on one that lies ``offset`` before it.
 
-        ``twist`` (3,): the robot's velocity at that time, needed if the camera's time offset is estimated.
+        ``twist`` (3,): the robot's velocity at that time, needed if the camera's time offset is estimated. ``displaced``: by name
+        how far (3,) points are from where the map has them, with its covariance, which becomes theirs.
         """
         self.used = np.empty(0, dtype=np.int64)
         factor = self.named(m) if isinstance(m, PixelSightings) else self._nothing(m)
         if factor is None:
             return None
+        moved = np.zeros_like(factor.points)
+        if displaced:
+            assert factor.point_covariances is not None
+            spreads = factor.point_covariances.copy()
+            for row, name in enumerate(self.names):
+                moved[row], spreads[row] = displaced.get(name, (moved[row], spreads[row]))
+            factor = replace(factor, point_covariances=spreads)
         if offset is not None:
             factor = replace(factor, offset=offset.delta, offset_covariance=offset.covariance)
         if self._estimated.indices:
             factor = replace(factor, estimated=self._estimated.indices, twist=twist)
-        here = factor.fixed([] if predicted.constants is None else [predicted.constants], None)
+        here = factor.fixed([] if predicted.constants is None else [predicted.constants], moved)
         camera = self._camera(here, predicted)
         focal = 0.0
         if predicted.spread is not None and FOCAL in self._estimated.indices:
@@ -144,7 +181,8 @@ class KnownPoints:
         if agreed == len(right):
             return factor
         self._diagnostics.reject(DISAGREES, len(right) - agreed)
-        return _rows(factor, right) if agreed else None
+        self.names = tuple(self.names[row] for row in np.flatnonzero(right).tolist())
+        return rows_of(factor, right) if agreed else None
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
         """The pose of an image without a prediction, or None, and the number of points that it seemed to show."""
@@ -179,6 +217,7 @@ class KnownPoints:
 
     def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
         """A factor without points yet; None if features cannot be matched with the map."""
+        self.names = ()
         if self.model is None or self.associator is None:
             if self.model is None or not self._others_matter:
                 self._diagnostics.ignore("camera", len(m.pixels))
@@ -285,6 +324,7 @@ def _agreeing(here: ReprojectionFactor, camera: CameraPose, focal: float) -> Tru
     return agreeing(model, camera, here.points, here.pixels, spreads)
 
 
-def _rows(factor: ReprojectionFactor, rows: Truths) -> ReprojectionFactor:
+def rows_of(factor: ReprojectionFactor, rows: Truths) -> ReprojectionFactor:
+    """The factor of some of its points."""
     spreads = None if factor.point_covariances is None else factor.point_covariances[rows]
     return replace(factor, points=factor.points[rows], pixels=factor.pixels[rows], point_covariances=spreads)

@@ -82,6 +82,8 @@ class CameraSettings(SensorSettings):
     """scale of Huber's loss, in standard deviations"""
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.03
     """exponent of the likelihood of features matched with a map, whose errors are correlated between images"""
+    exact_survey: Annotated[float, Field(ge=0.0, le=10.0)] = 0.2
+    """named points whose survey has a sigma below this share of what pixel_sigma is at 3 m are not estimated"""
     frontend: FrontendSettings = FrontendSettings()
     """features that are detected in images"""
     uncertainty: CameraUncertainty = CameraUncertainty()

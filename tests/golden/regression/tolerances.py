@@ -59,6 +59,7 @@ SINGLE_PRECISION = Branch(
             "belief.poses": 0.1,
             "belief.weights": 0.1,
             "nis.rfid.sums": 0.1,
+            "moved_tags.probabilities": 0.05,
         },
         **{f"{kind}.sums": 0.01 for kind in ("nis.bearing_range", "residuals.bearing_range.range")},
         "residuals.bearing_range.bearing.sums": 0.01,
