@@ -1,15 +1,25 @@
-"""What the documentation says is true: the README's example runs, and its links lead somewhere."""
+"""What the documentation says is true: the README's example runs, links lead somewhere, and there are the commands and options that
+pages use."""
 
 import ast
 import json
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
 import factorgraph_loc as fgloc
+from factorgraph_loc.cli.app import app
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "scripts"))
+
+from page_commands import commands, runnable  # noqa: E402
+
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 
 
@@ -33,3 +43,57 @@ def test_notebooks_are_without_results_and_use_what_is_public(notebook):
         tree = ast.parse("".join(cell["source"]), f"{notebook.name}, cell {number}")
         used = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)]
         assert {node.attr for node in used if node.value.id == "fgloc"} <= set(fgloc.__all__)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_of_pages_have_the_options_that_they_use(page):
+    for line in commands(page.read_text()):
+        words = shlex.split(line, comments=True)
+        if words[0] == "fgloc":
+            parse(words[1:])
+
+
+def parse(words):
+    """Parse a line as ``fgloc`` does, without executing anything. Raises click's error for an unknown command or option."""
+    command = get_command(app)
+    words = words[: words.index(">")] if ">" in words else words
+    while hasattr(command, "commands") and words and not words[0].startswith("-"):
+        assert words[0] in command.commands, words[0]
+        command, words = command.commands[words[0]], words[1:]
+    command.make_parser(command.context_class(command)).parse_args(list(words))
+
+
+@pytest.mark.parametrize(
+    "line", ["fgloc rum plaza2", "fgloc run plaza2 -e ekf --outt here", "fgloc experiment runs night.toml"]
+)
+def test_wrong_commands_would_be_found(line):
+    with pytest.raises(Exception, match=r"rum|--outt|runs"):
+        parse(line.split()[1:])
+
+
+def test_what_is_run_of_a_page_needs_no_data():
+    page = """
+```console
+$ fgloc info hall/                  # your own
+$ fgloc info hall/office-1          # made before
+office-1 1200 rows
+$ pip install 'factorgraph-loc[ros]'
+```
+
+```toml
+$ fgloc info no-command
+```
+"""
+    assert commands(page) == ["fgloc info hall/", "fgloc info hall/office-1", "pip install 'factorgraph-loc[ros]'"]
+    assert runnable(page) == ["fgloc info hall/office-1"]
+
+
+def test_a_tutorial_ends_with_the_command_that_fails(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("```console\n$ echo first > made\n$ ls nowhere\n$ touch never\n```\n")
+    command = [sys.executable, str(ROOT / "scripts/run_tutorial"), str(page)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "page.md: exit code 2 of ls nowhere" in done.stderr
+    assert (tmp_path / "made").read_text() == "first\n"
+    assert not (tmp_path / "never").exists()
