@@ -24,6 +24,7 @@ from factors.rfid.model import Packed, RfidModel
 from factors.rfid.tables import (
     Array32,
     Changes,
+    Floats,
     Tables,
     add_log_likelihood,
     add_mixed,
@@ -161,7 +162,8 @@ class RfidLikelihood:
         array = TagArray(points, np.repeat(self.tags.facing[tags], len(shifts)))
         hits = np.repeat(looks.hits[:, tags], len(shifts), axis=1)
         level = np.repeat(self._unadjusted._tables.level[:, tags], len(shifts), axis=1)
-        each = np.zeros((count, len(poses)), dtype=np.float32)
+        # in double precision, as the last bit of a single decides in which cell of a table a tag is
+        each = np.zeros((count, len(poses)))
         tables = self._unadjusted._tables._replace(level=level)
         self._add(
             poses,
@@ -173,7 +175,7 @@ class RfidLikelihood:
             each,
             self._of_poses(len(poses)),
         )
-        found = self.model.tempering * each.astype(float)
+        found = self.model.tempering * each
         most = found.max(axis=1)
         mean = most + np.log(np.mean(np.exp(found - most[:, None]), axis=1))
         return np.asarray(mean.reshape(len(tags), len(shifts)))
@@ -215,7 +217,7 @@ class RfidLikelihood:
         tables: Tables,
         apart: NDArray[np.int64],
         out: Array,
-        each: Array32,
+        each: Floats,
         parameters: Array | None,
     ) -> None:
         """Add all looks at ``tags``, see :func:`~factors.rfid.tables.add_log_likelihood`."""

@@ -17,6 +17,7 @@ from factors.rfid.model import LOGISTIC, NEAR, NEGLIGIBLE_LOGIT, Packed, RfidMod
 from factors.se2 import Array
 
 Array32 = NDArray[np.float32]
+Floats = Array32 | Array
 
 CELL = 0.05  # m
 FACINGS = 9  # knots of the facing's cosine
@@ -115,12 +116,13 @@ def add_log_likelihood(
     rounds: int,
     apart: NDArray[np.int64],
     out: Array,
-    each: Array32,
+    each: Floats,
     changes: Changes | None = None,
 ) -> None:
     """Add to ``out`` (N,) the log-likelihood, untempered, that one antenna at robot's poses (N, 3) reads each tag at ``points``
     (T, 3) with ``normals`` (T, 2) in ``hits`` (T,) of ``rounds`` rounds. ``apart`` (T,): in which row of ``each`` (U, N) a tag is
-    added by itself, above that of a silence out of reach, -1 of tags that go to ``out``. ``changes``: of the model, by pose."""
+    added by itself, above that of a silence out of reach, -1 of tags that go to ``out``; with its precision the cells are found.
+    ``changes``: of the model, by pose."""
     arrays = (points, normals, hits, rounds, apart)
     if changes is None:
         changes = Changes(np.ones(len(poses)), np.empty(0, np.int32), np.empty((0, 0, 2), np.float32))
@@ -131,7 +133,7 @@ def add_log_likelihood(
 
 
 @numba.njit(cache=True, fastmath=FAST)
-def add_mixed(each: Array32, odds: Array, elsewhere: Array, tempering: float, out: Array) -> None:
+def add_mixed(each: Floats, odds: Array, elsewhere: Array, tempering: float, out: Array) -> None:
     """Add to ``out`` (N,) the tempered log-likelihood of U tags that are, with prior log-odds ``odds`` (U,), not as surveyed, in
     which case theirs is ``elsewhere`` (U,); ``each`` (U, N): that of tags as surveyed (:mod:`factors.rfid.tag_states`)."""
     for u in range(len(odds)):
@@ -192,15 +194,16 @@ def _add_tabled(
     level: NDArray[np.int64],
     changes: Changes,
     out: Array,
-    each: Array32,
+    each: Floats,
 ) -> None:
     a = packed.antennas[antenna]
     ax, ay, ca, sa = a[0], a[1], a[3], a[4]
     logs = tables.logs
     far = _out_of_reach(poses, points, _reach(packed, antenna, changes))
     # place and direction of the antenna at each pose, in cells
-    x, y = np.empty(len(poses), np.float32), np.empty(len(poses), np.float32)
-    c, s = np.empty(len(poses), np.float32), np.empty(len(poses), np.float32)
+    x, y = np.empty(len(poses), each.dtype), np.empty(len(poses), each.dtype)
+    c, s = np.empty(len(poses), each.dtype), np.empty(len(poses), each.dtype)
+    place = np.empty(2, each.dtype)
     inverse = 1.0 / CELL
     middle_x, middle_y = poses[0, 0], poses[0, 1]
     for n in range(len(poses)):
@@ -211,7 +214,7 @@ def _add_tabled(
         c[n], s[n] = unit * (ct * ca - st * sa), unit * (st * ca + ct * sa)
     constant = 0.0
     # tags in the outer loop, because all poses access nearby cells for one tag
-    certain = np.zeros(len(poses), np.float32)
+    certain = np.zeros(len(poses), each.dtype)
     for t in range(len(points)):
         if far[t]:
             constant += _far(apart[t], hits[t], rounds, logs, each)
@@ -223,7 +226,8 @@ def _add_tabled(
             for n in range(len(poses)):
                 total[n] -= np.float32(rounds * logs[0, 1])
         k = level[t]
-        tx, ty = np.float32((points[t, 0] - middle_x) * inverse), np.float32((points[t, 1] - middle_y) * inverse)
+        place[0], place[1] = (points[t, 0] - middle_x) * inverse, (points[t, 1] - middle_y) * inverse
+        tx, ty = place[0], place[1]
         size = 2 * tables.half[k] + 1
         layers = tables.facings[k]
         begin = tables.start[k]
@@ -246,7 +250,7 @@ def _add_tabled(
 
 
 @numba.njit(cache=True)
-def _far(row: int, hits: int, rounds: int, logs: Array, each: Array32) -> float:
+def _far(row: int, hits: int, rounds: int, logs: Array, each: Floats) -> float:
     """What a tag that is out of reach from all poses adds to each of them, besides what goes to its own row, if it has one."""
     if row < 0:
         return float(hits * logs[0, 0] + (rounds - hits) * logs[0, 1])
@@ -274,16 +278,16 @@ def _read(row: int, hits: int, rounds: int, logs: Array, changes: Changes, n: in
 
 @numba.njit(cache=True, fastmath=True)
 def _add_missed(
-    x: Array32,
-    y: Array32,
-    c: Array32,
-    s: Array32,
+    x: Floats,
+    y: Floats,
+    c: Floats,
+    s: Floats,
     tx: np.float32,
     ty: np.float32,
     missed: Array32,
     size: int,
     rounds: np.float32,
-    total: Array32,
+    total: Floats,
 ) -> None:
     """Add a tag that was not read, the most frequent case."""
     width, ends = np.int32(size), np.int32(size - 1)
@@ -298,10 +302,10 @@ def _add_missed(
 
 @numba.njit(cache=True, fastmath=True)
 def _add_facing(
-    x: Array32,
-    y: Array32,
-    c: Array32,
-    s: Array32,
+    x: Floats,
+    y: Floats,
+    c: Floats,
+    s: Floats,
     tx: np.float32,
     ty: np.float32,
     table: NDArray[np.uint16],
@@ -312,7 +316,7 @@ def _add_facing(
     rounds: int,
     logs: Array,
     changes: Changes,
-    total: Array32,
+    total: Floats,
 ) -> None:
     """Add a tag with facing, interpolated between two layers of its table."""
     ends = size - 1
@@ -343,7 +347,7 @@ def _add_direct(
     logs: Array,
     changes: Changes,
     out: Array,
-    each: Array32,
+    each: Floats,
 ) -> None:
     """The same for a logistic model, which is faster to compute than to look up for all facings."""
     m = packed.which[antenna]

@@ -59,8 +59,9 @@ SINGLE_PRECISION = Branch(
             "belief.poses": 0.1,
             "belief.weights": 0.1,
             "nis.rfid.sums": 0.1,
-            "moved_tags.probabilities": 0.05,
+            "dead_tags.probabilities": 0.01,
         },
+        **dict.fromkeys(("moved_tags", "moved_tags.probabilities", "warnings"), NOT_HELD),
         **{f"{kind}.sums": 0.01 for kind in ("nis.bearing_range", "residuals.bearing_range.range")},
         "residuals.bearing_range.bearing.sums": 0.01,
     },
@@ -71,7 +72,7 @@ WHEN_FOUND = {
 }
 FOUND_BY_PARTICLES = Branch(
     SINGLE_PRECISION.reason + " So the place is found some ticks earlier or later.",
-    {**SINGLE_PRECISION.loose, **WHEN_FOUND, "causal.poses": 6.0},
+    {**SINGLE_PRECISION.loose, **WHEN_FOUND, "causal.poses": 6.0, "final.poses": 6.0},
 )
 FOUND = Branch(
     FOUND_BY_PARTICLES.reason,
@@ -86,7 +87,7 @@ UNDECIDED = Branch(
     {
         **dict.fromkeys(("belief", "belief.weights", "belief.poses", "causal.poses", "causal.covariances"), NOT_HELD),
         **WHEN_FOUND,
-        "final.poses": 2.0,
+        **{"events.t": 1.5, "final.poses": 2.0},
     },
     0.2,
 )
@@ -101,7 +102,10 @@ FAR_OFF = Branch(
 GATED = Branch(
     "Rows that are missing or come twice make landmarks lie at the edge of what is believed: the last bits decide which are, and "
     "whether a track is given up.",
-    {"final.poses": 10.0, "events": NOT_HELD, "events.t": NOT_HELD},
+    {
+        "final.poses": 40.0,
+        **dict.fromkeys(("events", "events.t", "moved_tags", "moved_tags.probabilities", "warnings"), NOT_HELD),
+    },
     10.0,
 )
 SUMS = tuple(
@@ -116,7 +120,25 @@ FEW_PARTICLES = Branch(
         **WHEN_FOUND,
         **dict.fromkeys(SUMS, 1.5),
         **{"learnt.constants": 5.0, "causal.poses": 8.0, "final.poses": 8.0, "final.covariances": 15.0},
-        "warnings": NOT_HELD,
+    },
+)
+UNDECIDED_BY_PARTICLES = Branch(
+    UNDECIDED.reason + " Particles of one of them may die out, the right one or another.",
+    {
+        **FEW_PARTICLES.loose,
+        **UNDECIDED.loose,
+        **dict.fromkeys(
+            (
+                *SUMS,
+                "nis.bearing_range.t",
+                "final.poses",
+                "final.covariances",
+                "learnt.constants",
+                "events",
+                "events.t",
+            ),
+            NOT_HELD,
+        ),
     },
 )
 CHOSEN = Branch(
@@ -145,6 +167,8 @@ def branch_of(case: str) -> Branch | None:
     elif name in ("tags-unknown-start", "tags-unknown-heading", "tags-kidnapped", "tags-landmarks-unknown-start"):
         found = FOUND_BY_PARTICLES if particles or label == "switching" else FOUND
         found = FEW_PARTICLES if case == "tags-landmarks-unknown-start/particle_filter" else found
+    elif name == "tags-landmarks-undecided":
+        found = UNDECIDED_BY_PARTICLES
     elif particles and name.startswith(("fault", "tags-landmarks")):
         found = FEW_PARTICLES
     elif hears_tags and (particles or label == "switching"):
