@@ -15,6 +15,7 @@ from factors.rfid.tag_states import FARTHEST, TagStates
 from factors.se2 import Array, Integers
 
 REACHING = 1.5  # times the reach of the antennas: tags that a longer range than the rig's might bring into reach
+WIDENED = 4.0  # times the standard deviations of the pose for what scans tell of tags: scans in a row have its error in common
 EXACT = 0.2  # a survey is exact if its sigma is below this share of `pass_sigma`
 
 
@@ -90,7 +91,7 @@ class KnownTags:
     def told(self, looks: TagReadCounts, pose: Array, covariance: Array, likelihood: RfidLikelihood) -> TagEvidence:
         """What looks tell of the tags in reach at a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3); ``likelihood``:
         with the detection models as they are estimated to be."""
-        root = math.sqrt(3.0) * positive.root(covariance)
+        root = WIDENED * math.sqrt(3.0) * positive.root(covariance)
         poses = se2.compose(pose, se2.exp(np.concatenate((root.T, -root.T))))
         near = likelihood.near(poses, looks, REACHING, FARTHEST) | looks.hits.any(axis=0)
         tags = np.flatnonzero(near & (looks.odds > -np.inf))
