@@ -1,9 +1,11 @@
 """Reads and misses of the tags of the map."""
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
@@ -15,6 +17,9 @@ from factors.rfid.tag_states import FARTHEST, TagStates
 from factors.se2 import Array, Integers
 
 REACHING = 1.5  # times the reach of the antennas: tags that a longer range than the rig's might bring into reach
+CONFIRMED = (
+    1.0  # s until a read counts as evidence on the state of its tag: a track that it contradicts may be doubted by then
+)
 WIDENED = 4.0  # times the standard deviations of the pose for what scans tell of tags: scans in a row have its error in common
 EXACT = 0.2  # a survey is exact if its sigma is below this share of `pass_sigma`
 
@@ -31,10 +36,12 @@ def trust(sigmas: Array, pass_sigma: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class TagEvidence:
-    """What a scan tells of the states of U ``tags`` (U,), see :meth:`~factors.rfid.tag_states.TagStates.expect`."""
+    """What a scan tells of the states of U ``tags`` (U,), see :meth:`~factors.rfid.tag_states.TagStates.expect`; ``heard`` (U,):
+    whether it read them."""
 
     tags: Integers
     told: Array
+    heard: NDArray[np.bool_]
 
 
 class KnownTags:
@@ -56,6 +63,7 @@ class KnownTags:
             self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
         dead, moved = (0.0, 0.0) if settings is None else (settings.dead_tags, settings.moved_tags)
         self.states = TagStates(len(self.map.names), dead, moved)
+        self._waiting: deque[tuple[float, Integers, Array]] = deque()  # what reads told since `CONFIRMED` ago
 
     def looks(self, m: RfidScan, *, count: bool = True) -> TagReadCounts | None:
         """Reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time. Without ``count``,
@@ -96,7 +104,9 @@ class KnownTags:
         near = likelihood.near(poses, looks, REACHING, FARTHEST) | looks.hits.any(axis=0)
         tags = np.flatnonzero(near & (looks.odds > -np.inf))
         shifts = np.concatenate((np.zeros((1, 2)), self.states.shifts))
-        return TagEvidence(tags, likelihood.displaced(poses, looks, tags, shifts))
+        return TagEvidence(
+            tags, likelihood.displaced(poses, looks, tags, shifts), np.asarray(looks.hits[:, tags].any(axis=0))
+        )
 
     def with_states(self, looks: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
         """The looks at tags that may be dead or moved, of which they tell ``evidence``."""
@@ -105,13 +115,18 @@ class KnownTags:
         return replace(looks, elsewhere=elsewhere)
 
     def learn(self, t: float, evidence: TagEvidence) -> None:
-        """Learn of the tags that were seen, or not, at ``t``."""
-        self.states.learn(t, evidence.tags, evidence.told)
+        """Learn of the tags that were not read at ``t``, and of those that were read :data:`CONFIRMED` ago."""
+        heard, tags, told = evidence.heard, evidence.tags, evidence.told
+        self.states.learn(t, tags[~heard], told[~heard])
+        self._waiting.append((t, tags[heard], told[heard]))
+        while self._waiting[0][0] < t - CONFIRMED:
+            self.states.learn(*self._waiting.popleft())
         self._tell()
 
     def forget(self, since: float) -> None:
         """Take back what was learnt since ``since``."""
         self.states.forget(since)
+        self._waiting = deque(row for row in self._waiting if row[0] < since)
         self._tell()
 
     def silent(self) -> None:

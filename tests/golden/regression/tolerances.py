@@ -97,7 +97,7 @@ ILL_CONDITIONED = Branch(
 )
 FAR_OFF = Branch(
     "Glitches of metres lead far from the truth, where nothing that is seen fits, and linearisation amplifies rounding.",
-    tolerance=1e-3,
+    tolerance=1e-2,
 )
 GATED = Branch(
     "Rows that are missing or come twice make landmarks lie at the edge of what is believed: the last bits decide which are, and "
