@@ -77,8 +77,8 @@ FOUND_BY_PARTICLES = Branch(
 FOUND = Branch(
     FOUND_BY_PARTICLES.reason,
     {
-        **{"causal.poses": 1.2, "causal.covariances": 1.2, "final.poses": 0.01, "final.covariances": 1e-3},
-        **{"learnt.constants": 0.01, "belief.poses": NOT_HELD, "belief.weights": 0.1},
+        **{"causal.poses": 1.2, "causal.covariances": 1.2, "final.poses": 0.05, "final.covariances": 0.015},
+        **{"learnt.constants": 0.04, "belief.poses": NOT_HELD, "belief.weights": 0.1},
         **WHEN_FOUND,
     },
 )
@@ -104,7 +104,9 @@ GATED = Branch(
     "whether a track is given up.",
     {
         "final.poses": 40.0,
-        **dict.fromkeys(("events", "events.t", "moved_tags", "moved_tags.probabilities", "warnings"), NOT_HELD),
+        **dict.fromkeys(
+            ("events", "events.t", "moved_tags", "moved_tags.probabilities", "warnings", "final.covariances"), NOT_HELD
+        ),
     },
     10.0,
 )
