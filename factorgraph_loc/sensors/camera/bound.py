@@ -160,15 +160,13 @@ class CameraSensor(Sensor):
         self.constants = constants if binding.calibration == "all" else NOTHING
         self._carries = binding.calibration != "particles"  # too many for particles
         self.points = KnownPoints(setup, diagnostics, constants, use, motion)
-        self._looks: dict[str, list[float]] = defaultdict(
-            list
-        )  # times of what was surveyed with an error that is not estimated
+        # times [s] of recent looks at what was surveyed with an error and is not estimated
+        self._looks: dict[str, list[float]] = defaultdict(list)
         self._shared = (self.modality,) if constants.names else ()
         if self.points.known:
             self.finder = PixelFinder(self.points, motion)
             # pixels of known points determine the pose so well that the graph need not be solved for each image, unless the
-            # camera's
-            # mounting is estimated
+            # camera's mounting is estimated
             self.solve_every = 0.0 if constants.names else SOLVE_EVERY
 
     def observe(self, m: Pixels, view: View) -> Iterator[PixelObservation | NewVariable]:
