@@ -218,6 +218,22 @@ def test_a_simulated_drive_has_it():
     assert all(abs(bias - 0.1) < 0.8 for bias in biases)
 
 
+def test_it_helps_to_find_an_unknown_start():
+    changes = {
+        "drive": {"duration": 20.0},
+        "world": {"tags": 6},
+        "rig": {"compass": {"bias": 0.1, "uncertainty": {"bias": 0.05}}},
+        "compass": {"rate": 2.0},
+    }
+    log = fgloc.simulate("office", 10, changes=changes)
+    alone, together = (
+        fgloc.run(log, "smoother", prior="unknown", sensors=["odometry", "rfid", *more]).scores
+        for more in ([], ["compass"])
+    )
+    assert together["time_to_localized"] < alone["time_to_localized"]
+    assert together["causal.position_rmse"] < 0.5
+
+
 def test_its_bias_is_calibrated(tmp_path):
     changes = {
         "drive": {"duration": 60.0},

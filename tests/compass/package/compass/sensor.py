@@ -86,6 +86,11 @@ class CompassSensor(Sensor):
         self._diagnostics.innovation(self.modality, observation.t, correction.nis, correction.dof)
         return True
 
+    def evidence(self, m: Heading) -> HeadingObservation:
+        """The heading where no pose is known, with the uncertainty of the bias as noise."""
+        sigma = float(np.hypot(self._settings.sigma, self._settings.uncertainty.bias))
+        return HeadingObservation(m.t, (Term(HeadingFactor(m.heading - self._settings.bias, sigma), (), 1),))
+
 
 def bind(binding: Binding) -> CompassSensor | None:
     """The sensor of a run, or None if it is not used."""
