@@ -25,7 +25,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
         "factorgraph_loc.fusion.base",
         "factorgraph_loc.model.belief",
         "factorgraph_loc.model.diagnostics",
-        "factorgraph_loc.model.learnt",
+        "factorgraph_loc.model.belief",
     ),
     "factorgraph_loc.evaluation.result": ("factorgraph_loc.model.result",),
     "factorgraph_loc.grids": ("factorgraph_loc.sensors.rfid.grids",),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.evaluation.pairing import pairs
-from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory

@@ -17,8 +17,8 @@ from factorgraph_loc.evaluation import alignment, pieces, space
 from factorgraph_loc.evaluation.alignment import rms
 from factorgraph_loc.evaluation.pairing import TOLERANCE, pairs, pauses
 from factorgraph_loc.evaluation.warned import WARNINGS
+from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult, Timings
 from factorgraph_loc.model.scoring import MAX_GAP, RULE

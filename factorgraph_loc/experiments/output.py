@@ -19,7 +19,7 @@ from factorgraph_loc.files.models import file_name, write_text, write_toml
 from factorgraph_loc.files.results import require_free, writing
 from factorgraph_loc.files.temporary import sweep, temporary_folder
 from factorgraph_loc.io.results.layout import FILES
-from factorgraph_loc.model.learnt import Learnt
+from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory, write_tum

@@ -8,8 +8,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FARTHEST
 from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, PosePrior, SpacePose
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.space_pose import planar_estimate
-from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.model.trajectory3 import Trajectory3, planar_estimate
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.text import quoted
 

@@ -10,9 +10,8 @@ import numpy as np
 
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.results import writing
-from factorgraph_loc.model.pose_path import upright
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.model.trajectory3 import Trajectory3, upright
 from factors.se2 import Array
 
 TIMES_SUFFIX = ".times.txt"

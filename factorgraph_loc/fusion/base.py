@@ -3,9 +3,8 @@
 from collections.abc import Container
 from typing import Protocol, runtime_checkable
 
-from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
+from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3

@@ -19,9 +19,8 @@ from factorgraph_loc.fusion.heading_search import HeadingSearch
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks, world_estimate
-from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status
+from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt, learnt_landmarks
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory

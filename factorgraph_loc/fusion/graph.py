@@ -29,12 +29,11 @@ from factorgraph_loc.fusion.variables import (
     landmark_key,
     pose_key,
 )
-from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.belief import Learnt, PosePrior, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt, learnt_landmarks
 from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.variable import Estimated
 from factorgraph_loc.sensors.base import NewVariable, Sensor, Term
 from factors import se2
 from factors.graph import Factor, PriorFactor, VectorPriorFactor

@@ -22,9 +22,8 @@ from factorgraph_loc.fusion.graph import Graph
 from factorgraph_loc.fusion.graph_parts import GraphSettings, Keyframe
 from factorgraph_loc.fusion.mapping import Mapper
 from factorgraph_loc.fusion.search import DURATION, Search
-from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status, gaussian_belief
+from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, gaussian_belief
 from factorgraph_loc.model.diagnostics import NOTHING_WRITTEN, Diagnostics, Written
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory

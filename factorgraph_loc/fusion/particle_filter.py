@@ -29,9 +29,8 @@ from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings
-from factorgraph_loc.model.belief import Belief, Mode, PoseEstimate, PosePrior, Status
+from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt, learnt_landmarks
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory

@@ -16,9 +16,8 @@ from factorgraph_loc.fusion.base import EVERY
 from factorgraph_loc.fusion.ekf import Ekf, EkfSettings
 from factorgraph_loc.fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks
-from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
+from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory

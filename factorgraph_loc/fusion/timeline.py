@@ -14,9 +14,8 @@ from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.fusion.base import EVERY
-from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status, gaussian_belief
+from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, gaussian_belief
 from factorgraph_loc.model.diagnostics import Diagnostics, Written
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory

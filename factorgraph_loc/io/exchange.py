@@ -13,7 +13,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.bags.file import require_rosbags
 from factorgraph_loc.io.bags.poses import check_rotations, seven
 from factorgraph_loc.model.planar import rotations_of
-from factorgraph_loc.model.pose_path import PosePath, require_poses
+from factorgraph_loc.model.trajectory3 import PosePath, require_poses
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
 

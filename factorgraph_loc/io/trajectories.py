@@ -9,7 +9,7 @@ from factorgraph_loc.io.bags.file import is_bag
 from factorgraph_loc.io.readers import read_log
 from factorgraph_loc.io.readers.pose_file import read_pose_file
 from factorgraph_loc.io.results.layout import FILES
-from factorgraph_loc.model.pose_path import PosePath, path_of
+from factorgraph_loc.model.trajectory3 import PosePath, path_of
 
 FINAL = FILES[0]
 TOPIC = ":"  # between a bag and a topic

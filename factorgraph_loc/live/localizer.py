@@ -19,9 +19,8 @@ from factorgraph_loc.fusion.base import Estimator, ForgettingEstimator, finds_he
 from factorgraph_loc.fusion.guarded import Guard, sound, sound_belief, sound_trajectory
 from factorgraph_loc.live.start import prior_of, require_options, usable_sensors
 from factorgraph_loc.model import setup as model_setup
-from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
+from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.measurement import Measurement, Tick, named
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.ticks import Ticks

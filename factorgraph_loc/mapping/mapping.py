@@ -20,7 +20,7 @@ import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.evaluation.alignment import align_points
-from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.map import Landmark

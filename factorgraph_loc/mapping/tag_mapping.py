@@ -15,8 +15,7 @@ from factorgraph_loc.mapping.mapping import LandmarkMap
 from factorgraph_loc.mapping.tag_looks import TagLooks, tag_looks
 from factorgraph_loc.mapping.tag_search import TagMode, TagPosterior, search, sigma
 from factorgraph_loc.mapping.tag_slam import tag_slam
-from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.belief import LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.map import Landmark

@@ -20,8 +20,7 @@ from factorgraph_loc.fusion.variables import Values, constants_key, landmark_key
 from factorgraph_loc.mapping.tag_looks import TagLooks
 from factorgraph_loc.mapping.tag_refinement import reach
 from factorgraph_loc.mapping.tag_search import TagPosterior, search
-from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.belief import LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.ticks import TICK_GAP
 from factorgraph_loc.sensors.odometry.whole import whole_motion

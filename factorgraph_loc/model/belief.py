@@ -1,13 +1,15 @@
-"""Priors of the start pose, pose estimates and beliefs."""
+"""Priors of the start pose, pose estimates, beliefs, and what is learnt besides the poses."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
+from factorgraph_loc.maps.points import PointMap
 from factors.se2 import Array
 
 # of a start given as a pose only
@@ -85,3 +87,30 @@ def gaussian_belief(estimate: PoseEstimate) -> Belief:
     if not np.isfinite(estimate.pose).all():
         return Belief(())
     return Belief((Mode(1.0, np.array(estimate.pose), np.array(estimate.covariance)),))
+
+
+@dataclass(frozen=True)
+class LearntPoint:
+    """Estimated ``position`` (2,) [m] of a landmark with ``covariance`` (2, 2) of (x, y), in the world frame."""
+
+    position: Array
+    covariance: Array
+
+
+def learnt_landmarks(blocks: Iterable[tuple[str, Array, Array]]) -> dict[str, LearntPoint]:
+    """The landmarks among ``blocks``, each ``SENSOR/NAME`` with its mean and covariance, by name; points in space are none."""
+    return {name.partition("/")[2]: LearntPoint(mean, spread) for name, mean, spread in blocks if len(mean) == 2}
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """Estimates besides the poses.
+
+    ``values``: constants by name, each (value, standard deviation) in SI units. Constants of odometry have plain names
+    (``scale_distance``), those of other sensors a prefix (``bearing_range.x``). ``landmarks``: by name. ``points``: points in
+    space that are not in the map, or None.
+    """
+
+    values: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    landmarks: Mapping[str, LearntPoint] = field(default_factory=dict)
+    points: PointMap | None = None

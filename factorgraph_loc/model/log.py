@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.model.measurement import Measurement, Rows
+from factorgraph_loc.model.measurement import Measurement, Rows, Stream, joined, selected
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.stream import Stream, joined, selected
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.model.world import World

@@ -1,9 +1,15 @@
-"""The interface of measurements: frozen values with timestamps in seconds from the start of the log, in SI units."""
+"""The interface of measurements, frozen values with timestamps in seconds from the start of the log, in SI units; and the rows
+of one sensor of a log."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from dataclasses import dataclass, fields, replace
+from itertools import compress, pairwise
+from typing import Any, ClassVar, Protocol, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.errors import InputError
 from factors.se2 import Array
 
 
@@ -78,3 +84,72 @@ class Rows:
     def singly(self) -> Iterator[Measurement]:
         """Each as a measurement of its own."""
         return map(self.kind, self.times.tolist(), *(values.tolist() for values in self.values))
+
+
+SEEN = 2  # rank of exteroceptive streams; motion has lower ranks
+
+
+@dataclass(frozen=True)
+class Stream:
+    """The rows of one channel as columns; ``t`` (N,) in seconds from the start of the log, by the sensor's clock.
+
+    Rows are in order of arrival; a late row has an older timestamp than the one before. ``rank`` orders rows with equal
+    timestamps: 0 for wheel odometry, 1 for other motion. ``kind``: class of the measurements, constructed from a timestamp and
+    the columns. ``joins``: whether consecutive rows, of numbers, can be one measurement
+    (:class:`~factorgraph_loc.model.measurement.Rows`).
+    """
+
+    rank: ClassVar[int] = SEEN
+    joins: ClassVar[bool] = False
+    kind: ClassVar[type[Any]]
+    t: Array
+
+    def measurements(self, offset: float) -> Iterator[Measurement]:
+        """One measurement per row; ``offset`` [s] is added to the timestamps."""
+        return map(self.kind, (self.t + offset).tolist(), *(np.asarray(column).tolist() for column in self._columns()))
+
+    def rows(self, offset: float) -> Rows:
+        """All rows as one measurement, if the stream ``joins``."""
+        return Rows(self.kind, self.t + offset, tuple(np.array(column, dtype=float) for column in self._columns()))
+
+    def _columns(self) -> Iterator[Any]:
+        return (getattr(self, field.name) for field in fields(self)[1:])
+
+    def begun_anew(self) -> Self:
+        """The stream of a robot that was placed at its first row, without any motion before it."""
+        return self
+
+    def scans(self) -> Iterator[tuple[int, int]]:
+        """First and end row of each run of equal timestamps."""
+        return pairwise([*np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist(), len(self.t)])
+
+
+@dataclass(frozen=True)
+class ScanStream(Stream):
+    """A stream in which the rows of one timestamp form one measurement, made of names (K,) and arrays (K,)."""
+
+    def measurements(self, offset: float) -> Iterator[Measurement]:
+        """One measurement per timestamp; ``offset`` [s] is added to the timestamps."""
+        for i, j in self.scans():
+            parts = (column[i:j] for column in self._columns())
+            values = (part if isinstance(part, np.ndarray) else tuple(part) for part in parts)
+            yield self.kind(float(self.t[i]) + offset, *values)
+
+
+def selected(stream: Stream, keep: NDArray[np.bool_]) -> Stream:
+    columns = {f.name: getattr(stream, f.name) for f in fields(stream)}
+    kept: dict[str, Any] = {
+        k: v[keep] if isinstance(v, np.ndarray) else list(compress(v, keep)) for k, v in columns.items()
+    }
+    return replace(stream, **kept)
+
+
+def joined(first: Stream, second: Stream) -> Stream:
+    if type(first) is not type(second):
+        kinds = f"{type(first).__name__} and one with {type(second).__name__}"
+        raise InputError(f"a log with {kinds} cannot be joined, expected tables of the same kind")
+    columns = {f.name: (getattr(first, f.name), getattr(second, f.name)) for f in fields(first)}
+    both: dict[str, Any] = {
+        k: np.concatenate((a, b)) if isinstance(a, np.ndarray) else [*a, *b] for k, (a, b) in columns.items()
+    }
+    return replace(first, **both)

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import gtsam
 
-from factorgraph_loc.model.variable import Estimated
+from factorgraph_loc.model.settings import Estimated
 from factors.graph import Factor
 from factors.motion import ChainState, Increment
 from factors.se2 import Array

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.model.belief import Status
+from factorgraph_loc.model.belief import Learnt, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, add_fields
 from factorgraph_loc.model.sections import sections, sections_of_channels
-from factorgraph_loc.model.settings import SensorSettings
-from factorgraph_loc.model.variable import NOTHING, Estimated
+from factorgraph_loc.model.settings import NOTHING, Estimated, SensorSettings
 from factorgraph_loc.plugins import FILES, MOVED, load
 
 S = TypeVar("S", bound=FileModel)

@@ -1,11 +1,84 @@
-"""Base class of the rig settings of sensors."""
+"""What settings of sensors are made of: bounded numbers with their units, which reject wrong ones (degrees for radians, mm for m),
+constants that are estimated, and the base class."""
 
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
-from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.model.units import Seconds
-from factorgraph_loc.model.variable import Estimated
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from factorgraph_loc.files.models import FileModel, InUnit
+from factors.se2 import Array
+
+Angle = Annotated[float, Field(ge=-math.pi, le=math.pi), InUnit("rad")]
+Offset = Annotated[float, Field(ge=-10.0, le=10.0), InUnit("m")]
+Scale = Annotated[float, Field(ge=0.2, le=5.0)]
+Seconds = Annotated[float, Field(ge=-5.0, le=5.0), InUnit("s")]
+Rate = Annotated[float, Field(ge=-1.0, le=1.0), InUnit("rad/s")]
+Noise = Annotated[float, Field(ge=0.0, le=5.0)]
+
+
+Metres = Annotated[float, Field(ge=1e-3, le=1000.0), InUnit("m")]
+Duration = Annotated[float, Field(ge=0.0, le=1e5), InUnit("s")]
+Hertz = Annotated[float, Field(ge=1e-3, le=100.0), InUnit("1/s")]
+Share = Annotated[float, Field(ge=0.0, lt=1.0)]
+
+
+def _positive_semidefinite(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    xx, xy, yy = value
+    # rounding may make the determinant of a singular matrix slightly negative
+    if xx < 0.0 or yy < 0.0 or xy * xy > xx * yy * (1.0 + 1e-9):
+        raise ValueError("expected (xx, xy, yy) [m^2] of a positive semi-definite matrix")
+    return value
+
+
+Variance = Annotated[float, Field(ge=-1e8, le=1e8), InUnit("m^2")]
+Covariance = Annotated[tuple[Variance, Variance, Variance], AfterValidator(_positive_semidefinite)]
+
+
+def spread_of(sigma: float, covariance: tuple[float, float, float] | None) -> Array:
+    """The covariance (2, 2) [m^2] of a position, from (xx, xy, yy) if given, else from the standard deviation ``sigma`` [m]."""
+    if covariance is None:
+        return sigma**2 * np.eye(2)
+    xx, xy, yy = covariance
+    return np.array(((xx, xy), (xy, yy)))
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """The constants of a sensor that are estimated, as corrections to the rig's values.
+
+    ``names`` (P,): their names; ``indices`` (P,): their indices among all constants; ``sigmas`` (P,): prior standard deviations.
+    """
+
+    names: tuple[str, ...]
+    indices: tuple[int, ...]
+    sigmas: Array
+
+    @staticmethod
+    def of(names: Sequence[str], uncertainty: FileModel | None) -> Estimated:
+        """Those of ``names`` whose uncertainty is above zero."""
+        return Estimated.among(names, np.array([getattr(uncertainty, name, 0.0) for name in names]))
+
+    @staticmethod
+    def among(names: Sequence[str], sigmas: Array) -> Estimated:
+        """Those of ``names`` (P,) whose ``sigmas`` (P,) are above zero."""
+        indices = tuple(np.flatnonzero(sigmas).tolist())
+        return Estimated(tuple(names[i] for i in indices), indices, sigmas[list(indices)])
+
+    def full(self, values: Array, count: int) -> Array:
+        """``values`` (..., P) inserted among all ``count`` constants; the others are zero."""
+        out = np.zeros((*np.shape(values)[:-1], count))
+        out[..., list(self.indices)] = values
+        return out
+
+
+NOTHING = Estimated((), (), np.zeros(0))
 
 
 class SensorSettings(FileModel):

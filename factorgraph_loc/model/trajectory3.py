@@ -1,23 +1,21 @@
-"""Trajectories in three dimensions."""
+"""Trajectories and poses in three dimensions, and what is seen of them from above."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import write_text
-from factorgraph_loc.model.exchange import Exchange
+from factorgraph_loc.model.belief import PoseEstimate, SpacePose
 from factorgraph_loc.model.planar import rotations_of
-from factorgraph_loc.model.trajectory import Trajectory, averaged, decimal_seconds, neighbours
+from factorgraph_loc.model.trajectory import Exchange, Trajectory, averaged, decimal_seconds, neighbours
 from factors.se2 import Array, Integers
-
-if TYPE_CHECKING:
-    from factorgraph_loc.model.pose_path import PosePath
 
 
 @dataclass(frozen=True)
@@ -98,3 +96,109 @@ class Trajectory3(Exchange):
             numbers = [*(f"{value:.9f}" for value in place), *(f"{value:.12f}" for value in turn)]
             rows.append(f"{decimal_seconds(t, t0_ns)} {' '.join(numbers)}\n")
         write_text(path, "".join(rows))
+
+
+_FLAT = 1e-9  # m and sines within which poses are planar
+
+
+@dataclass(frozen=True)
+class PosePath:
+    """A sequence of poses: ``positions`` (N, 3) [m] and ``rotations`` (N, 3, 3) in a world frame.
+
+    ``t_ns`` (N,): absolute times [ns], strictly increasing, or None if only the order of the poses is known. ``has_rotations`` is
+    False if the rotations are meaningless. ``warnings``: one line for each problem that a reader corrected.
+    """
+
+    name: str
+    positions: Array
+    rotations: Array
+    t_ns: Integers | None
+    has_rotations: bool = True
+    warnings: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether all poses have one height and stand upright."""
+        return bool(np.ptp(self.positions[:, 2]) <= _FLAT and np.all(np.abs(self.rotations[:, 2, :2]) <= _FLAT))
+
+    def seconds(self) -> Array:
+        """The times (N,) in seconds since 1970, each the float nearest to it. ValueError if they are unknown."""
+        if self.t_ns is None:
+            raise ValueError(f"{self.name} has no times")
+        return np.array([t / 10**9 for t in self.t_ns.tolist()])
+
+    def rows(self, which: Integers) -> PosePath:
+        """The poses with indices ``which``."""
+        t_ns = None if self.t_ns is None else self.t_ns[which]
+        return replace(self, positions=self.positions[which], rotations=self.rotations[which], t_ns=t_ns)
+
+    def planar(self, t0_ns: int) -> Trajectory:
+        """The poses seen from above, in seconds after ``t0_ns``: x, y and the direction of the robot's x axis."""
+        return replace(self.in_space(t0_ns).planar(), has_heading=self.has_rotations)
+
+    def in_space(self, t0_ns: int) -> Trajectory3:
+        """The poses as a trajectory, in seconds after ``t0_ns``. ValueError if their times are unknown."""
+        if self.t_ns is None:
+            raise ValueError(f"{self.name} has no times")
+        return Trajectory3((self.t_ns - t0_ns) / 1e9, self.positions, self.rotations)
+
+    def seen_from_above(self) -> PosePath:
+        """The same poses at height 0, turned about the vertical axis only."""
+        headings = np.arctan2(self.rotations[:, 1, 0], self.rotations[:, 0, 0])
+        return replace(self, positions=self.positions * (1.0, 1.0, 0.0), rotations=upright(headings))
+
+
+def path_of(trajectory: Trajectory | Trajectory3, name: str, t0_ns: int = 0) -> PosePath:
+    """The poses of a trajectory whose times count from ``t0_ns``; those of a planar one have height 0."""
+    t_ns = np.rint(trajectory.t * 1e9).astype(np.int64) + t0_ns
+    if isinstance(trajectory, Trajectory3):
+        return PosePath(name, trajectory.positions, trajectory.rotations, t_ns)
+    headings = trajectory.poses[:, 2] if trajectory.has_heading else np.zeros(len(trajectory))
+    positions = np.column_stack((trajectory.poses[:, :2], np.zeros(len(trajectory))))
+    return PosePath(name, positions, upright(headings), t_ns, trajectory.has_heading)
+
+
+def require_poses(path: PosePath) -> None:
+    """InputError if there are no poses, or one is not finite."""
+    if not len(path):
+        raise InputError(f"{path.name}: contains no poses, expected at least one")
+    known = np.isfinite(path.positions).all(axis=1) & np.isfinite(path.rotations).all(axis=(1, 2))
+    if not known.all():
+        raise InputError(f"{path.name}: pose {int(np.argmin(known)) + 1} is not finite, expected finite numbers")
+
+
+def upright(headings: Array) -> Array:
+    """Rotations (N, 3, 3) by ``headings`` (N,) about the vertical axis."""
+    out = np.zeros((len(headings), 3, 3))
+    out[:, 0, 0] = out[:, 1, 1] = np.cos(headings)
+    out[:, 1, 0] = np.sin(headings)
+    out[:, 0, 1] = -np.sin(headings)
+    out[:, 2, 2] = 1.0
+    return out
+
+
+def planar_estimate(t: float, pose: SpacePose) -> PoseEstimate:
+    """A localized estimate of (x, y) and of the direction of the robot's first axis, seen from above, with covariance; it
+    contains the pose in space too.
+    """
+    rotation = pose.rotation
+    x, y = rotation[0, 0], rotation[1, 0]
+    jacobian = np.zeros((3, 6))
+    jacobian[:2, 3:] = rotation[:2]
+    # a small rotation (a, b, c) moves the first axis by c times the second minus b times the third
+    across = np.array((-y, x)) / max(x * x + y * y, 1e-12)
+    jacobian[2, 1], jacobian[2, 2] = -across @ rotation[:2, 2], across @ rotation[:2, 1]
+    seen: Array = np.array((pose.position[0], pose.position[1], np.arctan2(y, x)))
+    return PoseEstimate(t, seen, jacobian @ pose.covariance @ jacobian.T, "localized", pose)
+
+
+def planar_trajectory(found: Trajectory3) -> Trajectory:
+    """A trajectory in space, with covariances, seen from above."""
+    assert found.covariances is not None, "an estimate has covariances"
+    rows = zip(found.t.tolist(), found.positions, found.rotations, found.covariances, strict=True)
+    seen = [planar_estimate(t, SpacePose(*pose)) for t, *pose in rows]
+    poses = np.array([e.pose for e in seen]).reshape(-1, 3)
+    return Trajectory(found.t, poses, np.array([e.covariance for e in seen]).reshape(-1, 3, 3))

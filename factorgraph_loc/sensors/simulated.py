@@ -6,9 +6,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.measurement import Measurement, Stream
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factors.se2 import Array

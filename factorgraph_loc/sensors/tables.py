@@ -19,8 +19,8 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.columns import STAMP, Column, Table
 from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.plugins import load
 from factorgraph_loc.sensors.registry import Channel, SensorType, channels, sensors
 from factors.se2 import Array, Integers

@@ -12,7 +12,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, InUnit, add_fields, inside, nearest, parse_model, read_toml
 from factorgraph_loc.io.native.rig_file import read_rig
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.simulation_units import Hertz
+from factorgraph_loc.model.settings import Hertz
 from factorgraph_loc.plugins import load
 from factorgraph_loc.sensors.registry import functions, sensors
 from factorgraph_loc.text import quoted

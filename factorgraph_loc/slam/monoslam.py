@@ -20,13 +20,11 @@ from pydantic import Field
 
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings
-from factorgraph_loc.model.belief import PoseEstimate, PosePrior, SpacePose
-from factorgraph_loc.model.learnt import Learnt, LearntPoint
+from factorgraph_loc.model.belief import Learnt, LearntPoint, PoseEstimate, PosePrior, SpacePose
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import MapUse, Setup
-from factorgraph_loc.model.space_pose import planar_estimate, planar_trajectory
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.model.trajectory3 import Trajectory3, planar_estimate, planar_trajectory
 from factorgraph_loc.sensors.camera.sensor import Pixels
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.sensors.twist.use import in_space, twist_settings

@@ -17,7 +17,7 @@ from factorgraph_loc.io.readers import load
 from factorgraph_loc.io.readers.space_poses import read_kitti
 from factorgraph_loc.io.write import write_log
 from factorgraph_loc.model.log import Log, cut
-from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.map import Landmark

@@ -18,7 +18,7 @@ from factorgraph_loc.cli import show
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.evaluation.tables import COLUMNS, comparison_cells, comparison_table
 from factorgraph_loc.experiments.run import run
-from factorgraph_loc.model.learnt import Learnt, LearntPoint
+from factorgraph_loc.model.belief import Learnt, LearntPoint
 from factorgraph_loc.model.trajectory import Trajectory, read_tum, write_tum
 
 RUN_FILES = {

@@ -9,7 +9,7 @@ from evo.core.geometry import umeyama_alignment
 from scipy.stats import chi2
 
 from factorgraph_loc.evaluation.alignment import align, align_points, free_map_figures
-from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory

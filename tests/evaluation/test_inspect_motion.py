@@ -8,8 +8,8 @@ import pytest
 from factorgraph_loc.evaluation.inspect import inspect
 from factorgraph_loc.io.look_over import look_over
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import selected
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.stream import selected
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.map import Landmark

@@ -10,8 +10,8 @@ from scipy.stats import binom, chi2
 
 from factorgraph_loc.evaluation.alignment import FIGURES
 from factorgraph_loc.evaluation.metrics import accuracy, errors, relative_errors, score
+from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult, Timings
 from factorgraph_loc.model.rig import Rig

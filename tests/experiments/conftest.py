@@ -9,9 +9,8 @@ import pytest
 from straight_log import log  # noqa: F401 - a fixture
 
 from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.model.belief import PoseEstimate
+from factorgraph_loc.model.belief import Learnt, PoseEstimate
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.plugins import ESTIMATORS
 

@@ -12,7 +12,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.results.layout import FILES
-from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.trajectory import read_tum
 
 COLUMNS = [

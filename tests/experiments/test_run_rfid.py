@@ -10,8 +10,8 @@ from factorgraph_loc.experiments.compare import compare
 from factorgraph_loc.experiments.preparation import use_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import settings_of
+from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.sensors.rfid.describe import doubts
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import RfidSettings

@@ -10,7 +10,7 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.mapping.mapping import TOLERANCE, align_robustly, make_map
-from factorgraph_loc.model.learnt import LearntPoint
+from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World

@@ -26,7 +26,7 @@ NAMES = {*channels(), *sensors(), *SECTIONS} - {"landmarks", "survey"}
 
 KEPT = {
     "experiments/maps.py": (1, "the word says whether poses are given or estimated, not which sensor there is"),
-    "model/stream.py": (1, "streams are joined that are of one type, whichever that is"),
+    "model/measurement.py": (1, "streams are joined that are of one type, whichever that is"),
     "simulation/filming.py": (1, "who renders images makes the stream of them"),
     "simulation/settings.py": (2, "presets are rigs, as files would say them"),
     "slam/monoslam_sighting.py": (

@@ -8,8 +8,8 @@ from benchmarking import trials
 from benchmarking.trials import kidnapping_trials, start_trials
 
 from factorgraph_loc.experiments.run import run
+from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult, Timings
 from factorgraph_loc.model.rig import Rig

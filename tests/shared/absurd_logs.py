@@ -12,7 +12,7 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log, StartPose
-from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.sensors.landmarks.map import Landmark
 from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise

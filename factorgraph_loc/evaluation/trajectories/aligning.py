@@ -13,8 +13,8 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.alignment import align_points
-from factorgraph_loc.model.pose_path import PosePath, upright
 from factorgraph_loc.model.scoring import Alignment
+from factorgraph_loc.model.trajectory3 import PosePath, upright
 from factors.se2 import Array
 
 FEWEST = 3  # pairs that define an alignment by least squares

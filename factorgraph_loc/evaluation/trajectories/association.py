@@ -8,8 +8,8 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.pairing import pairs, pairs_in_space, pauses
-from factorgraph_loc.model.pose_path import PosePath, path_of
 from factorgraph_loc.model.scoring import Association
+from factorgraph_loc.model.trajectory3 import PosePath, path_of
 from factors.se2 import Array, Integers
 
 

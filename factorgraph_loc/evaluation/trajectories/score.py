@@ -19,7 +19,6 @@ from factorgraph_loc.evaluation.pairing import TOLERANCE, pauses
 from factorgraph_loc.evaluation.trajectories.aligning import Similarity, alignment
 from factorgraph_loc.evaluation.trajectories.association import associate
 from factorgraph_loc.model.planar import MOST, RISE
-from factorgraph_loc.model.pose_path import PosePath, require_poses
 from factorgraph_loc.model.scoring import (
     ALIGNMENTS,
     ASSOCIATIONS,
@@ -29,6 +28,7 @@ from factorgraph_loc.model.scoring import (
     Association,
     check_max_gap,
 )
+from factorgraph_loc.model.trajectory3 import PosePath, require_poses
 from factorgraph_loc.text import listed, quoted
 from factors.se2 import Array, Integers
 

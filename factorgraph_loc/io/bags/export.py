@@ -21,7 +21,7 @@ from factorgraph_loc.io.bags.poses import POINT
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.io.native.world_file import write_world
 from factorgraph_loc.model.log import Log, StartPose
-from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream

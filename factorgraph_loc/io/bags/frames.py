@@ -16,9 +16,8 @@ from factorgraph_loc.io.bags.clock import Stamper
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.poses import ReferenceTopic, check_rotations, seven
 from factorgraph_loc.model.planar import on_floor
-from factorgraph_loc.model.pose_path import PosePath, path_of
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3, path_of
 from factorgraph_loc.text import listed, quoted
 from factors.se2 import Array
 

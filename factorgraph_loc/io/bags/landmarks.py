@@ -15,8 +15,8 @@ from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.frames import StaticFrames
 from factorgraph_loc.io.bags.tables import RowsOfTopic
 from factorgraph_loc.maps.markers import corner_names
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Axes, Turned
-from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.sensors.camera.columns import SIGHTINGS
 from factorgraph_loc.sensors.landmarks.columns import BEARING_RANGE
 from factorgraph_loc.sensors.tables import stream_of

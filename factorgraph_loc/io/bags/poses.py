@@ -13,8 +13,8 @@ from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.rows import TopicRows
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.planar import AS_IT_IS, Turned, on_floor, require_unit, rotations_of
-from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import PosePath
 from factors.se2 import Array, Integers
 
 POINT = "geometry_msgs/msg/PointStamped"

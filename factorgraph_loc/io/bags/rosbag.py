@@ -23,8 +23,8 @@ from factorgraph_loc.io.bags.poses import Poses, ReferenceTopic, Start, StartTop
 from factorgraph_loc.io.bags.rfid import Reads, RfidTopic
 from factorgraph_loc.io.bags.tables import DescribedRows, TableTopic
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.rfid.stream import RfidStream

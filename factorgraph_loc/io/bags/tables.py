@@ -15,7 +15,7 @@ from factorgraph_loc.io.bags.clock import Clock
 from factorgraph_loc.io.bags.fields import Fields, as_number, as_text
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.rows import TopicRows
-from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.sensors.tables import stream_of
 from factorgraph_loc.text import listed
 from factors.se2 import Array

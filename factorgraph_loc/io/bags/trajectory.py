@@ -9,7 +9,7 @@ from factorgraph_loc.io.bags.file import open_bag
 from factorgraph_loc.io.bags.frames import FrameReference
 from factorgraph_loc.io.bags.poses import POINT, POSES, Poses, ReferenceTopic
 from factorgraph_loc.io.bags.rosbag import Listeners, static_frames
-from factorgraph_loc.model.pose_path import PosePath
+from factorgraph_loc.model.trajectory3 import PosePath
 from factorgraph_loc.text import listed
 
 FRAMES, WITHIN = ":", "."  # /tf:PARENT.CHILD

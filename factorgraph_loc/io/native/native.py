@@ -19,10 +19,10 @@ from factorgraph_loc.io.native.world_file import parse_world, read_world, write_
 from factorgraph_loc.io.readers.manifests import StartSettings
 from factorgraph_loc.maps.points import POINTS_SUFFIX
 from factorgraph_loc.model.log import Log, StartPose
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import on_floor, rotations_of
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.sections import layers
-from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows, write_tum
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.registry import Channel, channel

@@ -26,8 +26,8 @@ from factorgraph_loc.io.readers.mapped_poses import (
 from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_reads, read_inventories
 from factorgraph_loc.io.readers.unread import Unread
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Turned, about_z
-from factorgraph_loc.model.stream import Stream
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.tables import make_images
 from factorgraph_loc.sensors.odometry.columns import IMU

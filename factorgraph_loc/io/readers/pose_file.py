@@ -9,8 +9,8 @@ from factorgraph_loc.files.models import read_text
 from factorgraph_loc.io.readers import euroc, tum_rgbd
 from factorgraph_loc.io.readers.space_poses import MATRIX, read_matrices, read_poses
 from factorgraph_loc.model.planar import rotations_of
-from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.trajectory import read_tum_rows
+from factorgraph_loc.model.trajectory3 import PosePath
 
 Format = Literal["tum", "kitti", "euroc"]
 EXPECTED = (

@@ -20,10 +20,9 @@ from factorgraph_loc.io.readers.pose_file import read_pose_file
 from factorgraph_loc.io.readers.space_poses import stamps_of
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.planar import RISE, TILT, Turned, on_floor
-from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.stream import IncrementStream
 from factors.se2 import Integers

@@ -12,7 +12,7 @@ from factorgraph_loc.files.models import FileModel, InUnit, parse_model
 from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
 from factorgraph_loc.io.readers.matlab import read_matlab
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.map import Landmark

@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from factorgraph_loc.model.variable import NOTHING, Estimated
+from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
 from factorgraph_loc.sensors.camera.finder import MISSED, PixelFinder
 from factorgraph_loc.sensors.camera.sensor import (

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 
+from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.usage import Use

@@ -8,8 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.model.measurement import Measurement
-from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.measurement import Measurement, Stream
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.se2 import Array

@@ -11,7 +11,7 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.bounded import NoFileNameError, copy_file
 from factorgraph_loc.files.models import inside
 from factorgraph_loc.files.tables import TableRows
-from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.sensors.tables import Columns, Reading, Writing
 

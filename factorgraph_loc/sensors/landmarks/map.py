@@ -5,7 +5,7 @@ from typing import Annotated
 from pydantic import Field
 
 from factorgraph_loc.files.models import Coordinate, FileModel
-from factorgraph_loc.model.survey import Covariance, spread_of
+from factorgraph_loc.model.settings import Covariance, spread_of
 from factors.se2 import Array
 
 

@@ -5,8 +5,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.model.settings import SensorSettings
-from factorgraph_loc.model.units import Angle, Offset
+from factorgraph_loc.model.settings import Angle, Offset, SensorSettings
 from factors.landmarks.model import PARAMETERS, BearingRangeModel
 
 

@@ -5,7 +5,7 @@ from typing import Annotated
 from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.model.simulation_units import Hertz, Metres
+from factorgraph_loc.model.settings import Hertz, Metres
 
 
 class SightingSettings(FileModel):

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from factorgraph_loc.model.stream import ScanStream
+from factorgraph_loc.model.measurement import ScanStream
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factors.se2 import Array
 

@@ -8,7 +8,7 @@ import numpy as np
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Rows
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.variable import NOTHING
+from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
 from factorgraph_loc.sensors.odometry.model import odometry_model
 from factors import se2

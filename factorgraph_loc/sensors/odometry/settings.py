@@ -5,8 +5,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.model.settings import SensorSettings
-from factorgraph_loc.model.units import Angle, Noise, Rate, Scale
+from factorgraph_loc.model.settings import Angle, Noise, Rate, Scale, SensorSettings
 from factors.odometry.model import PARAMETERS, Growth
 
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
 from factors.se2 import Array
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.tables import TableRows
-from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.sensors.odometry.columns import INCREMENTS, VELOCITIES
 from factorgraph_loc.sensors.odometry.stream import IncrementStream
 from factorgraph_loc.sensors.tables import Reading, stream_of

@@ -10,8 +10,8 @@ from typing import ClassVar, Self, cast
 import numpy as np
 
 from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.model.variable import NOTHING, Estimated
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags, TagEvidence
 from factorgraph_loc.sensors.rfid.measurement import RfidScan

@@ -14,8 +14,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, inside
-from factorgraph_loc.model.settings import SensorSettings
-from factorgraph_loc.model.variable import Estimated
+from factorgraph_loc.model.settings import Estimated, SensorSettings
 from factorgraph_loc.sensors.rfid.grids import read_grid, write_grid
 from factorgraph_loc.text import listed, quoted
 from factors import se2

@@ -5,7 +5,7 @@ from typing import Annotated
 from pydantic import ConfigDict, Field
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.model.simulation_units import Metres, Seconds, Share
+from factorgraph_loc.model.settings import Duration, Metres, Share
 from factorgraph_loc.sensors.rfid.settings import Weight
 
 
@@ -40,22 +40,22 @@ class AntennaStop(FileModel):
     model_config = ConfigDict(coerce_numbers_to_str=True)  # antennas are often named by numbers
 
     antenna: str
-    time: Seconds
+    time: Duration
     rounds_go_on: bool = False
 
 
 class ClockJump(FileModel):
     """From ``time`` on the reader's timestamps are ``jump`` seconds late."""
 
-    time: Seconds
+    time: Duration
     jump: Annotated[float, Field(ge=-60.0, le=60.0), InUnit("s")]
 
 
 class Silence(FileModel):
     """For ``duration`` seconds no tag is read."""
 
-    time: Seconds
-    duration: Seconds
+    time: Duration
+    duration: Duration
 
 
 class FaultSettings(FileModel):

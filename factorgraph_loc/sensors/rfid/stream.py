@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.model.measurement import Measurement
-from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.measurement import Measurement, Stream
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factors.se2 import Array
 

@@ -4,8 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-from factorgraph_loc.model.measurement import Measurement
-from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.measurement import Measurement, Stream
 from factorgraph_loc.sensors.twist.measurement import Twist
 from factors.se2 import Array
 

@@ -16,9 +16,8 @@ from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.fusion.base import Estimator
-from factorgraph_loc.model.belief import Belief
+from factorgraph_loc.model.belief import Belief, Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.learnt import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.trajectory import Trajectory

@@ -15,8 +15,8 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.model.variable import NOTHING
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.sensors.camera.sensor import KnownPoints, Predicted, lifted, pixel_update

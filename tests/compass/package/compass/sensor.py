@@ -7,7 +7,7 @@ import numpy as np
 
 from compass.settings import CompassSettings
 from compass.stream import Heading
-from factorgraph_loc.model.variable import NOTHING
+from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.sensors.base import Binding, ResidualObservation, Sensor, Term, View
 from factors import se2
 from factors.motion import Increment

@@ -5,9 +5,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.model.settings import SensorSettings
-from factorgraph_loc.model.simulation_units import Hertz
-from factorgraph_loc.model.units import Angle
+from factorgraph_loc.model.settings import Angle, Hertz, SensorSettings
 
 
 class CompassUncertainty(FileModel):

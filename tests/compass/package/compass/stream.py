@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from factorgraph_loc.files.columns import ANGLE, FULL_TURN, STAMP, Table, within
-from factorgraph_loc.model.stream import Stream
+from factorgraph_loc.model.measurement import Stream
 from factors.se2 import Array
 
 HEADINGS = Table(
