@@ -11,10 +11,8 @@ from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.settings import Setting, settings_in
 from factorgraph_loc.files.shipped import rigs as shipped
 from factorgraph_loc.fusion.registry import Description, describe
-from factorgraph_loc.io.native import new_rig as first
-from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
-from factorgraph_loc.io.native.rig_file import read_rig
-from factorgraph_loc.io.native.rig_text import rig_text
+from factorgraph_loc.io.native import rig_file as first
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig, rig_text
 from factorgraph_loc.io.readers import reader
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS

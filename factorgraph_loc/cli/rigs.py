@@ -44,8 +44,7 @@ def show_(
     """Print a rig as TOML, each key with its meaning."""
     from factorgraph_loc.api.lookups import sources_of_rigs
     from factorgraph_loc.files.models import nearest
-    from factorgraph_loc.io.native.rig_file import read_rig
-    from factorgraph_loc.io.native.rig_text import rig_text
+    from factorgraph_loc.io.native.rig_file import read_rig, rig_text
 
     known = sources_of_rigs()
     if name not in known and not name.endswith(".toml"):
@@ -72,7 +71,7 @@ def new(
 ) -> None:
     """Write the rig of a robot with some sensors, with comments. At a terminal, options that are not given are asked for."""
     from factorgraph_loc.api.lookups import write_new_rig
-    from factorgraph_loc.io.native.new_rig import RobotOptions, new_rig
+    from factorgraph_loc.io.native.rig_file import RobotOptions, new_rig
 
     asks = not json and sys.stdin.isatty() and sys.stderr.isatty()
     robot = RobotOptions(

@@ -6,7 +6,7 @@ import polars as pl
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.columns import LATEST
-from factorgraph_loc.files.parquet import parse_parquet
+from factorgraph_loc.files.tables import parse_parquet
 
 NAME = "estimates.parquet"
 TEXTS, STAMP = ("kind", "status"), "t_ns"

@@ -13,7 +13,7 @@ from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.store import Store, StoreError
 from factorgraph_loc.files.bounded import kind
 from factorgraph_loc.files.models import replacing
-from factorgraph_loc.files.parquet import read_parquet
+from factorgraph_loc.files.tables import read_parquet
 
 INDEX = "results.parquet"
 SWEEP = "sweep."

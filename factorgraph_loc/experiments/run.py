@@ -21,7 +21,7 @@ from factorgraph_loc.experiments.prior import KNOWN, at_origin, resolve_prior
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, SpaceEstimator, finds_heading
 from factorgraph_loc.fusion.guarded import Guard, sound, sound_space, sound_trajectory
-from factorgraph_loc.io.readers.bounds import require_bounds, require_one_span
+from factorgraph_loc.io.checks import require_bounds, require_one_span
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PoseEstimate, PosePrior
 from factorgraph_loc.model.log import Log

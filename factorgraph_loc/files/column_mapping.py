@@ -19,8 +19,8 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.columns import LATEST, Column, require_span
-from factorgraph_loc.files.csv_cells import Cells
 from factorgraph_loc.files.models import FileModel, nearest, parse_json, read_text
+from factorgraph_loc.files.tables import Cells
 from factorgraph_loc.text import listed, quoted, told, well_formed
 from factors.se2 import Array
 

@@ -1,5 +1,8 @@
-"""The tables of the native format: CSV with a header, or Parquet with the same columns."""
+"""The tables of the native format: CSV with a header, or Parquet with the same columns, whose declared sizes are checked before
+polars unpacks them."""
 
+import csv
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,13 +12,119 @@ import numpy as np
 import polars as pl
 
 from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import parquet_pages
+from factorgraph_loc.files.bounded import DATA, foreign, read_bytes, require_size
 from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table
-from factorgraph_loc.files.csv_cells import Shape, read_cells, shape_of
-from factorgraph_loc.files.parquet import read_parquet, text_column
+from factorgraph_loc.files.models import nearest, read_text
+from factorgraph_loc.files.quiet import quiet
+from factorgraph_loc.text import told
 from factors.se2 import Array, Integers
 
+Shape = tuple[str, ...]  # the names of columns
 NUMBERS, NAMES = ("number", "whole"), ("name", "file")  # kinds of columns
 KINDS = {"stamp": pl.Int64, "whole": pl.Int64, "number": pl.Float64, "name": pl.String, "file": pl.String}
+
+
+@dataclass(frozen=True)
+class Cells:
+    """N rows of a CSV: ``rows``: N line numbers in ``path``; ``columns``: N cells by name."""
+
+    path: Path
+    rows: Sequence[int]
+    columns: Mapping[str, Sequence[str]]
+
+    def numbers(self, name: str, column: Column, unit: str | float = 1.0) -> Array:
+        """The numbers (N,) of a column, converted from ``unit`` to that of ``column``. An empty cell is NaN.
+
+        InputError at the first cell that is no number, not finite, or outside of the column's bounds.
+        """
+        cells = self.columns[name]
+        try:
+            values = np.array([float(cell) if cell else np.nan for cell in cells])
+        except ValueError:
+            i = next(i for i, cell in enumerate(cells) if cell and not _is_number(cell))
+            raise bad_field(self.path, name, cells[i], "a number", row=self.rows[i]) from None
+        if written := [i for i in np.flatnonzero(~np.isfinite(values)).tolist() if cells[i]]:
+            raise bad_field(self.path, name, cells[written[0]], "a finite number", row=self.rows[written[0]])
+        told, factor = column.in_unit(unit)
+        if not column.may_lack and "" in cells:
+            raise bad_field(self.path, name, "", told.expected, row=self.rows[list(cells).index("")])
+        told.require(self.path, self.rows, values, name)
+        return values if factor == 1.0 else values * factor
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def read_cells(path: Path, shapes: Sequence[Shape]) -> tuple[Cells, Shape]:
+    """The cells of a CSV, and the first of ``shapes`` whose columns it has. InputError names file and row of invalid content."""
+    rows: list[int] = []
+    cells: list[list[str]] = []
+    reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
+    try:
+        header = [name.strip() for name in next(reader, [])]
+        if not any(header):
+            raise InputError(f"{path}: is empty, expected a header {' or '.join(','.join(s) for s in shapes)}")
+        shape = shape_of(path, header, shapes)
+        for parts in reader:
+            if len(parts) <= 1 and not "".join(parts).strip():
+                continue
+            if len(parts) != len(header):
+                expected = f"{len(header)} values: {','.join(header)}"
+                raise bad_field(path, "row", ",".join(parts), expected, row=reader.line_num)
+            rows.append(reader.line_num)
+            cells.append(parts)
+    except csv.Error as error:
+        raise InputError(f"{path}:{reader.line_num}: is not CSV: {told(error)}") from error
+    columns = [[parts[i] for parts in cells] for i in range(len(header))]
+    return Cells(path, rows, dict(zip(header, columns, strict=True))), shape
+
+
+def shape_of(path: Path, header: Sequence[str], shapes: Sequence[Shape]) -> Shape:
+    """The one of ``shapes`` with most columns in ``header``, the first one if several have all.
+
+    InputError if a column is missing: the best match is what was intended, even if a smaller shape is complete.
+    """
+    if len(set(header)) < len(header):
+        raise bad_field(path, "header", ",".join(header), "each column once", row=1)
+    meant = max(shapes, key=lambda shape: (len(set(shape) & set(header)), set(shape) <= set(header)))
+    if set(meant) <= set(header):
+        return meant
+    missing = next(column for column in meant if column not in header)
+    hint = nearest(missing, [column for column in header if column not in meant])
+    expected = " or ".join(",".join(shape) for shape in shapes)
+    raise InputError(f"{path}:1: column {missing} is missing{hint if 'mean' in hint else ''}, expected {expected}")
+
+
+def read_parquet(path: Path) -> pl.DataFrame:
+    """The table in a Parquet file; InputError if it is invalid or too large."""
+    return parse_parquet(read_bytes(path, DATA), path)
+
+
+def parse_parquet(content: bytes, source: object, columns: Sequence[str] | None = None) -> pl.DataFrame:
+    """The table, or some ``columns`` of it, in the bytes of a Parquet file; InputError as in :func:`read_parquet`."""
+    with foreign(source, "is not a Parquet file that can be read"), quiet():
+        parquet_pages.check(content, source)
+        return pl.read_parquet(io.BytesIO(content), columns=None if columns is None else list(columns))
+
+
+def text_column(table: pl.DataFrame, name: str, source: object) -> list[str]:
+    """A column of texts or integers as texts, "" for null; InputError if it has another type."""
+    column = table[name]
+    kind = column.dtype
+    if not (kind in (pl.String, pl.Null, pl.Categorical) or kind.is_integer() or isinstance(kind, pl.Enum)):
+        raise InputError(f"{source}: {name} is of type {kind}, expected texts")
+    with foreign(source, f"{name} is no column of texts"):
+        found = column.cast(pl.String)
+        if len(found) * found.estimated_size() > DATA:  # one long text may be referenced many times
+            length = int(found.str.len_bytes().sum())
+            require_size(source, f"the length of all texts of {name}", length, DATA)
+        return [text or "" for text in found.to_list()]
 
 
 @dataclass(frozen=True)

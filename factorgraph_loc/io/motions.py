@@ -1,7 +1,12 @@
-"""Motion between odometry poses or encoder counts, both of which may be reset during a log."""
+"""Motion between odometry poses or encoder counts, both of which may be reset during a log; radius and track of wheels."""
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.odometry.settings import DifferentialDrive, OdometrySettings
 from factors import se2
 from factors.se2 import Array, Integers
 
@@ -10,6 +15,7 @@ SPEED, TURN, FASTER = 1.0, 2.0, 3.0
 NEAR, ZERO = 0.05, 1e-6  # m: from the origin after a reset of odometry; and tolerance of zeros
 HELD = 1.0  # s for which the previous motion is continued across a reset
 COUNTERS = (2**8, 2**16, 2**32)  # ranges of encoders that wrap to 0
+TURNS, WAYS = {"left_angle", "left_rate"}, {"left", "left_speed"}  # columns of a mapped table
 
 
 def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[str]) -> Array:
@@ -98,3 +104,34 @@ def _tell(source: object, t_ns: Integers, anew: Integers, warnings: list[str]) -
         warnings.append(
             f"{source}: the odometry is reset{times} {at:.1f} s after its start: the previous motion is continued there"
         )
+
+
+def with_wheels_of(rig: Rig | None, options: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The options of a reader with radius and track of the rig, where they tell of wheels and the rig knows these."""
+    drive = None if rig is None else rig.of(OdometrySettings).wheels
+    told = options.get("odometry")
+    if drive is None or not isinstance(told, Mapping):
+        return options
+    known = drive.model_dump(exclude_none=True)
+    if isinstance(wheels := told.get("wheels"), Mapping):
+        return {**options, "odometry": {**told, "wheels": {**wheels, **_needed(known, wheels.get("unit") != "m")}}}
+    if isinstance(columns := told.get("columns"), Mapping) and (TURNS | WAYS) & columns.keys():
+        return {**options, "odometry": {**told, **_needed(known, bool(TURNS & columns.keys()))}}
+    return options
+
+
+def _needed(known: Mapping[str, Any], turns: bool) -> dict[str, Any]:
+    return {name: value for name, value in known.items() if turns or name != "radius"}
+
+
+def with_wheels_in(rig: Rig, options: Mapping[str, Any]) -> Rig:
+    """The rig with the wheels that valid options tell of, if it has none."""
+    told = options.get("odometry")
+    settings = rig.of(OdometrySettings)
+    if settings.wheels is not None or not isinstance(told, Mapping):
+        return rig
+    sizes = told.get("wheels") or told
+    if sizes.get("track") is None:
+        return rig
+    drive = DifferentialDrive(radius=sizes.get("radius"), track=sizes["track"])
+    return rig.model_copy(update={"odometry": settings.model_copy(update={"wheels": drive})})

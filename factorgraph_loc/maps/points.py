@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.columns import POINTS
 from factorgraph_loc.files.models import replacing
-from factorgraph_loc.files.parquet import read_parquet, text_column
+from factorgraph_loc.files.tables import read_parquet, text_column
 from factorgraph_loc.text import listed
 from factors.se2 import Array
 

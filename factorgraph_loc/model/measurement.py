@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError
 from factors.se2 import Array
 
+SEEN = 2  # rank of exteroceptive streams; motion has lower ranks
+
 
 class Measurement(Protocol):
     """A measurement at ``t`` [s], the time of the event with the clock offset applied.
@@ -84,9 +86,6 @@ class Rows:
     def singly(self) -> Iterator[Measurement]:
         """Each as a measurement of its own."""
         return map(self.kind, self.times.tolist(), *(values.tolist() for values in self.values))
-
-
-SEEN = 2  # rank of exteroceptive streams; motion has lower ranks
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,14 @@ if TYPE_CHECKING:
 
 
 KITTI = ".kitti"
+COVARIANCES = {  # columns of tables: entries of a covariance of (x, y, heading)
+    "cov_xx": (0, 0),
+    "cov_xy": (0, 1),
+    "cov_xh": (0, 2),
+    "cov_yy": (1, 1),
+    "cov_yh": (1, 2),
+    "cov_hh": (2, 2),
+}
 
 
 class Exchange:
@@ -155,16 +163,6 @@ def require_times(name: str, t: Array | Integers) -> None:
         i = int(stuck[0]) + 1
         unit = "ns" if np.issubdtype(t.dtype, np.integer) else "s"
         raise InputError(f"{name}: pose {i + 1} has the time {t[i]} {unit}, expected one after that of the pose before")
-
-
-COVARIANCES = {  # columns of tables: entries of a covariance of (x, y, heading)
-    "cov_xx": (0, 0),
-    "cov_xy": (0, 1),
-    "cov_xh": (0, 2),
-    "cov_yy": (1, 1),
-    "cov_yh": (1, 2),
-    "cov_hh": (2, 2),
-}
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,8 @@ from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.trajectory import Exchange, Trajectory, averaged, decimal_seconds, neighbours
 from factors.se2 import Array, Integers
 
+_FLAT = 1e-9  # m and sines within which poses are planar
+
 
 @dataclass(frozen=True)
 class Trajectory3(Exchange):
@@ -96,9 +98,6 @@ class Trajectory3(Exchange):
             numbers = [*(f"{value:.9f}" for value in place), *(f"{value:.12f}" for value in turn)]
             rows.append(f"{decimal_seconds(t, t0_ns)} {' '.join(numbers)}\n")
         write_text(path, "".join(rows))
-
-
-_FLAT = 1e-9  # m and sines within which poses are planar
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import write_toml
-from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.io.readers import load
-from factorgraph_loc.io.readers.space_poses import read_kitti
+from factorgraph_loc.io.readers.pose_file import read_kitti
 from factorgraph_loc.io.write import write_log
 from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.measurement import Stream

@@ -12,7 +12,7 @@ import pytest
 from factorgraph_loc import read_rig
 from factorgraph_loc.cli import completion
 from factorgraph_loc.files.models import parse_model, parse_toml
-from factorgraph_loc.io.native.rig_text import rig_text
+from factorgraph_loc.io.native.rig_file import rig_text
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.rfid.settings import rackham
 from factorgraph_loc.simulation import PRESETS, preset

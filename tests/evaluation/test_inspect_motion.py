@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.evaluation.inspect import inspect
-from factorgraph_loc.io.look_over import look_over
+from factorgraph_loc.io.checks import look_over
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import selected
 from factorgraph_loc.model.rig import Rig

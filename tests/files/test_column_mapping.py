@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.column_mapping import SECONDS, ColumnMapping, Mapped, iso_nanoseconds, read_mapped
 from factorgraph_loc.files.columns import POSES
-from factorgraph_loc.files.csv_cells import Cells
+from factorgraph_loc.files.tables import Cells
 from factorgraph_loc.sensors.rfid.columns import TAGS
 
 STAMPS = st.integers(-(2**61), 2**61)

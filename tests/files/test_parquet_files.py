@@ -6,8 +6,8 @@ import polars as pl
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import parquet, parquet_pages
-from factorgraph_loc.files.parquet import parse_parquet, text_column
+from factorgraph_loc.files import parquet_pages, tables
+from factorgraph_loc.files.tables import parse_parquet, text_column
 
 
 def table(rows: int = 2000) -> pl.DataFrame:
@@ -94,7 +94,7 @@ def test_texts_may_be_numbers_and_categories_but_no_lists():
 
 
 def test_a_long_text_that_is_referred_to_very_often_is_refused(monkeypatch):
-    monkeypatch.setattr(parquet, "DATA", parquet.DATA // 100)
+    monkeypatch.setattr(tables, "DATA", tables.DATA // 100)
     whole = content(pl.DataFrame({"x": pl.Series(["a" * 100_000]).repeat_by(200).explode()}))
     assert len(whole) < 200_000
     with pytest.raises(InputError, match=r"the length of all texts of x is 20,000,000, expected at most"):

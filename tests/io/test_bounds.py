@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.columns import LATEST, STAMP
+from factorgraph_loc.io.checks import require_bounds, require_one_span
 from factorgraph_loc.io.readers import load
-from factorgraph_loc.io.readers.bounds import require_bounds, require_one_span
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.sensors.camera.columns import SIGHTINGS
 from factorgraph_loc.sensors.landmarks.columns import BEARING_RANGE

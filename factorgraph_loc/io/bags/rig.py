@@ -8,7 +8,7 @@ import numpy as np
 from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.io.bags.camera import Info
 from factorgraph_loc.io.bags.frames import StaticFrames
-from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings

@@ -13,8 +13,7 @@ from factorgraph_loc.files.columns import require_span
 from factorgraph_loc.files.models import FileModel, file_name, inside, parse_model, read_toml, write_toml
 from factorgraph_loc.files.tables import TableRows, read_table, write_table
 from factorgraph_loc.files.temporary import sweep, temporary_folder
-from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
-from factorgraph_loc.io.native.rig_file import read_rig, write_rig
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig, write_rig
 from factorgraph_loc.io.native.world_file import parse_world, read_world, write_world
 from factorgraph_loc.io.readers.manifests import StartSettings
 from factorgraph_loc.maps.points import POINTS_SUFFIX

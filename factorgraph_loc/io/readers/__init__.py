@@ -9,7 +9,6 @@ __all__ = [
     "READERS",
     "Dataset",
     "Manifest",
-    "bounds",
     "describe",
     "euroc",
     "kitti_odometry",

@@ -15,7 +15,7 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.models import FileModel, inside, parse_model
 from factorgraph_loc.files.yaml import read_yaml
-from factorgraph_loc.io.readers.space_poses import ORTHONORMAL, later, read_image_list, read_poses
+from factorgraph_loc.io.readers.pose_file import ORTHONORMAL, later, read_image_list, read_poses
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World

@@ -15,7 +15,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.images import size_of_file
 from factorgraph_loc.files.models import FileModel, inside, parse_model, read_text
 from factorgraph_loc.files.tables import TableRows
-from factorgraph_loc.io.readers.space_poses import later, read_kitti, read_times
+from factorgraph_loc.io.readers.pose_file import later, read_kitti, read_times
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World

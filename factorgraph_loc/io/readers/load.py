@@ -1,4 +1,4 @@
-"""Loading of logs by manifest, native folder, shipped name, or path and reader."""
+"""The registry of readers: modules with a model of ``Options`` and a function ``read(path, options)``."""
 
 import itertools
 import math
@@ -12,16 +12,14 @@ from factorgraph_loc.files.bounded import kind
 from factorgraph_loc.files.column_mapping import JSON_SUFFIXES
 from factorgraph_loc.files.models import inside, nearest, parse_model, read_toml
 from factorgraph_loc.files.shipped import manifests
-from factorgraph_loc.io import look_over
 from factorgraph_loc.io.bags.file import is_bag, require_metadata
-from factorgraph_loc.io.native import default_rig
-from factorgraph_loc.io.native.rig_file import read_rig
+from factorgraph_loc.io.checks import look_over, require_bounds
+from factorgraph_loc.io.motions import with_wheels_in, with_wheels_of
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig
 from factorgraph_loc.io.native.world_file import read_world
 from factorgraph_loc.io.readers import registry as readers
-from factorgraph_loc.io.readers.bounds import require_bounds
 from factorgraph_loc.io.readers.manifests import Manifest, StartSettings, find_data_root, read_manifest
 from factorgraph_loc.io.readers.pose_file import is_pose_file
-from factorgraph_loc.io.readers.wheels import with_wheels_in, with_wheels_of
 from factorgraph_loc.maps.markers import MarkerSettings
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -212,11 +210,11 @@ def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log
         log = with_markers(log, source.markers.family)
     warnings = list(log.warnings)
     if "imu" in log.streams and "imu" not in log.rig.sensors:
-        if log.rig is default_rig.DEFAULT_RIG:
+        if log.rig is DEFAULT_RIG:
             log = replace(log, rig=log.rig.model_copy(update={"sensors": (*log.rig.sensors, "imu")}))
         else:
             warnings.append("the gyro is not used, because the rig's sensors do not include imu")
-    if log.rig.name == default_rig.DEFAULT_RIG.name:
+    if log.rig.name == DEFAULT_RIG.name:
         warnings.append("no rig is given: the default rig does not have this robot's noise and mounting")
     log = replace(log, rig=with_wheels_in(log.rig, options))
-    return replace(log, warnings=tuple(map(one_line, (*warnings, *look_over.look_over(log)))))
+    return replace(log, warnings=tuple(map(one_line, (*warnings, *look_over(log)))))

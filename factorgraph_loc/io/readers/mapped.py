@@ -13,7 +13,7 @@ from factorgraph_loc.files.columns import Table
 from factorgraph_loc.files.models import FileModel, add_fields, inside
 from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
 from factorgraph_loc.io.native import native
-from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.io.readers.mapped_poses import (
     OdometryFile,
     Offset,

@@ -13,7 +13,7 @@ from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.readers import euroc
-from factorgraph_loc.io.readers.space_poses import read_kitti, read_poses
+from factorgraph_loc.io.readers.pose_file import read_kitti, read_poses
 from factorgraph_loc.io.readers.unread import Unread
 from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows

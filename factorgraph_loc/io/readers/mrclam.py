@@ -12,8 +12,8 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, inside, parse_model
-from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
-from factorgraph_loc.io.readers.columns import read_columns
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
+from factorgraph_loc.io.readers.pose_file import read_columns
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.trajectory import Trajectory

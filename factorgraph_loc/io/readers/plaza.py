@@ -10,7 +10,7 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, parse_model
-from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.io.readers.matlab import read_matlab
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory

@@ -1,21 +1,154 @@
-"""Files of poses alone: TUM, KITTI and EuRoC, told apart by their first row."""
+"""Files of poses: numbers in whitespace-separated columns, quaternions in TUM and EuRoC files, 3x4 matrices in KITTI's, told apart
+by their first row; and lists of images."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
+from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
+from factorgraph_loc.files.columns import POSES
 from factorgraph_loc.files.models import read_text
+from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.io.readers import euroc, tum_rgbd
-from factorgraph_loc.io.readers.space_poses import MATRIX, read_matrices, read_poses
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.trajectory import read_tum_rows
-from factorgraph_loc.model.trajectory3 import PosePath
+from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3
+from factors.camera import model as reprojection
+from factors.se2 import Array, Integers
 
+ORTHONORMAL = 2e-3  # tolerance of rotation matrices: KITTI's have seven digits
+MATRIX = tuple(f"{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
 Format = Literal["tum", "kitti", "euroc"]
 EXPECTED = (
     "8 values (TUM: t x y z qx qy qz qw), 12 (KITTI), or 8 or more with commas (EuRoC: t, x, y, z, qw, qx, qy, qz)"
 )
+
+
+def read_columns(path: Path, fields: Sequence[str]) -> tuple[Array, Integers]:
+    """The finite numbers (N, K) of a file with K ``fields``, and line numbers (N,).
+
+    Blank lines and lines that begin with ``#`` are skipped. InputError names file, row and field of an invalid value; an empty file
+    is invalid.
+    """
+    text = read_text(path)
+    if not text.strip():
+        raise InputError(f"{path}: is empty, expected rows of {', '.join(fields)}")
+    numbered = [
+        (row, line)
+        for row, line in enumerate(text.split("\n"), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    rows = np.array([row for row, _ in numbered], dtype=np.int64)
+    if not numbered:
+        return np.empty((0, len(fields))), rows
+    try:
+        table = np.loadtxt([line for _, line in numbered], dtype=float, comments=None, ndmin=2)
+    except ValueError:
+        table = None
+    if table is None or table.shape[1] != len(fields):
+        raise first_fault(path, fields, numbered)
+    for i, field in enumerate(fields):
+        checks.require_finite(path, rows, field, table[:, i])
+    return table, rows
+
+
+def first_fault(path: Path, fields: Sequence[str], numbered: Sequence[tuple[int, str]]) -> InputError:
+    """The error for the first line that does not consist of one number per field."""
+    for row, line in numbered:
+        parts = line.split()
+        if len(parts) != len(fields):
+            return bad_field(path, "row", line.strip(), f"{len(fields)} values: {', '.join(fields)}", row=row)
+        for field, part in zip(fields, parts, strict=True):
+            try:
+                float(part)
+            except ValueError:
+                return bad_field(path, field, part, "a number", row=row)
+    return InputError(f"{path}: cannot be read as rows of {', '.join(fields)}")
+
+
+def read_kitti(path: Path, times: Path) -> tuple[Integers, Integers, Trajectory3]:
+    """Rows (N,), timestamps (N,) [ns] and poses of a KITTI odometry file, whose timestamps are the lines of ``times``.
+
+    The file's poses are those of a camera with z forward and y down, in the frame of the first one (Geiger, Lenz, Urtasun, "Are we
+    ready for autonomous driving?", CVPR 2012). They are converted to x forward and z up. InputError names file and row.
+    """
+    rows, matrices = read_matrices(path)
+    t_ns = stamps_of(path, len(rows), times)
+    u, _, vt = np.linalg.svd(matrices[:, :, :3])
+    ahead = reprojection.FORWARD
+    return rows, t_ns, Trajectory3((t_ns - t_ns[0]) / 1e9, matrices[:, :, 3] @ ahead.T, ahead @ (u @ vt) @ ahead.T)
+
+
+def stamps_of(path: Path, count: int, times: Path) -> Integers:
+    """The timestamps (N,) [ns] of the ``count`` poses of ``path``, the first lines of ``times``; InputError if it has fewer."""
+    stamps = read_times(times)
+    if len(stamps) < count:
+        raise bad_field(times, "number of rows", len(stamps), f"at least {count}, one for each pose of {path.name}")
+    return stamps[:count]
+
+
+def read_matrices(path: Path) -> tuple[Integers, Array]:
+    """Rows (N,) and poses (N, 3, 4), rotation and position, of a file in KITTI's format, as they are written. InputError names
+    file and row."""
+    table, rows = read_columns(path, MATRIX)
+    if not len(table):
+        raise InputError(f"{path}: contains no poses")
+    matrices = table.reshape(-1, 3, 4)
+    rotations = matrices[:, :, :3]
+    off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
+    bad = np.flatnonzero((off > ORTHONORMAL) | (np.linalg.det(rotations) < 0.0))
+    if len(bad):
+        i = int(bad[0])
+        raise bad_field(path, "rotation", rotations[i].tolist(), "an orthonormal matrix", row=int(rows[i]))
+    return rows, matrices
+
+
+def read_times(path: Path) -> Integers:
+    """The timestamps (N,) [ns] of a file with one per line, in seconds; InputError if they do not increase."""
+    columns = ColumnMapping(file=path.name, columns={"t": "1"}, units={"t": "s"}, separator=" ", header=False)
+    mapped = read_mapped(path, columns, (("t",),))
+    t_ns = mapped.stamps("t")
+    stuck = np.flatnonzero(np.diff(t_ns) <= 0) + 1
+    if len(stuck):
+        i = int(stuck[0])
+        expected = f"a timestamp after that of the row before, {int(t_ns[i - 1])} ns"
+        raise bad_field(path, "time", f"{int(t_ns[i])} ns", expected, row=int(mapped.rows[i]))
+    return t_ns
+
+
+def read_poses(
+    path: Path, columns: Sequence[str], *, unit: str, separator: Literal[",", " "], warnings: list[str]
+) -> tuple[Integers, Trajectory3]:
+    """Timestamps (N,) [ns] and poses, in seconds after the first, of a file with ``columns`` t, x, y, z, qx, qy, qz, qw in any
+    order; the last one of equal timestamps. InputError names file and row."""
+    named = {name: str(i) for i, name in enumerate(columns, start=1)}
+    told = ColumnMapping(file=path.name, columns=named, units={"t": unit}, separator=separator, header=False)
+    mapped = read_mapped(path, told, (tuple(columns),))
+    numbers = {name: mapped.numbers(name, POSES[name]) for name in columns if name != "t"}
+    t_ns = mapped.stamps("t")
+    rotations = rotations_of(path, mapped.rows, np.column_stack([numbers[name] for name in ("qx", "qy", "qz", "qw")]))
+    positions = np.column_stack([numbers[name] for name in "xyz"])
+    keep = checks.in_order(path, mapped.rows, t_ns, warnings)
+    t_ns = t_ns[keep]
+    return t_ns, Trajectory3((t_ns - t_ns[0]) / 1e9, positions[keep], rotations[keep])
+
+
+def read_image_list(path: Path, *, unit: str, separator: Literal[",", " "]) -> TableRows:
+    """The timestamps and names of images, as the table ``camera`` of the native format."""
+    columns = {"t": "1", "file": "2"}
+    told = ColumnMapping(file=path.name, columns=columns, units={"t": unit}, separator=separator, header=False)
+    mapped = read_mapped(path, told, (("t", "file"),))
+    return TableRows(path, mapped.rows, mapped.stamps("t"), {}, {"file": list(mapped.texts("file"))})
+
+
+def later(trajectory: Trajectory3, t_ns: Integers, t0_ns: int) -> Trajectory3:
+    """The trajectory with timestamps ``t_ns`` (N,), in seconds after ``t0_ns``."""
+    return replace(trajectory, t=checks.seconds(t_ns, t0_ns))
 
 
 def read_pose_file(path: Path) -> PosePath:

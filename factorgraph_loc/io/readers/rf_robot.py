@@ -15,10 +15,10 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.columns import require_span
-from factorgraph_loc.files.csv_cells import read_cells
 from factorgraph_loc.files.models import FileModel, inside, parse_model, read_text
-from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
-from factorgraph_loc.io.readers.columns import read_columns
+from factorgraph_loc.files.tables import read_cells
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
+from factorgraph_loc.io.readers.pose_file import read_columns
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World

@@ -14,10 +14,9 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import inside
 from factorgraph_loc.io import motions
-from factorgraph_loc.io.native.default_rig import DEFAULT_RIG
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.io.readers.mapped_poses import after_rest
-from factorgraph_loc.io.readers.pose_file import read_pose_file
-from factorgraph_loc.io.readers.space_poses import stamps_of
+from factorgraph_loc.io.readers.pose_file import read_pose_file, stamps_of
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.planar import RISE, TILT, Turned, on_floor
 from factorgraph_loc.model.rig import Rig

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, inside
-from factorgraph_loc.io.readers.space_poses import later, read_image_list, read_poses
+from factorgraph_loc.io.readers.pose_file import later, read_image_list, read_poses
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World

@@ -11,8 +11,8 @@ from pydantic import Field
 
 from factorgraph_loc.errors import bad_field
 from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, in_case, read_mapped
-from factorgraph_loc.files.csv_cells import read_cells
 from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, inside, parse_model, write_text
+from factorgraph_loc.files.tables import read_cells
 from factorgraph_loc.model.settings import Covariance, spread_of
 from factorgraph_loc.sensors.rfid.columns import TAGS
 from factors.se2 import Array

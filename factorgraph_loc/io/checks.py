@@ -1,4 +1,4 @@
-"""Bounds of columns and time span that every log must satisfy.
+"""Checks of whole logs: bounds of columns and time span that every log must satisfy, and warnings.
 
 Readers check what they can attribute to a file and row; values computed from several rows or foreign formats are checked here.
 """
@@ -9,13 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.checks import ROUNDING
 from factorgraph_loc.files.columns import MAX_SPAN, POSES, Column
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
 from factorgraph_loc.sensors.registry import channels
 from factorgraph_loc.sensors.tables import columns_of
 from factors.se2 import Array
 
-ROUNDING = 1e-9  # relative tolerance for converted values
+MAX_ODOMETRY_GAP = 5.0  # s
+TOLERANCE = 1e-9  # relative tolerance for converted values
 
 
 def require_bounds(log: Log) -> None:
@@ -38,7 +41,7 @@ def require_bounds(log: Log) -> None:
 def _require(where: str, column: Column, t: Array, values: Array) -> None:
     """InputError at the first row of ``values`` (N,) or (N, 3) that is out of bounds by more than rounding; ``t`` (N,): its
     time."""
-    low, high = column.low - ROUNDING * abs(column.low), column.high + ROUNDING * abs(column.high)
+    low, high = column.low - TOLERANCE * abs(column.low), column.high + TOLERANCE * abs(column.high)
     bad = replace(column, low=low, high=high).outside(values)
     if bad.any():
         i = int(np.argmax(bad.reshape(len(t), -1).any(axis=1)))
@@ -68,3 +71,32 @@ def require_one_span(log: Log) -> None:
         raise InputError(
             f"{log.name}: the start is at {log.start.t:.0f} s after the first timestamp, expected {expected}"
         )
+
+
+def look_over(log: Log) -> list[str]:
+    """Warnings about a whole log; InputError if it has no odometry, which only a hand-held camera and a bare trajectory lack."""
+    odometry = log.streams.get("odometry")
+    if odometry is None and (log.reference3 is not None or (log.reference is not None and not log.streams)):
+        return []
+    if odometry is None or len(odometry.t) == 0:
+        raise InputError(f"{log.name}: has no odometry, which every estimator needs")
+    warnings = []
+    gaps = np.diff(odometry.t)
+    wide = np.flatnonzero(gaps > MAX_ODOMETRY_GAP + ROUNDING)
+    if len(wide):
+        i = int(np.argmax(gaps))
+        count = "a gap" if len(wide) == 1 else f"{len(wide)} gaps"
+        warnings.append(
+            f"odometry: {count} above {MAX_ODOMETRY_GAP:g} s, the longest {gaps[i]:.1f} s at t = {odometry.t[i]:.3f} s"
+        )
+    for name, stream in log.streams.items():
+        if name != "odometry" and (early := int(np.count_nonzero(stream.t < odometry.t[0]))):
+            warnings.append(f"{name}: {early} rows come before the first odometry")
+    sightings = log.streams.get("bearing_range")
+    if isinstance(sightings, BearingRangeStream):
+        unknown = [name for name in sightings.landmark if name not in log.world.landmarks]
+        if unknown:
+            names = sorted(set(unknown))
+            shown = ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+            warnings.append(f"bearing_range: {len(unknown)} rows name landmarks that the map lacks: {shown}")
+    return warnings
