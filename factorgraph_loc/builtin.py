@@ -49,9 +49,9 @@ FILES.update(
         "write_world": "factorgraph_loc.io.native.world_file:write_world",
         "read_trajectory": "factorgraph_loc.io.trajectories:read_trajectory",
         "write_kitti": "factorgraph_loc.exports.trajectories:write_kitti",
-        "to_evo": "factorgraph_loc.io.exchange:to_evo",
-        "from_evo": "factorgraph_loc.io.exchange:from_evo",
-        "to_ros": "factorgraph_loc.io.exchange:to_ros",
-        "from_ros": "factorgraph_loc.io.exchange:from_ros",
+        "to_evo": "factorgraph_loc.io.trajectories:to_evo",
+        "from_evo": "factorgraph_loc.io.trajectories:from_evo",
+        "to_ros": "factorgraph_loc.io.trajectories:to_ros",
+        "from_ros": "factorgraph_loc.io.trajectories:from_ros",
     }
 )

@@ -2,7 +2,6 @@
 
 __all__ = [
     "active",
-    "active_figures",
     "alignment",
     "estimates_file",
     "features",
@@ -10,7 +9,6 @@ __all__ = [
     "inference",
     "inspect",
     "metrics",
-    "paired",
     "pairing",
     "plots",
     "report",

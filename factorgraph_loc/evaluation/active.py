@@ -1,17 +1,25 @@
 """Summaries and paired comparisons of active localization runs, policy by policy on the same seeds.
 
-A run that failed or did not end localized counts with an infinite distance.
-"""
+A run that failed or did not end localized counts with an infinite distance."""
+
+from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from factorgraph_loc.evaluation.paired import Interval, mcnemar, median_difference, median_ratio, quantile
+from factorgraph_loc.drawing.figures import COLOURS, dress, empty, grid, lay_out, legend, styles
+from factorgraph_loc.evaluation.statistics import Interval, mcnemar, median_difference, median_ratio, quantile
 from factorgraph_loc.fitting.shares import wilson
+from factorgraph_loc.model.world import World
 from factors.se2 import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Row = Mapping[str, Any]
 Case = tuple[str, str]  # world, estimator
@@ -25,6 +33,9 @@ DIFFERENCES: dict[str, type] = {
     "p": float,
 }
 NEVER = "never"
+SHOWN = 6  # decisions of a run that are plotted
+COLUMNS = 3
+ARROW = 0.7  # m
 
 
 def cases(rows: Sequence[Row]) -> list[Case]:
@@ -167,3 +178,143 @@ def _text(value: float, digits: int) -> str:
 def _median(rows: Sequence[Row], key: str) -> float:
     known = [row[key] for row in rows if row[key] is not None]
     return float(np.median(known)) if known else math.nan
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The state at a choice after ``metres`` [m]: the true ``pose`` (3,), the belief as equally weighted ``particles`` (M, 3),
+    and from that pose the ``candidates`` (S, 3), and the ``chosen`` one (S, 3) if any."""
+
+    metres: float
+    pose: Array
+    particles: Array
+    candidates: Sequence[Array]
+    chosen: Array | None
+
+    @property
+    def spread(self) -> float:
+        """Root of the sum of the belief's variances in x and y [m]."""
+        return float(np.sqrt(np.sum(np.var(self.particles[:, :2], axis=0))))
+
+
+@dataclass(frozen=True)
+class SeekingTrack:
+    """One run: its ``world``, the true poses ``truth`` (N, 3), and the decisions. It ended after ``metres`` [m]."""
+
+    title: str
+    world: World
+    truth: Array
+    metres: float
+    decisions: Sequence[Decision]
+
+
+def comparison(rows: Sequence[Row]) -> Figure:
+    """For each world and estimator: a box plot per policy, and the fraction of runs localized over distance."""
+    found = cases(rows)
+    seeds = len({row["seed"] for row in rows})
+    figure, axes = grid(len(found), 2, 4.2 * len(found) + 1.0, f"metres driven until localized, {seeds} runs of each")
+    for (world, estimator), (boxes, shares) in zip(found, axes, strict=True):
+        for axis in (boxes, shares):
+            axis.set_title(f"{world}, {estimator}")
+        _boxes(boxes, rows, (world, estimator))
+        _shares(shares, rows, (world, estimator))
+    legend(figure, [axes[0, 1]])
+    return figure
+
+
+def run_picture(track: SeekingTrack) -> Figure:
+    """Belief, candidates and choice at some decisions of a run; and the spread of the belief over distance."""
+    chosen = np.unique(np.linspace(0, len(track.decisions) - 1, SHOWN).round().astype(int)) if track.decisions else ()
+    rows = max(math.ceil(len(chosen) / COLUMNS), 1)
+    width, depth = np.ptp(_outline(track).reshape(-1, 2), axis=0)
+    height = float(np.clip(rows * (16.0 / COLUMNS * depth / max(width, 1e-9) + 0.9), 4.0, 14.0)) + 3.5
+    figure = empty(height, track.title)
+    names: list[Any] = [[f"{COLUMNS * row + column}" for column in range(COLUMNS)] for row in range(rows)]
+    axes = figure.subplot_mosaic([*names, ["belief"] * COLUMNS], height_ratios=(*[(height - 3.5) / rows] * rows, 2.5))
+    dress(axes.values())
+    for panel in range(rows * COLUMNS):
+        axis = axes[str(panel)]
+        if panel < len(chosen):
+            _decision(axis, track, int(chosen[panel]))
+        else:
+            axis.set_axis_off()
+    driven, spread = ([getattr(one, key) for one in track.decisions] for key in ("metres", "spread"))
+    axes["belief"].semilogy(driven, np.maximum(spread, 1e-3), "o-", color=COLOURS[0], markersize=4)
+    axes["belief"].axvline(track.metres, color="0.5", linestyle="--", label="end of the run")
+    axes["belief"].set(xlabel="metres driven", ylabel="spread of the belief [m]")
+    legend(figure, axes.values())
+    lay_out(figure)
+    return figure
+
+
+def _boxes(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
+    """Box plots with a dot for each run; runs that were never localized are at the upper end, and counted."""
+    names = policies(rows)
+    top = _farthest(rows, case)
+    rng = np.random.default_rng(0)  # horizontal jitter, so that dots do not cover each other
+    for i, policy in enumerate(names):
+        driven = metres(runs_of(rows, case, policy))
+        shown = np.minimum(driven, top)
+        if len(shown):
+            style = {"color": COLOURS[i % len(COLOURS)], "linewidth": 1.6}
+            props: dict[str, Any] = {f"{part}props": style for part in ("box", "whisker", "cap", "median")}
+            axis.boxplot([shown], positions=[i], widths=0.6, showfliers=False, whis=(10, 90), **props)
+            axis.plot(i + rng.uniform(-0.2, 0.2, len(shown)), shown, ".", color="0.6", markersize=4, zorder=1)
+        never = int(np.sum(np.isinf(driven)))
+        if never:
+            text = f"{never} of {len(driven)}\nnever"
+            axis.text(i, 0.98, text, ha="center", va="top", fontsize=11, transform=axis.get_xaxis_transform())
+    axis.set_xticks(range(len(names)), names)
+    axis.set_xlim(-0.6, len(names) - 0.4)
+    axis.set_ylim(-0.02 * top, 1.25 * top)  # space for the counts
+    axis.set_ylabel("metres (box: quartiles, 10 and 90 %)")
+
+
+def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
+    longest = _farthest(rows, case)
+    for policy, style in zip(policies(rows), styles(), strict=False):
+        driven = np.sort(metres(runs_of(rows, case, policy)))
+        known = driven[np.isfinite(driven)]
+        share = np.arange(len(known) + 1) / max(len(driven), 1)
+        x = np.concatenate((np.zeros(1), known, (longest,)))
+        axis.step(x, np.append(share, share[-1]), where="post", label=policy, linewidth=2.0, **style)
+    axis.set_ylim(0.0, 1.0)
+    axis.set_xlim(0.0, longest)
+    axis.set(xlabel="metres driven", ylabel="share of runs localized")
+
+
+def _farthest(rows: Sequence[Row], case: tuple[str, str]) -> float:
+    """The largest distance of a run in this world, 1 if there is none."""
+    return max((row["metres"] or 0.0 for row in rows if (row["world"], row["estimator"]) == case), default=0.0) or 1.0
+
+
+def _decision(axis: Axes, track: SeekingTrack, index: int) -> None:
+    one = track.decisions[index]
+    for i, (x1, y1, x2, y2) in enumerate(track.world.walls):
+        axis.plot((x1, x2), (y1, y2), color="0.35", linewidth=1.0, label=None if i else "walls", zorder=1)
+    tags = np.array([(tag.x, tag.y) for tag in track.world.tags.values()]).reshape(-1, 2)
+    axis.plot(*tags.T, "s", color=COLOURS[-1], markersize=4, markerfacecolor="none", label="tags", zorder=2)
+    axis.plot(*one.particles[:, :2].T, ".", color=COLOURS[4], markersize=2, label="belief", zorder=3)
+    for i, path in enumerate(one.candidates):
+        axis.plot(*path[:, :2].T, color="0.7", linewidth=0.6, label=None if i else "candidates", zorder=2)
+    if one.chosen is not None:
+        axis.plot(*one.chosen[:, :2].T, color=COLOURS[1], linewidth=2.2, label="chosen", zorder=6)
+    x, y, heading = one.pose.tolist()
+    along = (x, x + ARROW * math.cos(heading)), (y, y + ARROW * math.sin(heading))
+    axis.plot(*along, color=COLOURS[0], linewidth=2.0, zorder=5)
+    axis.plot(x, y, "o", color=COLOURS[0], markersize=6, label="robot (true)", zorder=5)
+    driven = np.concatenate((np.zeros(1), np.cumsum(np.hypot(*np.diff(track.truth[:, :2], axis=0).T))))
+    last = index == len(track.decisions) - 1
+    so_far = track.truth if last else track.truth[driven <= one.metres + 1e-6]
+    axis.plot(*so_far[:, :2].T, color=COLOURS[0], linewidth=1.2, label="way (true)", zorder=4)
+    low, high = _outline(track).min(axis=0), _outline(track).max(axis=0)
+    axis.set_xlim(low[0] - 0.5, high[0] + 0.5)
+    axis.set_ylim(low[1] - 0.5, high[1] + 0.5)
+    axis.set_aspect("equal", adjustable="box")
+    axis.set_title(f"after {one.metres:.1f} m" + (f", way to the end at {track.metres:.1f} m" if last else ""))
+
+
+def _outline(track: SeekingTrack) -> Array:
+    """The ends (K, 2) of all walls, or the trajectory if there are none."""
+    walls = np.array(track.world.walls).reshape(-1, 2)
+    return walls if len(walls) else track.truth[:, :2]

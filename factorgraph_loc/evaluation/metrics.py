@@ -1,19 +1,15 @@
-"""Accuracy of a trajectory against the reference, and consistency of its covariances.
+"""Pieces of a path over which relative errors are taken."""
 
-There is no alignment, as the map's frame is known; for runs that estimated the map, aligned figures are added. Pairing of poses:
-:mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to
-Tracking and Navigation", 2001, section 5.4. Relative pose error: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
-systems", 2012, section IV.A, over path length instead of time.
-"""
-
-from collections.abc import Sequence
+import bisect
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.evaluation import alignment, pieces, space
+from factorgraph_loc.evaluation import alignment, space
 from factorgraph_loc.evaluation.alignment import rms
 from factorgraph_loc.evaluation.pairing import TOLERANCE, pairs, pauses
 from factorgraph_loc.evaluation.warned import WARNINGS
@@ -26,6 +22,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factors import chi_squared, positive, se2
 from factors.se2 import Array, Integers
 
+PIECE_TOLERANCE = 0.1  # by which the length of one of all pairs may differ, as a share of it
 FEWEST_SCORED = 10  # least number of poses for meaningful figures
 RPE_DISTANCE = 1.0  # m
 CONFIDENCE = 0.95
@@ -42,6 +39,46 @@ _ACCURACY = (
     "invalid_covariances",
     "scored",
 )
+
+
+def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
+    """Pieces, one after the other, as indices of first and last pose, for the ``steps`` (N - 1,) between N poses that are numbered
+    from ``first``: each ends at the first pose at which the steps since its beginning sum up to ``length`` or more."""
+    found: list[tuple[int, int]] = []
+    begin, covered = first, 0.0
+    for i, step in enumerate(steps.tolist(), start=first + 1):
+        covered += step
+        if covered >= length:
+            found.append((begin, i))
+            begin, covered = i, 0.0
+    return found
+
+
+def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
+    """The same for pieces that may overlap: from each pose to that later one whose distance is nearest to ``length``, the first of
+    several, if it differs from that by at most :data:`PIECE_TOLERANCE` of it."""
+    covered = np.concatenate(([0.0], np.cumsum(steps))).tolist()
+    found: list[tuple[int, int]] = []
+    for i, here in enumerate(covered[:-1]):
+        after = bisect.bisect_left(covered, here + length, i + 1)
+        near = [j for j in (after - 1, after) if i < j < len(covered)]
+        best = min(near, key=lambda j: abs(covered[j] - here - length))
+        best = bisect.bisect_left(covered, covered[best], i + 1)  # the first of those that stand still
+        if abs(covered[best] - here - length) <= PIECE_TOLERANCE * length:
+            found.append((first + i, first + best))
+    return found
+
+
+def between(count: int, breaks: Iterable[int]) -> list[tuple[int, int]]:
+    """The half-open ranges of ``count`` indices that are split before each of ``breaks``."""
+    bounds = [0, *sorted({b for b in breaks if 0 < b < count}), count]
+    return list(itertools.pairwise(bounds))
+
+
+def indices(pieces: list[tuple[int, int]]) -> tuple[Integers, Integers]:
+    """First and last poses (K,) of ``pieces``."""
+    begins, ends = np.array(pieces, dtype=np.int64).reshape(-1, 2).T
+    return begins, ends
 
 
 @dataclass(frozen=True)
@@ -183,8 +220,8 @@ def relative_errors(poses: Array, reference: Array, breaks: Sequence[int] | Inte
     found: list[tuple[int, int]] = []
     for start, stop in _unbroken(np.isfinite(reference[:, 0]) & np.isfinite(poses[:, 0]), breaks):
         steps = np.linalg.norm(np.diff(reference[start:stop, :2], axis=0), axis=1)
-        found += pieces.successive(steps, RPE_DISTANCE, start)
-    begins, ends = pieces.indices(found)
+        found += successive(steps, RPE_DISTANCE, start)
+    begins, ends = indices(found)
     error = se2.between(se2.between(reference[begins], reference[ends]), se2.between(poses[begins], poses[ends]))
     return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
 
@@ -194,7 +231,7 @@ def _unbroken(valid: NDArray[np.bool_], breaks: Sequence[int] | Integers) -> lis
     edges = np.flatnonzero(np.diff(np.concatenate(([False], valid, [False])).astype(int)))
     found = []
     for start, stop in edges.reshape(-1, 2).tolist():
-        found += [(start + a, start + b) for a, b in pieces.between(stop - start, (int(i) - start for i in breaks))]
+        found += [(start + a, start + b) for a, b in between(stop - start, (int(i) - start for i in breaks))]
     return found
 
 

@@ -18,8 +18,16 @@ import polars as pl
 
 from factorgraph_loc.drawing.figures import save
 from factorgraph_loc.errors import FglocError, InputError
-from factorgraph_loc.evaluation.active import DIFFERENCES, difference_cells, differences, summary_cells
-from factorgraph_loc.evaluation.active_figures import Decision, SeekingTrack, comparison, run_picture
+from factorgraph_loc.evaluation.active import (
+    DIFFERENCES,
+    Decision,
+    SeekingTrack,
+    comparison,
+    difference_cells,
+    differences,
+    run_picture,
+    summary_cells,
+)
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files.models import file_name, nearest, replacing, write_text, write_toml
 from factorgraph_loc.files.results import require_free, writing

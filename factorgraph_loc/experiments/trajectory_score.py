@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from factorgraph_loc.evaluation.trajectories.output import check_free, write_score
+from factorgraph_loc.evaluation.trajectories.page import check_free, write_score
 from factorgraph_loc.evaluation.trajectories.score import TrajectoryScore, score_paths
 from factorgraph_loc.io.trajectories import read_trajectory
 from factorgraph_loc.model.scoring import MAX_DIFF, MAX_GAP, Alignment, Association

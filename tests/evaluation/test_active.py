@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.evaluation.active import (
+    Decision,
+    SeekingTrack,
+    comparison,
     difference_cells,
     differences,
     metres_text,
+    run_picture,
     summaries,
     summary_cells,
 )
-from factorgraph_loc.evaluation.active_figures import Decision, SeekingTrack, comparison, run_picture
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.rfid.map import Tag
 

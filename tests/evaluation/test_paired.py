@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorgraph_loc.evaluation.paired import mcnemar, median_difference, median_ratio, quantile
+from factorgraph_loc.evaluation.statistics import mcnemar, median_difference, median_ratio, quantile
 
 OUTCOMES = st.lists(st.tuples(st.booleans(), st.booleans()), max_size=40)
 

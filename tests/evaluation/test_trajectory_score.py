@@ -14,7 +14,7 @@ from pose_files import T0, wander, write
 from scipy.spatial.transform import Rotation
 
 from factorgraph_loc import InputError, Trajectory, Trajectory3, read_tum, score
-from factorgraph_loc.evaluation import metrics, pieces
+from factorgraph_loc.evaluation import metrics
 from factorgraph_loc.model.scoring import ALIGNMENTS
 
 OPTIONS = {
@@ -204,4 +204,4 @@ def test_pieces_of_all_pairs_are_those_of_a_search():
             far = np.abs(covered[i + 1 :] - covered[i] - 1.0)
             if far.min() <= 0.1:
                 expected.append((i, i + 1 + int(np.argmin(far))))
-        assert pieces.all_pairs(steps, 1.0) == expected
+        assert metrics.all_pairs(steps, 1.0) == expected

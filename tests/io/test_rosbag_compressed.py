@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from rosbags import rosbag1, rosbag2
 
-from factorgraph_loc.io.bags import unpacking as bag_unpacking
-from factorgraph_loc.io.bags.unpacking import unpacked
+from factorgraph_loc.io.bags import file
+from factorgraph_loc.io.bags.file import unpacked
 
 zstd = importlib.import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
 T0 = 1_700_000_000_000_000_000
@@ -54,16 +54,16 @@ def test_what_is_read(bag, one, folder):
 
 def test_a_bag_that_unpacks_to_too_much(bag, refused, folder, monkeypatch):
     for name in ("SMALL", "CHUNK_RATIO", "FILE", "FILE_RATIO"):
-        monkeypatch.setattr(bag_unpacking, name, 1)
+        monkeypatch.setattr(file, name, 1)
     for name in ("LARGE", "STEP"):
-        monkeypatch.setattr(bag_unpacking, name, 100)
+        monkeypatch.setattr(file, name, 100)
     refused(bag, str(bag), "unpacks to more than", "bytes, which is too much", reader="rosbag", options=OPTIONS)
     assert not list(folder.iterdir())
 
 
 @pytest.mark.parametrize("bag", [KINDS["file of mcap"], KINDS["file of sqlite3"]], indirect=True)
 def test_half_of_a_disk_is_left(bag, refused, folder, monkeypatch):
-    monkeypatch.setattr(bag_unpacking.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 200}))
+    monkeypatch.setattr(file.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 200}))
     refused(bag, "its file unpacks to more than 100 bytes", reader="rosbag", options=OPTIONS)
     assert not list(folder.iterdir())
 
@@ -77,7 +77,7 @@ COMPRESSED = {
 
 @pytest.mark.parametrize(("make", "compress"), COMPRESSED.values(), ids=list(COMPRESSED))
 def test_frames(make, compress, monkeypatch):
-    monkeypatch.setattr(bag_unpacking, "STEP", 1000)
+    monkeypatch.setattr(file, "STEP", 1000)
     one, other = np.random.default_rng(0).bytes(5000), bytes(7000)
     assert unpacked(make, compress(one) + compress(other)) == one + other
     with pytest.raises(ValueError, match="cut off"):
@@ -86,7 +86,7 @@ def test_frames(make, compress, monkeypatch):
 
 @pytest.mark.parametrize(("make", "compress"), COMPRESSED.values(), ids=list(COMPRESSED))
 def test_a_few_bytes_that_stand_for_very_many_take_no_memory(make, compress, monkeypatch):
-    monkeypatch.setattr(bag_unpacking, "LARGE", bag_unpacking.SMALL)
+    monkeypatch.setattr(file, "LARGE", file.SMALL)
     bomb = compress(bytes(2**26))
     tracemalloc.start()
     try:

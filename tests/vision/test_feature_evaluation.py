@@ -15,8 +15,7 @@ from factorgraph_loc.evaluation.features.feature_evaluation import (
     mutual_matches,
     rank,
 )
-from factorgraph_loc.evaluation.features.homography import project
-from factorgraph_loc.evaluation.features.sequences import SCALE, Sequence, find_sequences
+from factorgraph_loc.evaluation.features.sequences import SCALE, Sequence, find_sequences, project
 from factorgraph_loc.vision.features import Keypoints, extractor
 from factorgraph_loc.vision.matching import RATIO, match
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.features.homography import (
+from factorgraph_loc.evaluation.features.sequences import (
     checked,
     corner_error,
     inside,

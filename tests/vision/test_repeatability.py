@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorgraph_loc.evaluation.features.homography import project
 from factorgraph_loc.evaluation.features.repeatability import (
     OVERLAP_ERROR,
     RADIUS,
@@ -17,7 +16,7 @@ from factorgraph_loc.evaluation.features.repeatability import (
     repeatability,
     shared_area,
 )
-from factorgraph_loc.evaluation.features.sequences import find_sequences
+from factorgraph_loc.evaluation.features.sequences import find_sequences, project
 from factorgraph_loc.vision.features import Keypoints, extractor
 
 SHAPE = (480, 640)

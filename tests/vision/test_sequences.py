@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.features.homography import project, view
 from factorgraph_loc.evaluation.features.sequences import (
     OTHER,
     ROTATION,
@@ -16,6 +15,8 @@ from factorgraph_loc.evaluation.features.sequences import (
     VIEWPOINT,
     ZOOMS,
     find_sequences,
+    project,
+    view,
     warped,
 )
 

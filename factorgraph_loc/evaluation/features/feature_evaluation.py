@@ -19,7 +19,6 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.features.competitors import DETECTORS
-from factorgraph_loc.evaluation.features.homography import corner_error
 from factorgraph_loc.evaluation.features.repeatability import (
     OVERLAP_ERROR,
     Repeatability,
@@ -30,7 +29,7 @@ from factorgraph_loc.evaluation.features.repeatability import (
     pair_errors,
     repeatability,
 )
-from factorgraph_loc.evaluation.features.sequences import Sequence
+from factorgraph_loc.evaluation.features.sequences import Sequence, corner_error
 from factorgraph_loc.files.models import nearest
 from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.features import EXTRACTORS, Descriptors, Integers, Keypoints, extractor

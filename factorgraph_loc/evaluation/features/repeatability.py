@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from factorgraph_loc.evaluation.features.homography import inside, invert, jacobians, project
+from factorgraph_loc.evaluation.features.sequences import inside, invert, jacobians, project
 from factorgraph_loc.vision.features import Integers, Keypoints
 from factors.se2 import Array
 

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from factorgraph_loc.evaluation.inference import pooled
-from factorgraph_loc.evaluation.paired import quantile
 from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.report.results import SWEEP, MetricComparison, Results, score
+from factorgraph_loc.evaluation.statistics import quantile
 
 Chart = dict[str, Any]
 Trust = Mapping[str, tuple[float, float, float]]

@@ -1,31 +1,72 @@
-"""One self-contained HTML file of an experiment's results: text, tables, charts, and what is needed to repeat them.
+"""What all pages have: head, style, script, and a content security policy that forbids everything else."""
 
-The page loads nothing: style, script and data are included, and its content security policy forbids everything else, so that an
-unescaped string could not run. The same results give the same bytes.
-"""
-
-from collections.abc import Callable, Mapping, Sequence
+import base64
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import resources
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import polars as pl
 import tomli_w
 
-from factorgraph_loc.drawing.markup import Html, data, figure, join, table, tag
+from factorgraph_loc.drawing.markup import Html, data, figure, join, table, tag, text
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import charts, tables
 from factorgraph_loc.evaluation.report.metrics import DEFAULT, Metric, metric_of
-from factorgraph_loc.evaluation.report.reading import RunData, RunFiles, read_runs
-from factorgraph_loc.evaluation.report.results import SWEEP, MetricComparison, Results, score
-from factorgraph_loc.evaluation.report.shell import SCRIPTS, remark, whole_page
+from factorgraph_loc.evaluation.report.results import (
+    SWEEP,
+    MetricComparison,
+    Results,
+    RunData,
+    RunFiles,
+    read_runs,
+    score,
+)
 from factorgraph_loc.evaluation.report.summary import summary
 from factorgraph_loc.evaluation.report.tracks import KINDS
 from factorgraph_loc.evaluation.warned import by_text
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.version import __version__
 
+SCRIPTS = ("charts.js", "tracks.js", "page.js")  # of charts that can be used
 SHOWN = 8  # variants that are visible initially
 _SWEPT = 3  # metrics that are plotted over a swept setting
+
+
+def whole_page(
+    title: str, sections: Sequence[tuple[str, str]], body: Iterable[object], data: str = "", scripts: Sequence[str] = ()
+) -> str:
+    """An HTML page that loads nothing, of ``body``, whose ``sections`` (id and name) are linked at its head, and of ``data`` and
+    ``scripts``, by their names among the assets."""
+    style = _asset("page.css")
+    script = "".join(_asset(name) for name in scripts)
+    return Template(_asset("page.html")).substitute(
+        title=text(title),
+        contents=join(tag("a", name, href=f"#{identity}") for identity, name in sections),
+        body=join(body, "\n"),
+        data=data,
+        style=style,
+        style_hash=_digest(style),
+        script=script,
+        script_hash=_digest(script),
+        version=__version__,
+    )
+
+
+def remark(content: str) -> Html:
+    """An explanatory paragraph; a number and its percent sign are not separated."""
+    return tag("p", content.replace(" %", "\u00a0%"), class_="note")
+
+
+def _asset(name: str) -> str:
+    return resources.files("factorgraph_loc.evaluation.report").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def _digest(content: str) -> str:
+    return base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
 
 
 def write_report(

@@ -13,11 +13,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation import pieces
+from factorgraph_loc.evaluation import metrics
 from factorgraph_loc.evaluation.alignment import rms
 from factorgraph_loc.evaluation.pairing import TOLERANCE, pauses
-from factorgraph_loc.evaluation.trajectories.aligning import Similarity, alignment
-from factorgraph_loc.evaluation.trajectories.association import associate
+from factorgraph_loc.evaluation.trajectories.association import Similarity, alignment, associate
 from factorgraph_loc.model.planar import MOST, RISE
 from factorgraph_loc.model.scoring import (
     ALIGNMENTS,
@@ -129,7 +128,7 @@ def score_paths(
 ) -> TrajectoryScore:
     """Compare an estimate with a reference.
 
-    ``align``: see :func:`~factorgraph_loc.evaluation.trajectories.aligning.alignment`; ``se2`` compares both seen from above.
+    ``align``: see :func:`~factorgraph_loc.evaluation.trajectories.association.alignment`; ``se2`` compares both seen from above.
     ``associate_by``, ``max_diff``, ``max_gap``: see :func:`~factorgraph_loc.evaluation.trajectories.association.associate`.
     ``all_pairs``: relative errors over all pairs of poses about as far apart, not over pieces one after the other. InputError if
     the two have nothing in common, or do not determine the alignment.
@@ -180,9 +179,9 @@ def _relative(
     found: PosePath, truth: PosePath, steps: Array, length: float, gaps: Integers, *, all_pairs: bool
 ) -> PoseErrors:
     """The translation and rotation of ``Q^-1 P`` for the motions Q of the reference and P of the estimate over each piece."""
-    cut = pieces.all_pairs if all_pairs else pieces.successive
-    ranges = pieces.between(len(found), gaps.tolist())
-    begins, ends = pieces.indices([one for a, b in ranges for one in cut(steps[a : b - 1], length, a)])
+    cut = metrics.all_pairs if all_pairs else metrics.successive
+    ranges = metrics.between(len(found), gaps.tolist())
+    begins, ends = metrics.indices([one for a, b in ranges for one in cut(steps[a : b - 1], length, a)])
     (turn, way), (true_turn, true_way) = (_motions(path, begins, ends) for path in (found, truth))
     back = true_turn.transpose(0, 2, 1)
     error = np.linalg.norm(np.einsum("kij,kj->ki", back, way - true_way), axis=1)

@@ -18,8 +18,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, parse_model
 from factorgraph_loc.files.temporary import locked, sweep, temporary_folder
-from factorgraph_loc.io.bags.clock import Clock, Stamper
-from factorgraph_loc.io.bags.fields import as_nanoseconds
+from factorgraph_loc.io.bags.fields import Clock, Stamper, as_nanoseconds
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream

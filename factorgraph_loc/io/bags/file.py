@@ -1,29 +1,42 @@
 """Access to ROS bags with the library ``rosbags``, without ROS: version 1 (``.bag``), version 2 (a folder, or its ``.mcap`` or
 ``.db3``).
 
-Messages are read one by one; only the index and the current chunk of a bag are kept in memory.
+Messages are read one by one; only the index and the current chunk of a bag are kept in memory. A bag is compressed by chunks
+(``.bag``, ``.mcap``), by messages, or as a whole file that is unpacked to disk (version 2); what is unpacked is limited, because
+a few bytes may expand to gigabytes.
 """
 
 from __future__ import annotations
 
+import bz2
+import shutil
 import sys
-from collections.abc import Iterator, Sequence
+import tempfile
+from array import array
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import DEFINITION, opened, require_size
 from factorgraph_loc.files.models import inside, nearest
-from factorgraph_loc.io.bags import unpacking as bag_unpacking
 from factorgraph_loc.text import quoted, told
+from factors.se2 import Array, Integers
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection, MessageDefinition
     from rosbags.typesys.store import Typestore
 
+SMALL, LARGE = 2**24, 2**27  # bytes of a chunk that are always unpacked, and the maximum
+FILE = 2**30  # bytes of a file that are always unpacked, if the disk has room
+CHUNK_RATIO, FILE_RATIO = 1000, 50  # maximum compression ratios beyond that
+STEP = 2**22
 ROS1 = ".bag"
 SUFFIXES = (ROS1, ".mcap", ".db3")
 METADATA = "metadata.yaml"  # in the folder of a version 2 bag
@@ -36,6 +49,66 @@ HINTS = {
     "end magic": "it is truncated: `mcap recover` repairs it",
     "missing tables": "it is truncated, or not a bag",
 }
+
+
+@cache
+def bound() -> None:
+    """Replace the decompression functions in all readers of ``rosbags`` by those below."""
+    import lz4.frame  # type: ignore[import-untyped] # noqa: PLC0415 - optional libraries
+    from rosbags.rosbag1 import reader as reader1  # noqa: PLC0415
+    from rosbags.rosbag2 import reader as reader2  # noqa: PLC0415
+    from rosbags.rosbag2 import storage_mcap  # noqa: PLC0415
+
+    zstd = vars(reader2)["zstd"]
+    of_bz2 = partial(unpacked, bz2.BZ2Decompressor)
+    of_lz4 = partial(unpacked, lz4.frame.LZ4FrameDecompressor)
+    of_zstd = partial(unpacked, zstd.ZstdDecompressor)
+    reader1.decompressors.update(bz2=of_bz2, lz4=of_lz4)
+    storage_mcap.DECOMPRESSORS.update(lz4=lambda data, _: of_lz4(data), zstd=lambda data, _: of_zstd(data))
+    vars(reader2)["zstd"] = SimpleNamespace(open=lambda file, _: _File(zstd.open(file, "rb"), file), decompress=of_zstd)
+
+
+def unpacked(make: Callable[[], Any], data: bytes) -> bytes:
+    """Decompress ``data`` frame by frame with decompressors from ``make``; ValueError if it is too large or truncated."""
+    limit = max(SMALL, min(LARGE, CHUNK_RATIO * len(data)))
+    parts: list[bytes] = []
+    count = 0
+    while data:
+        one = make()
+        while not one.eof:
+            part = one.decompress(data, max_length=STEP)
+            data = b""
+            parts.append(part)
+            count += len(part)
+            if count > limit:
+                raise ValueError(f"a chunk or message unpacks to more than {limit:,} bytes, which is too much")
+            if not part and one.needs_input:
+                raise ValueError("a chunk or message is cut off")
+        data = one.unused_data or b""
+    return b"".join(parts)
+
+
+class _File:
+    """A compressed file for reading, which raises ValueError beyond its limit. ``content``: decompresses ``file``."""
+
+    def __init__(self, content: BinaryIO, file: BinaryIO) -> None:
+        self._content = content
+        room = shutil.disk_usage(tempfile.gettempdir()).free // 2
+        self._limit = min(max(FILE, FILE_RATIO * Path(file.name).stat().st_size), room)
+        self._count = 0
+
+    def __enter__(self) -> _File:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._content.close()
+
+    def read(self, size: int) -> bytes:
+        part = self._content.read(size)
+        self._count += len(part)
+        if self._count > self._limit:
+            raise ValueError(f"its file unpacks to more than {self._limit:,} bytes, which is too much")
+        return part
 
 
 @dataclass(frozen=True)
@@ -164,7 +237,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
             with opened(file, sys.maxsize):  # no FIFO, which would block, and no pointer of Git LFS
                 pass
     require_rosbags()
-    bag_unpacking.bound()
+    bound()
     from rosbags.rosbag1 import Reader as Reader1  # noqa: PLC0415 - an optional library
     from rosbags.rosbag2 import Reader as Reader2  # noqa: PLC0415
 
@@ -220,3 +293,35 @@ def _told(path: Path) -> Iterator[None]:
         text = told(error)
         hint = next((hint for words, hint in HINTS.items() if words in text), "")
         raise InputError(f"{path}: cannot be read as a bag: {text.rstrip('.')}{'; ' + hint if hint else ''}") from error
+
+
+class TopicRows:
+    """N rows of ``width`` numbers with timestamps, and the numbers of their messages, counted from 1 within the topic."""
+
+    def __init__(self, source: str, width: int) -> None:
+        self.source = source
+        self._width = width
+        self._row = array("q")
+        self._t_ns = array("q")
+        self._values = array("d")
+
+    def append(self, item: Stamped, t_ns: int, values: tuple[float, ...]) -> None:
+        self._row.append(item.row)
+        self._t_ns.append(t_ns)
+        self._values.extend(values)
+
+    def __len__(self) -> int:
+        return len(self._row)
+
+    @property
+    def rows(self) -> Integers:
+        return np.array(self._row, dtype=np.int64)
+
+    @property
+    def t_ns(self) -> Integers:
+        return np.array(self._t_ns, dtype=np.int64)
+
+    @property
+    def values(self) -> Array:
+        """The numbers (N, width)."""
+        return np.array(self._values, dtype=float).reshape(-1, self._width)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from itertools import islice
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,16 +14,20 @@ from scipy.spatial.transform import Rotation
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import nearest
-from factorgraph_loc.io.bags.clock import Stamper
+from factorgraph_loc.io.bags.fields import TF, Stamper
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.poses import ReferenceTopic, check_rotations, seven
 from factorgraph_loc.model.planar import on_floor
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3, path_of
-from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.text import listed, quoted, told
 from factors.se2 import Array
 
 STATIC = "/tf_static"
+MANY = 2000  # messages of a topic that are looked at
+ROBOT = ("base_link", "base_footprint", "base")
+ODOMETRY = ("odom", "odom_combined", "odometry")
+WORLD = ("mocap", "vicon", "optitrack", "world", "map")  # what is measured comes before what may be an estimate
 
 
 class StaticFrames:
@@ -185,3 +191,58 @@ def matrices(table: Array) -> Array:
     out[:, :3, 3] = table[:, :3]
     out[:, :3, :3] = Rotation.from_quat(table[:, 3:]).as_matrix()
     return out
+
+
+@dataclass(frozen=True)
+class Tree:
+    """``parents``: the parent of each frame; ``topic``: that of the moving frames, "" if none moves; ``moving``: these frames."""
+
+    parents: Mapping[str, str]
+    topic: str
+    moving: frozenset[str]
+
+    def robot(self) -> str | None:
+        """The frame of the robot, by its usual names."""
+        return next((name for name in ROBOT if name in self.parents), None)
+
+    def above(self, frame: str, names: tuple[str, ...]) -> str | None:
+        """The first of ``names`` that is above ``frame``, which moves in it."""
+        moves = False
+        known: set[str] = set()
+        seen = {frame}
+        while frame in self.parents and self.parents[frame] not in seen:
+            moves |= frame in self.moving
+            frame = self.parents[frame]
+            seen.add(frame)
+            if moves:
+                known.add(frame)
+        return next((name for name in names if name in known), None)
+
+
+def tree_of(bag: Bag, notes: list[str]) -> Tree:
+    """The frames in the transforms of a bag. A topic that cannot be read is told of in ``notes``."""
+    parents: dict[str, str] = {}
+    moving: set[str] = set()
+    topic = ""
+    for one in bag.topics.values():
+        if one.type not in TF or not one.count:
+            continue
+        found: dict[str, str] = {}
+        try:
+            found.update(_edges(bag, one.name))
+        except InputError as error:
+            notes.append(str(error))
+        except (AttributeError, TypeError, ValueError) as error:
+            notes.append(f"{bag.path}: topic {one.name} is defined in the bag unlike in ROS: {told(error)}")
+        parents |= found
+        if one.name != STATIC:
+            moving |= found.keys()
+            topic = topic or one.name
+    return Tree(parents, topic, frozenset(moving))
+
+
+def _edges(bag: Bag, topic: str) -> Iterator[tuple[str, str]]:
+    for item in islice(bag.messages([topic]), MANY):
+        transforms: Any = item.message.transforms
+        for transform in transforms:
+            yield plain(transform.child_frame_id), plain(transform.header.frame_id)

@@ -9,8 +9,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.columns import POSES
 from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.io.bags.clock import Clock
-from factorgraph_loc.io.bags.fields import leaves
+from factorgraph_loc.io.bags.fields import Clock, leaves
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.frames import StaticFrames
 from factorgraph_loc.io.bags.tables import RowsOfTopic

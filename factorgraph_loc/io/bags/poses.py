@@ -8,9 +8,8 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
-from factorgraph_loc.io.bags.clock import Clock
-from factorgraph_loc.io.bags.file import Bag, Stamped
-from factorgraph_loc.io.bags.rows import TopicRows
+from factorgraph_loc.io.bags.fields import Clock
+from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.planar import AS_IT_IS, Turned, on_floor, require_unit, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory

@@ -1,4 +1,4 @@
-"""The proposed manifest of a bag as a file, with remarks as comments."""
+"""The proposed manifest of a bag as a file, with remarks as comments, among them on what a bag carries that nothing here uses."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,36 @@ import tomli_w
 
 from factorgraph_loc.io.bags.file import Bag, open_bag
 from factorgraph_loc.io.bags.manifest import Proposal, propose
-from factorgraph_loc.io.bags.unused import UNUSED
+
+UNUSED = {
+    "sensor_msgs/msg/LaserScan": "laser scan",
+    "sensor_msgs/msg/MultiEchoLaserScan": "laser scan",
+    "sensor_msgs/msg/PointCloud": "point cloud",
+    "sensor_msgs/msg/PointCloud2": "point cloud",
+    "velodyne_msgs/msg/VelodyneScan": "point cloud",
+    "livox_ros_driver/msg/CustomMsg": "point cloud",
+    "livox_ros_driver2/msg/CustomMsg": "point cloud",
+    "sensor_msgs/msg/NavSatFix": "GNSS",
+    "sensor_msgs/msg/NavSatStatus": "GNSS",
+    "gps_common/msg/GPSFix": "GNSS",
+    "gps_msgs/msg/GPSFix": "GNSS",
+    "nmea_msgs/msg/Sentence": "GNSS",
+    "ublox_msgs/msg/NavPVT": "GNSS",
+    "sensor_msgs/msg/Range": "sonar or infrared range",
+    "sensor_msgs/msg/MagneticField": "magnetometer",
+    "sensor_msgs/msg/FluidPressure": "pressure",
+    "sensor_msgs/msg/Temperature": "temperature",
+    "sensor_msgs/msg/BatteryState": "battery",
+    "sensor_msgs/msg/Joy": "joystick",
+    "geometry_msgs/msg/WrenchStamped": "force",
+    "nav_msgs/msg/OccupancyGrid": "grid map",
+    "nav_msgs/msg/Path": "path",
+    "stereo_msgs/msg/DisparityImage": "depth image",
+    "dvs_msgs/msg/EventArray": "event camera",
+    "diagnostic_msgs/msg/DiagnosticArray": "diagnostics",
+    "rosgraph_msgs/msg/Log": "messages of programs",
+    "rcl_interfaces/msg/Log": "messages of programs",
+}
 
 
 @dataclass(frozen=True)

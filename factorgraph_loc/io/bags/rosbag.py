@@ -3,32 +3,80 @@
 The bag is read once; only the needed numbers of its messages are kept, and images are written to files.
 """
 
+import math
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+import numpy as np
+
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.models import FileModel, add_fields
-from factorgraph_loc.io.bags import clock as bag_clock
-from factorgraph_loc.io.bags import rig as bag_rig
+from factorgraph_loc.files.models import FileModel, add_fields, parse_model
+from factorgraph_loc.io.bags import fields as bag_clock
 from factorgraph_loc.io.bags.camera import CameraTopic, Images, Info
-from factorgraph_loc.io.bags.clock import TF, Clock, Stamper
+from factorgraph_loc.io.bags.fields import TF, Clock, Stamper
 from factorgraph_loc.io.bags.file import Bag, Stamped, open_bag
 from factorgraph_loc.io.bags.frames import STATIC, FrameReference, StaticFrames
 from factorgraph_loc.io.bags.landmarks import Landmarks, LandmarkTopic, PixelsOfPoints, PixelTopic
 from factorgraph_loc.io.bags.messages import tables_of_messages
 from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, WheelMotion, YawRates, odometry
-from factorgraph_loc.io.bags.poses import Poses, ReferenceTopic, Start, StartTopic
-from factorgraph_loc.io.bags.rfid import Reads, RfidTopic
-from factorgraph_loc.io.bags.tables import DescribedRows, TableTopic
+from factorgraph_loc.io.bags.poses import POINT, POSES, Poses, ReferenceTopic, Start, StartTopic
+from factorgraph_loc.io.bags.tables import DescribedRows, Reads, RfidTopic, TableTopic
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import PosePath
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.text import told
+from factorgraph_loc.text import listed, plain, told
+from factors.camera.model import angles_of_camera
+from factors.se2 import Array
+
+FRAMES, WITHIN = ":", "."  # /tf:PARENT.CHILD
+
+
+def camera_of(info: Info, frames: StaticFrames, base: str, notes: list[str]) -> CameraSettings:
+    """The camera of a ``CameraInfo``; it looks forward from the robot's origin if tf_static has no mounting."""
+    pose = frames.pose(info.frame, base)
+    if pose is None:
+        notes.append(f"tf_static has no mounting of {info.frame} on {base}")
+        return info.settings({}, notes)
+    notes.append(f"tf_static has the mounting of {info.frame} on {base}")
+    roll, pitch, yaw = angles_of_camera(pose[:3, :3])
+    x, y, z = pose[:3, 3].tolist()
+    return info.settings({"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}, notes)
+
+
+def antennas_of(
+    names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, base: str, notes: list[str]
+) -> RfidSettings:
+    """Antennas with frames ``given``, or frames of their names; the frame's x axis is the boresight. Others are at the origin."""
+    poses = {name: frames.pose(given.get(name, name), base) for name in sorted(names)}
+    for verb, known in (("has the", True), ("has no", False)):
+        if which := [name for name, pose in poses.items() if (pose is not None) == known]:
+            notes.append(f"tf_static {verb} mounting of antennas {', '.join(which)} on {base}")
+    return RfidSettings(
+        antennas={name: AntennaSettings() if p is None else _antenna(name, p) for name, p in poses.items()}
+    )
+
+
+def rig_of(sensors: Iterable[str], camera: CameraSettings | None, rfid: RfidSettings | None) -> Rig:
+    """A rig with the known settings and the default noise."""
+    return DEFAULT_RIG.model_copy(update={"sensors": tuple(sensors), "camera": camera, "rfid": rfid})
+
+
+def _antenna(name: str, pose: Array) -> AntennaSettings:
+    x, y, z = pose[:3, 3].tolist()
+    ahead = pose[:3, 0]
+    pitch = math.asin(float(np.clip(ahead[2], -1.0, 1.0)))
+    place = {"x": x, "y": y, "z": z, "yaw": math.atan2(ahead[1], ahead[0]), "pitch": pitch}
+    return parse_model(AntennaSettings, place, f"tf_static of antenna {plain(name)}")
 
 
 class Options(FileModel):
@@ -242,10 +290,36 @@ def _rig(
 ) -> Rig:
     """The rig from the bag; a rig in the manifest replaces it."""
     base = options.base_frame
-    camera = bag_rig.camera_of(gathered.info, frames, base, notes) if gathered.info else None
+    camera = camera_of(gathered.info, frames, base, notes) if gathered.info else None
     reads = streams.get("rfid")
     rfid = None
     if options.rfid and isinstance(reads, RfidStream) and reads.antenna:
-        rfid = bag_rig.antennas_of(set(reads.antenna), options.rfid.frames, frames, base, notes)
+        rfid = antennas_of(set(reads.antenna), options.rfid.frames, frames, base, notes)
     usable = [name for name in streams if name not in {"camera", "sightings"} or camera is not None]
-    return bag_rig.rig_of(usable, camera, rfid)
+    return rig_of(usable, camera, rfid)
+
+
+def read_trajectory(path: Path, topic: str) -> PosePath:
+    """The poses of ``topic`` in the bag ``path``, at the stamps of headers where there are any: messages with poses or points, or
+    ``/tf:PARENT.CHILD``, the frame CHILD in the frame PARENT. InputError names the invalid message."""
+    name, _, frames = topic.partition(FRAMES)
+    with open_bag(path) as bag:
+        if not name:
+            known = [one.name for one in bag.topics.values() if one.type in (*POSES, POINT, *TF)]
+            told = listed(known) or "none has poses"
+            raise InputError(f"{path}: is a bag, expected {path}:TOPIC, with one of its topics: {told}")
+        listeners, warnings = Listeners(bag, "header"), list[str]()
+        stamper = listeners.stamper(name, None)
+        if bag.topic(name).type not in TF:
+            poses = Poses(bag, name)
+            listeners.add(name, poses, stamper)
+            listeners.run()
+            return replace(poses.in_space(warnings), warnings=tuple(warnings))
+        parent, _, child = frames.partition(WITHIN)
+        if not parent or not child:
+            raise InputError(f"{path}: {name} holds transforms, expected two frames too: {path}:{name}:map.base_link")
+        static = static_frames(listeners)
+        moving = FrameReference(bag, ReferenceTopic(topic=name, parent=parent, child=child), stamper)
+        listeners.add(name, moving, stamper)
+        listeners.run()
+        return replace(moving.path(static, warnings), warnings=tuple(warnings))

@@ -15,7 +15,7 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.models import FileModel, inside, parse_model
 from factorgraph_loc.files.yaml import read_yaml
-from factorgraph_loc.io.readers.pose_file import ORTHONORMAL, later, read_image_list, read_poses
+from factorgraph_loc.io.readers.pose_file import EUROC, ORTHONORMAL, later, read_image_list, read_poses
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
@@ -26,8 +26,6 @@ from factors.camera.model import angles_of_camera
 from factors.se2 import Array
 
 TRUTHS = ("state_groundtruth_estimate0", "state_groundtruth0")
-# timestamp, position and orientation of the body; velocities and biases are not used
-STATE = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 UNDISTORTED = ("none", "pinhole", "")
 
 
@@ -62,7 +60,7 @@ def read(path: Path | None, options: Options) -> Log:
     warnings: list[str] = []
     table = read_image_list(inside(camera, "data.csv", camera), unit="ns", separator=",")
     t0_ns = int(table.t_ns.min())
-    t_ns, poses = read_poses(truth, STATE, unit="ns", separator=",", warnings=warnings)
+    t_ns, poses = read_poses(truth, EUROC, unit="ns", separator=",", warnings=warnings)
     name = path.resolve().name
     return Log(
         name=name,

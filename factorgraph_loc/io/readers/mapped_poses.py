@@ -12,8 +12,7 @@ from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, read_map
 from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.io import motions
-from factorgraph_loc.io.readers import euroc
-from factorgraph_loc.io.readers.pose_file import read_kitti, read_poses
+from factorgraph_loc.io.readers.pose_file import EUROC, read_kitti, read_poses
 from factorgraph_loc.io.readers.unread import Unread
 from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows
@@ -150,7 +149,7 @@ def _in_format(path: Path, times: Path | None, options: PosesFile, warnings: lis
         if not options.axes:
             turned = Turned(axes="body", mounting=options.mounting)  # the format defines the axes
     elif options.format == "euroc":
-        t_ns, space = read_poses(path, euroc.STATE, unit="ns", separator=",", warnings=warnings)
+        t_ns, space = read_poses(path, EUROC, unit="ns", separator=",", warnings=warnings)
         rows, positions, rotations = np.arange(1, len(t_ns) + 1), space.positions, space.rotations
     else:
         rows, t_ns, table = read_tum_rows(path)

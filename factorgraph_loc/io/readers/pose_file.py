@@ -14,7 +14,6 @@ from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
 from factorgraph_loc.files.columns import POSES
 from factorgraph_loc.files.models import read_text
 from factorgraph_loc.files.tables import TableRows
-from factorgraph_loc.io.readers import euroc, tum_rgbd
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.trajectory import read_tum_rows
 from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3
@@ -23,6 +22,9 @@ from factors.se2 import Array, Integers
 
 ORTHONORMAL = 2e-3  # tolerance of rotation matrices: KITTI's have seven digits
 MATRIX = tuple(f"{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
+# the columns of these formats; velocities and biases of EuRoC's are not used
+EUROC = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
+TUM = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 Format = Literal["tum", "kitti", "euroc"]
 EXPECTED = (
     "8 values (TUM: t x y z qx qy qz qw), 12 (KITTI), or 8 or more with commas (EuRoC: t, x, y, z, qw, qx, qy, qz)"
@@ -159,7 +161,7 @@ def read_pose_file(path: Path) -> PosePath:
     if kind is None:
         raise bad_field(path, "row", first, EXPECTED, row=row)
     if kind == "euroc":
-        t_ns, poses = read_poses(path, euroc.STATE, unit="ns", separator=",", warnings=warnings)
+        t_ns, poses = read_poses(path, EUROC, unit="ns", separator=",", warnings=warnings)
         return PosePath(str(path), poses.positions, poses.rotations, t_ns, warnings=tuple(warnings))
     if kind == "kitti":
         _, matrices = read_matrices(path)
@@ -190,9 +192,9 @@ def _is_number(text: str) -> bool:
 def _format(first: str) -> Format | None:
     """The format of a file whose first row this is."""
     if "," in first:
-        return "euroc" if first.count(",") + 1 >= len(euroc.STATE) else None
+        return "euroc" if first.count(",") + 1 >= len(EUROC) else None
     count = len(first.split())
-    return "tum" if count == len(tum_rgbd.POSES) else "kitti" if count == len(MATRIX) else None
+    return "tum" if count == len(TUM) else "kitti" if count == len(MATRIX) else None
 
 
 def _first_row(path: Path) -> tuple[int, str]:

@@ -6,14 +6,13 @@ from pathlib import Path
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, inside
-from factorgraph_loc.io.readers.pose_file import later, read_image_list, read_poses
+from factorgraph_loc.io.readers.pose_file import TUM, later, read_image_list, read_poses
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.tables import make_images
 
-POSES = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 # the robot frame is the camera frame; the lens is the nominal one of the benchmark
 RIG = Rig(
     name="kinect-tum",
@@ -35,7 +34,7 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     warnings: list[str] = []
     table = read_image_list(inside(path, "rgb.txt", path), unit="s", separator=" ")
     t0_ns = int(table.t_ns.min())
-    t_ns, poses = read_poses(inside(path, "groundtruth.txt", path), POSES, unit="s", separator=" ", warnings=warnings)
+    t_ns, poses = read_poses(inside(path, "groundtruth.txt", path), TUM, unit="s", separator=" ", warnings=warnings)
     name = path.resolve().name
     return Log(
         name=name,
