@@ -17,15 +17,14 @@ from factorgraph_loc.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from factorgraph_loc.api.experimenting import active, experiment, report, status
-    from factorgraph_loc.api.images import features, images
-    from factorgraph_loc.api.learning import build_map, calibrate
+    from factorgraph_loc.api.learning import build_map, calibrate, features, images
     from factorgraph_loc.api.logs import convert, datasets, info, manifest, simulate
     from factorgraph_loc.api.lookups import known_estimators, known_readers, known_rigs, known_sensors, new_rig
     from factorgraph_loc.api.results import export, view
     from factorgraph_loc.api.running import Run, compare, run
     from factorgraph_loc.errors import FglocError, InputError, RunFailedError
     from factorgraph_loc.evaluation.inference import contrast
-    from factorgraph_loc.experiments.index import load_results
+    from factorgraph_loc.experiments.reporting import load_results
     from factorgraph_loc.experiments.trajectory_score import score
     from factorgraph_loc.io.native.native import write_native
     from factorgraph_loc.io.native.rig_file import read_rig, write_rig
@@ -139,15 +138,14 @@ __all__ = [
 # module of each public name
 _MODULES = {
     "api.experimenting": ("active", "experiment", "report", "status"),
-    "api.images": ("features", "images"),
-    "api.learning": ("build_map", "calibrate"),
+    "api.learning": ("features", "images", "build_map", "calibrate"),
     "api.logs": ("convert", "datasets", "info", "manifest", "simulate"),
     "api.lookups": ("known_estimators", "new_rig", "known_readers", "known_rigs", "known_sensors"),
     "api.results": ("export", "view"),
     "api.running": ("Run", "compare", "run"),
     "errors": ("FglocError", "InputError", "RunFailedError"),
     "evaluation.inference": ("contrast",),
-    "experiments.index": ("load_results",),
+    "experiments.reporting": ("load_results",),
     "experiments.trajectory_score": ("score",),
     "io.native.native": ("write_native",),
     "io.native.rig_file": ("read_rig", "write_rig"),

@@ -7,4 +7,4 @@ Functions with ``jobs``, and :func:`~factorgraph_loc.api.logs.simulate` with ima
 needs ``if __name__ == "__main__"``.
 """
 
-__all__ = ["experimenting", "images", "learning", "logs", "lookups", "results", "running"]
+__all__ = ["experimenting", "learning", "logs", "lookups", "results", "running"]

@@ -1,6 +1,6 @@
-"""``fgloc calibrate`` and ``fgloc map`` as functions."""
+"""``fgloc calibrate``, ``map``, ``images`` and ``features evaluate`` as functions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +8,10 @@ from factorgraph_loc.api.given import LogLike, Progress, RigLike, Settings, Worl
 from factorgraph_loc.api.running import run
 from factorgraph_loc.calibration import calibrate as calibration
 from factorgraph_loc.calibration import report as rig_report
-from factorgraph_loc.experiments import maps, output
+from factorgraph_loc.evaluation.features import scores as feature_scores
+from factorgraph_loc.evaluation.features.feature_evaluation import feature
+from factorgraph_loc.evaluation.features.sequences import find_sequences
+from factorgraph_loc.experiments import image_localization, maps, output
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.results import writing
 from factorgraph_loc.files.temporary import of_system, temporary_folder
@@ -16,6 +19,7 @@ from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.model.log import Log
 
 RIG = ".rig.toml"
+FEATURES = ("colour", "sift", "orb")
 
 
 def calibrate(
@@ -75,3 +79,41 @@ def build_map(
 def _score(log: Log) -> dict[str, Any]:
     """Scores of the EKF, or of the smoother if the log has RFID, with the log's rig and its sensors."""
     return run(log, calibration.estimator_for(log.rig)).scores
+
+
+def images(
+    log: LogLike,
+    out: str | Path,
+    *,
+    mapped: Sequence[int],
+    queries: Mapping[str, Sequence[int]],
+    features: Sequence[str] = FEATURES,
+    count: int = 1500,
+    rig: RigLike | None = None,
+    world: WorldLike | None = None,
+    overwrite: bool = False,
+    progress: Callable[[float], None] = lambda _: None,
+) -> image_localization.ImageResults:
+    """Map some images of a log with their reference poses, localize the images of each query, and write the errors to ``out``."""
+    image_localization.check_free(Path(out), overwrite=overwrite)
+    loaded = one(log, rig, world)
+    results = image_localization.evaluate_images(loaded, features, count, mapped, queries, progress)
+    image_localization.write_results(loaded.name, results, Path(out))
+    return results
+
+
+def features(
+    images: Sequence[str | Path],
+    out: str | Path,
+    *,
+    features: Sequence[str] = FEATURES,
+    count: int = 1000,
+    overwrite: bool = False,
+    progress: Progress = lambda _done, _total: None,
+) -> feature_scores.FeatureScores:
+    """Evaluate point features on images of planar scenes: folders of sequences, or photographs, which are warped."""
+    feature_scores.check_free(Path(out), overwrite=overwrite)
+    chosen = [feature(name, count) for name in features]
+    scores = feature_scores.evaluate_all(find_sequences([Path(path) for path in images]), chosen, progress)
+    feature_scores.write_scores(scores, Path(out))
+    return scores

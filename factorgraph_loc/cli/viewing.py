@@ -12,8 +12,7 @@ from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, Reader, ReaderOption, RigFile, WorldFile
 
 if TYPE_CHECKING:
-    from factorgraph_loc.exports.particles import Particles
-    from factorgraph_loc.exports.runs import StoredRun
+    from factorgraph_loc.exports.runs import Particles, StoredRun
     from factorgraph_loc.model.log import Log
 
 SAME = 1e-6  # m between the positions of a run and of its repetition

@@ -7,7 +7,6 @@ __all__ = [
     "experiment",
     "experiment_file",
     "image_localization",
-    "index",
     "maps",
     "output",
     "particles",

@@ -20,8 +20,7 @@ from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
 from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, markdown
 from factorgraph_loc.evaluation.warned import WARNINGS, lines, row_of
 from factorgraph_loc.experiments.output import remove_run, write_run
-from factorgraph_loc.experiments.preparation import columns_of, fill_cache, use_of
-from factorgraph_loc.experiments.prior import check_prior
+from factorgraph_loc.experiments.preparation import check_prior, columns_of, fill_cache, use_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import file_name, nearest, replacing, write_text
 from factorgraph_loc.files.results import require_free, writing

@@ -70,8 +70,8 @@ def compute(run: PlannedRun) -> dict[str, bytes]:
 
     Raises StoreError only, if there is no space for them.
     """
+    from factorgraph_loc.experiments.output import run_files  # noqa: PLC0415
     from factorgraph_loc.experiments.run import run as run_log  # noqa: PLC0415
-    from factorgraph_loc.experiments.stored_run import run_files  # noqa: PLC0415
 
     _forget_peak_memory()
     started = perf_counter()

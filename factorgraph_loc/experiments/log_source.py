@@ -1,11 +1,13 @@
 """Sources of an experiment's logs, as plain data from which other processes can load them.
 
-Nothing numerical is imported until a log is loaded, so that an experiment with stored results starts quickly.
-"""
+Nothing numerical is imported until a log is loaded, so that an experiment with stored results starts quickly."""
 
 from __future__ import annotations
 
+import fnmatch
 import json
+import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -13,9 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.globs import is_pattern, matching
 from factorgraph_loc.files.bounded import kind
-from factorgraph_loc.files.models import inside, read_toml
+from factorgraph_loc.files.models import DEEPEST, inside, read_toml
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.files.yaml import read_yaml
 from factorgraph_loc.text import quoted
@@ -23,8 +24,70 @@ from factorgraph_loc.text import quoted
 if TYPE_CHECKING:
     from factorgraph_loc.model.log import Log
 
+VISITED = 100_000  # maximum number of files and folders visited for a pattern
+ANY_DEPTH = "**"
+_MAGIC = re.compile(r"[*?[]")
 RUN_FILE = "run.toml"
 NAMING = {".toml": read_toml, ".yaml": read_yaml, ".yml": read_yaml}  # files that name others
+
+
+def is_pattern(name: str) -> bool:
+    return _MAGIC.search(name) is not None
+
+
+def matching(pattern: str, folder: Path, source: object) -> list[Path]:
+    """The sorted paths that match ``pattern`` relative to ``folder``: ``*``, ``?`` and ``[...]`` within a name, ``**`` for any
+    folders except links. Raises InputError for an invalid pattern, or one that visits more than :data:`VISITED` files and
+    folders."""
+    path = Path(pattern)
+    parts = path.parts[1:] if path.anchor else path.parts
+    if len(parts) > DEEPEST:
+        raise InputError(f"{source}: {quoted(pattern)} has {len(parts)} parts, expected at most {DEEPEST}")
+    if wrong := [part for part in parts if ANY_DEPTH in part and part != ANY_DEPTH]:
+        raise InputError(f"{source}: {quoted(pattern)} has {quoted(wrong[0])}, expected {ANY_DEPTH} to be a whole part")
+    walk = _Walk(f"{source}: {quoted(pattern)} visits more than {VISITED:,} files and folders, expected a narrower one")
+    found = {Path(path.anchor) if path.anchor else folder}
+    for part in parts:
+        found = {one for base in found for one in walk.step(base, part)}
+    return sorted(one for one in found if os.path.lexists(one))
+
+
+class _Walk:
+    def __init__(self, too_many: str) -> None:
+        self._too_many = too_many
+        self._visited = 0
+
+    def step(self, base: Path, part: str) -> Iterator[Path]:
+        """The paths that match one part of a pattern."""
+        if part == ANY_DEPTH:
+            waiting = [base]
+            while waiting:
+                here = waiting.pop()
+                yield here
+                waiting += [Path(entry.path) for entry in self._entries(here) if entry.is_dir(follow_symlinks=False)]
+        elif is_pattern(part):
+            fits = re.compile(fnmatch.translate(part)).match
+            yield from (Path(entry.path) for entry in self._entries(base) if fits(entry.name))
+        else:
+            self._count()
+            yield base / part
+
+    def _entries(self, folder: Path) -> list[os.DirEntry[str]]:
+        """The entries of a folder; none if it is not a readable folder."""
+        found = []
+        try:
+            with os.scandir(folder) as entries:
+                for entry in entries:
+                    self._count()
+                    found.append(entry)
+        except OSError:
+            return found
+        return found
+
+    def _count(self) -> None:
+        self._visited += 1
+        if self._visited > VISITED:
+            raise InputError(self._too_many)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from factorgraph_loc.drawing.figures import save
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import beside
-from factorgraph_loc.experiments.prior import first_odometry, resolve_prior
+from factorgraph_loc.experiments.preparation import first_odometry, resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.results import writing
@@ -65,7 +65,7 @@ class MapOptions:
     ``poses``: of the robot, for tags and points: reference, or odometry, with estimation of the poses; None: the reference if
     there is one. ``tag_height`` [m]: of tags that the log's map lacks; None: that of the antennas. ``drop_dead``: write the log's
     map without the tags that are believed dead, and map nothing. ``prior``: see
-    :func:`~factorgraph_loc.experiments.prior.resolve_prior`.
+    :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
     """
 
     of: str | None = None

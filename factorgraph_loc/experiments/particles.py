@@ -7,8 +7,7 @@ import numpy as np
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.experiments.run import run as run_log
-from factorgraph_loc.exports.particles import Particles
-from factorgraph_loc.exports.runs import StoredRun
+from factorgraph_loc.exports.runs import Particles, StoredRun
 from factorgraph_loc.fusion.base import Estimator
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory

@@ -20,8 +20,7 @@ from factorgraph_loc.experiments.experiment_file import (
     canonical,
     nested,
 )
-from factorgraph_loc.experiments.facts import Facts
-from factorgraph_loc.experiments.keys import FileDigests, run_key
+from factorgraph_loc.experiments.keys import Facts, FileDigests, run_key
 from factorgraph_loc.experiments.log_source import LogSource, RecordedSource, SimulatedSource, recorded_sources
 from factorgraph_loc.files.models import nearest
 from factorgraph_loc.text import quoted

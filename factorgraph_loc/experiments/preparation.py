@@ -1,5 +1,7 @@
-"""The sensors of a run, and what their packages prepare before an estimator runs."""
+"""What comes before a run: its start, from the user, the log, or the reference; its sensors, and what their packages prepare before
+an estimator runs."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -7,12 +9,112 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph_loc.errors import FglocError, InputError
-from factorgraph_loc.files.models import FileModel, nearest
+from factorgraph_loc.files.models import FARTHEST, FileModel, nearest
 from factorgraph_loc.fusion import registry
+from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, PosePrior, SpacePose
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory3 import Trajectory3, planar_estimate
 from factorgraph_loc.sensors.registry import channels, functions, moving
 from factorgraph_loc.sensors.usage import PreparedLog, Use, lacking_section
 from factorgraph_loc.text import listed, quoted
+
+# of a start taken from the reference
+REFERENCE_POSITION_SIGMA = 0.02  # m
+REFERENCE_HEADING_SIGMA = 0.01  # rad
+
+KNOWN = "reference, log or X,Y,HEADING"
+EXPECTED = "reference, log, unknown, X,Y or X,Y,HEADING"
+
+
+def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
+    """The Gaussian prior of the start of a run, and the name of its source.
+
+    ``prior``: ``reference`` (the first reference pose at or after the first odometry, 0.02 m and 0.01 rad), ``log`` (the start
+    stated by the log), ``X,Y,HEADING`` [m, m, rad] (at the first odometry, 0.05 m and 0.05 rad), ``X,Y`` with unknown heading,
+    ``unknown``, or None: the log's start, else the reference, else unknown. An unknown start is returned as None. For a reference
+    without headings, the heading is unknown too.
+
+    Raises InputError if the log lacks what is requested, or ``prior`` is none of these.
+    """
+    if prior is None:
+        has_reference = log.reference is not None or log.reference3 is not None
+        prior = "log" if log.start is not None else "reference" if has_reference else "unknown"
+    if prior == "unknown":
+        return None, prior
+    if prior == "log":
+        if log.start is None:
+            raise InputError(f"{log.name}: states no start, expected a prior {EXPECTED}")
+        return PosePrior(log.start.t, np.array(log.start.pose), np.diag(np.square(log.start.sigmas))), prior
+    if prior == "reference":
+        return _from_reference(log), prior
+    pose, covariance = np.array(_parse(prior)), _covariance(POSITION_SIGMA, HEADING_SIGMA)
+    if len(pose) == 2:
+        return PosePrior.at_position(first_odometry(log), pose, covariance[:2, :2]), prior
+    return PosePrior(first_odometry(log), pose, covariance), prior
+
+
+def at_origin(log: Log) -> PosePrior:
+    """The start (0, 0, 0) of a log without other information, at the first odometry."""
+    return PosePrior(first_odometry(log), np.zeros(3), _covariance(POSITION_SIGMA, HEADING_SIGMA))
+
+
+def check_prior(prior: str | None) -> None:
+    """Raise InputError for an invalid ``prior`` of :func:`resolve_prior`, without checking the log."""
+    if prior not in (None, "unknown", "log", "reference"):
+        _parse(prior)
+
+
+def first_odometry(log: Log) -> float:
+    """Stamp of the first odometry [s], clock offset applied; of the first measurement if there is no odometry."""
+    starts = [
+        float(t.min()) + log.rig.time_offset(name)
+        for name in moving(log.streams, "floor")
+        if len(t := log.streams[name].t)
+    ]
+    return min(starts, default=log.span()[0])
+
+
+def _from_reference(log: Log) -> PosePrior:
+    if log.reference is None and log.reference3 is not None:
+        return _in_space(log.reference3)
+    if log.reference is None:
+        raise InputError(f"{log.name}: has no reference to start from, expected a prior {EXPECTED}")
+    start = first_odometry(log)
+    after = int(np.searchsorted(log.reference.t, start))
+    if after == len(log.reference):
+        raise InputError(
+            f"{log.name}: its reference ends before the first odometry at {start:.3f} s, choose another prior"
+        )
+    t, pose = float(log.reference.t[after]), np.array(log.reference.poses[after])
+    covariance = _covariance(REFERENCE_POSITION_SIGMA, REFERENCE_HEADING_SIGMA)
+    if not log.reference.has_heading:
+        return PosePrior.at_position(t, pose[:2], covariance[:2, :2])
+    return PosePrior(t, pose, covariance)
+
+
+def _in_space(reference: Trajectory3) -> PosePrior:
+    """The first pose of a robot in space."""
+    covariance = np.diag(np.repeat(np.square((REFERENCE_HEADING_SIGMA, REFERENCE_POSITION_SIGMA)), 3))
+    pose = SpacePose(reference.positions[0], reference.rotations[0], covariance)
+    seen = planar_estimate(float(reference.t[0]), pose)
+    return PosePrior(seen.t, seen.pose, seen.covariance, pose)
+
+
+def _covariance(position_sigma: float, heading_sigma: float) -> np.typing.NDArray[np.float64]:
+    return np.diag(np.square((position_sigma, position_sigma, heading_sigma)))
+
+
+def _parse(prior: str) -> list[float]:
+    """Position [m], and the heading [rad] if given."""
+    try:
+        x, y, *heading = (float(part) for part in prior.split(","))
+    except ValueError:
+        raise InputError(f"prior is {quoted(prior)}, expected {EXPECTED}") from None
+    if len(heading) > 1:
+        raise InputError(f"prior is {quoted(prior)}, expected {EXPECTED}")
+    if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and all(abs(angle) <= 2.0 * math.pi for angle in heading)):
+        raise InputError(f"prior is {quoted(prior)}, expected metres, at most {FARTHEST:g}, and a heading in radians")
+    return [x, y, *heading]
 
 
 def columns_of(streams: Iterable[str]) -> tuple[str, ...]:

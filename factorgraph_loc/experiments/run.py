@@ -16,8 +16,15 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.doubts import findable, never_localized, partly_scored, with_pauses
-from factorgraph_loc.experiments.preparation import prepare, unused, use_of, used_sensors
-from factorgraph_loc.experiments.prior import KNOWN, at_origin, resolve_prior
+from factorgraph_loc.experiments.preparation import (
+    KNOWN,
+    at_origin,
+    prepare,
+    resolve_prior,
+    unused,
+    use_of,
+    used_sensors,
+)
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, SpaceEstimator, finds_heading
 from factorgraph_loc.fusion.guarded import Guard, sound, sound_space, sound_trajectory
@@ -43,9 +50,9 @@ class RunConfig:
 
     ``estimator``: its registered name; ``settings``: overrides of its settings. ``sensors``: names of the streams it may use,
     None for those of the rig; ``rssi`` and ``phase`` are optional parts of the reads of ``rfid``. ``prior``: see
-    :func:`~factorgraph_loc.experiments.prior.resolve_prior`. ``seed``: of the estimator's random generator. ``max_gap`` [s]: the
-    largest interval between estimates that is interpolated for scoring; it changes no estimate. ``tick_gap`` [s]: there are no
-    estimates inside longer gaps between measurements.
+    :func:`~factorgraph_loc.experiments.preparation.resolve_prior`. ``seed``: of the estimator's random generator. ``max_gap``
+    [s]: the largest interval between estimates that is interpolated for scoring; it changes no estimate. ``tick_gap`` [s]: there
+    are no estimates inside longer gaps between measurements.
     """
 
     estimator: str

@@ -2,8 +2,7 @@
 
 A run's files are written beside the store's folders, synced, and moved into place by one rename. Its ``manifest.json`` contains
 the sha256 of each file except for timings. Whoever computes a run holds a lock on a file named by its key; the system releases it
-when the process ends in any way, so that no claim outlives its owner.
-"""
+when the process ends in any way, so that no claim outlives its owner."""
 
 from __future__ import annotations
 
@@ -16,21 +15,77 @@ import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.evaluation.warned import row_of
-from factorgraph_loc.experiments.stored_files import DamagedError, Failure, Figures, RunManifest, parse_stored
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files.temporary import sweep
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.figures import Track
 
+Whole = Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63)]  # as in tables
+Figure = Whole | Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
+FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]  # of a file within the run's folder
 MANIFEST, METRICS, TIMINGS, FAILURE = "manifest.json", "metrics.json", "timings.json", "failure.json"
 TIMING = "timing."  # prefix of timings
 State = Literal["ok", "failed", "missing", "damaged"]
 _AGAIN = "; `fgloc experiment run --verify` makes it again"
+
+
+class DamagedError(InputError):
+    """A stored file is missing, or differs from what was written."""
+
+
+class StoredFile(BaseModel):
+    """Base of the store's JSON files."""
+
+    model_config = ConfigDict(frozen=True, strict=True)
+
+
+class FileSum(StoredFile):
+    """Size and checksum of a file."""
+
+    bytes: Whole
+    sha256: str
+
+
+class RunManifest(StoredFile):
+    """The ``key`` of a run and its ``files`` by name."""
+
+    key: str
+    files: dict[FileName, FileSum]
+
+
+class Failure(StoredFile):
+    """Why a run gave no results."""
+
+    kind: str
+    reason: str
+
+
+class Figures(StoredFile):
+    """Scores or times of a run: numbers, None, and lists of these, besides the ``warnings``."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Figure | list[Figure]] = Field(init=False)
+    warnings: list[str] = []
+
+
+Kind = TypeVar("Kind", bound=StoredFile)
+
+
+def parse_stored(kind: type[Kind], content: bytes, path: Path) -> Kind:
+    """Parse the JSON ``content`` of the file ``path``. Raises DamagedError if it is not of that ``kind``."""
+    try:
+        return kind.model_validate_json(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part) for part in first["loc"])[:60]
+        raise DamagedError(f"{path}: is damaged ({where}{': ' * bool(where)}{first['msg'][:80]})") from error
 
 
 class StoreError(RunFailedError):
@@ -133,7 +188,7 @@ class Store:
 
     def track(self, key: str) -> Track:
         """The causal and the final trajectory of a run, with covariances, times [s] from its first estimate."""
-        from factorgraph_loc.experiments.stored_run import read_track  # noqa: PLC0415
+        from factorgraph_loc.experiments.output import read_track  # noqa: PLC0415
 
         return read_track(self.read(key, "estimates.parquet"))
 

@@ -29,6 +29,6 @@ def _import() -> None:
     """Import slow modules before the first run."""
     import cv2  # noqa: PLC0415
 
-    import factorgraph_loc.experiments.stored_run  # noqa: F401, PLC0415
+    import factorgraph_loc.experiments.output  # noqa: F401, PLC0415
 
     cv2.setNumThreads(1)

@@ -19,9 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
-from factorgraph_loc.exports.particles import Particles
 from factorgraph_loc.exports.rerun_camera import TIMELINE, WORLD, camera_path, record_camera, times
-from factorgraph_loc.exports.runs import StoredRun
+from factorgraph_loc.exports.runs import Particles, StoredRun
 from factorgraph_loc.exports.scene import DARK, LIT, REFERENCE, Colour, colours
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.results import writing

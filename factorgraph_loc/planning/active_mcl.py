@@ -32,7 +32,7 @@ from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.planning.proximity import ProximitySensor
+from factorgraph_loc.planning.robot import ProximitySensor
 from factorgraph_loc.sensors.base import NewVariable
 from factorgraph_loc.sensors.binding import bound_sensors
 from factors import se2

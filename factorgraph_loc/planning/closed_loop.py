@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
@@ -17,9 +18,9 @@ from factorgraph_loc.maps.free_space import CELL, FreeSpace, distance_to_walls, 
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import Belief, Mode, PoseEstimate
 from factorgraph_loc.model.measurement import Measurement, Tick
+from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
-from factorgraph_loc.planning.active_run import ActiveRun, PlanningStep
 from factorgraph_loc.planning.paths import Path, look_around, primitives, waypoint_paths, waypoints
 from factorgraph_loc.planning.policies import Choice, Policy, Situation, make_policy, usable
 from factorgraph_loc.planning.robot import SimulatedRobot
@@ -27,10 +28,9 @@ from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.sensors.odometry.simulation import RATE
 from factorgraph_loc.sensors.registry import sensors
-from factorgraph_loc.simulation.chance import generator
-from factorgraph_loc.simulation.plans import Plan, make_plan
 from factorgraph_loc.simulation.settings import SimulationSettings
-from factorgraph_loc.simulation.worlds import make_world
+from factorgraph_loc.simulation.simulate import generator
+from factorgraph_loc.simulation.worlds import Plan, make_plan, make_world
 from factorgraph_loc.text import quoted
 from factors import se2
 from factors.se2 import Array
@@ -45,6 +45,57 @@ TAGS, PLACES, SPREAD_OVER = 8, 6, 40  # nearest tags, nearest of the places spre
 LOOK = 0.5  # m between proximity readings
 PAUSE = 1.0  # s that a robot waits if it has no path
 SLACK = 0.2  # m that particles may be nearer to walls than the robot: the size of a cell
+
+
+@dataclass(frozen=True)
+class PlanningStep:
+    """One choice of a path.
+
+    At ``t`` [s] after ``metres`` [m], with true pose ``truth`` (3,), estimated ``pose`` (3,) and ``covariance`` (3, 3), both NaN
+    before the first observation. ``particles`` (K, 3): an equally weighted sample of the belief. ``candidates``: paths (S, 3)
+    from the true pose, in the world frame; ``values`` (C,): the policy's scores, higher is better, empty if it does not compare.
+    ``chosen``: the chosen path, None if there was none. ``planning_ms``: computing time.
+    """
+
+    t: float
+    metres: float
+    truth: Array
+    pose: Array
+    covariance: Array
+    particles: Array
+    candidates: tuple[Array, ...]
+    values: Array
+    chosen: Array | None
+    planning_ms: float
+
+
+@dataclass(frozen=True)
+class ActiveRun:
+    """A run of one policy with one estimator in one world.
+
+    ``localized``: the robot was localized correctly, after ``metres`` [m] and ``seconds`` [s], with ``error_position`` [m] and
+    ``error_heading`` [rad]; otherwise these are the values at the end. ``claimed_wrong``: at some time the estimator claimed to
+    be localized with an error above three times the limits. ``truth``: the true trajectory. ``steps``: the choices.
+    """
+
+    seed: int
+    preset: str
+    world: World
+    policy: str
+    estimator: str
+    localized: bool
+    metres: float
+    seconds: float
+    error_position: float
+    error_heading: float
+    claimed_wrong: bool
+    truth: Trajectory
+    steps: tuple[PlanningStep, ...]
+
+    @property
+    def planning_ms(self) -> Array:
+        """Computing times (N,) [ms] of the choices."""
+        return np.array([step.planning_ms for step in self.steps])
 
 
 def run_active(

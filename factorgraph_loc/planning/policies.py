@@ -20,8 +20,7 @@ from factorgraph_loc.files.models import nearest
 from factorgraph_loc.fusion.cloud import pose_moments
 from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.model.belief import Mode
-from factorgraph_loc.planning.fisher import fisher_gain
-from factorgraph_loc.planning.information import expected_gain, has_several_modes
+from factorgraph_loc.planning.information import expected_gain, fisher_gain, has_several_modes
 from factorgraph_loc.planning.paths import STEP, Path
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings

@@ -16,14 +16,11 @@ from factorgraph_loc.processes import run_each
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.sensors.simulated import times as times_of
-from factorgraph_loc.simulation.chance import generator
-from factorgraph_loc.simulation.plans import make_plan
 from factorgraph_loc.simulation.renderer import Image, Renderer
 from factorgraph_loc.simulation.scene import make_scene
 from factorgraph_loc.simulation.settings import SimulationSettings
-from factorgraph_loc.simulation.simulate import with_sensors
-from factorgraph_loc.simulation.trajectories import drive
-from factorgraph_loc.simulation.worlds import make_world
+from factorgraph_loc.simulation.simulate import drive, generator, with_sensors
+from factorgraph_loc.simulation.worlds import make_plan, make_world
 from factors import se2
 from factors.camera import model as reprojection
 from factors.se2 import Array

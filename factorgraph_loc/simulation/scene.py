@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.simulation import textures
 from factorgraph_loc.simulation.pictures import Canvas, paste
-from factorgraph_loc.simulation.plans import LOWEST_BOX, Plan, both_sides
+from factorgraph_loc.simulation.worlds import LOWEST_BOX, Plan, both_sides
 from factors.se2 import Array
 
 ROOM_HEIGHT = 2.7  # m

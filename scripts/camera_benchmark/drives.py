@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from factorgraph_loc.experiments.prior import REFERENCE_HEADING_SIGMA, REFERENCE_POSITION_SIGMA
+from factorgraph_loc.experiments.preparation import REFERENCE_HEADING_SIGMA, REFERENCE_POSITION_SIGMA
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.mapping.camera_poses import posed_frames
 from factorgraph_loc.mapping.point_mapping import map_points

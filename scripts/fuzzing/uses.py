@@ -14,8 +14,7 @@ from numpy.random import Generator
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.experiments.experiment import prepare
-from factorgraph_loc.experiments.index import load_results
-from factorgraph_loc.experiments.reporting import report_experiment
+from factorgraph_loc.experiments.reporting import load_results, report_experiment
 from factorgraph_loc.exports.foxglove import write_mcap
 from factorgraph_loc.exports.g2o import pose_graph, write_g2o
 from factorgraph_loc.exports.rerun_scene import write_rrd

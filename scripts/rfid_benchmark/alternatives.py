@@ -10,7 +10,7 @@ import numpy as np
 from benchmarking.ensemble import Series, series
 from benchmarking.report import Options, Report, pooled
 
-from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.problem import Problem
 from factorgraph_loc.fusion.variables import Values, constants_key, pose_key

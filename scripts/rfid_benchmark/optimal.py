@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.setup import Setup

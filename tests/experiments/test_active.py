@@ -11,7 +11,7 @@ from factorgraph_loc.experiments import active
 from factorgraph_loc.experiments.active import ROW, jobs_of, run_job, run_jobs, seek
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.planning.active_run import ActiveRun, PlanningStep
+from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation.settings import SimulationSettings, preset
 

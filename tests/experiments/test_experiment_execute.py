@@ -11,8 +11,8 @@ from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments import execute
 from factorgraph_loc.experiments.experiment import PACE, estimate_seconds, prepare, run_experiment
 from factorgraph_loc.experiments.experiment_file import Experiment
-from factorgraph_loc.experiments.index import load_results
 from factorgraph_loc.experiments.plan import plan
+from factorgraph_loc.experiments.reporting import load_results
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.experiments.store import FAILURE, MANIFEST, TIMINGS, Store, StoreError
 from factorgraph_loc.io.native.native import write_native
@@ -150,7 +150,7 @@ def test_a_full_disk_is_no_failure_of_the_run(planned, out, monkeypatch):
         raise OSError(28, "No space left on device")
 
     (one,) = planned()
-    monkeypatch.setattr("factorgraph_loc.experiments.stored_run.write_files", full)
+    monkeypatch.setattr("factorgraph_loc.experiments.output.write_files", full)
     with pytest.raises(StoreError, match="No space left on device"):
         execute.run_planned(one, out)
     assert Store(out).state(one.key) == "missing"

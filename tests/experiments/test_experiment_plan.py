@@ -10,7 +10,7 @@ import pytest
 from pydantic import BaseModel
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments import facts, globs, keys
+from factorgraph_loc.experiments import keys, log_source
 from factorgraph_loc.experiments import plan as plan_module
 from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.plan import MOST_RUNS, TooManyRunsError, plan
@@ -65,7 +65,7 @@ def test_a_glob_that_is_none_or_matches_nothing_is_one_line(planned, glob):
 
 
 def test_a_glob_visits_a_bounded_number_of_files(planned, logs, monkeypatch):
-    monkeypatch.setattr(globs, "VISITED", 20)
+    monkeypatch.setattr(log_source, "VISITED", 20)
     for i in range(30):
         (logs / f"x{i}").mkdir()
     with pytest.raises(InputError, match="visits more than"):
@@ -106,7 +106,7 @@ def test_runs_are_counted_before_any_is_planned(planned, content, monkeypatch):
 )
 def test_what_is_to_simulate_is_counted_before_any_log_is_simulated(planned, monkeypatch, settings, expected):
     """Each kind of limit, with 140 logs; those that are known already need not be simulated."""
-    monkeypatch.setattr(facts, "_facts", lambda *_: pytest.fail("a log was looked at"))
+    monkeypatch.setattr(keys, "_facts", lambda *_: pytest.fail("a log was looked at"))
     looks = expected.endswith("observations")
     monkeypatch.setattr(plan_module, "MOST_LOOKS", 28_799_999 if looks else 10**12)
     with pytest.raises(InputError, match=rf"^has to simulate drives of .*{expected}.*, expected at most"):
@@ -125,7 +125,7 @@ def test_what_is_simulated_already_counts_no_more(planned, monkeypatch):
 
 def test_an_interrupted_plan_keeps_what_it_has_looked_up(planned, monkeypatch):
     logs = [{"simulate": "office", "settings": {"drive": {"duration": 20.0}}, "seeds": [1, 2]}]
-    look, made = facts._facts, []
+    look, made = keys._facts, []
 
     def once(log):
         if made:
@@ -133,10 +133,10 @@ def test_an_interrupted_plan_keeps_what_it_has_looked_up(planned, monkeypatch):
         made.append(log.name)
         return look(log)
 
-    monkeypatch.setattr(facts, "_facts", once)
+    monkeypatch.setattr(keys, "_facts", once)
     with pytest.raises(KeyboardInterrupt):
         planned(logs=logs)
-    monkeypatch.setattr(facts, "_facts", lambda log: made.append(log.name) or look(log))
+    monkeypatch.setattr(keys, "_facts", lambda log: made.append(log.name) or look(log))
     assert [run.log for run in planned(logs=logs)] == made == ["office-1", "office-2"]
 
 
@@ -207,7 +207,6 @@ def test_a_key_changes_with_everything_that_a_result_depends_on(planned, logs, m
     found.append(key())
     for name, value in (("code_version", "x"), ("library_versions", {"gtsam": "9"})):
         monkeypatch.setattr(keys, name, lambda value=value: value)
-        monkeypatch.setattr(facts, name, lambda value=value: value)
         found.append(key())
     monkeypatch.setattr(keys, "RULE", 1)
     found.append(key())
@@ -275,7 +274,7 @@ def test_a_file_is_read_again_only_if_it_has_changed(tmp_path, monkeypatch):
 
 def test_parts_of_the_package_that_are_no_part_of_a_key_are_not_loaded_by_a_run():
     script = (
-        "import sys, factorgraph_loc.experiments.stored_run, factorgraph_loc.io.readers, factorgraph_loc.simulation\n"
+        "import sys, factorgraph_loc.experiments.output, factorgraph_loc.io.readers, factorgraph_loc.simulation\n"
         "from factorgraph_loc.fusion import registry\n"
         "for name in registry.ESTIMATORS: registry.estimator_type(name)\n"
         "print(*sys.modules)"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError, RunFailedError
-from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import estimator_type
 from factorgraph_loc.model.log import StartPose

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.store import FAILURE, MANIFEST, METRICS, TIMINGS, Store, StoreError
-from factorgraph_loc.experiments.stored_files import DamagedError
+from factorgraph_loc.experiments.store import FAILURE, MANIFEST, METRICS, TIMINGS, DamagedError, Store, StoreError
 
 KEY, OTHER = "ab" * 32, "cd" * 32
 FILES = {

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import rerun_scene
-from factorgraph_loc.exports.particles import Particles
-from factorgraph_loc.exports.runs import find_runs, read_runs
+from factorgraph_loc.exports.runs import Particles, find_runs, read_runs
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from landmark_world import simulate
 
-from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.belief import PoseEstimate, gaussian_belief

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.fusion.kept import Kept
 from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.measurement import Tick

@@ -20,7 +20,7 @@ from factorgraph_loc import (
     VelocityOdometry,
     YawRate,
 )
-from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.ekf import Ekf
 from factorgraph_loc.model.log import cut

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import factorgraph_loc as fgloc
-from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig

@@ -12,8 +12,7 @@ from factorgraph_loc.maps.free_space import distance_to_walls
 from factorgraph_loc.model.belief import Belief, Mode
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning import closed_loop
-from factorgraph_loc.planning.active_run import ActiveRun
-from factorgraph_loc.planning.closed_loop import run_active
+from factorgraph_loc.planning.closed_loop import ActiveRun, run_active
 from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
 from factorgraph_loc.simulation import preset
 from factors import se2

@@ -8,8 +8,7 @@ import pytest
 
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.planning.fisher import expected_covariance
-from factorgraph_loc.planning.information import FINEST, expected_gain, gaussian_entropy
+from factorgraph_loc.planning.information import FINEST, expected_covariance, expected_gain, gaussian_entropy
 from factorgraph_loc.planning.paths import primitives
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.sensors.landmarks.map import Landmark

@@ -9,8 +9,14 @@ import pytest
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.planning.fisher import expected_covariance, expected_information, fisher_gain
-from factorgraph_loc.planning.information import FINEST, expected_gain, gaussian_entropy
+from factorgraph_loc.planning.information import (
+    FINEST,
+    expected_covariance,
+    expected_gain,
+    expected_information,
+    fisher_gain,
+    gaussian_entropy,
+)
 from factorgraph_loc.planning.paths import Path, primitives
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.sensors.camera.forecast import CameraForecast

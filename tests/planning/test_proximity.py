@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.maps.free_space import CELL, free_space
-from factorgraph_loc.planning.proximity import SIGMA, TEMPERING, UNEXPECTED, ProximitySensor
+from factorgraph_loc.planning.robot import SIGMA, TEMPERING, UNEXPECTED, ProximitySensor
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.worlds import make_world
 

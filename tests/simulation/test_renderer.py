@@ -9,10 +9,10 @@ import pytest
 
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.simulation import preset
-from factorgraph_loc.simulation.plans import Plan, make_plan
 from factorgraph_loc.simulation.renderer import Renderer
 from factorgraph_loc.simulation.scene import ROOM_HEIGHT, make_scene
 from factorgraph_loc.simulation.settings import ImageSettings
+from factorgraph_loc.simulation.worlds import Plan, make_plan
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 

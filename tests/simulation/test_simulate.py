@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.model.world import World

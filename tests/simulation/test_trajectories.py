@@ -9,7 +9,7 @@ from factorgraph_loc.maps.walls import crosses
 from factorgraph_loc.model.world import World
 from factorgraph_loc.simulation import PRESETS, preset
 from factorgraph_loc.simulation.settings import DriveSettings
-from factorgraph_loc.simulation.trajectories import drive
+from factorgraph_loc.simulation.simulate import drive
 from factorgraph_loc.simulation.worlds import make_world
 from factors import se2
 

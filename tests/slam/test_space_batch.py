@@ -11,7 +11,7 @@ from space_world import RIG, carried, with_features
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation import space
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.io.readers import load

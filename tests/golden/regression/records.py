@@ -22,7 +22,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
-from factorgraph_loc.planning.active_run import ActiveRun
+from factorgraph_loc.planning.closed_loop import ActiveRun
 from factors.se2 import Array
 
 CAUSAL, FINAL, IN_SPACE, SUMS, LEARNT = 10, 6, 4, 4, 12  # rows that are held, at most

@@ -9,7 +9,7 @@ import pytest
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.experiments.prior import resolve_prior
+from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.rig import Rig
