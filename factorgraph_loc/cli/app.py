@@ -12,22 +12,17 @@ from factorgraph_loc.cli import (
     active,
     calibrating,
     experimenting,
-    exporting,
-    features,
     images,
     inspecting,
     lookups,
-    manifest,
     mapping,
-    rigs,
     running,
     scoring,
     show,
     simulating,
     viewing,
 )
-from factorgraph_loc.cli.stopping import end, unwrapped
-from factorgraph_loc.cli.streams import OutputError, standard_streams
+from factorgraph_loc.cli.stopping import OutputError, end, standard_streams, unwrapped
 from factorgraph_loc.errors import FglocError, unusable
 from factorgraph_loc.text import MESSAGE, plain
 from factorgraph_loc.threads import use_one_thread
@@ -87,20 +82,20 @@ app.command()(lookups.sensors)
 app.command()(lookups.readers)
 app.command()(inspecting.info)
 app.command()(inspecting.convert)
-app.command()(manifest.manifest)
+app.command()(inspecting.manifest)
 app.command()(running.run)
 app.command()(running.compare)
 app.command()(scoring.score)
 app.command()(viewing.view)
-app.command()(exporting.export)
+app.command()(viewing.export)
 app.command()(calibrating.calibrate)
 app.command("map")(mapping.map_)
 app.command()(images.images)
 app.command()(simulating.simulate)
 app.command()(active.active)
-app.add_typer(rigs.app, name="rigs")
+app.add_typer(lookups.rigs_app, name="rigs")
 app.add_typer(experimenting.app, name="experiment")
-app.add_typer(features.app, name="features")
+app.add_typer(images.features, name="features")
 
 
 def _print_version(wanted: bool) -> None:

@@ -1,4 +1,4 @@
-"""``fgloc view``: shows results and their log in a viewer."""
+"""``fgloc view`` and ``fgloc export``: results and their log in a viewer, and in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, Reader, Read
 if TYPE_CHECKING:
     from factorgraph_loc.exports.runs import Particles, StoredRun
     from factorgraph_loc.model.log import Log
+
 
 SAME = 1e-6  # m between the positions of a run and of its repetition
 
@@ -73,3 +74,33 @@ def _particles(log: Log, runs: list[StoredRun]) -> dict[str, Particles]:
 def shown(log: Log, runs: list[StoredRun]) -> dict[str, Any]:
     """The content of what is shown or written, for ``--json``."""
     return {"log": log.name, "runs": {run.name: str(run.folder.path) for run in runs}}
+
+
+def export(
+    what: What,
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            help="The file to write; its suffix selects the format: .mcap (Foxglove), .tum, .kitti or .g2o.",
+        ),
+    ],
+    reader: Reader = None,
+    reader_option: ReaderOption = None,
+    data_root: DataRoot = None,
+    rig: RigFile = None,
+    world: WorldFile = None,
+    json: Json = False,
+) -> None:
+    """Write runs for Foxglove, or the final trajectory of a run or the reference of a log for other programs."""
+    from factorgraph_loc.api import results
+
+    results.require_format(out)
+    log, runs = results.stored(what, LogOptions(reader, reader_option, data_root, rig, world).load_one)
+    files = results.write(log, runs, out)
+    if json:
+        show.document(shown(log, runs) | {"files": [str(file) for file in files]})
+    else:
+        show.line(f"wrote {' and '.join(map(str, files))}")

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 from PIL import Image
 
-from factorgraph_loc.cli.features import ALL
+from factorgraph_loc.cli.images import ALL
 from factorgraph_loc.evaluation.features.competitors import DETECTORS
 from factorgraph_loc.evaluation.features.feature_evaluation import FEATURES
 from factorgraph_loc.vision.features import EXTRACTORS

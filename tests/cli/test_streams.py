@@ -63,7 +63,7 @@ def test_who_reads_no_further_ends_the_command_quietly() -> None:
 def test_a_closed_descriptor_is_not_taken_by_a_file(tmp_path: Path) -> None:
     program = (
         "import os, sys\n"
-        "from factorgraph_loc.cli.streams import standard_streams\n"
+        "from factorgraph_loc.cli.stopping import standard_streams\n"
         "with standard_streams(), open(sys.argv[1], 'w') as file:\n"
         "    print(file.fileno(), file=file, flush=True)\n"
     )
