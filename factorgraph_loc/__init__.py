@@ -42,19 +42,23 @@ if TYPE_CHECKING:
     from factorgraph_loc.model.world import World
     from factorgraph_loc.sensors.camera.measurement import PixelSightings
     from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream, RightSightingStream, SightingStream
-    from factorgraph_loc.sensors.landmarks.map import Landmark
-    from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-    from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+    from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeStream
+    from factorgraph_loc.sensors.landmarks.settings import Landmark
     from factorgraph_loc.sensors.measurements import Exteroceptive, Odometry
-    from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
-    from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
+    from factorgraph_loc.sensors.odometry.measurement import (
+        IncrementOdometry,
+        IncrementStream,
+        VelocityOdometry,
+        VelocityStream,
+        YawRate,
+        YawRateStream,
+    )
     from factorgraph_loc.sensors.rfid.grids import read_grid, write_grid
     from factorgraph_loc.sensors.rfid.map import Tag
     from factorgraph_loc.sensors.rfid.measurement import RfidScan
     from factorgraph_loc.sensors.rfid.pushed import RfidRead
     from factorgraph_loc.sensors.rfid.stream import RfidStream
-    from factorgraph_loc.sensors.twist.measurement import Twist
-    from factorgraph_loc.sensors.twist.stream import TwistStream
+    from factorgraph_loc.sensors.twist.measurement import Twist, TwistStream
     from factorgraph_loc.vision.frame import CameraFrame
 
 __all__ = [
@@ -165,17 +169,21 @@ _MODULES = {
     "model.world": ("World",),
     "sensors.camera.measurement": ("PixelSightings",),
     "sensors.camera.stream": ("FeatureStream", "ImageStream", "RightSightingStream", "SightingStream"),
-    "sensors.landmarks.map": ("Landmark",),
-    "sensors.landmarks.measurement": ("BearingRange",),
-    "sensors.landmarks.stream": ("BearingRangeStream",),
-    "sensors.odometry.measurement": ("IncrementOdometry", "VelocityOdometry", "YawRate"),
-    "sensors.odometry.stream": ("IncrementStream", "VelocityStream", "YawRateStream"),
+    "sensors.landmarks.settings": ("Landmark",),
+    "sensors.landmarks.measurement": ("BearingRange", "BearingRangeStream"),
+    "sensors.odometry.measurement": (
+        "IncrementOdometry",
+        "VelocityOdometry",
+        "YawRate",
+        "IncrementStream",
+        "VelocityStream",
+        "YawRateStream",
+    ),
     "sensors.rfid.grids": ("read_grid", "write_grid"),
     "sensors.rfid.map": ("Tag",),
     "sensors.rfid.measurement": ("RfidScan",),
     "sensors.rfid.stream": ("RfidStream",),
-    "sensors.twist.measurement": ("Twist",),
-    "sensors.twist.stream": ("TwistStream",),
+    "sensors.twist.measurement": ("Twist", "TwistStream"),
     "vision.frame": ("CameraFrame",),
 }
 sys.meta_path.insert(0, OldPlaces())  # first, because an upgrade may leave empty folders of old modules behind

@@ -30,7 +30,11 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "factorgraph_loc.evaluation.result": ("factorgraph_loc.model.result",),
     "factorgraph_loc.grids": ("factorgraph_loc.sensors.rfid.grids",),
     "factorgraph_loc.localizer": ("factorgraph_loc.live.localizer",),
-    "factorgraph_loc.log": ("factorgraph_loc.model.log", *(f"{sensor}.stream" for sensor in _SENSORS)),
+    "factorgraph_loc.log": (
+        "factorgraph_loc.model.log",
+        *(f"{sensor}.measurement" for sensor in _SENSORS[:3]),
+        *(f"{sensor}.stream" for sensor in _SENSORS[3:]),
+    ),
     "factorgraph_loc.measurements": (
         "factorgraph_loc.model.measurement",
         "factorgraph_loc.sensors.measurements",
@@ -62,7 +66,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "factorgraph_loc.world": (
         "factorgraph_loc.model.world",
         "factorgraph_loc.io.native.world_file",
-        "factorgraph_loc.sensors.landmarks.map",
+        "factorgraph_loc.sensors.landmarks.settings",
         "factorgraph_loc.sensors.rfid.map",
     ),
 }
@@ -107,8 +111,8 @@ class OldPlaces(MetaPathFinder, Loader):
 
 
 def odometry_model(rig: Any, **options: bool) -> Any:
-    """factorgraph_loc.sensors.odometry.model.odometry_model"""
-    return load("factorgraph_loc.sensors.odometry.model:odometry_model")(rig, **options)
+    """factorgraph_loc.sensors.odometry.motion.odometry_model"""
+    return load("factorgraph_loc.sensors.odometry.motion:odometry_model")(rig, **options)
 
 
 def estimated(rig: Any, *, section: str) -> Any:

@@ -19,7 +19,7 @@ from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.landmarks.located import located_landmarks
-from factorgraph_loc.sensors.odometry.whole import whole_motion
+from factorgraph_loc.sensors.odometry.motion import whole_motion
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.text import listed
 from factors.motion import Increment

@@ -12,7 +12,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.checks import ROUNDING
 from factorgraph_loc.files.columns import MAX_SPAN, POSES, Column
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.registry import channels
 from factorgraph_loc.sensors.tables import columns_of
 from factors.se2 import Array

@@ -27,7 +27,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3, planar_estimate, planar_trajectory
 from factorgraph_loc.sensors.camera.sensor import Pixels
 from factorgraph_loc.sensors.registry import moving
-from factorgraph_loc.sensors.twist.use import in_space, twist_settings
+from factorgraph_loc.sensors.twist.measurement import in_space, twist_settings
 from factorgraph_loc.slam.monoslam_invariance import carried
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
 from factorgraph_loc.slam.monoslam_past import UpdateRecord, smoothed

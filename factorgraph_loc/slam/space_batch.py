@@ -21,8 +21,8 @@ from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.camera.sensor import Pixels
+from factorgraph_loc.sensors.twist.measurement import in_space, twist_settings
 from factorgraph_loc.sensors.twist.settings import TwistSettings
-from factorgraph_loc.sensors.twist.use import in_space, twist_settings
 from factorgraph_loc.slam.monoslam import Monoslam, MonoslamSettings
 from factorgraph_loc.slam.monoslam_sighting import Match
 from factorgraph_loc.slam.monoslam_state import Eye, squared

@@ -12,7 +12,7 @@ import numpy as np
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.result import RunResult
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factors import se2
 from factors.se2 import Array
 

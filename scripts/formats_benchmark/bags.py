@@ -24,7 +24,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.stream import ImageStream
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 
 KINDS = {"ROS 1": "bag", "ROS 2, mcap": "mcap", "ROS 2, sqlite3": "db3"}

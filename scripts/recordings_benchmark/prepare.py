@@ -20,10 +20,10 @@ from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.map import Landmark
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 from factorgraph_loc.sensors.odometry.simulation import wheel_odometry
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
 from factors import se2
 from factors.se2 import Array
 from recordings_benchmark.listed import Recording

@@ -13,10 +13,10 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.odometry.motion import OdometryMotion
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factorgraph_loc.sensors.odometry.simulation import ALONG, HEADING, LATERAL, RATE
-from factorgraph_loc.sensors.odometry.stream import IncrementStream
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings

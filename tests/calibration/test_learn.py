@@ -8,7 +8,7 @@ import pytest
 from factorgraph_loc.calibration.calibrate import check
 from factorgraph_loc.calibration.learn import learn
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factors import se2
 
 WHEELS = {"scale_distance": 0.95, "scale_rotation": 1.04, "speed_bias": -0.02, "direction": 0.06}

@@ -18,8 +18,8 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream
-from factorgraph_loc.sensors.landmarks.map import Landmark
-from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors import se2
 from factors.camera.model import camera_pose

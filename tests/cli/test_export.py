@@ -16,8 +16,8 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import read_tum
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.twist.measurement import TwistStream
 from factorgraph_loc.sensors.twist.settings import TwistSettings
-from factorgraph_loc.sensors.twist.stream import TwistStream
 
 
 @pytest.fixture(scope="module")

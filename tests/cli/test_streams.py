@@ -14,7 +14,7 @@ from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 
 NAME = "Gärtnerstraße ± 廊下 🤖"
 FGLOC = f"{sys.executable} -c 'from factorgraph_loc.cli.main import main; main()'"

@@ -14,7 +14,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera import summary as inspect_camera
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
-from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 
 CAMERA = CameraSettings(
     width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5, frontend={"feature": "orb", "count": 30}

@@ -10,7 +10,7 @@ from factorgraph_loc.evaluation.inspect import inspect
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream

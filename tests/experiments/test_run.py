@@ -15,8 +15,8 @@ from factorgraph_loc.fusion.registry import estimator_type
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
-from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
+from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 
 
 def test_order_of_what_is_fed(log, fake):

@@ -7,8 +7,8 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.columns import POINTS, POSES
-from factorgraph_loc.sensors.landmarks.columns import BEARING_RANGE
-from factorgraph_loc.sensors.odometry.columns import VELOCITIES
+from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
+from factorgraph_loc.sensors.odometry.tables import VELOCITIES
 from factorgraph_loc.sensors.tables import all_tables
 
 COLUMNS = [

@@ -9,8 +9,8 @@ from landmark_world import simulate
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.incremental import Incremental
 from factorgraph_loc.model.log import StartPose
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
-from factorgraph_loc.sensors.odometry.stream import IncrementStream
 
 CONFIGS = {
     "smoother": RunConfig("smoother"),

@@ -7,8 +7,8 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
-from factorgraph_loc.sensors.odometry.stream import VelocityStream
 
 NONE = GrowthSettings()
 BY_DISTANCE = OdometryNoise(

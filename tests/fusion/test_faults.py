@@ -12,7 +12,7 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.solvers import FullHistory, Window
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
 
 CONFIGS = {

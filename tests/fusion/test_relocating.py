@@ -11,7 +11,7 @@ from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import cut, join
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 
 CONFIGS = {
     "smoother": RunConfig("smoother"),

@@ -18,7 +18,7 @@ from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.known_position import KnownPosition
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
 from factorgraph_loc.sensors.odometry.motion import OdometryMotion
 from factorgraph_loc.simulation.settings import preset

@@ -15,9 +15,9 @@ from factorgraph_loc.io.checks import require_bounds, require_one_span
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.sensors.camera.columns import SIGHTINGS
-from factorgraph_loc.sensors.landmarks.columns import BEARING_RANGE
-from factorgraph_loc.sensors.odometry.columns import IMU, INCREMENTS, VELOCITIES
-from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream
+from factorgraph_loc.sensors.odometry.tables import IMU, INCREMENTS, VELOCITIES
 from factorgraph_loc.sensors.rfid.columns import INVENTORIES, RFID
 
 UNIX = 1_700_000_000_000_000_000

@@ -5,7 +5,7 @@ import pytest
 from mapped_hall import MANIFEST, ODOMETRY, READS, TRUTH, WHEELS
 
 from factorgraph_loc.files.column_mapping import iso_nanoseconds
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 
 
 def test_files_of_three_programs_are_one_log(hall, one):

@@ -20,11 +20,10 @@ from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.map import Landmark
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, Landmark
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.sensors.odometry.settings import ImuSettings
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
 
 
 def test_what_is_read(native, one):

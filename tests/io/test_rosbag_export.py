@@ -19,11 +19,11 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.twist.stream import TwistStream
+from factorgraph_loc.sensors.twist.measurement import TwistStream
 
 T0 = 1_700_000_000_123_456_789
 SUFFIXES = [".bag", ".mcap", ".db3"]

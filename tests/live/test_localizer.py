@@ -25,7 +25,7 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.ekf import Ekf
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factors import se2
 
 SENSORS = ("odometry", "rfid", "bearing_range")

@@ -28,12 +28,12 @@ from factorgraph_loc import (
 from factorgraph_loc.live.start import prior_of
 from factorgraph_loc.sensors.camera.columns import FEATURES
 from factorgraph_loc.sensors.camera.pushed import PIXELS
-from factorgraph_loc.sensors.landmarks.columns import BEARING_RANGE
-from factorgraph_loc.sensors.odometry.columns import IMU, INCREMENTS, VELOCITIES
+from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
+from factorgraph_loc.sensors.odometry.tables import IMU, INCREMENTS, VELOCITIES
 from factorgraph_loc.sensors.pushed import checked
 from factorgraph_loc.sensors.rfid.columns import READS
 from factorgraph_loc.sensors.rfid.pushed import scan_of
-from factorgraph_loc.sensors.twist.columns import TWIST
+from factorgraph_loc.sensors.twist.measurement import TWIST
 
 ONE = np.ones(1)
 SOUND = [

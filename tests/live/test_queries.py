@@ -18,7 +18,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import SightingStream
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors.camera import model as reprojection
 
 ASKED = ("estimate", "belief", "learnt", "trajectory", "diagnostics")

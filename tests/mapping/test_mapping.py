@@ -14,10 +14,9 @@ from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.map import Landmark
 from factorgraph_loc.sensors.landmarks.mapping import check
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, Landmark
 from factors import se2
 
 FRAME = np.array((3.0, -2.0, 2.0))  # of the run in the map

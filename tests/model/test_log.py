@@ -14,12 +14,16 @@ from factorgraph_loc.model.measurement import Rows
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.map import Landmark
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeStream
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, Landmark
+from factorgraph_loc.sensors.odometry.measurement import (
+    IncrementOdometry,
+    IncrementStream,
+    VelocityOdometry,
+    VelocityStream,
+    YawRate,
+    YawRateStream,
+)
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 
 

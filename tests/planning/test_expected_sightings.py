@@ -11,8 +11,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.information import FINEST, expected_covariance, expected_gain, gaussian_entropy
 from factorgraph_loc.planning.paths import primitives
 from factorgraph_loc.planning.sensors import Sensors
-from factorgraph_loc.sensors.landmarks.map import Landmark
-from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
+from factorgraph_loc.sensors.landmarks.settings import Landmark, SightingSettings
 from factorgraph_loc.simulation.settings import RACKHAM_RIG
 from factors.landmarks import model as bearing_range
 

@@ -13,10 +13,10 @@ from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.measurement import Stream
-from factorgraph_loc.sensors.landmarks.map import Landmark
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
-from factorgraph_loc.sensors.odometry.stream import IncrementStream
 from factors import se2
 
 SECONDS = 4.0

@@ -8,16 +8,15 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.map import Landmark
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, BearingRangeUncertainty
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, BearingRangeUncertainty, Landmark
+from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,
     OdometryNoise,
     OdometrySettings,
     OdometryUncertainty,
 )
-from factorgraph_loc.sensors.odometry.stream import VelocityStream
 from factors import se2
 from factors.landmarks import model as bearing_range
 

@@ -9,8 +9,8 @@ from camera_world import with_frames
 
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import cut
+from factorgraph_loc.sensors.odometry.measurement import YawRateStream
 from factorgraph_loc.sensors.odometry.settings import ImuSettings
-from factorgraph_loc.sensors.odometry.stream import YawRateStream
 from factorgraph_loc.sensors.rfid.settings import PhaseSettings, RssiSettings
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation import simulate as simulate_office

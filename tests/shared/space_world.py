@@ -12,8 +12,8 @@ from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import FeatureStream, RightSightingStream, SightingStream
+from factorgraph_loc.sensors.twist.measurement import TwistStream
 from factorgraph_loc.sensors.twist.settings import TwistSettings
-from factorgraph_loc.sensors.twist.stream import TwistStream
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera.model import linearize_in_space
 

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 
 UNKNOWN = {"landmarks": "unknown"}
 CONFIGS = {

@@ -16,7 +16,7 @@ from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.stream import FeatureStream
-from factorgraph_loc.sensors.odometry.stream import VelocityStream
+from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
 
 UNKNOWN = {"landmarks": "unknown"}

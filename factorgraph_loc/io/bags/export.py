@@ -24,7 +24,7 @@ from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera.stream import ImageStream
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.rfid.tables import tables_of
 from factorgraph_loc.sensors.tables import rows_of

@@ -17,7 +17,7 @@ from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
 from factorgraph_loc.io.bags.frames import FrameReference, StaticFrames
 from factorgraph_loc.io.bags.poses import POSES, Poses
 from factorgraph_loc.model.planar import Turned, about_z, on_floor
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream, YawRateStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.text import quoted
 from factors.se2 import Array, Integers
 

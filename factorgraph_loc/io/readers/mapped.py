@@ -30,7 +30,7 @@ from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Turned, about_z
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.tables import make_images
-from factorgraph_loc.sensors.odometry.columns import IMU
+from factorgraph_loc.sensors.odometry.tables import IMU
 from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, ReadsByRound, read_rounds
 from factorgraph_loc.sensors.tables import Reading, native_tables
 from factors.se2 import Array

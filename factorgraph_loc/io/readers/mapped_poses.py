@@ -16,9 +16,9 @@ from factorgraph_loc.io.readers.pose_file import EUROC, read_kitti, read_poses
 from factorgraph_loc.io.readers.unread import Unread
 from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows
-from factorgraph_loc.sensors.odometry.columns import INCREMENTS, VELOCITIES, WAYS
-from factorgraph_loc.sensors.odometry.columns import WHEELS as WHEEL_COLUMNS
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.odometry.tables import INCREMENTS, VELOCITIES, WAYS
+from factorgraph_loc.sensors.odometry.tables import WHEELS as WHEEL_COLUMNS
 from factors import se2
 from factors.se2 import Array, Integers
 

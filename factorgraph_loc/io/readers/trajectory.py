@@ -23,7 +23,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.odometry.stream import IncrementStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factors.se2 import Integers
 
 RATE = 10.0  # Hz, of KITTI's camera

@@ -3,29 +3,29 @@
 from factorgraph_loc.model.sections import Layer, Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
-__all__ = ["SENSOR", "columns", "located", "map", "mapping", "measurement", "settings", "stream"]
+__all__ = ["SENSOR", "located", "mapping", "measurement", "settings"]
 
 SENSOR = SensorType(
     "landmarks",
     channels=(
         Channel(
             "bearing_range",
-            streams=("factorgraph_loc.sensors.landmarks.stream:BearingRangeStream",),
+            streams=("factorgraph_loc.sensors.landmarks.measurement:BearingRangeStream",),
             measurements=("factorgraph_loc.sensors.landmarks.measurement:BearingRange",),
-            tables=("factorgraph_loc.sensors.landmarks.columns:BEARING_RANGE",),
+            tables=("factorgraph_loc.sensors.landmarks.measurement:BEARING_RANGE",),
             section="bearing_range",
         ),
     ),
     settings={"bearing_range": Section("factorgraph_loc.sensors.landmarks.settings:BearingRangeSettings")},
-    layers={"landmarks": Layer("factorgraph_loc.sensors.landmarks.map:Landmark")},
+    layers={"landmarks": Layer("factorgraph_loc.sensors.landmarks.settings:Landmark")},
     bind="factorgraph_loc.sensors.landmarks.bound:bind",
     summarize="factorgraph_loc.sensors.landmarks.summary:summarize",
     check="factorgraph_loc.sensors.landmarks.describe:check",
     findable="factorgraph_loc.sensors.landmarks.describe:findable",
     mappable="factorgraph_loc.sensors.landmarks.mapping:mappable",
-    draw="factorgraph_loc.sensors.landmarks.draw:draw",
+    draw="factorgraph_loc.sensors.landmarks.describe:draw",
     simulation={
-        "sightings": Section("factorgraph_loc.sensors.landmarks.simulation_settings:SightingSettings", always=True),
+        "sightings": Section("factorgraph_loc.sensors.landmarks.settings:SightingSettings", always=True),
     },
     simulate="factorgraph_loc.sensors.landmarks.simulation:simulate",
     looks="factorgraph_loc.sensors.landmarks.simulation:looks",

@@ -1,4 +1,4 @@
-"""Descriptions of what a run can do with landmarks."""
+"""What a run can do with landmarks, and plots of them."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,8 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
+from factorgraph_loc.sensors.marks import Marks
 from factorgraph_loc.sensors.usage import Use
 
 
@@ -36,3 +37,14 @@ def check(use: Use) -> None:
         f"{log.name}: {name}.landmarks is {wanted}, but no sighting has a {lacks}, so no landmark can be located; give a map of "
         f"them (--world) with {name}.landmarks=known, or leave out bearing_range (--sensors)"
     )
+
+
+def draw(log: Log) -> Marks:
+    """The landmarks of the map, on the floor, and the times of their sightings."""
+    places = log.world.positions()
+    positions = np.column_stack((places, np.zeros(len(places))))
+    stream = log.streams.get("bearing_range")
+    t, seen = np.empty(0), tuple[str, ...]()
+    if isinstance(stream, BearingRangeStream):
+        t, seen = stream.t + log.rig.time_offset("bearing_range"), tuple(stream.landmark)
+    return Marks("landmarks", tuple(log.world.landmarks), positions, t, seen, marker="^", size=7.0, order=4.0)

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.forecast import Array32, Places
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, SightingSettings
 from factorgraph_loc.sensors.landmarks.simulation import in_sight
-from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
 from factors.landmarks import model as bearing_range
 from factors.landmarks.model import BearingRangeModel
 from factors.se2 import Array

@@ -1,12 +1,13 @@
-"""Rig settings of a landmark sensor."""
+"""Settings of a landmark sensor in rigs and simulations, and landmarks of the map."""
 
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.model.settings import Angle, Offset, SensorSettings
+from factorgraph_loc.files.models import Coordinate, FileModel, InUnit
+from factorgraph_loc.model.settings import Angle, Covariance, Hertz, Metres, Offset, SensorSettings, spread_of
 from factors.landmarks.model import PARAMETERS, BearingRangeModel
+from factors.se2 import Array
 
 
 class BearingRangeUncertainty(FileModel):
@@ -69,3 +70,28 @@ class BearingRangeSettings(SensorSettings):
             bearing_sigma=self.bearing_sigma,
             robust=self.robust,
         )
+
+
+class SightingSettings(FileModel):
+    """Visibility of landmarks: ``rate`` measurements per second, up to ``max_range``, within ``field_of_view`` [rad] about the
+    sensor's axis, and not through walls."""
+
+    rate: Hertz = 2.0
+    max_range: Metres = 6.0
+    field_of_view: Annotated[float, Field(ge=0.01, le=6.3), InUnit("rad")] = 6.3
+
+
+class Landmark(FileModel):
+    """A point landmark: position [m] in the world frame and its uncertainty.
+
+    ``sigma``: standard deviation of the survey in x and y [m]. ``covariance``: (xx, xy, yy) [m^2], instead of ``sigma``.
+    """
+
+    x: Coordinate
+    y: Coordinate
+    sigma: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
+    covariance: Covariance | None = None
+
+    def spread(self) -> Array:
+        """The covariance (2, 2) of the position [m^2]."""
+        return spread_of(self.sigma, self.covariance)

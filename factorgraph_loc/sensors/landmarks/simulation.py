@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from factorgraph_loc.maps.walls import crosses
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
-from factorgraph_loc.sensors.landmarks.simulation_settings import SightingSettings
-from factorgraph_loc.sensors.landmarks.stream import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeStream
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, SightingSettings
 from factorgraph_loc.sensors.simulated import Ride, Simulated
 from factors import se2
 from factors.landmarks import model as bearing_range

@@ -3,7 +3,7 @@
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
-__all__ = ["SENSOR", "calibration", "columns", "measurement", "model", "settings", "simulation", "stream", "whole"]
+__all__ = ["SENSOR", "calibration", "measurement", "motion", "settings", "simulation", "tables"]
 
 SENSOR = SensorType(
     "odometry",
@@ -11,31 +11,31 @@ SENSOR = SensorType(
         Channel(
             "odometry",
             streams=(
-                "factorgraph_loc.sensors.odometry.stream:VelocityStream",
-                "factorgraph_loc.sensors.odometry.stream:IncrementStream",
+                "factorgraph_loc.sensors.odometry.measurement:VelocityStream",
+                "factorgraph_loc.sensors.odometry.measurement:IncrementStream",
             ),
             measurements=(
                 "factorgraph_loc.sensors.odometry.measurement:VelocityOdometry",
                 "factorgraph_loc.sensors.odometry.measurement:IncrementOdometry",
             ),
             tables=(
-                "factorgraph_loc.sensors.odometry.columns:VELOCITIES",
-                "factorgraph_loc.sensors.odometry.columns:INCREMENTS",
+                "factorgraph_loc.sensors.odometry.tables:VELOCITIES",
+                "factorgraph_loc.sensors.odometry.tables:INCREMENTS",
             ),
             described=(
-                "factorgraph_loc.sensors.odometry.columns:WAYS",
-                "factorgraph_loc.sensors.odometry.columns:WHEELS",
+                "factorgraph_loc.sensors.odometry.tables:WAYS",
+                "factorgraph_loc.sensors.odometry.tables:WHEELS",
             ),
             assemble="factorgraph_loc.sensors.odometry.tables:assemble",
-            sequence="factorgraph_loc.sensors.odometry.pushed:Increments",
+            sequence="factorgraph_loc.sensors.odometry.measurement:Increments",
             section="odometry",
             motion="floor",
         ),
         Channel(
             "imu",
-            streams=("factorgraph_loc.sensors.odometry.stream:YawRateStream",),
+            streams=("factorgraph_loc.sensors.odometry.measurement:YawRateStream",),
             measurements=("factorgraph_loc.sensors.odometry.measurement:YawRate",),
-            tables=("factorgraph_loc.sensors.odometry.columns:IMU",),
+            tables=("factorgraph_loc.sensors.odometry.tables:IMU",),
             section="imu",
             motion="turn",
         ),

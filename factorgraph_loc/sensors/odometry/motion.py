@@ -1,26 +1,69 @@
-"""The odometry of a run."""
+"""The odometry of a run, of a whole log, and the motion model of a rig."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
 
 import gtsam
 import numpy as np
 
 from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Measurement, Rows
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
-from factorgraph_loc.sensors.odometry.model import odometry_model
+from factorgraph_loc.sensors.odometry.settings import ImuSettings, OdometrySettings
 from factors import se2
 from factors.motion import ChainState, Increment
 from factors.odometry import kernels
 from factors.odometry.chain import OdometryChain
-from factors.odometry.model import PARAMETERS, OdometryFactor, between_factor
+from factors.odometry.model import PARAMETERS, OdometryFactor, OdometryModel, between_factor
 from factors.se2 import Array
 
+# m, rad, s: over which the error of a constant accumulates before other sensors correct it
+WAY, TURN, TIME = 4.0, 4.0, 8.0
 HORIZON = 5.0  # s of odometry that are kept
 UNUSED = {"imu": "yaw rate", "twist": "motion in space"}  # reason why rows of an unused sensor are ignored
 TWIST_TIME = 0.1  # s over which the velocity is averaged
+
+
+def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool = False) -> OdometryModel:
+    """The motion model; with ``use_gyro`` the heading's noise and bias are those of the gyro.
+
+    ``constants_as_noise``: for an estimator that does not estimate the uncertain constants: their errors are part of the noise,
+    as a random walk that reaches the variance of the constant's effect after :data:`WAY`, :data:`TURN` or :data:`TIME`.
+    """
+    s = rig.of(OdometrySettings)
+    along, heading = s.noise.along.model(), s.noise.heading.model()
+    if constants_as_noise:
+        u = s.uncertainty
+        along = along.widened(per_distance=u.scale_distance * math.sqrt(WAY))
+        heading = heading.widened(
+            per_distance=u.heading_drift * math.sqrt(WAY),
+            per_rotation=u.scale_rotation * math.sqrt(TURN),
+            per_time=u.heading_rate_bias * math.sqrt(TIME),
+        )
+    imu = rig.find(ImuSettings) or ImuSettings()
+    return OdometryModel(
+        scale_distance=s.scale_distance,
+        scale_rotation=s.scale_rotation,
+        speed_bias=s.speed_bias,
+        heading_rate_bias=s.heading_rate_bias,
+        heading_drift=s.heading_drift,
+        direction=s.direction,
+        delay=s.delay,
+        lag=s.lag,
+        turn_slowdown=s.turn_slowdown,
+        gyro_bias=imu.bias,
+        max_hold=s.max_hold,
+        unknown_distance=s.unknown_distance,
+        unknown_rotation=s.unknown_rotation,
+        along=along,
+        lateral=s.noise.lateral.model(),
+        heading=imu.heading.model() if use_gyro else heading,
+    )
 
 
 class OdometryMotion:
@@ -126,3 +169,13 @@ class OdometryMotion:
         """The robot's velocity (3,) just before ``t``, in the robot frame."""
         moved = self.relative(self.state(t - TWIST_TIME), self.state(t))
         return np.asarray(se2.log(moved.delta) / TWIST_TIME)
+
+
+def whole_motion(log: Log, sensors: Sequence[str]) -> OdometryMotion:
+    """The motion between any two times of a log, from the odometry and gyro among ``sensors``."""
+    motion = OdometryMotion(log.rig, tuple(sensors), Diagnostics())
+    motion.keep(math.inf)
+    for m in log.measurements(sensors):
+        if isinstance(m, VelocityOdometry | IncrementOdometry | YawRate):
+            motion.add(m)
+    return motion

@@ -3,17 +3,17 @@
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
-__all__ = ["SENSOR", "measurement", "settings", "stream", "use"]
+__all__ = ["SENSOR", "measurement", "settings"]
 
 SENSOR = SensorType(
     "twist",
     channels=(
         Channel(
             "twist",
-            streams=("factorgraph_loc.sensors.twist.stream:TwistStream",),
+            streams=("factorgraph_loc.sensors.twist.measurement:TwistStream",),
             measurements=("factorgraph_loc.sensors.twist.measurement:Twist",),
-            described=("factorgraph_loc.sensors.twist.columns:TWIST",),
-            check="factorgraph_loc.sensors.twist.pushed:check",
+            described=("factorgraph_loc.sensors.twist.measurement:TWIST",),
+            check="factorgraph_loc.sensors.twist.measurement:check",
             section="twist",
             motion="space",
         ),

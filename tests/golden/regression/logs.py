@@ -24,8 +24,8 @@ from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
 from factorgraph_loc.sensors.camera.stream import FeatureStream, RightSightingStream
+from factorgraph_loc.sensors.twist.measurement import TwistStream
 from factorgraph_loc.sensors.twist.settings import TwistSettings
-from factorgraph_loc.sensors.twist.stream import TwistStream
 from factorgraph_loc.simulation import preset, simulate
 
 SECONDS = 12.0  # of a drive among landmarks

@@ -7,8 +7,8 @@ import pytest
 
 from factorgraph_loc.sensors.odometry.calibration.noise import fit_noise
 from factorgraph_loc.sensors.odometry.calibration.windows import cut, integrated
+from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import OdometrySettings
-from factorgraph_loc.sensors.odometry.stream import VelocityStream
 from factors.odometry.chain import OdometryChain
 from factors.odometry.model import OdometryModel
 

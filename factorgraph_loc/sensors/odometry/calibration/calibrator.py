@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
 from factorgraph_loc.drawing.markup import Rows, image, number, table
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.constants import FittedConstant
@@ -15,12 +16,11 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import BLOCKS, ConstantsCalibrator, ConstantsFound, Settled, Told, Unit
 from factorgraph_loc.sensors.odometry.calibration import constants as odometry
-from factorgraph_loc.sensors.odometry.calibration.figures import odometry_figure
-from factorgraph_loc.sensors.odometry.calibration.noise import NoiseFit, fit_noise
+from factorgraph_loc.sensors.odometry.calibration.noise import BLACKOUT, LENGTHS, NoiseFit, fit_noise
 from factorgraph_loc.sensors.odometry.calibration.windows import Windows, cut, odometry_of
-from factorgraph_loc.sensors.odometry.model import odometry_model
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.odometry.motion import odometry_model
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 
@@ -29,6 +29,7 @@ ROUNDS = 2  # of fitting constants and scatter in turn
 MOST_OUTLIERS = 0.05  # share of the windows
 NOISE = Unit("odometry", ("noise",))
 KINDS = {VelocityStream: "velocities", IncrementStream: "increments"}
+_VIEW = 5.0  # robust standard deviations; larger residuals are drawn at the edge
 
 
 @dataclass(frozen=True)
@@ -194,3 +195,41 @@ def _wheels(rig: Rig) -> list[tuple[str, float, float]]:
 
 
 CALIBRATOR = OdometryCalibrator()
+
+
+def odometry_figure(windows: Sequence[Windows], model: OdometryModel) -> bytes:
+    """Residuals over windows: in time, over distance, and their growth with the length of the window."""
+    figure, axes = grid(3, 3, 12.0)
+    residuals = [one.residuals(model) for one in windows]
+    lengths = (*LENGTHS, BLACKOUT)
+    growth = [_growth([cut(one.log, length) for one in windows], model) for length in lengths]
+    for row, (panels, (what, unit)) in enumerate(
+        zip(axes, (("along", "m"), ("lateral", "m"), ("heading", "rad")), strict=True)
+    ):
+        for i, (one, residual) in enumerate(zip(windows, residuals, strict=True)):
+            start, end = one.states(model)
+            limit = max(_VIEW * 1.4826 * float(np.median(np.abs(residual[:, row]))), 1e-3)
+            values = np.clip(residual[:, row], -limit, limit)
+            style = {"color": COLOURS[i % len(COLOURS)], "label": one.log.name}
+            panels[0].plot(one.begin, values, ".", markersize=3, **style)
+            panels[1].plot((end - start)[:, 4], values, ".", markersize=3, **style)
+        panels[2].plot(
+            lengths, [g[0][row] for g in growth], "o-", color=COLOURS[0], label="residuals, root mean square"
+        )
+        panels[2].plot(lengths, [g[1][row] for g in growth], "s--", color="0.3", label="noise in the rig")
+        panels[2].set_xscale("log")
+        panels[2].set_yscale("log")
+        panels[0].set(xlabel="time [s]", ylabel=f"{what} [{unit}] in 2 s")
+        panels[1].set(xlabel="distance [m] in 2 s", ylabel=f"{what} [{unit}] in 2 s")
+        panels[2].set(xlabel="length of the window [s]", ylabel=f"{what} [{unit}]")
+    legend(figure, axes.flat, markers=3.0)
+    return png(figure)
+
+
+def _growth(windows: Sequence[Windows], model: OdometryModel) -> tuple[Array, Array]:
+    """Root mean squares (3,) of the residuals and of the model's prediction for them."""
+    squares = np.concatenate([one.residuals(model) for one in windows]) ** 2
+    stated = np.concatenate([np.diagonal(one.covariances(model), axis1=1, axis2=2) for one in windows])
+    if not len(squares):
+        return np.full(3, np.nan), np.full(3, np.nan)
+    return np.sqrt(np.mean(squares, axis=0)), np.sqrt(np.mean(stated, axis=0))

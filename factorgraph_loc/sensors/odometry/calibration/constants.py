@@ -8,8 +8,8 @@ import numpy as np
 
 from factorgraph_loc.fitting.robust import Constant, Fit, blocks, fit, loss, spread
 from factorgraph_loc.sensors.odometry.calibration.windows import Windows, odometry_of
+from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import OdometrySettings
-from factorgraph_loc.sensors.odometry.stream import VelocityStream
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 

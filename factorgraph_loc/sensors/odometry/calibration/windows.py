@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.odometry.model import odometry_model
-from factorgraph_loc.sensors.odometry.stream import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.odometry.motion import odometry_model
 from factors import se2
 from factors.motion import ChainState
 from factors.odometry.chain import OdometryChain
