@@ -19,7 +19,6 @@ from typing import Literal
 
 import numpy as np
 from scipy.special import ndtr
-from scipy.stats import rankdata
 
 from factorgraph_loc.evaluation.metrics import CONFIDENCE
 from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS, bounds, draw_pooled, pair_seeds
@@ -201,8 +200,10 @@ def mean_nees_band(counts: Sequence[float], dof: float) -> tuple[float, float]:
 
 
 def _ranks(differences: Array) -> Array:
-    """Ranks of the absolute values; zeros get the lowest and count for neither side."""
-    return np.asarray(rankdata(np.abs(differences)))
+    """Ranks of the absolute values, equal ones sharing theirs; zeros get the lowest and count for neither side. As
+    ``scipy.stats.rankdata``, which takes half a second to import."""
+    _, which, counts = np.unique(np.abs(differences), return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(counts) - 0.5 * (counts - 1.0))[which])
 
 
 def _average(scores: Array, rms: bool) -> Array:
