@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from in_short import blank_pictures, in_short, runs_here  # noqa: F401 - fixtures
 from typer.testing import CliRunner, Result
 
 from factorgraph_loc.cli.app import app

@@ -6,23 +6,11 @@ import math
 import polars as pl
 import pytest
 
-from factorgraph_loc.experiments import active
-
 SMALL = ("--set", "world.width=8", "--set", "world.plan=hall", "--set", "world.depth=6", "--set", "world.tags=12")
 FEW = ("--set", "particles=300", "--set", "policy.samples=16")
 
 
-@pytest.fixture
-def here(monkeypatch):
-    """Runs in this process: to start others takes long."""
-
-    def run_each(function, jobs, _):
-        for i, job in enumerate(jobs):
-            yield i, function(job)
-
-    monkeypatch.setattr(active, "run_each", run_each)
-
-
+@pytest.mark.in_full
 def test_runs_have_processes_of_their_own(fgloc, tmp_path):
     out = tmp_path / "out"
     done = fgloc("active", "office", "--policy", "random", "--seeds", "0:2", *SMALL, *FEW, "-o", out)
@@ -35,7 +23,6 @@ def test_runs_have_processes_of_their_own(fgloc, tmp_path):
     assert "holds results already" in again.stderr
 
 
-@pytest.mark.usefixtures("here")
 def test_policies_are_compared(fgloc, tmp_path):
     out = tmp_path / "out"
     few = (*SMALL[:-1], "world.tags=4", "--max-metres", 8)
@@ -49,7 +36,6 @@ def test_policies_are_compared(fgloc, tmp_path):
     assert (out / "plots" / "comparison.png").exists()
 
 
-@pytest.mark.usefixtures("here")
 def test_json_is_all_that_is_printed(fgloc, tmp_path):
     done = fgloc("active", "office", *SMALL, *FEW, "--policy", "random,patrol", "--json", "-o", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
@@ -60,7 +46,6 @@ def test_json_is_all_that_is_printed(fgloc, tmp_path):
     assert found["failures"] == []
 
 
-@pytest.mark.usefixtures("here")
 def test_a_robot_that_finds_nothing_gives_up(fgloc, tmp_path):
     out = tmp_path / "out"
     bare = (*SMALL[:-1], "world.tags=0")
@@ -72,7 +57,6 @@ def test_a_robot_that_finds_nothing_gives_up(fgloc, tmp_path):
     assert "never" in done.stdout
 
 
-@pytest.mark.usefixtures("here")
 def test_the_world_may_come_from_a_file(fgloc, tmp_path):
     path = tmp_path / "store.toml"
     path.write_text('preset = "office"\n[world]\nplan = "hall"\nwidth = 8\ndepth = 6\ntags = 12\n')
@@ -83,7 +67,6 @@ def test_the_world_may_come_from_a_file(fgloc, tmp_path):
     assert row["error_heading"] < math.radians(10.0)
 
 
-@pytest.mark.usefixtures("here")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -90,6 +90,7 @@ def test_convert_overwrites_a_log_alone(fgloc, short_log, tmp_path):
     assert (out / "notes.md").read_text() == "mine"
 
 
+@pytest.mark.in_full
 def test_run_writes_its_files_and_says_where(fgloc, short_log, tmp_path):
     out = tmp_path / "out"
     result = fgloc("run", short_log, "-e", "ekf", "-o", out, "--seed", 3)
@@ -262,10 +263,9 @@ def test_run_says_what_is_doubtful_and_stores_it(fgloc, doubtful_log, tmp_path):
     assert len(stored) == 1
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_compare_says_what_is_doubtful_once_and_stores_it(fgloc, doubtful_log, tmp_path, jobs):
+def test_compare_says_what_is_doubtful_once_and_stores_it(fgloc, doubtful_log, tmp_path):
     out = tmp_path / "out"
-    result = fgloc("compare", doubtful_log, "-e", "dead_reckoning,ekf", "-o", out, "--jobs", jobs)
+    result = fgloc("compare", doubtful_log, "-e", "dead_reckoning,ekf", "-o", out, "--jobs", 2)
     assert result.exit_code == 0, result.output
     assert result.stderr.count(DOUBT) == 1
     text = json.loads((out / "runs/short/ekf/seed0/metrics.json").read_text())["warnings"][0]
@@ -277,7 +277,18 @@ def test_compare_says_what_is_doubtful_once_and_stores_it(fgloc, doubtful_log, t
 
 def test_compare_prints_one_table_with_seeds_pooled_and_the_best_in_words(fgloc, short_log, tmp_path):
     out = tmp_path / "out"
-    result = fgloc("compare", short_log, "-e", "dead_reckoning,particle_filter", "-o", out, "--seeds", "0:2")
+    result = fgloc(
+        "compare",
+        short_log,
+        "-e",
+        "dead_reckoning,particle_filter",
+        "-o",
+        out,
+        "--seeds",
+        "0:2",
+        "--set",
+        "particle_filter.particles=500",
+    )
     assert result.exit_code == 0, result.output
     lines = [line.split() for line in result.stdout.splitlines()]
     assert [line[-1] for line in lines if line[:1] == ["short"]] == ["1/1", "2/2"]
@@ -336,6 +347,7 @@ def test_compare_prints_json_alone(fgloc, short_log, tmp_path):
 
 
 def test_a_pipe_gets_plain_text(short_log, tmp_path):
+    """A comparison as it is given to a shell, with processes of its own and all pictures."""
     command = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
     arguments = ["compare", str(short_log), "-e", "dead_reckoning,ekf", "-o", str(tmp_path / "out")]
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=True)

@@ -42,6 +42,7 @@ def shown(text: str) -> bool:
     return all(c == "\n" or c.isprintable() for c in text)
 
 
+@pytest.mark.in_full
 @settings(max_examples=2, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(
     name=ANY, landmark=st.text("ab$_\\é廊\x1b\u202e", min_size=1, max_size=40).filter(lambda text: text == text.strip())

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from in_short import blank_pictures, runs_here  # noqa: F401 - fixtures
 from straight_log import log  # noqa: F401 - a fixture
 
 from factorgraph_loc.files.models import FileModel

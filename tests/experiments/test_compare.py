@@ -11,6 +11,7 @@ from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.io.results.layout import FILES
 
 
+@pytest.mark.usefixtures("runs_here", "blank_pictures")
 def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
     nowhere = replace(log, name="no/where", reference=None)
     configs = [
@@ -58,8 +59,12 @@ def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
 
 
 def test_an_unforeseen_error_leaves_its_traceback(log, tmp_path):
+    """In a process of its own, as the run beside it, whose pictures are drawn."""
     broken = replace(log, streams={"odometry": log.streams["odometry"], "bearing_range": None})
-    (row,) = compare([broken], [RunConfig("dead_reckoning", prior="0,0,0")], tmp_path).rows
+    config = RunConfig("dead_reckoning", prior="0,0,0")
+    row, other = compare([broken, replace(log, name="whole")], [config], tmp_path, jobs=2).rows
+    assert other["status"] == "ok"
+    assert (tmp_path / "plots/whole-trajectories.png").stat().st_size > 5000  # it is drawn
     assert row["reason"].startswith("AttributeError: ")
     assert "Traceback" in (tmp_path / "runs/straight/dead_reckoning/seed0/error.txt").read_text()
 
@@ -81,6 +86,7 @@ def test_bad_input_is_found_before_anything_runs(log, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("runs_here", "blank_pictures")
 def test_the_same_comparison_may_be_made_again_where_it_was_interrupted(log, tmp_path):
     out = tmp_path / "out"
     configs = [RunConfig("dead_reckoning", prior="reference"), RunConfig("ekf", prior="reference")]
@@ -100,6 +106,7 @@ def test_the_same_comparison_may_be_made_again_where_it_was_interrupted(log, tmp
         compare([log], configs, out)
 
 
+@pytest.mark.usefixtures("runs_here", "blank_pictures")
 def test_what_a_killed_run_has_left_beside_its_place_is_removed(log, tmp_path):
     place = tmp_path / "out/runs/straight/ekf"
     (place / ".seed0.fgloc-0123abcd").mkdir(parents=True)

@@ -88,6 +88,7 @@ def test_no_tag_of_the_map_is_ever_read(reading):
     assert any("none of the 3 tags of the map is read" in warning for warning in result.warnings)
 
 
+@pytest.mark.usefixtures("runs_here", "blank_pictures")
 def test_compare_takes_the_same_sensors(reading, tmp_path):
     compare([reading], [RunConfig("dead_reckoning", sensors=ALL[:3])], tmp_path / "out", jobs=1)
     assert not list((tmp_path / "out").rglob("error.txt"))

@@ -43,7 +43,9 @@ def test_no_import_goes_up():
 
 def test_nothing_waits_for_the_statistics_of_scipy():
     # their import takes half a second, in each process of a comparison too; scipy.special has what is needed of them
-    assert not [path for path in MODULES.values() if re.search(r"^ *(from|import) scipy\.stats", path.read_text(), re.M)]
+    assert not [
+        path for path in MODULES.values() if re.search(r"^ *(from|import) scipy\.stats", path.read_text(), re.M)
+    ]
 
 
 def test_no_estimator_imports_a_sensor():

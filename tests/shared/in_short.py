@@ -1,0 +1,57 @@
+"""What tests of commands need not wait for: the start of other processes, and the drawing of pictures.
+
+Comparisons and experiments in processes of their own, and pictures in full, have tests of their own (``tests/test_processes.py``,
+``tests/experiments``, ``tests/evaluation/test_plots.py``, ``tests/drawing``), and here those that are marked ``in_full``.
+"""
+
+import pickle
+
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from factorgraph_loc.experiments.execute import run_planned
+
+
+@pytest.fixture(autouse=True)
+def in_short(request):
+    """Runs are made in this process, and pictures are a blank line, but for tests that are marked ``in_full``."""
+    if request.node.get_closest_marker("in_full") is None:
+        request.getfixturevalue("runs_here")
+        request.getfixturevalue("blank_pictures")
+
+
+@pytest.fixture
+def runs_here(monkeypatch):
+    """Comparisons and experiments make their runs in this process. What would be sent to another is pickled all the same."""
+
+    def run_each(function, jobs, *_, **__):
+        for i, job in enumerate(jobs):
+            try:
+                value = _sent(_sent(function)(_sent(job)))
+            except Exception as error:
+                value = error
+            yield i, value
+
+    def execute(runs, folder, *, again=False, **_):
+        for run in runs:
+            yield _sent(run_planned(_sent(run), folder, again=again))
+
+    for user in ("active", "compare"):
+        monkeypatch.setattr(f"factorgraph_loc.experiments.{user}.run_each", run_each)
+    monkeypatch.setattr("factorgraph_loc.experiments.experiment.execute", execute)
+
+
+def _sent(what):
+    return pickle.loads(pickle.dumps(what))
+
+
+@pytest.fixture
+def blank_pictures(monkeypatch):
+    """Figures are made, but neither laid out nor drawn: a picture is one blank line, as wide as it would be."""
+
+    def savefig(figure, out, *, format, dpi):
+        Image.new("L", (round(figure.get_figwidth() * dpi), 1), 255).save(out, format=format)
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    monkeypatch.setattr(Figure, "draw_without_rendering", lambda _: None)
