@@ -1,4 +1,5 @@
-"""Summaries and paired comparisons of active localization runs, policy by policy on the same seeds.
+"""Active localization runs, policy by policy on the same seeds: summaries, paired comparisons, and plots of them and of the
+decisions of one run.
 
 A run that failed or did not end localized counts with an infinite distance."""
 
@@ -278,9 +279,7 @@ def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
         share = np.arange(len(known) + 1) / max(len(driven), 1)
         x = np.concatenate((np.zeros(1), known, (longest,)))
         axis.step(x, np.append(share, share[-1]), where="post", label=policy, linewidth=2.0, **style)
-    axis.set_ylim(0.0, 1.0)
-    axis.set_xlim(0.0, longest)
-    axis.set(xlabel="metres driven", ylabel="share of runs localized")
+    axis.set(ylim=(0.0, 1.0), xlim=(0.0, longest), xlabel="metres driven", ylabel="share of runs localized")
 
 
 def _farthest(rows: Sequence[Row], case: tuple[str, str]) -> float:
@@ -308,8 +307,7 @@ def _decision(axis: Axes, track: SeekingTrack, index: int) -> None:
     so_far = track.truth if last else track.truth[driven <= one.metres + 1e-6]
     axis.plot(*so_far[:, :2].T, color=COLOURS[0], linewidth=1.2, label="way (true)", zorder=4)
     low, high = _outline(track).min(axis=0), _outline(track).max(axis=0)
-    axis.set_xlim(low[0] - 0.5, high[0] + 0.5)
-    axis.set_ylim(low[1] - 0.5, high[1] + 0.5)
+    axis.set(xlim=(low[0] - 0.5, high[0] + 0.5), ylim=(low[1] - 0.5, high[1] + 0.5))
     axis.set_aspect("equal", adjustable="box")
     axis.set_title(f"after {one.metres:.1f} m" + (f", way to the end at {track.metres:.1f} m" if last else ""))
 

@@ -60,8 +60,7 @@ def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
     start, end = track.final.t[0], track.final.t[-1]
     for axis in axes.values():
         mark_events(axis, track.events)
-        axis.set_xlim(start, max(end, start + 1e-3))
-        axis.set_xlabel("time [s]")
+        axis.set(xlim=(start, max(end, start + 0.001)), xlabel="time [s]")
     legend(figure, axes.values())
     return figure
 
@@ -83,9 +82,7 @@ def running_mean(t: Array, values: Array, weights: Array) -> tuple[Array, Array]
 
 def _nees(axis: Axes, kind: str, trajectory: Trajectory | None, reference: Trajectory, max_gap: float) -> None:
     dof = 3 if reference.has_heading else 2
-    axis.set_title(f"{kind} poses")
-    axis.set_ylabel("NEES of x, y, heading" if dof == 3 else "NEES of x, y")
-    axis.set_yscale("log")
+    axis.set(title=f"{kind} poses", ylabel="NEES of x, y, heading" if dof == 3 else "NEES of x, y", yscale="log")
     low, high = chi_squared.quantile(_TAILS, dof)
     axis.axhspan(low, high, **_BAND)
     axis.axhline(dof, **_IDEAL)
@@ -103,9 +100,7 @@ def _nis(axis: Axes, sensor: str, rows: Array) -> None:
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     t, nis, dof = rows.T
     mean, total = running_mean(t, nis, dof)
-    axis.set_title(f"innovations of {sensor}")
-    axis.set_ylabel("NIS per degree of freedom")
-    axis.set_yscale("log")
+    axis.set(title=f"innovations of {sensor}", ylabel="NIS per degree of freedom", yscale="log")
     mean[np.diff(t, append=t[-1]) > WINDOW] = np.nan  # no line across a gap
     low, high = (np.where(np.isnan(mean), np.nan, chi_squared.quantile(tail, total) / total) for tail in _TAILS)
     axis.fill_between(t, low, high, **_BAND)

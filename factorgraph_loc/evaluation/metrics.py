@@ -1,4 +1,10 @@
-"""Pieces of a path over which relative errors are taken."""
+"""Accuracy of a trajectory against the reference, and consistency of its covariances.
+
+There is no alignment, as the map's frame is known; for runs that estimated the map, aligned figures are added. Pairing of poses:
+:mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to
+Tracking and Navigation", 2001, section 5.4. Relative pose error: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
+systems", 2012, section IV.A, over path length instead of time.
+"""
 
 import bisect
 import itertools

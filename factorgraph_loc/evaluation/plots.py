@@ -136,8 +136,7 @@ def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -
             (_extent(e, t, row) for e, (_, t) in zip(found, track.kinds(), strict=True) if e and t), default=1.0
         )
         for axis in axes[row]:
-            axis.set_ylim(-limit, limit)
-            axis.set_ylabel(f"error in {what} [{unit}]")
+            axis.set(ylim=(-limit, limit), ylabel=f"error in {what} [{unit}]")
     legend(figure, axes[0])
     return figure
 
@@ -156,8 +155,7 @@ def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Tra
                 _distribution(axes[row, column], getattr(e, what), label=estimator, **style)
     for row, (what, unit) in enumerate(rows):
         for axis in axes[row]:
-            axis.set_xlabel(f"{what} error [{unit}]")
-            axis.set_ylabel("share of times below")
+            axis.set(xlabel=f"{what} error [{unit}]", ylabel="share of times below")
         _same_range(axes[row])
     legend(figure, axes[0])
     return figure
@@ -172,8 +170,7 @@ def update_times(log: Log, tracks: Mapping[str, Track]) -> Figure:
             axis.plot([], [], label=f"{estimator} (offline)", **style)
         else:
             _distribution(axis, track.update_ms, label=estimator, **style)
-    axis.set_xlabel("time per update [ms]")
-    axis.set_ylabel("share of updates below")
+    axis.set(xlabel="time per update [ms]", ylabel="share of updates below")
     legend(figure, axes[0])
     return figure
 
@@ -190,11 +187,9 @@ def _map(axis: Axes, log: Log, view: Array | None) -> None:
             look: dict[str, Any] = {"markersize": m.size, "label": m.layer, "zorder": m.order}
             axis.plot(*m.positions[:, :2].T, f"k{m.marker}", markerfacecolor="none", **look)
     axis.set_aspect("equal", adjustable="box")
-    axis.set_xlabel("x [m]")
-    axis.set_ylabel("y [m]")
+    axis.set(xlabel="x [m]", ylabel="y [m]")
     if view is not None:
-        axis.set_xlim(view[0, 0], view[1, 0])
-        axis.set_ylim(view[0, 1], view[1, 1])
+        axis.set(xlim=(view[0, 0], view[1, 0]), ylim=(view[0, 1], view[1, 1]))
 
 
 def _layers(log: Log) -> list[Marks]:
@@ -247,8 +242,7 @@ def _extent(e: Errors, trajectory: Trajectory, row: int) -> float:
 
 def _distribution(axis: Axes, values: Array, **style: Any) -> None:
     values = np.sort(values[np.isfinite(values)])
-    axis.set_xscale("log")
-    axis.set_ylim(0.0, 1.0)
+    axis.set(xscale="log", ylim=(0.0, 1.0))
     if len(values):
         # an error of exactly 0 is not on a logarithmic axis
         axis.plot(np.maximum(values, 1e-6), np.arange(1, len(values) + 1) / len(values), linewidth=2.0, **style)

@@ -1,7 +1,13 @@
-"""Pooled figures, and differences between estimators with intervals.
+"""Pooled figures, differences between estimators with intervals, and paired comparison of two methods on the same cases.
 
 Runs are paired by log and seed; logs are clusters. The interval is a percentile bootstrap over logs and, within each, over seeds
-(Davison and Hinkley, "Bootstrap Methods and their Application", 1997, section 3.8)."""
+(Davison and Hinkley, "Bootstrap Methods and their Application", 1997, section 3.8).
+
+McNemar's exact test of proportions: McNemar, "Note on the sampling error of the difference between correlated proportions or
+percentages", Psychometrika 12(2), 1947, with the exact binomial distribution. Medians: percentile bootstrap over the cases (Efron
+and Tibshirani, "An Introduction to the Bootstrap", 1993, section 13.3). A case that never succeeds has an infinite value: the
+median exists if more than half of the cases are finite.
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -173,16 +173,13 @@ def picture(log: str, results: ImageResults) -> Figure:
             position.plot(outcome.frames, np.clip(outcome.position, 1e-4, 10.0), **style)
             angle.plot(outcome.frames, np.clip(np.degrees(outcome.angle), 1e-2, 180.0), **style)
         above.set_aspect("equal", adjustable="datalim")
-        above.set_xlabel("x [m]")
-        above.set_ylabel("y [m]")
+        above.set(xlabel="x [m]", ylabel="y [m]")
         for axis, limit, name in (
             (position, NEAR, "position error [m]"),
             (angle, np.degrees(TURNED), "angle [degrees]"),
         ):
             axis.axhline(limit, color="0.4", linestyle="--")
-            axis.set_yscale("log")
-            axis.set_xlabel("image")
-            axis.set_ylabel(name)
+            axis.set(yscale="log", xlabel="image", ylabel=name)
     legend(out, axes.flat)
     return out
 

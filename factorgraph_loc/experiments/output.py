@@ -1,4 +1,7 @@
-"""The files of one run: trajectories, estimates, learnt values, events, scores, and the configuration; those that a store keeps."""
+"""The files of one run: trajectories, estimates, learnt values, events, scores, and the configuration; those that a store keeps.
+
+Times aside, all files of a run are reproducible to the byte.
+"""
 
 import io
 import json

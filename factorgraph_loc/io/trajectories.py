@@ -1,5 +1,8 @@
 """Trajectories by name, from whatever holds one (files of poses, topics of bags, results of runs, references of logs); as those of
-evo (https://github.com/MichaelGrupp/evo) and as ROS messages, and back."""
+evo (https://github.com/MichaelGrupp/evo) and as ROS messages, and back.
+
+Neither library is needed for anything else: they are imported where they are used.
+"""
 
 from collections.abc import Iterable
 from dataclasses import replace

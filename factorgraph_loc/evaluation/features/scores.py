@@ -163,9 +163,9 @@ def figure3(scores: FeatureScores) -> Any:
             row[1].fill_between(x, values.min(axis=0), values.max(axis=0), color="0.88", label="range of the others")
             row[1].plot(*_means(scores, OURS, members), label=OURS, **_style(OURS, scores.names()))
         for axis in row:
-            axis.set_title(title)
-            axis.set_ylim(0.0, 1.0)
-            axis.set_xlabel(scores.rows[scores.of(scores.names()[0], members)[0]]["change"])
+            axis.set(
+                title=title, ylim=(0.0, 1.0), xlabel=scores.rows[scores.of(scores.names()[0], members)[0]]["change"]
+            )
         row[0].set_ylabel("repeatability")
     legend(figure, axes.flat)
     return figure
@@ -180,10 +180,7 @@ def recall_curves(scores: FeatureScores) -> Any:
         rows, columns, 5.0 * rows + 1.2, "Mutual nearest neighbours, by a threshold on the ratio of distances"
     )
     for axis, (title, members) in zip(axes.flat, groups.items(), strict=False):
-        axis.set_title(title)
-        axis.set_xlim(0.0, 1.0)
-        axis.set_ylim(0.0, 1.0)
-        axis.set(xlabel="1 - precision", ylabel="recall")
+        axis.set(title=title, xlim=(0.0, 1.0), ylim=(0.0, 1.0), xlabel="1 - precision", ylabel="recall")
         for name in scores.names():
             ranked = [r for i in scores.of(name, members) if (r := scores.ranked[i]) is not None]
             if ranked:

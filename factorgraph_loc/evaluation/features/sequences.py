@@ -1,4 +1,9 @@
-"""Homographies between two images: mapping of points and regions, and the zoom, rotation and tilt they contain."""
+"""Images of one planar scene with known homographies: folders in the Oxford format, or one photograph with known warps; mapping of
+points and regions by a homography, and the zoom, rotation and tilt it contains.
+
+Folders: Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005: ``img1`` to ``imgN`` and the homographies
+``H1to2p`` to ``H1toNp`` from the first image to each other one.
+"""
 
 import re
 import xml.etree.ElementTree as ET

@@ -1,4 +1,8 @@
-"""What all pages have: head, style, script, and a content security policy that forbids everything else."""
+"""One self-contained HTML file of an experiment's results: text, tables, charts, and what is needed to repeat them.
+
+The page loads nothing: style, script and data are included, and its content security policy forbids everything else, so that an
+unescaped string could not run. The same results give the same bytes.
+"""
 
 import base64
 import hashlib

@@ -1,4 +1,9 @@
-"""Which pose of an estimate belongs to which pose of the reference."""
+"""Which pose of an estimate belongs to which pose of the reference, and the alignment of the one with the other.
+
+Least squares in space: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE
+Transactions on Pattern Analysis and Machine Intelligence, 1991, equations 38 to 43. In the plane:
+:func:`~factorgraph_loc.evaluation.alignment.align_points`.
+"""
 
 from __future__ import annotations
 

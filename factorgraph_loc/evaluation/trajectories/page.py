@@ -1,4 +1,4 @@
-"""Plots of a score: both trajectories, and the errors over time and by size."""
+"""The report of a score as one HTML page and as files, with plots of both trajectories and of the errors over time and by size."""
 
 from __future__ import annotations
 
@@ -75,11 +75,9 @@ def _trajectories(score: TrajectoryScore) -> Figure:
         *score.estimate.positions[0, :2], "o", color=COLOURS[0], markersize=5, label="start of the estimate"
     )
     axes[0, 0].set_aspect("equal", adjustable="datalim")
-    axes[0, 0].set_xlabel("x [m]")
-    axes[0, 0].set_ylabel("y [m]")
+    axes[0, 0].set(xlabel="x [m]", ylabel="y [m]")
     if not flat:
-        axes[0, 1].set_xlabel(label)
-        axes[0, 1].set_ylabel("z [m]")
+        axes[0, 1].set(xlabel=label, ylabel="z [m]")
     legend(figure, axes[0])
     lay_out(figure)  # the first layout changes the axes, and their labels would overlap the legend
     return figure
@@ -92,8 +90,7 @@ def _absolute(score: TrajectoryScore) -> Figure:
     for (left, right), (what, unit, values) in zip(axes, rows, strict=True):
         left.plot(_broken(score, x), _broken(score, values), color=COLOURS[0], linewidth=1.2, label="error")
         left.axhline(np.sqrt(np.mean(values**2)), color=COLOURS[1], linestyle="--", linewidth=1.2, label="RMSE")
-        left.set_xlabel(label)
-        left.set_ylabel(f"{what} error [{unit}]")
+        left.set(xlabel=label, ylabel=f"{what} error [{unit}]")
         left.set_ylim(bottom=0.0)
         _distribution(right, values, f"{what} error [{unit}]")
     legend(figure, axes[0])
@@ -113,8 +110,7 @@ def _relative(score: TrajectoryScore) -> Figure:
         for axis, (what, unit, values) in zip((upper, lower), _kinds(errors), strict=True):
             axis.plot(x[errors.ends], values, ".", color=COLOURS[0], markersize=4, label="error at the end of a piece")
             axis.axhline(np.sqrt(np.mean(values**2)), color=COLOURS[1], linestyle="--", linewidth=1.2, label="RMSE")
-            axis.set_xlabel(label)
-            axis.set_ylabel(f"{what} error [{unit}]")
+            axis.set(xlabel=label, ylabel=f"{what} error [{unit}]")
             axis.set_ylim(bottom=0.0)
     legend(figure, axes[0])
     return figure
@@ -140,9 +136,7 @@ def _broken(score: TrajectoryScore, values: Array) -> Array:
 def _distribution(axis: Axes, values: Array, label: str) -> None:
     axis.plot(np.sort(values), np.arange(1, len(values) + 1) / len(values), color=COLOURS[0], linewidth=2.0)
     axis.set_xlim(left=0.0)
-    axis.set_ylim(0.0, 1.0)
-    axis.set_xlabel(label)
-    axis.set_ylabel("share of poses below")
+    axis.set(ylim=(0.0, 1.0), xlabel=label, ylabel="share of poses below")
 
 
 def errors_table(score: TrajectoryScore) -> Rows:

@@ -1,4 +1,6 @@
-"""The wheels of a differential drive in a bag: joints of a message, or a topic for each wheel."""
+"""Motion of the robot in a bag: poses or velocities of odometry, the gyro of an IMU, or the wheels of a differential drive, as joints
+of a message, or with a topic for each wheel.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Reads of tags from tables with a column of strengths per tag or per antenna."""
+"""RFID reads from mapped CSV or JSON lines of readers and their tools, with presets; also from tables with a column of strengths
+per tag or per antenna."""
 
 import base64
 from collections.abc import Mapping, Sequence

@@ -244,7 +244,10 @@ def correlation_figure(seen: Sequence[Sightings], correlations: Sequence[Correla
             )
         axis.axhline(np.exp(-1.0), color="0.3", linestyle="--", label="1/e")
         axis.axhline(0.0, color="0.5", linewidth=0.8)
-        axis.set_xscale("log")
-        axis.set(xlabel="time between two sightings of a landmark [s]", ylabel=f"correlation of {what} residuals")
+        axis.set(
+            xscale="log",
+            xlabel="time between two sightings of a landmark [s]",
+            ylabel=f"correlation of {what} residuals",
+        )
     legend(figure, axes.flat, markers=3.0)
     return png(figure)

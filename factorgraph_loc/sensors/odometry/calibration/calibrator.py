@@ -217,8 +217,7 @@ def odometry_figure(windows: Sequence[Windows], model: OdometryModel) -> bytes:
             lengths, [g[0][row] for g in growth], "o-", color=COLOURS[0], label="residuals, root mean square"
         )
         panels[2].plot(lengths, [g[1][row] for g in growth], "s--", color="0.3", label="noise in the rig")
-        panels[2].set_xscale("log")
-        panels[2].set_yscale("log")
+        panels[2].set(xscale="log", yscale="log")
         panels[0].set(xlabel="time [s]", ylabel=f"{what} [{unit}] in 2 s")
         panels[1].set(xlabel="distance [m] in 2 s", ylabel=f"{what} [{unit}] in 2 s")
         panels[2].set(xlabel="length of the window [s]", ylabel=f"{what} [{unit}]")
