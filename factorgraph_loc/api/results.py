@@ -8,9 +8,8 @@ from factorgraph_loc.api.given import LogLike, RigLike, WorldLike, one
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.particles import particles_of
 from factorgraph_loc.exports import foxglove, rerun_scene
-from factorgraph_loc.exports.g2o import pose_graph, write_g2o
 from factorgraph_loc.exports.runs import Particles, StoredRun, find_runs, is_results, read_runs
-from factorgraph_loc.exports.trajectories import TIMES_SUFFIX
+from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write_g2o
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory

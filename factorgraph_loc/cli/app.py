@@ -9,13 +9,11 @@ from typer.completion import install_callback, show_callback
 from typer.core import TyperGroup
 
 from factorgraph_loc.cli import (
-    active,
-    calibrating,
     experimenting,
     images,
     inspecting,
+    learning,
     lookups,
-    mapping,
     running,
     scoring,
     show,
@@ -88,11 +86,11 @@ app.command()(running.compare)
 app.command()(scoring.score)
 app.command()(viewing.view)
 app.command()(viewing.export)
-app.command()(calibrating.calibrate)
-app.command("map")(mapping.map_)
+app.command()(learning.calibrate)
+app.command("map")(learning.map_)
 app.command()(images.images)
 app.command()(simulating.simulate)
-app.command()(active.active)
+app.command()(experimenting.active)
 app.add_typer(lookups.rigs_app, name="rigs")
 app.add_typer(experimenting.app, name="experiment")
 app.add_typer(images.features, name="features")

@@ -1,25 +1,42 @@
-"""Common parts of all plots: the plotted data of a run, colours, legends, and PNG files 1600 px wide.
+"""The plotted data of a run, common parts of its plots, and the plot of its consistency: NEES of its poses, NIS of its predictions.
 
-Colours: Okabe and Ito, "Color Universal Design", 2008, distinguishable by colour-blind readers.
+Both are chi-square distributed for a consistent estimator (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking
+and Navigation", 2001, section 5.4). Errors of consecutive poses are correlated, so the NEES is compared with the interval of a
+single value. Innovations are independent, so the running mean of the NIS is compared with the interval of the mean. Colours: Okabe
+and Ito, "Color Universal Design", 2008, distinguishable by colour-blind readers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from factorgraph_loc.drawing.figures import COLOURS
+from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend
+from factorgraph_loc.evaluation.metrics import CONFIDENCE, errors
 from factorgraph_loc.evaluation.pairing import pauses
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory
+from factors import chi_squared
 from factors.se2 import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WINDOW = 20.0  # s, of running means
+_TAILS = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
+_BAND: dict[str, Any] = {
+    "color": COLOURS[5],
+    "alpha": 0.3,
+    "linewidth": 0.0,
+    "label": f"{100 * CONFIDENCE:g} % band (of the single NEES, of the mean NIS)",
+}
+_IDEAL: dict[str, Any] = {"color": "black", "linewidth": 1.0, "label": "ideal"}
 
 
 @dataclass(frozen=True)
@@ -66,3 +83,84 @@ def with_pauses(t: Array, values: Array) -> tuple[Array, Array]:
 def way(trajectory: Trajectory) -> Array:
     """The positions (N, 2) of a trajectory, with a row of NaN in each gap."""
     return with_pauses(trajectory.t, trajectory.poses[:, :2])[1]
+
+
+def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
+    """NEES of the causal and final poses, if there is a reference, and NIS per degree of freedom of each sensor, over time.
+
+    None if there is neither.
+    """
+    # empty innovations have no degrees of freedom
+    told = {s: rows[(rows[:, 2] > 0.0) & np.isfinite(rows[:, 1])] for s, rows in track.nis.items()}
+    sensors = sorted(sensor for sensor, values in told.items() if len(values))
+    rows: list[Any] = [["causal", "final"]] if log.reference is not None else []
+    rows += [[f"nis.{sensor}"] * 2 for sensor in sensors]
+    if not rows:
+        return None
+    figure = empty(3.5 * len(rows) + 1.0, f"{log.name}, {estimator}: consistency")
+    axes = figure.subplot_mosaic(rows)
+    dress(axes.values())
+    if log.reference is not None:
+        for kind, trajectory in track.kinds():
+            _nees(axes[kind], kind, trajectory, log.reference, track.max_gap)
+        limits = np.array([axes[kind].get_ylim() for kind in ("causal", "final")])
+        for kind in ("causal", "final"):
+            axes[kind].set_ylim(limits[:, 0].min(), limits[:, 1].max())
+    for sensor in sensors:
+        _nis(axes[f"nis.{sensor}"], sensor, told[sensor])
+    start, end = track.final.t[0], track.final.t[-1]
+    for axis in axes.values():
+        mark_events(axis, track.events)
+        axis.set(xlim=(start, max(end, start + 0.001)), xlabel="time [s]")
+    legend(figure, axes.values())
+    return figure
+
+
+def running_mean(t: Array, values: Array, weights: Array) -> tuple[Array, Array]:
+    """Weighted running mean of ``values`` (sums of ``values`` over sums of ``weights``) within ``WINDOW`` seconds around each
+    ``t`` (N,), ascending; and the sums of weights.
+
+    NaN where a window has no weight.
+    """
+    first = np.searchsorted(t, t - WINDOW / 2.0, side="left")
+    last = np.searchsorted(t, t + WINDOW / 2.0, side="right")
+    sums = [
+        np.diff(np.concatenate(([0.0], np.cumsum(x)))[np.stack((first, last))], axis=0)[0] for x in (values, weights)
+    ]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return sums[0] / sums[1], sums[1]
+
+
+def _nees(axis: Axes, kind: str, trajectory: Trajectory | None, reference: Trajectory, max_gap: float) -> None:
+    dof = 3 if reference.has_heading else 2
+    axis.set(title=f"{kind} poses", ylabel="NEES of x, y, heading" if dof == 3 else "NEES of x, y", yscale="log")
+    low, high = chi_squared.quantile(_TAILS, dof)
+    axis.axhspan(low, high, **_BAND)
+    axis.axhline(dof, **_IDEAL)
+    e = None if trajectory is None else errors(trajectory, reference, max_gap)
+    known = np.empty(0, dtype=bool) if e is None else np.isfinite(e.nees)
+    if e is None or not known.any():
+        axis.text(0.5, 0.9, f"no {kind} estimate to score", ha="center", transform=axis.transAxes, color="0.4")
+        return
+    t, nees = e.t[known], e.nees[known]
+    mean, _ = running_mean(t, nees, np.ones(len(t)))
+    _draw(axis, t, nees, with_pauses(t, mean), low)
+
+
+def _nis(axis: Axes, sensor: str, rows: Array) -> None:
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    t, nis, dof = rows.T
+    mean, total = running_mean(t, nis, dof)
+    axis.set(title=f"innovations of {sensor}", ylabel="NIS per degree of freedom", yscale="log")
+    mean[np.diff(t, append=t[-1]) > WINDOW] = np.nan  # no line across a gap
+    low, high = (np.where(np.isnan(mean), np.nan, chi_squared.quantile(tail, total) / total) for tail in _TAILS)
+    axis.fill_between(t, low, high, **_BAND)
+    axis.axhline(1.0, **_IDEAL)
+    _draw(axis, t, nis / dof, (t, mean), 0.1)
+
+
+def _draw(axis: Axes, t: Array, single: Array, mean: tuple[Array, Array], low: float) -> None:
+    axis.plot(t, single, ".", color="0.6", markersize=2.5, label="single values", zorder=2)
+    axis.plot(*mean, color=COLOURS[1], linewidth=2.0, label=f"mean over {WINDOW:g} s", zorder=3)
+    # cut off the smallest values
+    axis.set_ylim(low / 4.0, 2.0 * max(float(np.nanmax(single)), 20.0 * low))

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.interfaces import Summary
 from factorgraph_loc.sensors.registry import functions
-from factorgraph_loc.sensors.summary import Summary
 from factors.se2 import Array
 
 LONG_GAP = 5.0  # s

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from factorgraph_loc.drawing.figures import COLOURS, grid, lay_out, legend, save, styles
-from factorgraph_loc.evaluation.consistency import consistency
-from factorgraph_loc.evaluation.figures import Track, mark_events, way, with_pauses
+from factorgraph_loc.evaluation.figures import Track, consistency, mark_events, way, with_pauses
 from factorgraph_loc.evaluation.metrics import Errors, errors
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.marks import Marks, marks
+from factorgraph_loc.sensors.interfaces import Marks, marks
 from factors.se2 import Array
 
 if TYPE_CHECKING:

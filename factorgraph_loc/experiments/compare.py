@@ -26,7 +26,7 @@ from factorgraph_loc.files.models import file_name, nearest, replacing, write_te
 from factorgraph_loc.files.results import require_free, writing
 from factorgraph_loc.files.temporary import sweep
 from factorgraph_loc.fusion import registry
-from factorgraph_loc.io.results.layout import FILES
+from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import check_max_gap
 from factorgraph_loc.model.ticks import check_tick_gap

@@ -25,8 +25,7 @@ from factorgraph_loc.experiments.store import TIMING, TIMINGS
 from factorgraph_loc.files.models import file_name, write_text, write_toml
 from factorgraph_loc.files.results import require_free, writing
 from factorgraph_loc.files.temporary import of_system, sweep, temporary_folder
-from factorgraph_loc.io.results.estimates import trajectory_of
-from factorgraph_loc.io.results.layout import FILES
+from factorgraph_loc.io.results import FILES, trajectory_of
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult

@@ -14,8 +14,8 @@ from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, PosePrior, SpacePose
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory3 import Trajectory3, planar_estimate
+from factorgraph_loc.sensors.interfaces import PreparedLog, Use, lacking_section
 from factorgraph_loc.sensors.registry import channels, functions, moving
-from factorgraph_loc.sensors.usage import PreparedLog, Use, lacking_section
 from factorgraph_loc.text import listed, quoted
 
 # of a start taken from the reference

@@ -37,8 +37,8 @@ from factorgraph_loc.model.result import RunResult, Timings
 from factorgraph_loc.model.scoring import MAX_GAP, check_max_gap
 from factorgraph_loc.model.ticks import TICK_GAP, Ticks, check_tick_gap
 from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.sensors.interfaces import PreparedLog
 from factorgraph_loc.sensors.registry import functions, moving
-from factorgraph_loc.sensors.usage import PreparedLog
 from factorgraph_loc.text import listed
 from factorgraph_loc.version import __version__
 from factors.se2 import Array

@@ -14,8 +14,7 @@ from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates
 from factorgraph_loc.files.bounded import DATA, foreign, read_bytes
 from factorgraph_loc.files.columns import LATEST
 from factorgraph_loc.files.models import FileModel, parse_model, read_json, read_toml
-from factorgraph_loc.io.results.estimates import trajectory_of
-from factorgraph_loc.io.results.layout import FILES
+from factorgraph_loc.io.results import FILES, trajectory_of
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory

@@ -10,7 +10,7 @@ import numpy as np
 from factorgraph_loc.drawing import figures as drawing_figures
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.marks import Marks, marks
+from factorgraph_loc.sensors.interfaces import Marks, marks
 from factors.se2 import Array
 
 LIT_FOR = 0.5  # s that a tag or landmark stays highlighted after an observation

@@ -1,20 +1,37 @@
-"""Export of trajectories in KITTI format; for TUM see :func:`~factorgraph_loc.model.trajectory.write_tum`.
+"""Export of trajectories in KITTI format, and of the pose graph of a run as a g2o file; for TUM see
+:func:`~factorgraph_loc.model.trajectory.write_tum`.
 
-Each row contains the upper three rows of a pose (4, 4), row by row: A. Geiger, P. Lenz, R. Urtasun, "Are we ready for
+KITTI: each row contains the upper three rows of a pose (4, 4), row by row: A. Geiger, P. Lenz, R. Urtasun, "Are we ready for
 autonomous driving? The KITTI vision benchmark suite", CVPR 2012. Stamps are in a separate file, one per row.
+
+g2o: R. Kuemmerle, G. Grisetti, H. Strasdat, K. Konolige, W. Burgard, "g2o: a general framework for graph optimization", ICRA 2011,
+types ``slam2d``. The file contains the motion between poses (``EDGE_SE2``) and landmarks with simultaneous range and bearing
+(``EDGE_SE2_XY``); ranges or bearings alone, tag reads and pixels cannot be represented.
 """
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.results import writing
+from factorgraph_loc.model.belief import LearntPoint
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3, upright
+from factorgraph_loc.sensors.landmarks.located import located_landmarks
+from factorgraph_loc.sensors.odometry.motion import whole_motion
+from factorgraph_loc.sensors.registry import moving
+from factorgraph_loc.text import listed
+from factors.motion import Increment
 from factors.se2 import Array
 
 TIMES_SUFFIX = ".times.txt"
+LEAST = 1e-12  # m^2 or rad^2: least variance of an edge, for a finite information
 
 
 def matrices(trajectory: Trajectory | Trajectory3) -> Array:
@@ -38,3 +55,83 @@ def write_kitti(trajectory: Trajectory | Trajectory3, path: Path) -> Path:
         write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows.tolist()))
         write_text(times, "".join(f"{t:.9f}\n" for t in trajectory.t.tolist()))
     return times
+
+
+@dataclass(frozen=True)
+class LandmarkEdge:
+    """A landmark at ``point`` (2,) in the robot's frame, with ``covariance`` (2, 2) [m^2], sighted from the pose ``index``."""
+
+    index: int
+    landmark: str
+    point: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class PoseGraph:
+    """``t`` (N,) and estimated ``poses`` (N, 3); ``motions``: N - 1, between consecutive poses. ``landmarks``: positions (2,)
+    by name; ``known``: whether they come from the map and are fixed.
+    """
+
+    t: Array
+    poses: Array
+    motions: tuple[Increment, ...]
+    landmarks: Mapping[str, Array]
+    known: bool
+    sightings: tuple[LandmarkEdge, ...]
+
+
+def pose_graph(
+    log: Log, trajectory: Trajectory, sensors: Sequence[str], learnt: Mapping[str, LearntPoint] | None = None
+) -> PoseGraph:
+    """The pose graph of a log, with poses at the stamps of ``trajectory`` and of the sightings between them.
+
+    ``sensors``: the channels of the log to use. Landmarks are those of the map or, if it has none, ``learnt``. Raises
+    InputError for fewer than two poses, or a log without odometry.
+    """
+    used = [name for name in log.streams if name in sensors]
+    if not moving(used, "floor"):
+        raise InputError(
+            f"{log.name}: has no odometry among {listed(sensors)}, expected it for the edges of a pose graph"
+        )
+    landmarks = {name: np.array((mark.x, mark.y)) for name, mark in log.world.landmarks.items()}
+    if not landmarks:
+        landmarks = {name: point.position for name, point in (learnt or {}).items()}
+    seen = located_landmarks(log, sensors, landmarks) if len(trajectory) else []
+    seen = [s for s in seen if trajectory.t[0] <= s.t <= trajectory.t[-1]]
+    t = np.unique(np.concatenate((trajectory.t, [s.t for s in seen])))
+    if len(t) < 2:
+        raise InputError(f"{log.name}: the run has {len(t)} poses, expected two or more for a pose graph")
+    index = {at: i for i, at in enumerate(t.tolist())}
+    sightings = tuple(LandmarkEdge(index[at], name, point, covariance) for at, name, point, covariance in seen)
+    found = {s.landmark for s in seen}
+    landmarks = {name: place for name, place in landmarks.items() if name in found}
+    motion = whole_motion(log, moving(used, "floor", "turn"))
+    motions = tuple(motion.relative(a, b) for a, b in pairwise([motion.state(at) for at in t.tolist()]))
+    return PoseGraph(t, trajectory.at(t), motions, landmarks, bool(log.world.landmarks), sightings)
+
+
+def write_g2o(graph: PoseGraph, path: Path) -> None:
+    """Write a g2o file: poses, numbered from 0, then landmarks. Landmarks of a map are fixed, otherwise the first pose is."""
+    number = {name: len(graph.t) + i for i, name in enumerate(graph.landmarks)}
+    lines = [f"VERTEX_SE2 {i} {_numbers(pose)}" for i, pose in enumerate(graph.poses)]
+    lines += [f"VERTEX_XY {number[name]} {_numbers(place)}" for name, place in graph.landmarks.items()]
+    for i, motion in enumerate(graph.motions):
+        lines.append(f"EDGE_SE2 {i} {i + 1} {_numbers(motion.delta)} {_information(motion.covariance)}")
+    for s in graph.sightings:
+        lines.append(f"EDGE_SE2_XY {s.index} {number[s.landmark]} {_numbers(s.point)} {_information(s.covariance)}")
+    # last, as GTSAM stops reading here
+    lines += [f"FIX {i}" for i in (number.values() if graph.known and number else (0,))]
+    with writing(path):
+        write_text(path, "\n".join(lines) + "\n")
+
+
+def _numbers(values: Array) -> str:
+    return " ".join(f"{value:.12g}" for value in np.ravel(values).tolist())
+
+
+def _information(covariance: Array) -> str:
+    """The upper triangle, by rows, of the inverse of a covariance (D, D), regularised for a robot at rest."""
+    variances, axes = np.linalg.eigh(covariance)
+    inverse = (axes / np.maximum(variances, LEAST)) @ axes.T
+    return _numbers(inverse[np.triu_indices(len(covariance))])

@@ -1,7 +1,7 @@
-"""Reading of files within limits of size and time.
+"""Reading of files within limits of size and time, and without the messages that C and Rust libraries print about damaged ones.
 
 All files are opened here: only regular files, because a FIFO blocks and a device never ends. Sizes, including declared ones, are
-checked before memory is allocated.
+checked before memory is allocated. libpng and libjpeg ignore OpenCV's log level; polars prints from its threads before it raises.
 """
 
 import errno
@@ -10,6 +10,7 @@ import os
 import shutil
 import stat
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -143,3 +144,28 @@ def _kind(found: os.stat_result) -> str:
 def _require_file(path: Path, kind: str) -> None:
     if kind != "a file":
         raise InputError(f"{plain(path)}: is {kind}, expected a regular file")
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Discard writes to descriptor 2 in this block; only in the main thread, otherwise it has no effect.
+
+    The descriptor is shared by all threads, so their messages are lost too. Therefore a block should contain only the call that
+    reads one file. In several threads, such blocks could leave the descriptor redirected for good.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    try:
+        kept = os.dup(2)
+    except OSError:  # the descriptor is closed
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)

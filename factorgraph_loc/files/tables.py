@@ -13,10 +13,9 @@ import polars as pl
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import parquet_pages
-from factorgraph_loc.files.bounded import DATA, foreign, read_bytes, require_size
+from factorgraph_loc.files.bounded import DATA, foreign, quiet, read_bytes, require_size
 from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table
 from factorgraph_loc.files.models import nearest, read_text
-from factorgraph_loc.files.quiet import quiet
 from factorgraph_loc.text import told
 from factors.se2 import Array, Integers
 

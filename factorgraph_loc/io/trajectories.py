@@ -18,7 +18,7 @@ from factorgraph_loc.io.bags.file import is_bag, require_rosbags
 from factorgraph_loc.io.bags.poses import check_rotations, seven
 from factorgraph_loc.io.readers import read_log
 from factorgraph_loc.io.readers.pose_file import read_pose_file
-from factorgraph_loc.io.results.layout import FILES
+from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.trajectory3 import PosePath, path_of, require_poses
 from factorgraph_loc.text import quoted

@@ -14,8 +14,8 @@ from factorgraph_loc.files.values import numbers, seconds_of
 from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, PosePrior
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.interfaces import lacking_section
 from factorgraph_loc.sensors.registry import sensor_of
-from factorgraph_loc.sensors.usage import lacking_section
 from factorgraph_loc.text import quoted
 
 # bounds of standard deviations in m and rad: a wider one means an unknown pose, a narrower one is implausible

@@ -25,7 +25,7 @@ from factorgraph_loc.fusion.cloud import pose_moments, systematic
 from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.planning.paths import Path, free_steps
 from factorgraph_loc.planning.sensors import SPEED, Sensors
-from factorgraph_loc.sensors.forecast import Array32, Places
+from factorgraph_loc.sensors.interfaces import Array32, Places
 from factorgraph_loc.sensors.rfid import forecast as expected_scans
 from factorgraph_loc.text import quoted
 from factors import se2

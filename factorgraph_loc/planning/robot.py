@@ -17,10 +17,10 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.paths import DIRECTIONS, Path, free_steps, straight
 from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.sensors.interfaces import LiveSensor
 from factorgraph_loc.sensors.odometry import simulation as wheels
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
 from factorgraph_loc.sensors.registry import functions
-from factorgraph_loc.sensors.simulated import LiveSensor
 from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.simulation.simulate import generator
 from factors import se2

@@ -10,7 +10,7 @@ import numpy as np
 
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.forecast import Forecast
+from factorgraph_loc.sensors.interfaces import Forecast
 from factorgraph_loc.sensors.odometry.motion import odometry_model
 from factorgraph_loc.sensors.registry import functions
 from factors.odometry.model import OdometryModel

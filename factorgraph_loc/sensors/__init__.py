@@ -2,21 +2,16 @@
 
 __all__ = [
     "base",
-    "binding",
     "calibrating",
     "camera",
-    "forecast",
+    "interfaces",
     "known_position",
     "landmarks",
-    "marks",
     "measurements",
     "odometry",
     "pushed",
     "registry",
     "rfid",
-    "simulated",
-    "summary",
     "tables",
     "twist",
-    "usage",
 ]

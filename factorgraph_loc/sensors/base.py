@@ -3,8 +3,7 @@
 A sensor that is bound to a run turns a measurement and a view of the estimate into observations. The estimator applies each
 before it asks for the next, and lets the sensor judge each correction first. An observation depends on the pose at one time and
 on named blocks (constants of a sensor, positions of landmarks). It can be linearised, as a factor of a graph or a correction of a
-Gaussian, and evaluated as a likelihood over poses. Neither side depends on the other's implementation.
-"""
+Gaussian, and evaluated as a likelihood over poses. Neither side depends on the other's implementation."""
 
 from __future__ import annotations
 
@@ -20,6 +19,7 @@ from factorgraph_loc.model.motion import Motion
 from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.sensors.known_position import KnownPosition
+from factorgraph_loc.sensors.registry import functions
 from factors import se2
 from factors.graph import Factor
 from factors.marginal import Marginalized
@@ -355,3 +355,25 @@ class ResidualObservation:
             held = tuple(values[name] for name in term.blocks), tuple(spreads.get(name) for name in term.blocks)
             terms.append(Term(Marginalized(cast(SightingFactor, term.factor), *held), (), term.rows))
         return ResidualObservation(self.t, tuple(terms))
+
+
+def bound_motion(setup: Setup, diagnostics: Diagnostics, *, self_calibration: bool = False) -> Motion:
+    """The motion sensor of a run."""
+    _, predict = next(functions("predict"))
+    return cast(Motion, predict(setup.rig, setup.sensors, diagnostics, self_calibration=self_calibration))
+
+
+def bound_sensors(
+    setup: Setup,
+    motion: Motion,
+    diagnostics: Diagnostics,
+    *,
+    use: MapUse = "known",
+    points: MapUse = "known",
+    calibration: Calibration = "all",
+) -> dict[str, Sensor]:
+    """The exteroceptive sensors of a run by modality. ``use``: how landmarks of the map are used, ``points``: how its points are
+    used."""
+    binding = Binding(setup, motion, diagnostics, use, points, calibration)
+    sensors: list[Sensor | None] = [bind(binding) for _, bind in functions("bind")]
+    return {sensor.modality: sensor for sensor in sensors if sensor is not None}

@@ -61,22 +61,23 @@ class SensorType:
     """A sensor: its ``channels``, its ``settings`` (sections of the rig), its ``layers`` of the world, and the places of its
     functions, "" for none. :func:`functions` returns those of all sensors.
 
-    ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.summary.Summary`, for ``fgloc info``; ``draw``: ``(log) ->``
-    :class:`~factorgraph_loc.sensors.marks.Marks`, for plots and viewers.
+    ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.interfaces.Summary`, for ``fgloc info``; ``draw``: ``(log) ->``
+    :class:`~factorgraph_loc.sensors.interfaces.Marks`, for plots and viewers.
 
     For estimators: ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor`, or None if a run does not use it;
     ``predict``: ``(rig, sensors, diagnostics, self_calibration) ->`` :class:`~factorgraph_loc.model.motion.Motion`.
 
-    For runs (:class:`~factorgraph_loc.sensors.usage.Use`): ``check``: ``(use)``, raises InputError if log and settings do not fit;
-    ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.usage.PreparedLog`; ``doubts``: ``(use, diagnostics,
-    learnt)``, warnings at the end; ``findable``: ``(log, sensors)``, a plural for the map elements that the channels can detect and
-    a message that none was detected, or None; ``mappable``: ``(log)``, the world layer that ``fgloc map`` can make, or None.
+    For runs (:class:`~factorgraph_loc.sensors.interfaces.Use`): ``check``: ``(use)``, raises InputError if log and settings do not
+    fit; ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.interfaces.PreparedLog`; ``doubts``: ``(use,
+    diagnostics, learnt)``, warnings at the end; ``findable``: ``(log, sensors)``, a plural for the map elements that the channels
+    can detect and a message that none was detected, or None; ``mappable``: ``(log)``, the world layer that ``fgloc map`` can make,
+    or None.
 
     For simulated logs, whose settings have the sections ``simulation``: ``simulate``: ``(ride) ->``
-    :class:`~factorgraph_loc.sensors.simulated.Simulated`, from a :class:`~factorgraph_loc.sensors.simulated.Ride`; ``looks``:
+    :class:`~factorgraph_loc.sensors.interfaces.Simulated`, from a :class:`~factorgraph_loc.sensors.interfaces.Ride`; ``looks``:
     ``(settings)``, the measurement rate [Hz] by plural of the detected things; ValueError if the settings are inconsistent. For
-    active robots: ``on_robot``: ``(world, rig, settings, rng) ->`` :class:`~factorgraph_loc.sensors.simulated.LiveSensor` or None;
-    ``forecast``: ``(world, rig, speed, settings) ->`` :class:`~factorgraph_loc.sensors.forecast.Forecast` or None.
+    active robots: ``on_robot``: ``(world, rig, settings, rng) ->`` :class:`~factorgraph_loc.sensors.interfaces.LiveSensor` or None;
+    ``forecast``: ``(world, rig, speed, settings) ->`` :class:`~factorgraph_loc.sensors.interfaces.Forecast` or None.
 
     ``calibrator``: a :class:`~factorgraph_loc.sensors.calibrating.Calibrator`.
     """

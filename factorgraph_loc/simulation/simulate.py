@@ -18,9 +18,9 @@ from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.interfaces import Ride, Simulated
 from factorgraph_loc.sensors.registry import functions
 from factorgraph_loc.sensors.rfid.recorded import RecordedLooks
-from factorgraph_loc.sensors.simulated import Ride, Simulated
 from factorgraph_loc.simulation.settings import DriveSettings, SimulationSettings
 from factorgraph_loc.simulation.worlds import make_world
 from factorgraph_loc.version import __version__

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.bounded import IMAGE, foreign, read_bytes
+from factorgraph_loc.files.bounded import IMAGE, foreign, quiet, read_bytes
 from factorgraph_loc.files.images import NO_IMAGE, image_size
-from factorgraph_loc.files.quiet import quiet
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.uint8]

@@ -16,10 +16,9 @@ import factorgraph_loc as fgloc
 from factorgraph_loc.experiments.experiment import prepare
 from factorgraph_loc.experiments.reporting import load_results, report_experiment
 from factorgraph_loc.exports.foxglove import write_mcap
-from factorgraph_loc.exports.g2o import pose_graph, write_g2o
 from factorgraph_loc.exports.rerun_scene import write_rrd
 from factorgraph_loc.exports.runs import find_runs, read_runs
-from factorgraph_loc.exports.trajectories import write_kitti
+from factorgraph_loc.exports.trajectories import pose_graph, write_g2o, write_kitti
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import ALIGNMENTS, ASSOCIATIONS
 from factorgraph_loc.sensors.camera.stream import ImageStream

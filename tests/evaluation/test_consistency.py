@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.evaluation.consistency import WINDOW, consistency, running_mean
-from factorgraph_loc.evaluation.figures import Track
+from factorgraph_loc.evaluation.figures import WINDOW, Track, consistency, running_mean
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory

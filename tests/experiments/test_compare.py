@@ -8,7 +8,7 @@ import pytest
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.compare import compare
 from factorgraph_loc.experiments.run import RunConfig
-from factorgraph_loc.io.results.layout import FILES
+from factorgraph_loc.io.results import FILES
 
 
 @pytest.mark.usefixtures("runs_here", "blank_pictures")

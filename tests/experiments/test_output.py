@@ -11,7 +11,7 @@ import pytest
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.io.results.layout import FILES
+from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.trajectory import read_tum
 

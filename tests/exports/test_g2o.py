@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.exports.g2o import pose_graph, write_g2o
+from factorgraph_loc.exports.trajectories import pose_graph, write_g2o
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World

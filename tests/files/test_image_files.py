@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.bounded import quiet
 from factorgraph_loc.files.images import size_of_file
-from factorgraph_loc.files.quiet import quiet
 from factorgraph_loc.vision import images
 from factorgraph_loc.vision.images import as_image, read_image
 

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.maps.free_space import CELL, distance_to_walls, free_space
-from factorgraph_loc.maps.walls import crosses
+from factorgraph_loc.maps.free_space import CELL, crosses, distance_to_walls, free_space
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.paths import STEP, Path, free_steps, primitives, waypoint_paths, waypoints
 from factorgraph_loc.simulation import preset

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.maps.free_space import distance_to_walls
-from factorgraph_loc.maps.walls import crosses
+from factorgraph_loc.maps.free_space import crosses, distance_to_walls
 from factorgraph_loc.simulation import PRESETS, preset
 from factorgraph_loc.simulation.settings import WorldSettings
 from factorgraph_loc.simulation.worlds import STANDOFF, make_world

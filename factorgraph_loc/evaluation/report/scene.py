@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 from factorgraph_loc.evaluation.pairing import pauses
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.marks import Marks, marks
+from factorgraph_loc.sensors.interfaces import Marks, marks
 from factors.se2 import Array
 
 _POSES = 1500  # of the reference, in total

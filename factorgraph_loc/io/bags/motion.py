@@ -1,5 +1,5 @@
-"""Motion of the robot in a bag: poses or velocities of odometry, the gyro of an IMU, or the wheels of a differential drive, as joints
-of a message, or with a topic for each wheel.
+"""Motion of the robot in a bag: poses or velocities of odometry, the gyro of an IMU, or the wheels of a differential drive, each a
+topic, or joints of one message.
 """
 
 from __future__ import annotations

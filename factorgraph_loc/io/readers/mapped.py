@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, read_mapped
+from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, Unread, read_mapped
 from factorgraph_loc.files.columns import Table
 from factorgraph_loc.files.models import FileModel, add_fields, inside
 from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
@@ -24,7 +24,6 @@ from factorgraph_loc.io.readers.mapped_poses import (
     read_reference,
 )
 from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_reads, read_inventories
-from factorgraph_loc.io.readers.unread import Unread
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Turned, about_z

@@ -8,12 +8,11 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, read_mapped
+from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, Unread, read_mapped
 from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.readers.pose_file import EUROC, read_kitti, read_poses
-from factorgraph_loc.io.readers.unread import Unread
 from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream

@@ -12,11 +12,10 @@ from pydantic import Field, model_validator
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import bounded
-from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, Mapped, in_case, read_mapped
+from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, Mapped, Unread, in_case, read_mapped
 from factorgraph_loc.files.columns import PURE, Column
 from factorgraph_loc.files.models import FileModel, InUnit, inside
 from factorgraph_loc.files.tables import Cells, TableRows
-from factorgraph_loc.io.readers.unread import Unread
 from factorgraph_loc.sensors.rfid.columns import INVENTORIES, RFID
 from factorgraph_loc.sensors.rfid.tables import check_reads
 from factorgraph_loc.text import listed, quoted

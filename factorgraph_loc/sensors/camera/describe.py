@@ -6,7 +6,7 @@ from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.usage import Use
+from factorgraph_loc.sensors.interfaces import Use
 
 NAMES = ("camera", "sightings")
 

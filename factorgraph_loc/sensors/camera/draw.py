@@ -10,7 +10,7 @@ from factorgraph_loc.files.bounded import IMAGE, read_bytes
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
-from factorgraph_loc.sensors.marks import Marks
+from factorgraph_loc.sensors.interfaces import Marks
 from factorgraph_loc.vision.images import decoded
 from factors.se2 import Array
 

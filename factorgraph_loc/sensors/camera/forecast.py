@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.maps.walls import crosses
+from factorgraph_loc.maps.free_space import crosses
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
-from factorgraph_loc.sensors.forecast import Array32, Places
+from factorgraph_loc.sensors.interfaces import Array32, Places
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.se2 import Array
@@ -20,7 +20,7 @@ IMAGES_PER_SECOND = 2.0  # default rate
 
 @dataclass(frozen=True, eq=False)
 class CameraForecast:
-    """A :class:`~factorgraph_loc.sensors.forecast.Forecast` for images, ``looks_per_metre``; visibility follows ``settings`` and
+    """A :class:`~factorgraph_loc.sensors.interfaces.Forecast` for images, ``looks_per_metre``; visibility follows ``settings`` and
     walls. It draws no simulated images, so particles are not weighed."""
 
     world: World

@@ -12,7 +12,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
-from factorgraph_loc.sensors.usage import PreparedLog, Use
+from factorgraph_loc.sensors.interfaces import PreparedLog, Use
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors.se2 import Array

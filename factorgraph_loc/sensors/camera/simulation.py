@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.maps.walls import crosses
+from factorgraph_loc.maps.free_space import crosses
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.simulation_settings import PixelSettings
 from factorgraph_loc.sensors.camera.stream import SightingStream
-from factorgraph_loc.sensors.simulated import Ride, Simulated
+from factorgraph_loc.sensors.interfaces import Ride, Simulated
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.se2 import Array

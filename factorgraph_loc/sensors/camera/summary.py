@@ -10,7 +10,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
-from factorgraph_loc.sensors.summary import Paragraph, Summary
+from factorgraph_loc.sensors.interfaces import Paragraph, Summary
 from factorgraph_loc.vision.features import extractor
 from factorgraph_loc.vision.images import read_image
 from factorgraph_loc.vision.settings import FrontendSettings

@@ -6,9 +6,8 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.interfaces import Marks, Use
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.marks import Marks
-from factorgraph_loc.sensors.usage import Use
 
 
 def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.forecast import Array32, Places
+from factorgraph_loc.sensors.interfaces import Array32, Places
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, SightingSettings
 from factorgraph_loc.sensors.landmarks.simulation import in_sight
 from factors.landmarks import model as bearing_range
@@ -23,7 +23,8 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class LandmarkForecast:
-    """A :class:`~factorgraph_loc.sensors.forecast.Forecast` for landmarks, ``looks_per_metre``; visibility follows ``settings``."""
+    """A :class:`~factorgraph_loc.sensors.interfaces.Forecast` for landmarks, ``looks_per_metre``; ``settings`` tell which are
+    visible."""
 
     world: World
     model: BearingRangeModel

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.maps.walls import crosses
+from factorgraph_loc.maps.free_space import crosses
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.interfaces import Ride, Simulated
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeStream
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, SightingSettings
-from factorgraph_loc.sensors.simulated import Ride, Simulated
 from factors import se2
 from factors.landmarks import model as bearing_range
 from factors.landmarks.model import BearingRangeModel
@@ -72,7 +72,7 @@ def in_sight(
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSightings:
-    """A :class:`~factorgraph_loc.sensors.simulated.LiveSensor` of landmarks."""
+    """A :class:`~factorgraph_loc.sensors.interfaces.LiveSensor` of landmarks."""
 
     model: BearingRangeModel
     world: World

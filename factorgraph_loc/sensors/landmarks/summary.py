@@ -14,10 +14,10 @@ from scipy.optimize import least_squares
 
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors import summary
+from factorgraph_loc.sensors import interfaces
+from factorgraph_loc.sensors.interfaces import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP, Summary
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
-from factorgraph_loc.sensors.summary import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP, Summary
 from factors import se2
 from factors.landmarks import model as bearing_range
 from factors.se2 import Array
@@ -206,4 +206,4 @@ def _shifted(log: Log) -> list[str]:
     if abs(shifts[best]) < LARGE or not costs[best] < BETTER * costs[len(SHIFTS) // 2]:
         return []
     shift = float(shifts[best])
-    return [summary.line("bearing_range", shift, "the reference", "bearing_range", -shift)]
+    return [interfaces.line("bearing_range", shift, "the reference", "bearing_range", -shift)]

@@ -9,8 +9,8 @@ import numpy as np
 
 from factorgraph_loc.model.ticks import TICK_GAP
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.interfaces import Ride, Simulated
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
-from factorgraph_loc.sensors.simulated import Ride, Simulated
 from factors import se2
 from factors.se2 import Array
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.ticks import TICK_GAP
-from factorgraph_loc.sensors import summary
-from factorgraph_loc.sensors.odometry.calibration.windows import integrated
+from factorgraph_loc.sensors import interfaces
+from factorgraph_loc.sensors.interfaces import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP, Paragraph, Summary
+from factorgraph_loc.sensors.odometry.calibration.constants import integrated
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.sensors.odometry.motion import odometry_model
-from factorgraph_loc.sensors.summary import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP, Paragraph, Summary
 from factors import se2
 from factors.se2 import Array
 
@@ -188,7 +188,7 @@ def _compared(sensor: str, name: str, found: RateMatch | None) -> list[str]:
     if found.shift:
         # a late timestamp needs a negative offset; the odometry is early if the other one is late
         offset = -found.shift if sensor == "imu" else found.shift
-        lines.append(summary.line(name, found.shift, "the odometry", sensor, offset))
+        lines.append(interfaces.line(name, found.shift, "the odometry", sensor, offset))
     return lines
 
 

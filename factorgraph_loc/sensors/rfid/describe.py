@@ -8,9 +8,9 @@ import numpy as np
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.interfaces import Use
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.usage import Use
 from factorgraph_loc.text import quoted
 from factors.rfid.adjustment import MOST_CERTAIN, rates
 

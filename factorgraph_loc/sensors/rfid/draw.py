@@ -3,7 +3,7 @@
 import numpy as np
 
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.marks import Marks
+from factorgraph_loc.sensors.interfaces import Marks
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.rfid.tag_map import tag_map

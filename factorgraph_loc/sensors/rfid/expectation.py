@@ -8,7 +8,7 @@ import numpy as np
 
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.forecast import Array32, Places
+from factorgraph_loc.sensors.interfaces import Array32, Places
 from factorgraph_loc.sensors.rfid.forecast import ScanTables, log_weights, make_tables
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
@@ -20,7 +20,7 @@ ROUNDS_PER_SECOND = 2.0  # default rate
 
 @dataclass(frozen=True, eq=False)
 class RfidForecast:
-    """A :class:`~factorgraph_loc.sensors.forecast.Forecast` of inventory rounds, ``rounds_per_metre`` of each antenna."""
+    """A :class:`~factorgraph_loc.sensors.interfaces.Forecast` of inventory rounds, ``rounds_per_metre`` of each antenna."""
 
     likelihood: RfidLikelihood
     rounds_per_metre: float = 4.0

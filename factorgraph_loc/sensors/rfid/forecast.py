@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.sensors.forecast import Array32, Places
+from factorgraph_loc.sensors.interfaces import Array32, Places
 from factors.rfid.detection import RfidLikelihood
 from factors.rfid.kernels import FAST, detection, of_tag, placed
 from factors.rfid.model import Packed

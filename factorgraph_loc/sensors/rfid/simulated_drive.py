@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_loc.sensors.interfaces import Ride, Simulated
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.simulated_signals import phases, strengths
 from factorgraph_loc.sensors.rfid.simulation import draw_dead, draw_reads, read_probabilities, rfid_stream
 from factorgraph_loc.sensors.rfid.simulation_settings import FaultSettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
-from factorgraph_loc.sensors.simulated import Ride, Simulated
 from factorgraph_loc.text import listed, quoted
 from factors.se2 import Array
 

@@ -16,7 +16,7 @@ from factors.se2 import Array
 
 
 class SimulatedReader:
-    """A :class:`~factorgraph_loc.sensors.simulated.LiveSensor`: all antennas measure one round at a time."""
+    """A :class:`~factorgraph_loc.sensors.interfaces.LiveSensor`: all antennas measure one round at a time."""
 
     channel, decides = "rfid", True
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.interfaces import Paragraph, Summary
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.summary import Paragraph, Summary
 
 STOPPED = 10.0  # s; an antenna without rounds for longer before the end has stopped
 CLOCK_STEP = 1.0  # s

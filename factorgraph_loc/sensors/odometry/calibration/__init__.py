@@ -1,3 +1,3 @@
 """Calibration of wheel odometry from logs with a reference."""
 
-__all__ = ["calibrator", "windows"]
+__all__ = ["calibrator", "constants"]

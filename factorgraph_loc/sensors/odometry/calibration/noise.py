@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.odometry.calibration.windows import Windows, cut
+from factorgraph_loc.sensors.odometry.calibration.constants import Windows, cut
 from factors import chi_squared
 from factors.odometry.model import MINIMUM_HEADING_VARIANCE, MINIMUM_POSITION_VARIANCE, Growth, OdometryModel
 from factors.se2 import Array

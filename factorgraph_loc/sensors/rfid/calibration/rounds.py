@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.odometry.calibration.windows import REFERENCE_GAP
+from factorgraph_loc.sensors.odometry.calibration.constants import REFERENCE_GAP
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factors import se2

@@ -2,7 +2,7 @@
 
 from compass.settings import CompassSettings
 from compass.stream import HeadingStream
-from factorgraph_loc.sensors.simulated import Ride, Simulated
+from factorgraph_loc.sensors.interfaces import Ride, Simulated
 from factors import se2
 
 

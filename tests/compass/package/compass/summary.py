@@ -3,7 +3,7 @@
 import numpy as np
 
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.summary import Paragraph, Summary
+from factorgraph_loc.sensors.interfaces import Paragraph, Summary
 from factors import se2
 
 

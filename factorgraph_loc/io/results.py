@@ -1,9 +1,19 @@
-"""Trajectories in the table of a run."""
+"""Files of a result folder: their names, and trajectories in the table of a run."""
 
 import numpy as np
 import polars as pl
 
 from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory
+
+FILES = (
+    "final.tum",
+    "causal.tum",
+    "estimates.parquet",
+    "learnt.json",
+    "events.csv",
+    "config.toml",
+    "metrics.json",
+)  # the last one is written last
 
 
 def trajectory_of(table: pl.DataFrame, t0_ns: int) -> Trajectory:

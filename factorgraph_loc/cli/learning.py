@@ -1,4 +1,4 @@
-"""``fgloc map``: a map of landmarks, RFID tags or points from a log."""
+"""``fgloc calibrate`` and ``fgloc map``: a rig from logs with reference poses; a map of landmarks, RFID tags or points."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from factorgraph_loc.cli.options import (
     DataRoot,
     Json,
     LogName,
+    LogNames,
     LogOptions,
     Overwrite,
     Prior,
@@ -27,12 +28,52 @@ from factorgraph_loc.cli.options import (
     parse_settings,
 )
 
+OutRig = Annotated[
+    Path, typer.Option("--out", "-o", metavar="OUT.rig.toml", help="The rig to write; a report is written next to it.")
+]
 MAPPERS = ("batch", "smoother", "ekf")  # as in factorgraph_loc.experiments.maps
 OutWorld = Annotated[
     Path,
     typer.Option("--out", "-o", metavar="OUT.world.toml", help="The map to write; a picture is written next to it."),
 ]
 COLUMNS = ("given x [m]", "y [m]", "learnt x [m]", "y [m]", "sigma [m]", "distance [m]", "verdict")
+
+
+def calibrate(
+    logs: LogNames,
+    out: OutRig,
+    reader: Reader = None,
+    reader_option: ReaderOption = None,
+    data_root: DataRoot = None,
+    rig: RigFile = None,
+    world: WorldFile = None,
+    overwrite: Overwrite = False,
+    json: Json = False,
+) -> None:
+    """Calibrate a rig from logs with reference poses; write the rig and a report."""
+    from factorgraph_loc.api import learning
+    from factorgraph_loc.calibration import report
+
+    page = learning.report_beside(out, overwrite=overwrite)  # before the logs are read
+    loaded = LogOptions(reader, reader_option, data_root, rig, world).load(logs)
+    show.first_use()
+    with show.progress("calibrating", counted=True) as progress:
+        found = learning.calibrate(loaded, out, overwrite=overwrite, progress=progress)
+    for doubt in found.doubts:
+        show.note(f"warning: {doubt}")
+    if json:
+        show.document(report.document(found) | {"files": {"rig": str(out), "report": str(page)}})
+        return
+    show.table(*report.constants_table(found.knowledge.constants))
+    show.line()
+    for table in report.sensor_tables(found):
+        show.table(*table)
+        show.line()
+    show.table(*report.judgements_table(found))
+    show.line()
+    show.table(*report.accuracy_table(found))
+    show.line()
+    show.line(f"the rig is in {out}, the report in {page}")
 
 
 def map_(

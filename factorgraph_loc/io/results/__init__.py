@@ -1,3 +1,0 @@
-"""Files of a result folder."""
-
-__all__ = ["estimates", "layout"]

@@ -1,0 +1,182 @@
+"""What functions of sensors take and return: the use of a sensor in a run, its summary for ``fgloc info``, what is drawn of it,
+simulated drives, and the expected information along a planned path."""
+
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import Measurement, Stream
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.registry import channels, functions
+from factors.se2 import Array
+
+STEP = 0.05  # s between compared times and between shifts
+FARTHEST = 2.5  # s; largest shift
+SHIFTS = np.arange(-round(FARTHEST / STEP), round(FARTHEST / STEP) + 1)  # in steps
+LARGE = 0.15  # s; smallest shift that is reported
+BETTER = 0.7  # largest ratio of the residual at a reported shift to that without a shift
+FEWEST = 200  # minimum number of times and sightings
+SLOWEST = 1.0  # s; longest interval between reference poses that still gives rates
+Array32 = NDArray[np.float32]
+Places = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Use:
+    """A run of a log. ``sensors``: names of usable channels; ``estimator``: its name, with ``settings``; ``modalities``: of
+    measurements that it uses; ``estimates_points``: whether it may estimate points that are not in the map."""
+
+    log: Log
+    sensors: tuple[str, ...]
+    estimator: str
+    settings: FileModel
+    modalities: Container[str]
+    estimates_points: bool
+
+
+@dataclass(frozen=True)
+class PreparedLog:
+    """A ``log`` that can be run, with images replaced by features. ``images``: number of images whose features were computed or
+    loaded from the cache, in ``seconds``."""
+
+    log: Log
+    warnings: tuple[str, ...] = ()
+    images: int = 0
+    seconds: float = 0.0
+
+
+def lacking_section(rig: Rig, sensor: str) -> str:
+    """The section that a sensor requires, if the rig lacks it, else ""."""
+    channel = channels().get(sensor)
+    if channel is None or not channel.needs_section or getattr(rig, channel.section, None) is not None:
+        return ""
+    return channel.section
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """A line, and a table below it if it has a ``header``: cells (R, C) of text."""
+
+    line: str
+    header: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The summary of one sensor in a log.
+
+    ``found``: entries of ``fgloc info --json``; ``in_map``: number of detectable elements by map layer; ``problems``: warnings, one
+    line each; ``text``: printed paragraphs.
+    """
+
+    found: Mapping[str, Any] = field(default_factory=dict)
+    in_map: Mapping[str, int] = field(default_factory=dict)
+    problems: Sequence[str] = ()
+    text: Sequence[Paragraph] = ()
+
+
+def line(name: str, shift: float, than: str, setting: str, offset: float) -> str:
+    """The message that ``name`` is stamped ``shift`` [s] later than ``than``, with the ``time_offset`` [s] that corrects it."""
+    late = "later" if shift > 0.0 else "earlier"
+    mends = f"{setting}.time_offset = {offset:+.2f}"
+    return f"{name} is stamped about {abs(shift):.2f} s {late} than {than}: set {mends} in the rig"
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """A ``layer`` of the map: ``names`` (K) of its elements and ``positions`` (K, 3) [m].
+
+    ``t`` (N,) [s of the log], ``seen`` (N) names: detections. ``marker``, ``size``, ``order``: matplotlib style, lowest order
+    first. ``dense``: whether there are too many elements to label.
+    """
+
+    layer: str
+    names: Sequence[str]
+    positions: Array
+    t: Array = field(default_factory=lambda: np.empty(0))
+    seen: Sequence[str] = ()
+    marker: str = "d"
+    size: float = 6.0
+    order: float = 3.0
+    dense: bool = False
+
+
+def marks(log: Log) -> list[Marks]:
+    """The marks of all sensors for a log and its map."""
+    return [draw(log) for _, draw in functions("draw")]
+
+
+@dataclass(frozen=True, eq=False)
+class Ride:
+    """A drive through a world: the ``truth`` from t = 0, the ``rig`` given to estimators, and the true ``world``.
+
+    ``settings``: of the simulation, with the sections of the sensors. ``rng``, ``rng_of_world``: random generators by name, from
+    the seeds of the log and of the world. ``recorded``: recorded reads to resample, or None.
+    """
+
+    settings: Any
+    rig: Rig
+    world: World
+    truth: Trajectory
+    rng: Callable[[str], np.random.Generator]
+    rng_of_world: Callable[[str], np.random.Generator]
+    recorded: Any = None
+
+    def times(self, rate: float) -> Array:
+        """Times (N,) of a sensor with ``rate`` [Hz], starting after one period."""
+        return times(rate, self.truth)
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """The streams of a sensor's channels. ``layers``: of the surveyed world, if it differs from the true one; ``metadata`` and
+    ``warnings`` of the log."""
+
+    streams: Mapping[str, Stream] = field(default_factory=dict)
+    layers: Mapping[str, Any] = field(default_factory=dict)
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+class LiveSensor(Protocol):
+    """A simulated sensor of an active robot with ``rate`` [Hz]. ``decides``: whether the robot checks after each measurement if it
+    is localized."""
+
+    channel: str
+    rate: float
+    decides: bool
+
+    def measure(self, t: float, pose: Array) -> Measurement:
+        """The measurement at ``t`` [s] from pose (3,)."""
+
+
+def times(rate: float, truth: Trajectory) -> Array:
+    """Times (N,) of a sensor on a drive, starting after one period."""
+    count = int(float(truth.t[-1]) * rate + 1e-9)
+    return np.asarray(np.minimum(np.arange(1, count + 1) / rate, truth.t[-1]))
+
+
+class Forecast(Protocol):
+    """The forecast of one sensor in a world whose map is exact. ``goals`` (K, 2) [m]: positions near which it is most
+    informative; empty for a sensor with long range."""
+
+    goals: Array
+
+    def information(self, poses: Array, ways: Array) -> Array:
+        """Expected Fisher information (N, 3, 3) on the body-frame perturbation of poses (N, 3). ``ways`` (N,) [m]: distance
+        travelled at each pose; turns count by their duration."""
+
+    def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
+        """Add the log-likelihoods (M,) of measurements that the first J particles might make on a path to ``out`` (J, M).
+
+        ``poses`` (S, M, 3): where particles measure; ``metres``: length of the path, with turns by their duration; ``stops``
+        (M,): number of measurements of each particle. Random draws are the same for all paths with one ``seed``.
+        """
