@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -35,13 +36,14 @@ def package_of(module: str) -> str:
     return top if top == "factors" else below.partition(".")[0]
 
 
-def named(module: str, *, at_once: bool = False) -> set[tuple[str, str]]:
+def named(module: str, *, at_once: bool = False) -> frozenset[tuple[str, str]]:
     """What a module of this project imports, or names in a string, as (module, name in it), the name "" where it is the module
     itself; ``at_once``: when it is itself imported."""
     return names_in(MODULES[module], at_once=at_once)
 
 
-def names_in(path: Path, *, at_once: bool = False) -> set[tuple[str, str]]:
+@cache
+def names_in(path: Path, *, at_once: bool = False) -> frozenset[tuple[str, str]]:
     """Those of a file, see :func:`named`."""
     tree = ast.parse(path.read_text())
     found: set[tuple[str, str]] = set()
@@ -53,7 +55,7 @@ def names_in(path: Path, *, at_once: bool = False) -> set[tuple[str, str]]:
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and not at_once:
             place, _, name = node.value.partition(":")
             found.add((place, name))
-    return {(place, name) for place, name in found if place in MODULES}
+    return frozenset((place, name) for place, name in found if place in MODULES)
 
 
 def imported(module: str, *, at_once: bool = False) -> set[str]:
