@@ -13,8 +13,7 @@ from factorgraph_loc.evaluation.features.feature_evaluation import feature
 from factorgraph_loc.evaluation.features.sequences import find_sequences
 from factorgraph_loc.experiments import image_localization, maps, output
 from factorgraph_loc.files.models import replacing
-from factorgraph_loc.files.results import writing
-from factorgraph_loc.files.temporary import of_system, temporary_folder
+from factorgraph_loc.files.temporary import of_system, temporary_folder, writing
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.model.log import Log
 

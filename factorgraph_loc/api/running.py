@@ -13,8 +13,7 @@ from factorgraph_loc.experiments import output
 from factorgraph_loc.experiments import run as running
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.model.result import RunResult
-from factorgraph_loc.model.scoring import MAX_GAP
-from factorgraph_loc.model.ticks import TICK_GAP
+from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP
 from factorgraph_loc.text import listed
 
 

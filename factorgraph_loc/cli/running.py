@@ -32,8 +32,7 @@ from factorgraph_loc.cli.options import (
     parse_settings,
 )
 from factorgraph_loc.experiments.seeds import parse_seeds
-from factorgraph_loc.model.scoring import MAX_GAP
-from factorgraph_loc.model.ticks import TICK_GAP
+from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP
 
 if TYPE_CHECKING:
     from factorgraph_loc.model.result import RunResult

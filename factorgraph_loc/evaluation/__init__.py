@@ -2,7 +2,6 @@
 
 __all__ = [
     "active",
-    "alignment",
     "estimates_file",
     "features",
     "figures",
@@ -15,5 +14,4 @@ __all__ = [
     "statistics",
     "tables",
     "trajectories",
-    "warned",
 ]

@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.evaluation import alignment, space
-from factorgraph_loc.evaluation.alignment import rms
-from factorgraph_loc.evaluation.pairing import TOLERANCE, pairs, pauses
-from factorgraph_loc.evaluation.warned import WARNINGS
+from factorgraph_loc.evaluation import pairing, space
+from factorgraph_loc.evaluation.pairing import TOLERANCE, pairs, pauses, rms
+from factorgraph_loc.evaluation.tables import WARNINGS
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
@@ -153,7 +152,7 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
     is scored from its beginning. ``causal.space_*`` and ``final.space_*`` (see
     :func:`~factorgraph_loc.evaluation.space.accuracy`) are None except for estimators of poses in space. ``time_to_localized``
     [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
-    :func:`~factorgraph_loc.evaluation.alignment.free_map_figures`) are None unless the map was estimated. ``learnt.NAME.value``
+    :func:`~factorgraph_loc.evaluation.pairing.free_map_figures`) are None unless the map was estimated. ``learnt.NAME.value``
     and ``learnt.NAME.sigma`` exist for each learnt constant. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
     ``timing.*`` always exist, as do ``warnings``, a list of texts.
     """
@@ -173,9 +172,9 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
         scores |= {f"{kind}.{name}": value for name, value in figures.items()}
     scores["time_to_localized"] = None if causal is None else float(causal.t[0] - result.t[0])
     if result.config.get("settings", {}).get("landmarks") == FREE_MAP:
-        scores |= alignment.free_map_figures(final, result.learnt.landmarks, log, gap)
+        scores |= pairing.free_map_figures(final, result.learnt.landmarks, log, gap)
     else:
-        scores |= dict.fromkeys(alignment.FIGURES)
+        scores |= dict.fromkeys(pairing.FIGURES)
     return scores | _constants(result.learnt) | _counts(result.diagnostics) | _timing(result.timings)
 
 

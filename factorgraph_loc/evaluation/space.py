@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.evaluation.alignment import rms
-from factorgraph_loc.evaluation.pairing import pairs_in_space
+from factorgraph_loc.evaluation.pairing import pairs_in_space, rms
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factors import chi_squared, positive

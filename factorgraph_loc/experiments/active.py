@@ -30,8 +30,8 @@ from factorgraph_loc.evaluation.active import (
 )
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files.models import file_name, nearest, replacing, write_text, write_toml
-from factorgraph_loc.files.results import require_free, writing
 from factorgraph_loc.files.tables import read_parquet
+from factorgraph_loc.files.temporary import require_free, writing
 from factorgraph_loc.planning.closed_loop import ESTIMATORS, ActiveRun, run_active
 from factorgraph_loc.planning.policies import POLICIES
 from factorgraph_loc.planning.settings import ActiveSettings

@@ -17,19 +17,16 @@ from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import plot_log, remove_plots
 from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
-from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, markdown
-from factorgraph_loc.evaluation.warned import WARNINGS, lines, row_of
+from factorgraph_loc.evaluation.tables import BASELINE, WARNINGS, comparison_cells, lines, markdown, row_of
 from factorgraph_loc.experiments.output import remove_run, write_run
 from factorgraph_loc.experiments.preparation import check_prior, columns_of, fill_cache, use_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import file_name, nearest, replacing, write_text
-from factorgraph_loc.files.results import require_free, writing
-from factorgraph_loc.files.temporary import sweep
+from factorgraph_loc.files.temporary import require_free, sweep, writing
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.scoring import check_max_gap
-from factorgraph_loc.model.ticks import check_tick_gap
+from factorgraph_loc.model.scoring import check_max_gap, check_tick_gap
 from factorgraph_loc.processes import run_each
 from factorgraph_loc.text import quoted
 

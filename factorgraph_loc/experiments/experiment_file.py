@@ -16,8 +16,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.seeds import LARGEST_SEED, MOST_SEEDS, parse_seeds
 from factorgraph_loc.files.models import DEEPEST, FileModel, check_content, nearest, parse_model, read_toml
-from factorgraph_loc.model.scoring import MAX_GAP
-from factorgraph_loc.model.ticks import LONGEST, SHORTEST, TICK_GAP
+from factorgraph_loc.model.scoring import LONGEST, MAX_GAP, SHORTEST, TICK_GAP
 from factorgraph_loc.text import listed, plain, quoted
 
 SIMULATION = "simulation"  # first word of settings of simulated logs

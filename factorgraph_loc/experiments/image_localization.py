@@ -16,7 +16,7 @@ from factorgraph_loc.drawing.figures import COLOURS, grid, legend, save
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files.models import replacing, write_text
-from factorgraph_loc.files.results import require_free, writing
+from factorgraph_loc.files.temporary import require_free, writing
 from factorgraph_loc.mapping.camera_poses import PosedFrames, posed_frames
 from factorgraph_loc.mapping.image_localization import ImageLocalizer, Located
 from factorgraph_loc.mapping.point_mapping import PointReport, PointSettings, map_points

@@ -17,7 +17,7 @@ from factorgraph_loc.experiments.output import beside
 from factorgraph_loc.experiments.preparation import first_odometry, resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import replacing
-from factorgraph_loc.files.results import writing
+from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.io.native.world_file import write_world
 from factorgraph_loc.mapping import map_figure, mapping, tag_mapping
 from factorgraph_loc.mapping.camera_poses import posed_frames

@@ -23,8 +23,7 @@ from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.evaluation.plots import plot_run, remove_plots
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
 from factorgraph_loc.files.models import file_name, write_text, write_toml
-from factorgraph_loc.files.results import require_free, writing
-from factorgraph_loc.files.temporary import of_system, sweep, temporary_folder
+from factorgraph_loc.files.temporary import of_system, require_free, sweep, temporary_folder, writing
 from factorgraph_loc.io.results import FILES, trajectory_of
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.log import Log

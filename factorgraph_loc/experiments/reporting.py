@@ -13,15 +13,15 @@ import polars as pl
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
-from factorgraph_loc.evaluation.warned import WARNINGS
+from factorgraph_loc.evaluation.tables import WARNINGS
 from factorgraph_loc.experiments.experiment import Prepared
 from factorgraph_loc.experiments.keys import code_version, library_versions
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.store import Store, StoreError
 from factorgraph_loc.files.bounded import kind
 from factorgraph_loc.files.models import replacing
-from factorgraph_loc.files.results import writing
 from factorgraph_loc.files.tables import read_parquet
+from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.version import __version__
 
 INDEX = "results.parquet"

@@ -34,8 +34,7 @@ from factorgraph_loc.model.belief import PoseEstimate, PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Measurement, Rows, Tick
 from factorgraph_loc.model.result import RunResult, Timings
-from factorgraph_loc.model.scoring import MAX_GAP, check_max_gap
-from factorgraph_loc.model.ticks import TICK_GAP, Ticks, check_tick_gap
+from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Ticks, check_max_gap, check_tick_gap
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.interfaces import PreparedLog
 from factorgraph_loc.sensors.registry import functions, moving

@@ -22,7 +22,7 @@ from factorgraph_loc.exports.foxglove_schemas import OTHERS, SCHEMAS
 from factorgraph_loc.exports.runs import StoredRun
 from factorgraph_loc.exports.scene import DARK, LIT, SEEN, Colour, colours
 from factorgraph_loc.files.models import replacing
-from factorgraph_loc.files.results import writing
+from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera import draw

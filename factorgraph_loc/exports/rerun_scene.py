@@ -23,7 +23,7 @@ from factorgraph_loc.exports.rerun_camera import TIMELINE, WORLD, camera_path, r
 from factorgraph_loc.exports.runs import Particles, StoredRun
 from factorgraph_loc.exports.scene import DARK, LIT, REFERENCE, Colour, colours
 from factorgraph_loc.files.models import replacing
-from factorgraph_loc.files.results import writing
+from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3

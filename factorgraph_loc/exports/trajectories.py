@@ -18,7 +18,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import write_text
-from factorgraph_loc.files.results import writing
+from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory

@@ -8,7 +8,6 @@ __all__ = [
     "images",
     "models",
     "npz",
-    "results",
     "settings",
     "shipped",
     "tables",

@@ -1,4 +1,4 @@
-"""Temporary files and folders next to their targets.
+"""Temporary files and folders next to their targets; checks and errors of commands that write results.
 
 Their names consist of a dot, the target's name, :data:`MARK` and eight digits. The creating process holds a lock, which the system
 releases when the process ends. Unlocked ones are removed when a command that writes to the same folder starts.
@@ -10,9 +10,11 @@ import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from factorgraph_loc.errors import InputError
 
 MARK = ".fgloc-"
 _NAME = re.compile(rf"\..*{re.escape(MARK)}[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
@@ -141,3 +143,26 @@ def _remove(path: Path) -> None:
         with suppress(OSError):
             path.unlink()
     _own.discard(path)
+
+
+@contextmanager
+def writing(path: object) -> Iterator[None]:
+    """Context in which an OSError is raised as an InputError that names ``path``."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def require_free(out: Path, names: Iterable[str], *, overwrite: bool, folders: Iterable[Path] = ()) -> None:
+    """Raise InputError if ``out`` is not a folder, or contains one of the files ``names`` that must not be replaced.
+
+    Temporary files of previous calls are removed from ``out`` and ``folders``.
+    """
+    for folder in (out, *folders):
+        sweep(folder)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file, expected a folder for the results")
+    held = [name for name in names if (out / name).exists()]
+    if held and not overwrite:
+        raise InputError(f"{out}: holds results already ({held[0]}); choose another folder, or --overwrite")

@@ -31,7 +31,7 @@ from factorgraph_loc.fusion.variables import (
 )
 from factorgraph_loc.model.belief import Learnt, PosePrior, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import NewVariable, Sensor, Term

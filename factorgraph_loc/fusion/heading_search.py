@@ -8,8 +8,7 @@ import numpy as np
 
 from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.model.belief import Belief, PosePrior
-from factorgraph_loc.model.measurement import Measurement, Tick
-from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.measurement import Measurement, Motion, Tick
 from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
 from factors import se2
 from factors.se2 import Array

@@ -17,7 +17,7 @@ import numpy as np
 
 from factorgraph_loc.fusion.population import Population
 from factorgraph_loc.model.belief import Mode, PosePrior
-from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.sensors.base import Observation, Sensor, View
 from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
 from factors import positive, se2

@@ -23,7 +23,7 @@ from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick, named
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.ticks import Ticks
+from factorgraph_loc.model.scoring import Ticks
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import load

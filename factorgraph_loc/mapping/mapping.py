@@ -19,7 +19,7 @@ from itertools import combinations
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.evaluation.alignment import align_points
+from factorgraph_loc.evaluation.pairing import align_points
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World

@@ -22,7 +22,7 @@ from factorgraph_loc.mapping.tag_refinement import reach
 from factorgraph_loc.mapping.tag_search import TagPosterior, search
 from factorgraph_loc.model.belief import LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.ticks import TICK_GAP
+from factorgraph_loc.model.scoring import TICK_GAP
 from factorgraph_loc.sensors.odometry.motion import whole_motion
 from factorgraph_loc.sensors.registry import moving
 from factors import se2

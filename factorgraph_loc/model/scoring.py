@@ -1,6 +1,8 @@
-"""The version of the scoring rule and the settings of scoring; importable without numerical libraries."""
+"""The version of the scoring rule and the settings of scoring; the ticks of a run, a grid of 10 Hz from its start, except in long
+gaps between measurements. Importable without numerical libraries."""
 
 import math
+from collections.abc import Iterable, Iterator
 from typing import Literal
 
 from factorgraph_loc.errors import InputError
@@ -12,9 +14,73 @@ Alignment = Literal["none", "origin", "se2", "se3", "sim3"]
 ALIGNMENTS: tuple[Alignment, ...] = ("none", "origin", "se2", "se3", "sim3")
 Association = Literal["nearest", "interpolate"]
 ASSOCIATIONS: tuple[Association, ...] = ("nearest", "interpolate")
+RATE = 10  # Hz
+TICK_GAP = 60.0  # s; gaps without measurements above this length have no ticks
+SHORTEST, LONGEST = 1.0, 86400.0  # s; bounds of the setting
+TOLERANCE = 1e-6  # fraction of a tick, for rounding at the last measurement
 
 
 def check_max_gap(max_gap: float) -> None:
     """InputError if ``max_gap`` is not positive."""
     if not 0.0 < max_gap < math.inf:
         raise InputError(f"max_gap is {max_gap:g}, expected a time above 0 s")
+
+
+def check_tick_gap(gap: float) -> None:
+    """InputError if ``gap`` is out of bounds."""
+    if not SHORTEST <= gap <= LONGEST:
+        raise InputError(f"tick_gap is {gap:g}, expected {SHORTEST:g} to {LONGEST:g} s")
+
+
+class Ticks:
+    """The ticks of a run that starts at ``start``, generated as measurements arrive.
+
+    A tick follows all measurements that arrived up to its time. Gaps of more than ``gap`` [s] between measurements (of all
+    sensors) have no ticks; the grid continues after them. So the cost of a gap does not grow with its length.
+    """
+
+    def __init__(self, start: float, gap: float = TICK_GAP) -> None:
+        self._start, self._gap = start, gap
+        self._newest = start
+        self._next = 0  # index of the next tick on the grid
+        self.count = 0  # number of ticks so far
+        self.skipped: list[tuple[float, float]] = []  # start and end [s] of gaps without ticks
+
+    @property
+    def seconds(self) -> float:
+        """Time since the start, without gaps."""
+        return self._newest - self._start - sum(end - begin for begin, end in self.skipped)
+
+    @property
+    def due(self) -> float:
+        """When the next tick is."""
+        return self._start + self._next / RATE
+
+    def before(self, t: float) -> Iterable[float]:
+        """The ticks before the next measurement, which is at ``t``."""
+        if self._newest <= t <= self._start + self._next / RATE and t <= self._newest + self._gap:
+            self._newest = t
+            return ()  # the usual case for odometry
+        return self._before(t)
+
+    def _before(self, t: float) -> Iterator[float]:
+        if t > self._newest + self._gap:
+            yield from self.rest()
+            self.skipped.append((self._newest, t))
+            self._next = max(self._next, math.floor((t - self._start) * RATE) - 1)
+            for _ in range(3):  # find the first tick that is not before `t` despite rounding
+                self._next += self._start + self._next / RATE < t
+        self._newest = max(self._newest, t)
+        while (tick := self._start + self._next / RATE) < t:
+            self._next += 1
+            self.count += 1
+            yield tick
+
+    def rest(self) -> Iterator[float]:
+        """The ticks up to the newest measurement."""
+        last = math.floor((self._newest - self._start) * RATE + TOLERANCE)
+        while self._next <= last:
+            tick = self._start + self._next / RATE
+            self._next += 1
+            self.count += 1
+            yield tick

@@ -15,7 +15,7 @@ import numpy as np
 
 from factorgraph_loc.model.belief import Mode, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.sensors.known_position import KnownPosition

@@ -65,7 +65,7 @@ class SensorType:
     :class:`~factorgraph_loc.sensors.interfaces.Marks`, for plots and viewers.
 
     For estimators: ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor`, or None if a run does not use it;
-    ``predict``: ``(rig, sensors, diagnostics, self_calibration) ->`` :class:`~factorgraph_loc.model.motion.Motion`.
+    ``predict``: ``(rig, sensors, diagnostics, self_calibration) ->`` :class:`~factorgraph_loc.model.measurement.Motion`.
 
     For runs (:class:`~factorgraph_loc.sensors.interfaces.Use`): ``check``: ``(use)``, raises InputError if log and settings do not
     fit; ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.interfaces.PreparedLog`; ``doubts``: ``(use,

@@ -8,7 +8,7 @@ import pytest
 from evo.core.geometry import umeyama_alignment
 from scipy.stats import chi2
 
-from factorgraph_loc.evaluation.alignment import align, align_points, free_map_figures
+from factorgraph_loc.evaluation.pairing import align, align_points, free_map_figures
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig

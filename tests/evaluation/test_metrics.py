@@ -8,8 +8,8 @@ from evo.core import metrics as evo
 from evo.core.trajectory import PosePath3D
 from scipy.stats import binom, chi2
 
-from factorgraph_loc.evaluation.alignment import FIGURES
 from factorgraph_loc.evaluation.metrics import accuracy, errors, relative_errors, score
+from factorgraph_loc.evaluation.pairing import FIGURES
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log

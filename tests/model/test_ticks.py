@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.model.ticks import Ticks, check_tick_gap
+from factorgraph_loc.model.scoring import Ticks, check_tick_gap
 
 
 def fired(start, stamps, gap=60.0):

@@ -16,7 +16,7 @@ from factorgraph_loc.evaluation.features.feature_evaluation import Feature, Rank
 from factorgraph_loc.evaluation.features.sequences import OTHER, Sequence
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files.models import replacing, write_text
-from factorgraph_loc.files.results import require_free, writing
+from factorgraph_loc.files.temporary import require_free, writing
 from factorgraph_loc.vision.matching import RATIO
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 Least squares in space: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE
 Transactions on Pattern Analysis and Machine Intelligence, 1991, equations 38 to 43. In the plane:
-:func:`~factorgraph_loc.evaluation.alignment.align_points`.
+:func:`~factorgraph_loc.evaluation.pairing.align_points`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.alignment import align_points
-from factorgraph_loc.evaluation.pairing import pairs, pairs_in_space, pauses
+from factorgraph_loc.evaluation.pairing import align_points, pairs, pairs_in_space, pauses
 from factorgraph_loc.model.scoring import Alignment, Association
 from factorgraph_loc.model.trajectory3 import PosePath, path_of, upright
 from factors.se2 import Array, Integers

@@ -16,7 +16,7 @@ from factorgraph_loc.evaluation.pairing import pauses
 from factorgraph_loc.evaluation.report import remark, whole_page
 from factorgraph_loc.evaluation.trajectories.score import HOW, PoseErrors, TrajectoryScore
 from factorgraph_loc.files.models import replacing, write_text
-from factorgraph_loc.files.results import require_free, writing
+from factorgraph_loc.files.temporary import require_free, writing
 from factors.se2 import Array
 
 if TYPE_CHECKING:

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation import metrics
-from factorgraph_loc.evaluation.alignment import rms
-from factorgraph_loc.evaluation.pairing import TOLERANCE, pauses
+from factorgraph_loc.evaluation.pairing import TOLERANCE, pauses, rms
 from factorgraph_loc.evaluation.trajectories.association import Similarity, alignment, associate
 from factorgraph_loc.model.planar import MOST, RISE
 from factorgraph_loc.model.scoring import (

@@ -15,8 +15,8 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import IMAGE, read_bytes
 from factorgraph_loc.files.checks import absolute
 from factorgraph_loc.files.temporary import sweep, temporary_folder
+from factorgraph_loc.io.bags.fields import INITIAL_POSE, READ, ROUND, definitions, tables_of_messages
 from factorgraph_loc.io.bags.file import ROS1, SUFFIXES, require_rosbags
-from factorgraph_loc.io.bags.messages import INITIAL_POSE, READ, ROUND, definitions, tables_of_messages
 from factorgraph_loc.io.bags.poses import POINT
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.io.native.world_file import write_world

@@ -7,12 +7,11 @@ from typing import Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.bags.camera import COMPRESSED, INFO, RAW
-from factorgraph_loc.io.bags.fields import LIST, TF, has_header, leaves
+from factorgraph_loc.io.bags.fields import INITIAL_POSE, LIST, ROUND, TF, has_header, leaves, tables_of_messages
 from factorgraph_loc.io.bags.file import Bag, Topic
 from factorgraph_loc.io.bags.frames import ODOMETRY as ORIGINS
 from factorgraph_loc.io.bags.frames import ROBOT, STATIC, WORLD, Tree, tree_of
 from factorgraph_loc.io.bags.landmarks import CORNERS, DETECTIONS
-from factorgraph_loc.io.bags.messages import INITIAL_POSE, ROUND, tables_of_messages
 from factorgraph_loc.io.bags.motion import IMU, JOINTS, ODOMETRY, TWISTS
 from factorgraph_loc.io.bags.poses import POINT, POSES
 from factorgraph_loc.text import listed

@@ -16,11 +16,10 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, add_fields, parse_model
 from factorgraph_loc.io.bags import fields as bag_clock
 from factorgraph_loc.io.bags.camera import CameraTopic, Images, Info
-from factorgraph_loc.io.bags.fields import TF, Clock, Stamper
+from factorgraph_loc.io.bags.fields import TF, Clock, Stamper, tables_of_messages
 from factorgraph_loc.io.bags.file import Bag, Stamped, open_bag
 from factorgraph_loc.io.bags.frames import STATIC, FrameReference, StaticFrames
 from factorgraph_loc.io.bags.landmarks import Landmarks, LandmarkTopic, PixelsOfPoints, PixelTopic
-from factorgraph_loc.io.bags.messages import tables_of_messages
 from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, WheelMotion, YawRates, odometry
 from factorgraph_loc.io.bags.poses import POINT, POSES, Poses, ReferenceTopic, Start, StartTopic
 from factorgraph_loc.io.bags.tables import DescribedRows, Reads, RfidTopic, TableTopic

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.measurement import Motion
 
 TIME = 0.1  # s over which a turn rate is averaged
 LONGEST = 2.0  # s between images

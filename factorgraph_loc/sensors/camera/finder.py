@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.model.belief import Mode, PosePrior
-from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.sensors.camera.sensor import KnownPoints, Pixels
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.vision.relocalization import FoundOnFloor

@@ -13,7 +13,7 @@ import numpy as np
 from factorgraph_loc.maps.markers import marker_of
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.sensors.camera.clock_check import ClockCheck

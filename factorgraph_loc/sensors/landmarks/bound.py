@@ -11,14 +11,13 @@ import numpy as np
 
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
 from factorgraph_loc.sensors.known_position import KnownPosition
-from factorgraph_loc.sensors.landmarks.finder import Hypothesis, Relocalizer
+from factorgraph_loc.sensors.landmarks.finder import Hypothesis, Relocalizer, TrackMonitor
 from factorgraph_loc.sensors.landmarks.located import NewLandmarks
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.landmarks.monitor import TrackMonitor
 from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks, together
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factors.graph import Factor

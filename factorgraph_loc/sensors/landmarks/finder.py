@@ -1,12 +1,11 @@
-"""Localization from identified landmarks alone, for an unknown start and a kidnapped robot.
+"""Localization from identified landmarks alone, for an unknown start and a kidnapped robot; and detection of a lost track.
 
 The sightings of the last minute are related to the present pose by odometry. Candidate poses are generated from few of them (one
 landmark: a circle around it; two: the alignment of two points) and scored against all sightings by the robust likelihood; the
 best are refined by Gauss-Newton, and those that remain distinct are hypotheses. Their weights are posterior probabilities by
 Laplace's method (MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, eq. 27.6): likelihood times the volume
 of the mode, under a flat prior or, if the start position is known, under that. Generating hypotheses from few features and
-testing them with the others: Jensfelt, Kristensen, IEEE Transactions on Robotics and Automation 17(5), 2001.
-"""
+testing them with the others: Jensfelt, Kristensen, IEEE Transactions on Robotics and Automation 17(5), 2001."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.model.belief import Mode, PosePrior, Status
-from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.landmarks.window import Sighting, SightingWindow
 from factors import positive, se2
@@ -26,7 +25,7 @@ from factors.landmarks.model import BearingRangeModel
 from factors.motion import ChainState
 from factors.robust import geman_mcclure_loss
 from factors.se2 import Array
-from factors.update import GATE
+from factors.update import GATE, SightingFactor
 
 DURATION = 60.0  # s of sightings that are used
 INTERVAL = 1.0  # s; closer sightings of a landmark have nearly equal errors and count once
@@ -45,6 +44,10 @@ CLEAR_WEIGHT = 0.99
 CLEAR_POSITION, CLEAR_HEADING = 0.3, 0.15
 CLEAR_SIGHTINGS = 4
 FOUND_HEADING = 0.3  # rad; for a known start position, where only the heading can be confused
+STAMPS, MONITORED = 4, 2.0  # minimum number of timestamps, and their duration in s
+KEPT = 100  # timestamps
+BEYOND = 2.0  # times the gate
+SHARE = 0.6  # of the landmarks
 
 
 @dataclass(frozen=True)
@@ -239,3 +242,50 @@ def _distance(pose: Array, other: Array, covariance: Array) -> float:
     difference = pose - other
     difference[2] = se2.wrap_scalar(difference[2])
     return float(positive.squared(difference, covariance))
+
+
+class TrackMonitor:
+    """Detects that most landmarks of the last timestamps are far outside the gate.
+
+    That is only a suspicion, because a wrong map looks the same. A :class:`Relocalizer` tells whether there is a better pose.
+    """
+
+    def __init__(self) -> None:
+        self._stamps: list[tuple[float, int, int]] = []
+        self._since: float | None = None
+
+    @property
+    def suspicious_since(self) -> float | None:
+        """The time since which most landmarks are outside, or None."""
+        return self._since
+
+    def add(self, t: float, seen: SightingFactor, pose: Array, covariance: Array) -> None:
+        """Add the landmarks of a timestamp, with the predicted ``pose`` (3,) and its body-frame ``covariance`` (3, 3)."""
+        residual, (jacobian,) = seen.whitened([pose])
+        spread = np.eye(2) + jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+        squared = positive.squared(residual, spread)
+        self._stamps = [s for s in self._stamps if s[0] < t][-KEPT:]
+        self._stamps.append((t, int(np.count_nonzero(squared > BEYOND * GATE)), len(squared)))
+        last = self._last()
+        share = sum(s[1] for s in last) / max(1, sum(s[2] for s in last))
+        if share > SHARE or (self._since is not None and share >= SHARE / 2.0):
+            self._since = self._beginning()
+        else:
+            self._since = None
+
+    def clear(self) -> None:
+        """Forget the history: a new track starts."""
+        self._stamps.clear()
+        self._since = None
+
+    def _beginning(self) -> float:
+        """The change point: it maximises the number of landmarks outside after and inside before it."""
+        excess = np.array([2 * beyond - count for _, beyond, count in self._stamps])
+        return self._stamps[int(np.argmax(np.cumsum(excess[::-1])[::-1]))][0]
+
+    def _last(self) -> list[tuple[float, int, int]]:
+        """The fewest last timestamps that are sufficient, empty if there are too few."""
+        for i in range(len(self._stamps) - STAMPS, -1, -1):
+            if self._stamps[i][0] <= self._stamps[-1][0] - MONITORED:
+                return self._stamps[i:]
+        return []

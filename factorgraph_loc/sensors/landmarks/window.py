@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from factorgraph_loc.model.motion import Motion
+from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import positive, se2
 from factors.landmarks.model import BearingRangeModel, jacobians, located, residuals, sigmas

@@ -67,7 +67,7 @@ def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool
 
 
 class OdometryMotion:
-    """The motion sensor (:class:`~factorgraph_loc.model.motion.Motion`) made of wheel odometry.
+    """The motion sensor (:class:`~factorgraph_loc.model.measurement.Motion`) made of wheel odometry.
 
     A gyro replaces the rotation of the wheels if ``sensors`` include ``imu``. ``self_calibration``: the uncertain constants of
     the odometry are estimated; otherwise their error is part of the noise.
@@ -129,7 +129,7 @@ class OdometryMotion:
     def predicted(
         self, increment: Increment, pose: Array, covariance: Array, constants: Array, first: int
     ) -> tuple[Array, Array, Array]:
-        """Predict a Gaussian by an increment; see :meth:`factorgraph_loc.model.motion.Motion.predicted`."""
+        """Predict a Gaussian by an increment; see :meth:`factorgraph_loc.model.measurement.Motion.predicted`."""
         motion = increment.delta, increment.covariance, increment.moving
         pose, transition, after = kernels.predicted(*motion, pose, covariance, constants, self._indices, first)
         return pose, transition, after

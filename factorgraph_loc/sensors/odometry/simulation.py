@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from factorgraph_loc.model.ticks import TICK_GAP
+from factorgraph_loc.model.scoring import TICK_GAP
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.interfaces import Ride, Simulated
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream

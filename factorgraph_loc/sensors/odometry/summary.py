@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.ticks import TICK_GAP
+from factorgraph_loc.model.scoring import TICK_GAP
 from factorgraph_loc.sensors import interfaces
 from factorgraph_loc.sensors.interfaces import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP, Paragraph, Summary
 from factorgraph_loc.sensors.odometry.calibration.constants import integrated
@@ -136,7 +136,7 @@ def motion_problems(log: Log) -> list[str]:
 
 
 def _longest(t: Array) -> tuple[float, float]:
-    """Start and end of the longest part without a gap above :data:`~factorgraph_loc.model.ticks.TICK_GAP` in timestamps (N,)."""
+    """Start and end of the longest part without a gap above :data:`~factorgraph_loc.model.scoring.TICK_GAP` in timestamps (N,)."""
     parts = np.split(t, np.flatnonzero(np.diff(t) > TICK_GAP) + 1)
     longest = max(parts, key=lambda part: float(part[-1] - part[0]))
     return float(longest[0]), float(longest[-1])

@@ -10,9 +10,8 @@ from landmark_world import simulate
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.landmarks.finder import Relocalizer, _apart
+from factorgraph_loc.sensors.landmarks.finder import Relocalizer, TrackMonitor, _apart
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeStream
-from factorgraph_loc.sensors.landmarks.monitor import TrackMonitor
 from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks
 from factorgraph_loc.sensors.odometry.motion import OdometryMotion
 from factors import se2
