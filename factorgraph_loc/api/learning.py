@@ -16,6 +16,7 @@ from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.temporary import of_system, temporary_folder, writing
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.result import RunResult
 
 RIG = ".rig.toml"
 FEATURES = ("colour", "sift", "orb")
@@ -30,13 +31,14 @@ def calibrate(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> calibration.Calibration:
-    """Calibrate a rig from logs with reference poses. Writes ``out`` (``NAME.rig.toml``) and ``NAME.report.html`` next to it."""
+    """Calibrate a rig from logs, all with reference poses or all without. Writes ``out`` (``NAME.rig.toml``) and
+    ``NAME.report.html`` next to it."""
     file, page = Path(out), report_beside(Path(out), overwrite=overwrite)
     loaded = every(logs, rig, world)
     # learnt grids are kept here until the rig is written, so that a failed calibration leaves nothing behind
     with temporary_folder(of_system("grids")) as folder:
         grids = folder / file.name.removesuffix(RIG)
-        found = calibration.calibrate(loaded, _score, progress=progress, grids=grids)
+        found = calibration.calibrate(loaded, _score, progress=progress, smooth=smoothed, grids=grids)
         with writing(file), replacing(page) as temporary:  # write both files or none
             temporary.write_text(rig_report.page(found), encoding="utf-8")
             write_rig(found.rig, file)
@@ -73,6 +75,11 @@ def build_map(
     made = maps.make_map(one(log, rig, world), options)
     made.write(Path(out), overwrite=overwrite)
     return made
+
+
+def smoothed(log: Log) -> RunResult:
+    """The smoother's result on a log, with the log's rig and its sensors."""
+    return run(log, "smoother").result
 
 
 def _score(log: Log) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments import compare as comparing
 from factorgraph_loc.experiments import output
 from factorgraph_loc.experiments import run as running
+from factorgraph_loc.experiments.learning import run_and_learn
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP
@@ -37,14 +38,15 @@ def run(
     world: WorldLike | None = None,
     max_gap: float = MAX_GAP,
     tick_gap: float = TICK_GAP,
+    learn: bool = False,
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Run:
     """Run one estimator on one log and score the result.
 
-    For the arguments see :class:`~factorgraph_loc.experiments.run.RunConfig`. ``out``: folder for the files that ``fgloc run``
-    writes.
+    For the arguments see :class:`~factorgraph_loc.experiments.run.RunConfig`. ``learn``: learn the rig from the log itself, for
+    the final trajectory alone. ``out``: folder for the files that ``fgloc run`` writes.
     """
     if out is not None:
         output.check_free(Path(out), overwrite=overwrite)
@@ -52,7 +54,7 @@ def run(
     config = RunConfig(
         estimator, settings or {}, None if sensors is None else tuple(sensors), prior, seed, max_gap, tick_gap
     )
-    result = running.run(loaded, config, progress)
+    result = run_and_learn(loaded, config, progress).result if learn else running.run(loaded, config, progress)
     if out is None:
         return Run(result, score(result, loaded))
     scores = output.write_run(result, loaded, Path(out), overwrite=overwrite)

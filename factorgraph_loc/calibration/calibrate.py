@@ -10,6 +10,7 @@ from factorgraph_loc.calibration.held_out import folds_of, recordings
 from factorgraph_loc.calibration.judging import Judgement
 from factorgraph_loc.calibration.learn import Knowledge, calibrators, has_heading, learn, senses, sensing
 from factorgraph_loc.calibration.selection import Bench, Learner, constants_of, dependents_of
+from factorgraph_loc.calibration.turns import Smooth, learn_by_turns
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -29,7 +30,8 @@ class Calibration:
     what was learnt, with the accepted constants only. ``consistency``: of each sensor's noise, by sensor (landmarks with the
     EKF, the tempering of RFID with the smoother), from rigs learnt from the other logs where there are any. ``before`` and
     ``after``: scores on each log with the input rig and the new rig; ``held_out``: with a rig learnt from the other logs,
-    except for the factor on the noise; empty for a single log. ``doubts``: warnings, one line each.
+    except for the factor on the noise; empty for a single log. ``doubts``: warnings, one line each. ``turns``: for logs without
+    a reference, by how many standard errors each turn changed what was learnt; nothing is judged and scored then.
     """
 
     logs: tuple[str, ...]
@@ -43,6 +45,7 @@ class Calibration:
     after: tuple[Scores, ...]
     held_out: tuple[Scores, ...]
     doubts: tuple[str, ...]
+    turns: tuple[float, ...] = ()
 
     def judgement(self, name: str) -> Judgement | None:
         """The judgement of a parameter, named ``section.parameter``; None if it was not judged."""
@@ -63,16 +66,20 @@ def calibrate(
     rig: Rig | None = None,
     progress: Callable[[float, float], None] | None = None,
     *,
+    smooth: Smooth | None = None,
     grids: Path | None = None,
 ) -> Calibration:
     """Calibrate a rig from ``logs``. Values that the logs do not determine, or that do not improve the estimator, come from
     ``rig``, by default that of the first log.
 
-    ``evaluate`` runs an estimator on a log, with the sensors of the log's rig, and returns its scores. ``progress`` is called
+    ``evaluate`` runs an estimator on a log, with the sensors of the log's rig, and returns its scores. ``smooth`` runs the
+    smoother: if no log has a reference, smoothing and learning take turns. ``progress`` is called
     with the number of steps done and of all steps. ``grids``: path prefix of the files of learnt detection grids; needed for
     logs with tag reads. Raises InputError if a log lacks a reference or odometry, has neither exteroceptive measurements nor a
     reference with headings, is too short, or differs in kind from the others.
     """
+    if smooth is not None and logs and all(log.reference is None for log in logs):
+        return _by_turns(logs, rig, smooth, progress, grids)
     check(logs)
     report = progress or (lambda _done, _total: None)
     start = sensing(rig or logs[0].rig, logs[0])
@@ -103,6 +110,33 @@ def calibrate(
         after=after,
         held_out=held_out,
         doubts=_doubts(knowledge, search, found),
+    )
+
+
+def _by_turns(
+    logs: Sequence[Log],
+    rig: Rig | None,
+    smooth: Smooth,
+    progress: Callable[[float, float], None] | None,
+    grids: Path | None,
+) -> Calibration:
+    """Calibrate from logs without a reference."""
+    check_together(logs)
+    start = sensing(rig or logs[0].rig, logs[0])
+    turns = learn_by_turns(logs, start, smooth, grids, progress)
+    return Calibration(
+        logs=tuple(log.name for log in logs),
+        input_rig=start,
+        rig=turns.knowledge.rig,
+        knowledge=turns.knowledge,
+        judgements=(),
+        accepted=frozenset(),
+        consistency={},
+        before=(),
+        after=(),
+        held_out=(),
+        doubts=turns.doubts,
+        turns=turns.changed,
     )
 
 
@@ -257,12 +291,19 @@ def estimator_for(rig: Rig) -> str:
 
 
 def check(logs: Sequence[Log]) -> None:
-    """Raise InputError if these logs cannot be calibrated together."""
+    """Raise InputError if these logs cannot be calibrated together against their references."""
     if not logs:
         raise InputError("there is no log to calibrate from")
     for log in logs:
         if log.reference is None or len(log.reference) < 2:
-            raise InputError(f"{log.name}: has no reference, expected one to calibrate against")
+            more = "; logs without any reference are calibrated by themselves" if len(logs) > 1 else ""
+            raise InputError(f"{log.name}: has no reference, expected one to calibrate against{more}")
+    check_together(logs)
+
+
+def check_together(logs: Sequence[Log]) -> None:
+    """Raise InputError if these logs are not of one kind, or nothing can be learnt from one of them."""
+    for log in logs:
         if not any(_has(log, name) for name in moving(log.streams, "floor")):
             raise InputError(f"{log.name}: has no odometry, expected one in every log to calibrate from")
         if not any(_has(log, sensor) for sensor in senses()) and not has_heading(log):

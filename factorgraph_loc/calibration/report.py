@@ -101,6 +101,7 @@ def document(calibration: Calibration) -> dict[str, Any]:
         "before": scores(calibration.before),
         "after": scores(calibration.after),
         "held_out": scores(calibration.held_out),
+        "turns": list(calibration.turns),
         "doubts": list(calibration.doubts),
         "rig": calibration.rig.model_dump(mode="json", exclude_none=True),
     }
@@ -124,31 +125,53 @@ def page(calibration: Calibration) -> str:
         f"<p>From {text(', '.join(calibration.logs))}. {text(_verdict(calibration))}</p>",
         *(f'<p class="doubt">{text(doubt)}</p>' for doubt in calibration.doubts),
         "<h2>Constants</h2>",
-        "<p>A constant is kept if it improves the prediction of held-out data: "
-        + ("the other logs" if len(calibration.logs) > 1 else "another fifth of the log")
-        + f", and if it improves the {_estimator(calibration)}. Otherwise the rig keeps the input value. "
-        + ("The fits to each log show how much it differs between runs." if len(calibration.logs) > 1 else "")
-        + "</p>",
+        f"<p>{_how(calibration)}</p>",
         table(*_long_constants(calibration)),
         "<h2>Noise</h2>",
         *(part for calibrator, told in calibration.told() for part in calibrator.told_noise(told)),
         *(part for calibrator, told in calibration.told() for part in calibrator.told_section(told)),
         *_judgements(calibration),
-        f"<h2>Accuracy of the {_estimator(calibration)}</h2>",
-        "<p>ANEES is ideal at 3 (at 2 without the reference's heading); above it the estimator is overconfident. "
-        + (
-            "The rows <i>from the other logs</i> are cross-validated: only the factor on the noise has used the log."
-            if calibration.held_out
-            else "With one log there is no cross-validation: test the rig on another log."
-        )
-        + "</p>",
-        table(*accuracy_table(calibration)),
+        *_accuracy(calibration),
     ]
     for calibrator, told in reversed(list(calibration.told())):
         parts += calibrator.told_residuals(told)
     title = f"Calibration of {text(calibration.rig.name)}"
     head = f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style></head>'
     return f"{head}<body>\n" + "\n".join(parts) + "\n</body></html>\n"
+
+
+def _how(calibration: Calibration) -> str:
+    """How the constants were found."""
+    each = "The fits to each log show how much it differs between runs." if len(calibration.logs) > 1 else ""
+    if calibration.turns:
+        turns = ", ".join(number(one, 1) for one in calibration.turns)
+        return (
+            "The logs have no reference. Smoothing the logs, and learning from the smoothed trajectories, took turns: the "
+            f"largest change of a constant in each was {turns} of its standard errors. One of the odometry or of landmarks is kept "
+            f"if its mean over the logs differs from the input beyond chance. {each}"
+        )
+    whose = "the other logs" if len(calibration.logs) > 1 else "another fifth of the log"
+    return (
+        f"A constant is kept if it improves the prediction of held-out data: {whose}, and if it improves the "
+        f"{_estimator(calibration)}. Otherwise the rig keeps the input value. {each}"
+    )
+
+
+def _accuracy(calibration: Calibration) -> list[str]:
+    """The accuracy of the judging estimator, if there is a reference."""
+    if calibration.turns:
+        return []
+    unseen = (
+        "The rows <i>from the other logs</i> are cross-validated: only the factor on the noise has used the log."
+        if calibration.held_out
+        else "With one log there is no cross-validation: test the rig on another log."
+    )
+    return [
+        f"<h2>Accuracy of the {_estimator(calibration)}</h2>",
+        "<p>ANEES is ideal at 3 (at 2 without the reference's heading); above it the estimator is overconfident. "
+        f"{unseen}</p>",
+        table(*accuracy_table(calibration)),
+    ]
 
 
 def _verdict(calibration: Calibration) -> str:

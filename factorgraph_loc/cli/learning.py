@@ -50,7 +50,7 @@ def calibrate(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Calibrate a rig from logs with reference poses; write the rig and a report."""
+    """Calibrate a rig from logs, all with reference poses or all without; write the rig and a report."""
     from factorgraph_loc.api import learning
     from factorgraph_loc.calibration import report
 
@@ -69,9 +69,12 @@ def calibrate(
     for table in report.sensor_tables(found):
         show.table(*table)
         show.line()
-    show.table(*report.judgements_table(found))
-    show.line()
-    show.table(*report.accuracy_table(found))
+    if found.turns:
+        show.line(f"learnt without a reference, in {len(found.turns)} turns with the smoother")
+    else:
+        show.table(*report.judgements_table(found))
+        show.line()
+        show.table(*report.accuracy_table(found))
     show.line()
     show.line(f"the rig is in {out}, the report in {page}")
 

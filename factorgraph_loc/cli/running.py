@@ -73,11 +73,19 @@ def run(
     world: WorldFile = None,
     max_gap: MaxGap = MAX_GAP,
     tick_gap: TickGap = TICK_GAP,
+    learn: Annotated[
+        bool,
+        typer.Option(
+            "--learn", help="Learn the rig from the log itself, without its reference, for the final trajectory."
+        ),
+    ] = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Run one estimator on one log; write trajectories, estimates, scores and plots."""
+    from factorgraph_loc.calibration.report import constants_table
     from factorgraph_loc.experiments import run as experiment
+    from factorgraph_loc.experiments.learning import run_and_learn
     from factorgraph_loc.experiments.output import check_free, write_plots, write_run
     from factorgraph_loc.fusion.registry import check_names
 
@@ -90,7 +98,11 @@ def run(
     )
     show.first_use()
     with show.progress(estimator, counted=False) as report:
-        result = experiment.run(loaded, config, lambda share: report(share, 1.0))
+        if learn:
+            learning = run_and_learn(loaded, config, lambda share: report(share, 1.0))
+            result, learnt = learning.result, learning.turns.knowledge.constants
+        else:
+            result, learnt = experiment.run(loaded, config, lambda share: report(share, 1.0)), ()
     scores = write_run(result, loaded, out, overwrite=overwrite)
     write_plots(result, loaded, out)
     show.warnings(result.warnings)
@@ -100,6 +112,9 @@ def run(
     _print_accuracy(scores)
     _print_consistency(scores)
     _print_learnt(result)
+    if learnt:
+        show.line("learnt from the log, for the final trajectory alone:")
+        show.table(*constants_table(learnt))
     _print_events(result)
     _print_effort(scores)
     show.line()

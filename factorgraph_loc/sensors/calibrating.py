@@ -13,6 +13,7 @@ from factorgraph_loc.fitting.constants import FittedConstant, describe
 from factorgraph_loc.fitting.robust import Constant, Fit, blocks, fit, folds, gains, is_worth
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.smoothed import Smoothed, pooled_constants
 from factors.se2 import Array
 
 BLOCK = 20.0  # s; errors within a block may be correlated
@@ -105,6 +106,28 @@ class Calibrator:
         """The result with only those worthwhile constants that are in ``accepted`` (names with the section); None: all worthwhile
         ones. Without ``by_log``, individual logs are not examined."""
         raise NotImplementedError
+
+    def relearn(self, smoothed: Sequence[Smoothed], rig: Rig, first: Rig, _grids: Path | None) -> Settled:
+        """Learn from logs without a reference, smoothed with ``rig``: by default the constants that estimators learn on each run.
+
+        ``first``: the rig before all turns, see :meth:`widened`; ``_grids``: as in :meth:`learn`. InputError if a log does not
+        tell enough.
+        """
+        if getattr(rig, self.section) is None or not self.uncertain:
+            return Settled()
+        prefix = f"{self.channel}." if self.senses else ""
+        now, before = getattr(rig, self.section), getattr(first, self.section)
+        settings, constants = pooled_constants(self.section, prefix, now, before, self.uncertain, smoothed)
+        return Settled({self.section: settings}, constants)
+
+    def widened(self, rig: Rig, first: Rig) -> Rig:
+        """The rig with the uncertainties of the ``first`` one: those that are learnt hold for later runs, and would bind the next
+        turn to what the last one found."""
+        if getattr(rig, self.section) is None or not self.uncertain:
+            return rig
+        uncertainty = getattr(first, self.section).uncertainty
+        settings = getattr(rig, self.section).model_copy(update={"uncertainty": uncertainty})
+        return rig.model_copy(update={self.section: settings})
 
     def constant_units(
         self, _found: Any, kept: Sequence[FittedConstant], _learnt: Rig, _start: Rig

@@ -81,12 +81,17 @@ def test_a_bad_name_is_told_at_once(fgloc, tmp_path, out, message):
     assert message in result.stderr
 
 
-def test_a_log_without_reference_is_named(fgloc, short_log, tmp_path):
+def test_a_log_without_reference_is_calibrated_by_itself(fgloc, short_log, tmp_path):
+    """Of ranges and wheels, the constants that the input rig is uncertain of."""
     import shutil  # noqa: PLC0415
 
     blind = shutil.copytree(short_log, tmp_path / "blind")
     (blind / "reference.tum").unlink()
     result = fgloc("calibrate", blind, "-o", tmp_path / "a.rig.toml")
-    assert result.exit_code == 2
-    assert "has no reference, expected one to calibrate against" in result.stderr
-    assert len(result.stderr.splitlines()) == 1
+    assert result.exit_code == 0
+    assert "learnt without a reference, in" in result.stdout
+    assert "took turns" in (tmp_path / "a.report.html").read_text()
+    mixed = fgloc("calibrate", short_log, blind, "-o", tmp_path / "b.rig.toml")
+    assert mixed.exit_code == 2
+    assert "has no reference, expected one to calibrate against" in mixed.stderr
+    assert len(mixed.stderr.splitlines()) == 1

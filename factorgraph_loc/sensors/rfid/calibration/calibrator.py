@@ -6,14 +6,17 @@ from pathlib import Path
 from typing import Any
 
 from factorgraph_loc.drawing.markup import Rows, image, table, text
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import Calibrator, Settled, State, Told, Unit
 from factorgraph_loc.sensors.rfid.calibration import figures, report
 from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge, learn_rfid
 from factorgraph_loc.sensors.rfid.calibration.rounds import distinct
+from factorgraph_loc.sensors.rfid.calibration.smoothed import relearn_rfid, with_priors
 from factorgraph_loc.sensors.rfid.calibration.tempering import tempered
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, default_models
+from factorgraph_loc.sensors.smoothed import Smoothed
 
 PLACES, MODEL, STRENGTH = Unit("rfid", ("places",)), Unit("rfid", ("models",)), Unit("rfid", ("rssi",))
 TOO_SHORT = "rejected: the logs are too short to judge it"
@@ -57,6 +60,20 @@ class RfidCalibrator(Calibrator):
         told = knowledge if like is None else like.like
         assert told is not None, "all logs tell something"
         return RfidFound({"rfid": learnt.rfid, "survey": learnt.survey}, knowledge, told, grids)
+
+    def relearn(self, smoothed: Sequence[Smoothed], rig: Rig, first: Rig, grids: Path | None) -> Settled:
+        """Detection models and their priors, along smoothed trajectories."""
+        if rig.rfid is None or grids is None:
+            raise InputError(
+                f"{smoothed[0].log.name}: its rig has no RFID antennas, expected their mounting in [rfid.antennas]"
+            )
+        return relearn_rfid(smoothed, rig, first, grids)
+
+    def widened(self, rig: Rig, first: Rig) -> Rig:
+        """The rig with the first priors of its detection models."""
+        if rig.rfid is None or first.rfid is None:
+            return rig
+        return rig.model_copy(update={"rfid": with_priors(rig.rfid, first.rfid)})
 
     def settle(
         self,

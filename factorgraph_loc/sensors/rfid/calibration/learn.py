@@ -74,7 +74,7 @@ def learn_rfid(
         raise InputError(f"{logs[0].name}: its rig has no RFID antennas, expected their mounting in [rfid.antennas]")
     numbers = distinct(logs)
     logs = [log for i, log in enumerate(logs) if numbers.index(numbers[i]) == i]
-    floor = _floor(settings)
+    floor = floor_of(settings)
     rounds = [rounds_of(log, settings) for log in logs]
     survey = _about_the_middle(rounds, rig.survey)
     facing = any(np.any(np.isfinite(one.tags.facing)) for one in rounds)
@@ -149,7 +149,7 @@ def _has_phases(log: Log) -> bool:
     return bool(np.any(np.isfinite(stream.phase)))
 
 
-def _floor(settings: RfidSettings) -> Floor:
+def floor_of(settings: RfidSettings) -> Floor:
     """The rig's floor if given, else one that is robust to a few wrong tags and reads."""
     given = settings.model_fields_set & {"false_read", "miss"}
     return Floor(settings.false_read, settings.miss) if given else Floor()
@@ -172,7 +172,7 @@ def _with_models(
     names = [DEFAULT] * len(models)
     if len(models) > 1:
         names = [next((a for a, w in zip(antennas, which, strict=True) if w == i), DEFAULT) for i in range(len(models))]
-    written = {name: _settings_of(model, name, grids) for name, model in zip(names, models, strict=True)}
+    models_of = {name: written(model, name, grids) for name, model in zip(names, models, strict=True)}
     antennas = {
         a: s.model_copy(update={"x": round(s.x, 4), "y": round(s.y, 4), "yaw": round(s.yaw, 5), "model": names[w]})
         for (a, s), w in zip(antennas.items(), which, strict=True)
@@ -181,7 +181,7 @@ def _with_models(
         update={
             "antennas": antennas,
             "preset": None,
-            "models": written,
+            "models": models_of,
             "false_read": floor.false_read,
             "miss": floor.miss,
         }
@@ -206,7 +206,8 @@ def _with_signals(
     return settings.model_copy(update=changes)
 
 
-def _settings_of(model: DetectionModel, name: str, grids: Path) -> BeamSettings | LogisticSettings | GridSettings:
+def written(model: DetectionModel, name: str, grids: Path) -> BeamSettings | LogisticSettings | GridSettings:
+    """The settings of a learnt model; a grid is written to a file with the prefix ``grids``."""
     if isinstance(model, BeamModel):
         return BeamSettings.bounded(
             p0=round(model.p0, 4),

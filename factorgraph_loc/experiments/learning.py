@@ -1,0 +1,63 @@
+"""A run whose final trajectory has a rig that was learnt from the log itself.
+
+What was learnt comes from the whole log, so that no causal estimate may use it: those are of the run with the rig as it was given.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+from factorgraph_loc.calibration.turns import TURNS, Turns, learn_by_turns
+from factorgraph_loc.experiments.preparation import used_sensors
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.files.temporary import of_system, temporary_folder
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.result import RunResult
+
+SMOOTHER = "smoother"
+
+
+@dataclass(frozen=True)
+class LearningRun:
+    """A ``result`` whose final trajectory has what the ``turns`` of smoothing and learning found; all else in it is of the rig as
+    it was given."""
+
+    result: RunResult
+    turns: Turns
+
+
+def run_and_learn(log: Log, config: RunConfig, progress: Callable[[float], None] | None = None) -> LearningRun:
+    """Run an estimator on a log, learn the rig from the log by turns with the smoother, and compute the final trajectory with it.
+
+    ``progress`` is called with the fraction done. The effective configuration of the result has the ``learnt_rig`` too. Raises
+    InputError if the log does not tell enough, and what :func:`~factorgraph_loc.experiments.run.run` does.
+    """
+    report = progress or (lambda _share: None)
+    runs = TURNS + 2
+    given = run(log, config, lambda share: report(share / runs))
+    settings = config.settings if config.estimator == SMOOTHER else {}
+    smoothing = replace(config, estimator=SMOOTHER, settings=settings)
+    start = log.rig.model_copy(update={"sensors": used_sensors(log, config.sensors)})
+    started = perf_counter()
+    with temporary_folder(of_system("grids")) as folder:
+        turns = learn_by_turns(
+            [log],
+            start,
+            lambda one: run(replace(log, rig=one.rig), smoothing),
+            folder / "learnt",
+            lambda done, _all: report((1.0 + done) / runs),
+        )
+        rig = turns.knowledge.rig
+        again = run(replace(log, rig=rig), config)
+    report(1.0)
+    return LearningRun(
+        replace(
+            given,
+            config={**given.config, "learnt_rig": rig.model_dump(mode="json", exclude_none=True)},
+            final=again.final,
+            final_space=again.final_space,
+            timings=replace(given.timings, final_seconds=perf_counter() - started),
+            warnings=(*given.warnings, *turns.doubts),
+        ),
+        turns,
+    )

@@ -1,0 +1,138 @@
+"""Calibration without a reference: smoothing and learning by turns."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.calibration.calibrate import calibrate, check
+from factorgraph_loc.calibration.report import constants_table, document, page
+from factorgraph_loc.calibration.turns import learn_by_turns
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.experiments.learning import run_and_learn
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.sensors.rfid.settings import BeamSettings, RfidSettings
+from factorgraph_loc.sensors.smoothed import pooled
+from factorgraph_loc.simulation import preset, simulate
+
+
+def smoothed(log):
+    return run(log, RunConfig("smoother"))
+
+
+def with_beam(log, **changes):
+    rfid = log.rig.of(RfidSettings)
+    models = {"default": rfid.models["default"].model_copy(update=changes)}
+    return log.rig.model_copy(update={"rfid": rfid.model_copy(update={"models": models})})
+
+
+@pytest.fixture(scope="module")
+def offices():
+    """Two logs of 90 s."""
+    return [simulate(preset("office", {"drive": {"duration": 90.0}}), seed) for seed in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def blind(offices):
+    return [replace(log, reference=None) for log in offices]
+
+
+@pytest.fixture(scope="module")
+def found(blind, tmp_path_factory):
+    """From a rig whose antennas reach 20 % too far, and read too little."""
+    rig = with_beam(blind[0], r_max=5.4, p0=0.7)
+    grids = tmp_path_factory.mktemp("grids") / "cart"
+    return calibrate(
+        blind, lambda log: pytest.fail(f"{log.name} has nothing to score"), rig, smooth=smoothed, grids=grids
+    )
+
+
+def test_the_antennas_are_learnt_without_a_reference(found):
+    """Each within four standard errors of what made the reads, and these are small."""
+    beam = found.rig.rfid.models["default"]
+    assert isinstance(beam, BeamSettings)
+    errors = {c.name.rpartition(".")[2]: c.error for c in found.knowledge.constants if c.sensor == "rfid"}
+    for name, true in {"p0": 0.9, "r_max": 4.5, "s_r": 0.3, "sigma_phi": 0.698}.items():
+        assert getattr(beam, name) == pytest.approx(true, abs=4.0 * errors[name] + 1e-3), name
+        assert errors[name] < 0.06 * true, name
+    assert found.turns[-1] < 0.3 < found.turns[0]
+
+
+def test_priors_come_from_the_scatter_between_logs(found):
+    prior = found.rig.rfid.models["default"].prior
+    assert 0.005 < prior.range_scale < 0.03
+    assert 0.02 < prior.read_rate < 0.2
+
+
+def test_the_report_says_how_it_was_learnt(found):
+    text = page(found)
+    assert "took turns" in text
+    assert "Accuracy of the" not in text
+    assert document(found)["turns"] == list(found.turns)
+    assert any(row[0] == "rfid.models.default.r_max" for row in constants_table(found.knowledge.constants)[1])
+
+
+def test_a_grid_learns_its_range_and_rate(blind, tmp_path):
+    """A grid that was made of a beam whose range is 10 % too long."""
+    from factorgraph_loc.sensors.rfid.grids import write_grid  # noqa: PLC0415
+    from factorgraph_loc.sensors.rfid.settings import GridSettings  # noqa: PLC0415
+    from factors.rfid.model import BeamModel, bake  # noqa: PLC0415
+
+    beam = BeamModel(r_max=4.95)
+    write_grid(bake(beam, 7.0, 0.25), tmp_path / "given.npz")
+    rfid = blind[0].rig.of(RfidSettings)
+    models = {"default": GridSettings(file="given.npz").placed(tmp_path)}
+    rig = blind[0].rig.model_copy(update={"rfid": rfid.model_copy(update={"models": models})})
+    turns = learn_by_turns(blind[:1], rig, smoothed, tmp_path / "cart")
+    (scale,) = (c for c in turns.knowledge.constants if c.name.endswith("range_scale"))
+    assert scale.fitted == pytest.approx(-np.log(1.1), abs=0.03)
+    assert turns.knowledge.rig.rfid.models["default"].model().cell == pytest.approx(
+        0.25 * np.exp(scale.fitted), rel=1e-6
+    )
+
+
+def test_what_logs_agree_on_becomes_the_rigs_and_their_scatter_its_uncertainty():
+    same = pooled([(0.1, 0.001), (0.1, 0.001), (0.1, 0.001)], 0.02)
+    assert same.mean == pytest.approx(0.1)
+    assert same.spread == pytest.approx(0.02 * np.sqrt(2.0 / 4.0))
+    apart = pooled([(0.2, 0.001), (0.0, 0.001)], 0.02)
+    assert 0.05 < apart.spread < 0.15
+    vague = pooled([(0.14, 0.1), (0.0, 0.1)], 0.02)  # as far apart as their errors let them be
+    assert vague.spread < 0.03
+
+
+def test_the_final_trajectory_alone_is_of_what_was_learnt(offices):
+    log = replace(offices[0], rig=with_beam(offices[0], r_max=5.4, s_r=0.6, sigma_phi=1.1))
+    plain, learning = run(log, RunConfig("ekf")), run_and_learn(log, RunConfig("ekf"))
+    for name in ("t", "poses", "covariances"):
+        assert np.array_equal(getattr(plain, name), getattr(learning.result, name))
+    assert plain.status == learning.result.status
+    before, after = score(plain, log), score(learning.result, log)
+    assert after["causal.position_rmse"] == before["causal.position_rmse"]
+    assert after["final.position_rmse"] < 0.9 * before["final.position_rmse"]
+    assert learning.result.config["learnt_rig"]["rfid"]["models"]["default"]["r_max"] == pytest.approx(4.5, abs=0.1)
+    assert learning.result.config["rig"]["rfid"]["models"]["default"]["r_max"] == 5.4
+
+
+def test_the_reference_is_not_used(offices, blind, tmp_path):
+    """Learnt is the same with a reference that lies elsewhere."""
+    log = offices[0]
+    shifted = replace(log, reference=replace(log.reference, poses=log.reference.poses + 1.0))
+    found = [learn_by_turns([one], one.rig, smoothed, tmp_path / "cart").knowledge.rig for one in (blind[0], shifted)]
+    assert found[0] == found[1]
+
+
+def test_what_does_not_tell_enough_is_named(offices, blind, tmp_path):
+    with pytest.raises(
+        InputError, match=r"office-2: has no reference, expected one to calibrate against; logs without any"
+    ):
+        check([offices[0], blind[1]])
+    lost = replace(blind[0], world=blind[0].world.model_copy(update={"tags": {}}))
+    with pytest.raises(InputError, match=r"office-1: the smoother .* to learn from it without a reference"):
+        learn_by_turns([lost], lost.rig, smoothed, tmp_path / "cart")
+    bare = blind[0].rig.model_copy(update={"sensors": ("odometry",)})
+    known = bare.odometry.model_copy(update={"uncertainty": type(bare.odometry.uncertainty)()})
+    certain = bare.model_copy(update={"odometry": known})
+    with pytest.raises(InputError, match=r"office-1: nothing of the rig rackham can be learnt without a reference"):
+        learn_by_turns(blind[:1], certain, smoothed, tmp_path / "cart")
