@@ -7,6 +7,7 @@ __all__ = [
     "experiment",
     "experiment_file",
     "image_localization",
+    "learning",
     "maps",
     "output",
     "particles",

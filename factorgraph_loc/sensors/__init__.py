@@ -12,6 +12,7 @@ __all__ = [
     "pushed",
     "registry",
     "rfid",
+    "smoothed",
     "tables",
     "twist",
 ]

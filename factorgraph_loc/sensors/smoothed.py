@@ -34,8 +34,8 @@ class Smoothed:
 
 
 @dataclass(frozen=True)
-class Pooled:
-    """Corrections (N,) of one constant in N logs: their ``mean``, and ``spread``, the standard deviation between logs."""
+class Corrections:
+    """Corrections ``each`` (N,) of one constant in N logs: their ``mean``, and ``spread``, the standard deviation between logs."""
 
     each: Array
     mean: float
@@ -47,7 +47,7 @@ class Pooled:
         return self.spread / float(np.sqrt(len(self.each)))
 
 
-def pooled(found: Sequence[tuple[float, float]], known: float) -> Pooled:
+def pooled(found: Sequence[tuple[float, float]], known: float) -> Corrections:
     """The mean and the scatter of corrections, each with a standard deviation; ``known``: the scatter that is known before.
 
     The scatter is that of the corrections less what their own errors explain, by moments; with what was known before it is
@@ -56,7 +56,7 @@ def pooled(found: Sequence[tuple[float, float]], known: float) -> Pooled:
     each, errors = np.array(found).T
     beyond = float(np.sum((each - each.mean()) ** 2) - (len(each) - 1) * np.mean(errors**2))
     variance = (WORTH * known**2 + max(beyond, 0.0)) / (WORTH + len(each) - 1)
-    return Pooled(each, float(each.mean()), float(np.sqrt(variance)))
+    return Corrections(each, float(each.mean()), float(np.sqrt(variance)))
 
 
 def pooled_constants(

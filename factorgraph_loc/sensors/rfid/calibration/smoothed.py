@@ -24,7 +24,7 @@ from factorgraph_loc.sensors.rfid.calibration.pairs import BLOCKS, TagPairs, pai
 from factorgraph_loc.sensors.rfid.calibration.refit import Refit, refit_beam, refit_logistic
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, rounds_of
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings
-from factorgraph_loc.sensors.smoothed import Pooled, Smoothed, pooled
+from factorgraph_loc.sensors.smoothed import Corrections, Smoothed, pooled
 from factorgraph_loc.text import quoted
 from factors.rfid.adjustment import MOST_CERTAIN, PARAMETERS, rates
 from factors.rfid.model import FEATURES, BeamModel, DetectionModel, GridModel, LogisticModel
@@ -114,7 +114,7 @@ def _refit(model: DetectionModel, pairs: TagPairs, floor: Floor) -> Refit:
 
 
 def _constants(
-    fitted: Refit, each: Sequence[Refit], before: DetectionModel, name: str, told: dict[str, Pooled]
+    fitted: Refit, each: Sequence[Refit], before: DetectionModel, name: str, told: dict[str, Corrections]
 ) -> list[FittedConstant]:
     """The parameters of a fitted model."""
     scatter: dict[str, float] = {}
@@ -144,7 +144,7 @@ def _constants(
 
 
 def _grid(
-    model: GridModel, before: GridModel, name: str, told: dict[str, Pooled]
+    model: GridModel, before: GridModel, name: str, told: dict[str, Corrections]
 ) -> tuple[GridModel, list[FittedConstant]]:
     """A grid changed by the mean changes of its range and rate, and what they are since the grid ``before`` all turns."""
     scale, shift = (told[kind].mean if kind in told else 0.0 for kind in PARAMETERS)
