@@ -17,7 +17,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import Settled
-from factorgraph_loc.sensors.odometry.calibration.windows import REFERENCE_GAP
+from factorgraph_loc.sensors.odometry.calibration.constants import REFERENCE_GAP
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor
 from factorgraph_loc.sensors.rfid.calibration.learn import CALIBRATED, floor_of, written
 from factorgraph_loc.sensors.rfid.calibration.pairs import BLOCKS, TagPairs, pairs_of
