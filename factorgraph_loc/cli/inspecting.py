@@ -121,10 +121,9 @@ def convert(
 
 def _draw(logs: list[Log], path: Path) -> None:
     """Write the picture of the only log. Raises InputError for several, and for a path that is no PNG file."""
-    from factorgraph_loc.drawing.figures import save
+    from factorgraph_loc.evaluation.figures import write_picture
     from factorgraph_loc.evaluation.plots import overview
     from factorgraph_loc.experiments.run import RunConfig, run
-    from factorgraph_loc.files.models import replacing
     from factorgraph_loc.sensors.registry import moving
 
     if path.suffix.lower() != ".png":
@@ -134,8 +133,7 @@ def _draw(logs: list[Log], path: Path) -> None:
     (log,) = logs
     odometry = run(log, RunConfig("dead_reckoning")).final if moving(tuple(log.streams), "floor") else None
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        save(overview(log, odometry), temporary)
+    write_picture(overview(log, odometry), path)
 
 
 def _print(log: Log, found: Inspection) -> None:

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend
+from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend, save
 from factorgraph_loc.evaluation.metrics import CONFIDENCE, errors
 from factorgraph_loc.evaluation.pairing import pauses
+from factorgraph_loc.files.models import replacing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import MAX_GAP
@@ -65,6 +67,12 @@ class Track:
     def kinds(self) -> tuple[tuple[str, Trajectory | None], tuple[str, Trajectory | None]]:
         """Both trajectories by name, None if there is nothing to plot."""
         return ("causal", self.causal), ("final", self.final if len(self.final) else None)
+
+
+def write_picture(figure: Figure, path: Path) -> None:
+    """Write a figure as a PNG file, atomically."""
+    with replacing(path) as temporary:
+        save(figure, temporary)
 
 
 def mark_events(axis: Axes, events: Sequence[tuple[float, str]]) -> None:

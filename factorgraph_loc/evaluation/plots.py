@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from factorgraph_loc.drawing.figures import COLOURS, grid, lay_out, legend, save, styles
-from factorgraph_loc.evaluation.figures import Track, consistency, mark_events, way, with_pauses
+from factorgraph_loc.drawing.figures import COLOURS, grid, lay_out, legend, styles
+from factorgraph_loc.evaluation.figures import Track, consistency, mark_events, way, with_pauses, write_picture
 from factorgraph_loc.evaluation.metrics import Errors, errors
-from factorgraph_loc.files.models import replacing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.interfaces import Marks, marks
@@ -78,8 +77,7 @@ def _write(figures: Mapping[str, Figure], folder: Path, name: str) -> list[Path]
     paths = []
     for what, figure in figures.items():
         path = folder / f"{name}-{what}.png"
-        with replacing(path) as temporary:
-            save(figure, temporary)
+        write_picture(figure, path)
         paths.append(path)
     return paths
 

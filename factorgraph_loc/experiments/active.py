@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from factorgraph_loc.drawing.figures import save
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.evaluation.active import (
     DIFFERENCES,
@@ -28,9 +27,10 @@ from factorgraph_loc.evaluation.active import (
     run_picture,
     summary_cells,
 )
+from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.tables import markdown
-from factorgraph_loc.files.models import file_name, nearest, replacing, write_text, write_toml
-from factorgraph_loc.files.tables import read_parquet
+from factorgraph_loc.files.models import file_name, nearest, write_text, write_toml
+from factorgraph_loc.files.tables import read_parquet, write_parquet
 from factorgraph_loc.files.temporary import require_free, writing
 from factorgraph_loc.planning.closed_loop import ESTIMATORS, ActiveRun, run_active
 from factorgraph_loc.planning.policies import POLICIES
@@ -198,8 +198,7 @@ def run_job(job: ActiveJob) -> list[Row]:
     rows = [_run(job, seed) for seed in job.seeds]
     if all(row["status"] == "ok" for row in rows):
         job.part.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(job.part) as temporary:
-            pl.DataFrame(rows, schema=ROW).write_parquet(temporary)
+        write_parquet(pl.DataFrame(rows, schema=ROW), job.part)
     return rows
 
 
@@ -239,14 +238,7 @@ def write_tables(rows: Sequence[Row], out: Path) -> None:
     write_text(out / "results.csv", table.write_csv())
     write_text(out / "differences.csv", pl.DataFrame(differences(rows), schema=DIFFERENCES).write_csv())
     write_text(out / "table.md", markdown(*summary_cells(rows)) + "\n" + markdown(*difference_cells(rows)))
-    with replacing(out / "results.parquet") as temporary:
-        table.write_parquet(temporary)
-
-
-def write_picture(figure: Any, path: Path) -> None:
-    """Write a figure as PNG, atomically."""
-    with replacing(path) as temporary:
-        save(figure, temporary)
+    write_parquet(table, out / "results.parquet")
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:

@@ -21,7 +21,8 @@ from factorgraph_loc.evaluation.tables import BASELINE, WARNINGS, comparison_cel
 from factorgraph_loc.experiments.output import remove_run, write_run
 from factorgraph_loc.experiments.preparation import check_prior, columns_of, fill_cache, use_of
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.files.models import file_name, nearest, replacing, write_text
+from factorgraph_loc.files.models import file_name, nearest, write_text
+from factorgraph_loc.files.tables import write_parquet
 from factorgraph_loc.files.temporary import require_free, sweep, writing
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.results import FILES
@@ -217,8 +218,7 @@ def _row(job: _Job, outcome: _Outcome | Exception) -> dict[str, Any]:
 
 def _write_tables(rows: Sequence[Mapping[str, Any]], out: Path) -> None:
     table = pl.DataFrame(rows, infer_schema_length=None)
-    with replacing(out / "results.parquet") as temporary:
-        table.write_parquet(temporary)
+    write_parquet(table, out / "results.parquet")
     write_text(out / "results.csv", table.write_csv())
     write_text(out / "differences.csv", pl.DataFrame(differences(rows), schema=DIFFERENCES).write_csv())
     write_text(out / "table.md", markdown(*comparison_cells(rows)))

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from factorgraph_loc.drawing.figures import COLOURS, grid, legend, save
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.tables import markdown
-from factorgraph_loc.files.models import replacing, write_text
+from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import require_free, writing
 from factorgraph_loc.mapping.camera_poses import PosedFrames, posed_frames
 from factorgraph_loc.mapping.image_localization import ImageLocalizer, Located
@@ -146,10 +147,8 @@ def write_results(log: str, results: ImageResults, folder: Path) -> None:
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_text(folder / "table.md", markdown(*table(results)) + "\n")
-        with replacing(folder / "images.csv") as temporary:
-            _rows(results).write_csv(temporary)
-        with replacing(folder / "images.png") as temporary:
-            save(picture(log, results), temporary)
+        write_text(folder / "images.csv", _rows(results).write_csv())
+        write_picture(picture(log, results), folder / "images.png")
 
 
 def picture(log: str, results: ImageResults) -> Figure:

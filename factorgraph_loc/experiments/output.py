@@ -212,8 +212,7 @@ def run_files(result: RunResult, log: Log, started: float) -> dict[str, bytes]:
 
 def timings_file(timings: Mapping[str, Any]) -> bytes:
     """The content of ``timings.json``; non-finite values are null."""
-    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in timings.items()}
-    return (json.dumps(plain, indent=2) + "\n").encode()
+    return _json(timings).encode()
 
 
 def read_track(estimates: bytes) -> Track:

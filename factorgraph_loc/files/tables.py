@@ -15,7 +15,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import parquet_pages
 from factorgraph_loc.files.bounded import DATA, foreign, quiet, read_bytes, require_size
 from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table
-from factorgraph_loc.files.models import nearest, read_text
+from factorgraph_loc.files.models import nearest, read_text, replacing
 from factorgraph_loc.text import told
 from factors.se2 import Array, Integers
 
@@ -159,6 +159,12 @@ def read_table(path: Path, tables: Sequence[Table]) -> TableRows:
     shapes = [shape for table in tables for shape in table.shapes]
     columns = {column.name: column for table in tables for column in table.columns}
     return _read_parquet(path, columns, shapes) if path.suffix == ".parquet" else _read_csv(path, columns, shapes)
+
+
+def write_parquet(frame: pl.DataFrame, path: Path) -> None:
+    """Write a table as a Parquet file, atomically."""
+    with replacing(path) as temporary:
+        frame.write_parquet(temporary)
 
 
 def write_table(path: Path, tables: Sequence[Table], columns: Mapping[str, Array | Integers | Sequence[str]]) -> None:

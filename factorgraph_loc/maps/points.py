@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.columns import POINTS
-from factorgraph_loc.files.models import replacing
-from factorgraph_loc.files.tables import read_parquet, text_column
+from factorgraph_loc.files.tables import read_parquet, text_column, write_parquet
 from factorgraph_loc.text import listed
 from factors.se2 import Array
 
@@ -109,8 +108,7 @@ def write_points(points: PointMap, path: Path) -> None:
             columns[name] = np.where(shown, points.seen_from[views, axis], np.nan)
         columns["size"] = np.where(shown, points.sizes[views], np.nan)
         columns["descriptor"] = [points.descriptors[v].tobytes() if v >= 0 else b"" for v in views.tolist()]
-    with replacing(path) as temporary:
-        pl.DataFrame(columns).write_parquet(temporary)
+    write_parquet(pl.DataFrame(columns), path)
 
 
 def read_points(path: Path) -> PointMap:

@@ -50,7 +50,7 @@ def calls(monkeypatch):
     monkeypatch.setattr(active, "run_active", run)
     monkeypatch.setattr(active, "run_each", here)
     monkeypatch.setattr(active, "CHUNK", 5)
-    monkeypatch.setattr(active, "save", lambda figure, path: path.write_text(type(figure).__name__))
+    monkeypatch.setattr(active, "write_picture", lambda figure, path: path.write_text(type(figure).__name__))
     return seen
 
 

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import polars as pl
 
-from factorgraph_loc.drawing.figures import COLOURS, grid, legend, save
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend
 from factorgraph_loc.evaluation.features.feature_evaluation import Feature, RankedMatches, evaluate
 from factorgraph_loc.evaluation.features.sequences import OTHER, Sequence
+from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.tables import markdown
-from factorgraph_loc.files.models import replacing, write_text
+from factorgraph_loc.files.models import write_text
+from factorgraph_loc.files.tables import write_parquet
 from factorgraph_loc.files.temporary import require_free, writing
 from factorgraph_loc.vision.matching import RATIO
 
@@ -107,11 +109,10 @@ def write_scores(scores: FeatureScores, out: Path) -> None:
         write_text(out / "table.md", tables(scores))
         frame = pl.DataFrame(scores.rows).drop("homography_found")
         unknown = (pl.col(pl.Float64).is_nan()) | (pl.col(pl.Float64).is_infinite())
-        _write_parquet(frame.with_columns(pl.when(~unknown).then(pl.col(pl.Float64))), out / "pairs.parquet")
-        _write_parquet(_matches(scores), out / "matches.parquet")
+        write_parquet(frame.with_columns(pl.when(~unknown).then(pl.col(pl.Float64))), out / "pairs.parquet")
+        write_parquet(_matches(scores), out / "matches.parquet")
         for name, draw in (("figure3.png", figure3), ("matching.png", recall_curves)):
-            with replacing(out / name) as temporary:
-                save(draw(scores), temporary)
+            write_picture(draw(scores), out / name)
 
 
 def summary(scores: FeatureScores, sequences: Several[str] | None = None) -> tuple[list[str], list[list[str]]]:
@@ -252,8 +253,3 @@ def _matches(scores: FeatureScores) -> pl.DataFrame:
     ]
     schema = {"feature": pl.String, "sequence": pl.String, "image": pl.Int32, "ratio": pl.Float64, "right": pl.Boolean}
     return pl.concat([pl.DataFrame(schema=schema), *(frame.cast({"image": pl.Int32}) for frame in frames)])
-
-
-def _write_parquet(frame: pl.DataFrame, path: Path) -> None:
-    with replacing(path) as temporary:
-        frame.write_parquet(temporary)

@@ -10,12 +10,13 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.drawing.figures import COLOURS, grid, lay_out, legend, png, save
+from factorgraph_loc.drawing.figures import COLOURS, grid, lay_out, legend, png
 from factorgraph_loc.drawing.markup import Html, Rows, image, number, table, tag
+from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.pairing import pauses
 from factorgraph_loc.evaluation.report import remark, whole_page
 from factorgraph_loc.evaluation.trajectories.score import HOW, PoseErrors, TrajectoryScore
-from factorgraph_loc.files.models import replacing, write_text
+from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import require_free, writing
 from factors.se2 import Array
 
@@ -231,8 +232,7 @@ def write_score(score: TrajectoryScore, out: Path) -> None:
         for name in (*reversed(FILES), *(f"plots/{plot}" for plot in PLOTS)):
             (out / name).unlink(missing_ok=True)
         for name, figure in plots(score).items():
-            with replacing(out / "plots" / f"{name}.png") as temporary:
-                save(figure, temporary)
+            write_picture(figure, out / "plots" / f"{name}.png")
         write_text(out / FILES[0], errors_of(score).write_csv())
         write_text(out / FILES[1], page(score))
         write_text(out / FILES[2], json.dumps(score.document(), indent=2, allow_nan=False) + "\n")
