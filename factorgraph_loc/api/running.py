@@ -7,14 +7,14 @@ from typing import Any
 
 from factorgraph_loc.api.given import LogLike, RigLike, Settings, WorldLike, every, one
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.evaluation.aligned import score
 from factorgraph_loc.experiments import compare as comparing
 from factorgraph_loc.experiments import output
 from factorgraph_loc.experiments import run as running
 from factorgraph_loc.experiments.learning import run_and_learn
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.model.result import RunResult
-from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP
+from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
 from factorgraph_loc.text import listed
 
 
@@ -39,6 +39,7 @@ def run(
     max_gap: float = MAX_GAP,
     tick_gap: float = TICK_GAP,
     learn: bool = False,
+    align: Alignment = "none",
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
@@ -46,7 +47,8 @@ def run(
     """Run one estimator on one log and score the result.
 
     For the arguments see :class:`~factorgraph_loc.experiments.run.RunConfig`. ``learn``: learn the rig from the log itself, for
-    the final trajectory alone. ``out``: folder for the files that ``fgloc run`` writes.
+    the final trajectory alone. ``align``: also score after this alignment with the reference. ``out``: folder for the files that
+    ``fgloc run`` writes.
     """
     if out is not None:
         output.check_free(Path(out), overwrite=overwrite)
@@ -56,8 +58,8 @@ def run(
     )
     result = run_and_learn(loaded, config, progress).result if learn else running.run(loaded, config, progress)
     if out is None:
-        return Run(result, score(result, loaded))
-    scores = output.write_run(result, loaded, Path(out), overwrite=overwrite)
+        return Run(result, score(result, loaded, align))
+    scores = output.write_run(result, loaded, Path(out), align=align, overwrite=overwrite)
     output.write_plots(result, loaded, Path(out))
     return Run(result, scores)
 
@@ -75,13 +77,16 @@ def compare(
     world: WorldLike | None = None,
     max_gap: float = MAX_GAP,
     tick_gap: float = TICK_GAP,
+    align: Alignment = "none",
+    rpe: bool = False,
     jobs: int | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> comparing.Comparison:
     """Run several estimators on several logs with each seed, in ``jobs`` processes, and write tables and plots to ``out``.
 
-    ``settings`` are given per estimator. See :func:`factorgraph_loc.experiments.compare.compare`.
+    ``settings`` are given per estimator. ``align``, ``rpe``: what is scored and shown further. See
+    :func:`factorgraph_loc.experiments.compare.compare`.
     """
     comparing.check_free(Path(out), overwrite=overwrite)
     named = settings or {}
@@ -95,5 +100,12 @@ def compare(
         for seed in chosen
     ]
     return comparing.compare(
-        every(logs, rig, world), configs, Path(out), jobs=jobs, overwrite=overwrite, progress=progress
+        every(logs, rig, world),
+        configs,
+        Path(out),
+        align=align,
+        rpe=rpe,
+        jobs=jobs,
+        overwrite=overwrite,
+        progress=progress,
     )

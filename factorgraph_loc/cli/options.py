@@ -11,6 +11,7 @@ import typer
 
 from factorgraph_loc.cli import completion
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.model.scoring import Alignment
 from factorgraph_loc.text import listed, plain, quoted
 
 if TYPE_CHECKING:
@@ -83,6 +84,14 @@ TickGap = Annotated[
     float,
     typer.Option(metavar="SECONDS", help="Gaps between measurements longer than this contain no estimates."),
 ]
+Align = Annotated[
+    Alignment,
+    typer.Option(
+        help="Show the errors after this alignment with the reference too: first pose onto first pose, or by least squares in the "
+        "plane, in space, or in space with a scale."
+    ),
+]
+Rpe = Annotated[bool, typer.Option("--rpe", help="Show relative errors too, over a metre of path and over a second.")]
 Settings = Annotated[
     list[str] | None,
     typer.Option(

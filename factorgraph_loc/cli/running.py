@@ -10,6 +10,7 @@ import typer
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import (
+    Align,
     DataRoot,
     Estimator,
     Estimators,
@@ -24,6 +25,7 @@ from factorgraph_loc.cli.options import (
     Reader,
     ReaderOption,
     RigFile,
+    Rpe,
     Sensors,
     Settings,
     TickGap,
@@ -79,6 +81,8 @@ def run(
             "--learn", help="Learn the rig from the log itself, without its reference, for the final trajectory."
         ),
     ] = False,
+    align: Align = "none",
+    rpe: Rpe = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -103,13 +107,14 @@ def run(
             result, learnt = learning.result, learning.turns.knowledge.constants
         else:
             result, learnt = experiment.run(loaded, config, lambda share: report(share, 1.0)), ()
-    scores = write_run(result, loaded, out, overwrite=overwrite)
+    scores = write_run(result, loaded, out, align=align, overwrite=overwrite)
     write_plots(result, loaded, out)
-    show.warnings(result.warnings)
+    show.warnings(scores["warnings"])
     if json:
         show.document(scores)
         return
     _print_accuracy(scores)
+    _print_further(scores, rpe=rpe)
     _print_consistency(scores)
     _print_learnt(result)
     if learnt:
@@ -137,11 +142,13 @@ def compare(
     world: WorldFile = None,
     max_gap: MaxGap = MAX_GAP,
     tick_gap: TickGap = TICK_GAP,
+    align: Align = "none",
+    rpe: Rpe = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Run several estimators on several logs; write a table and plots."""
-    from factorgraph_loc.evaluation.tables import comparison_table, verdict
+    from factorgraph_loc.evaluation.tables import comparison_table, further_tables, unscored, verdict
     from factorgraph_loc.experiments import compare as experiment
     from factorgraph_loc.experiments.run import RunConfig
     from factorgraph_loc.fusion.registry import check_names
@@ -158,7 +165,9 @@ def compare(
     ]
     show.first_use()
     with show.progress("runs", counted=True) as report:
-        comparison = experiment.compare(loaded, configs, out, jobs=jobs, overwrite=overwrite, progress=report)
+        comparison = experiment.compare(
+            loaded, configs, out, align=align, rpe=rpe, jobs=jobs, overwrite=overwrite, progress=report
+        )
     show.warnings(comparison.warnings)
     for failure in comparison.failures:
         show.note(f"failed: {failure}")
@@ -166,7 +175,10 @@ def compare(
         show.document({"runs": comparison.rows, "failures": comparison.failures, "warnings": comparison.warnings})
     else:
         show.rich_table(comparison_table(comparison.rows))
-        for line in verdict(comparison.rows):
+        for title, columns in further_tables(comparison.rows, rpe=rpe).items():
+            show.line(f"{title}:")
+            show.rich_table(comparison_table(comparison.rows, columns))
+        for line in (*unscored(comparison.rows), *verdict(comparison.rows)):
             show.line(line)
         show.line()
         show.line(
@@ -211,6 +223,21 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
         show.line(f"learnt landmarks: {scores['landmarks.count']}, aligned RMSE {error} m, ANEES {anees}, ideal 2")
     if scores["time_to_localized"]:
         show.line(f"localized after {scores['time_to_localized']:.1f} s")
+
+
+def _print_further(scores: Mapping[str, Any], *, rpe: bool) -> None:
+    """The tables that are asked for; nothing without a reference."""
+    from factorgraph_loc.evaluation.tables import KINDS, further_tables
+
+    for title, columns in further_tables([scores], rpe=rpe).items():
+        rows = [
+            (kind, *(show.number(scores[key], n) for key, n, _ in columns.values() if key.startswith(kind)))
+            for kind in KINDS
+        ]
+        if any(cell != "-" for row in rows for cell in row[1:]):
+            names = [name.removeprefix(f"{KINDS[0]} ") for name in columns if name.startswith(KINDS[0])]
+            show.line(f"{title}:")
+            show.table(("", *names), rows)
 
 
 def _print_consistency(scores: Mapping[str, Any]) -> None:

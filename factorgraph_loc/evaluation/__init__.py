@@ -2,6 +2,7 @@
 
 __all__ = [
     "active",
+    "aligned",
     "estimates_file",
     "features",
     "figures",

@@ -3,7 +3,7 @@
 There is no alignment, as the map's frame is known; for runs that estimated the map, aligned figures are added. Pairing of poses:
 :mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to
 Tracking and Navigation", 2001, section 5.4. Relative pose error: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
-systems", 2012, section IV.A, over path length instead of time.
+systems", 2012, section IV.A, over time and over path length.
 """
 
 import bisect
@@ -29,7 +29,7 @@ from factors.se2 import Array, Integers
 
 PIECE_TOLERANCE = 0.1  # by which the length of one of all pairs may differ, as a share of it
 FEWEST_SCORED = 10  # least number of poses for meaningful figures
-RPE_DISTANCE = 1.0  # m
+RPE_DISTANCE, RPE_TIME = 1.0, 1.0  # m, s
 CONFIDENCE = 0.95
 FREE_MAP = "unknown"  # value of an estimator's setting ``landmarks`` with which it estimates the map
 
@@ -38,6 +38,8 @@ _ACCURACY = (
     "rpe_position_per_m",
     "rpe_heading_per_m",
     "rpe_pieces",
+    "rpe_position_per_s",
+    "rpe_heading_per_s",
     "anees",
     "nees_bounds",
     "coverage_95",
@@ -159,7 +161,7 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
     causal = result.causal()
     final = result.final
     if causal is not None:
-        final = _from(final, float(causal.t[0]))
+        final = since(final, float(causal.t[0]))
     gap = result.max_gap
     scores: dict[str, Any] = {"scoring.rule": RULE, "scoring.max_gap": gap, WARNINGS: list(result.warnings)}
     for kind, trajectory in (("causal", causal), ("final", final)):
@@ -182,7 +184,8 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
     """The figures of one trajectory against the reference, see :func:`errors`; all None without one.
 
     ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95``, ``max``. ``rpe_*_per_m``: root mean square of
-    :func:`relative_errors` over ``rpe_pieces`` of path. ``anees``: mean NEES, ideally 3 (2 if the reference has no heading).
+    :func:`relative_errors` over ``rpe_pieces`` of path; ``rpe_*_per_s``: over a second. ``anees``: mean NEES, ideally 3 (2 if the
+    reference has no heading).
     ``nees_bounds``: 95 % interval of the mean of as many *independent* NEES; errors along a trajectory are correlated, so a
     consistent estimator is outside more often. ``coverage_95``: fraction of the times at which the true (x, y) lies in the 95 %
     ellipse. ``invalid_covariances``: number of scored poses whose covariance is not positive definite, excluded from these three.
@@ -199,6 +202,9 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
         figures["rpe_position_per_m"] = rms(position)
         figures["rpe_heading_per_m"] = rms(heading)
         figures["rpe_pieces"] = len(position)
+        position, heading = relative_errors(e.poses, e.reference, pauses(e.t), np.diff(e.t), RPE_TIME - TOLERANCE)
+        figures["rpe_position_per_s"] = rms(position)
+        figures["rpe_heading_per_s"] = rms(heading)
     nees = e.nees[np.isfinite(e.nees)]
     if len(nees):
         tail = (1.0 - CONFIDENCE) / 2.0
@@ -213,19 +219,27 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
     return figures
 
 
-def relative_errors(poses: Array, reference: Array, breaks: Sequence[int] | Integers = ()) -> tuple[Array, Array]:
+def relative_errors(
+    poses: Array,
+    reference: Array,
+    breaks: Sequence[int] | Integers = (),
+    steps: Array | None = None,
+    length: float = RPE_DISTANCE,
+) -> tuple[Array, Array]:
     """Relative pose errors over 1 m of the reference's path: position (K,) [m] and heading (K,) [rad, absolute].
 
     ``poses`` and ``reference`` (N, 3) at the same times, NaN where missing; ``breaks``: indices of the poses after a gap of the
-    reference. A piece begins at the first pose, or at the end of the previous piece, and ends at the first pose for which the
-    reference has moved 1 m or more along its path; a NaN or a break discards the piece. With the motions Q of the reference and P
-    of the estimate over a piece, the error is the translation and rotation of ``Q^-1 P``, not divided by the length. Without gaps
-    this is evo's RPE with ``delta=1``, ``delta_unit=meters``, ``all_pairs=False``, ``pairs_from_reference=True``.
+    reference. ``steps`` (N - 1,): what is counted between the poses until it is ``length``, by default the reference's path [m]. A
+    piece begins at the first pose, or at the end of the previous piece, and ends at the first pose for which the reference has
+    moved 1 m or more along its path; a NaN or a break discards the piece. With the motions Q of the reference and P of the
+    estimate over a piece, the error is the translation and rotation of ``Q^-1 P``, not divided by the length. Without gaps this is
+    evo's RPE with ``delta=1``, ``delta_unit=meters``, ``all_pairs=False``, ``pairs_from_reference=True``.
     """
+    if steps is None:
+        steps = np.linalg.norm(np.diff(reference[:, :2], axis=0), axis=1)
     found: list[tuple[int, int]] = []
     for start, stop in _unbroken(np.isfinite(reference[:, 0]) & np.isfinite(poses[:, 0]), breaks):
-        steps = np.linalg.norm(np.diff(reference[start:stop, :2], axis=0), axis=1)
-        found += successive(steps, RPE_DISTANCE, start)
+        found += successive(steps[start : stop - 1], length, start)
     begins, ends = indices(found)
     error = se2.between(se2.between(reference[begins], reference[ends]), se2.between(poses[begins], poses[ends]))
     return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
@@ -240,7 +254,8 @@ def _unbroken(valid: NDArray[np.bool_], breaks: Sequence[int] | Integers) -> lis
     return found
 
 
-def _from(trajectory: Trajectory, t: float) -> Trajectory:
+def since(trajectory: Trajectory, t: float) -> Trajectory:
+    """The poses of a trajectory from the time ``t`` on."""
     keep = trajectory.t >= t - TOLERANCE
     covariances = None if trajectory.covariances is None else trajectory.covariances[keep]
     return Trajectory(trajectory.t[keep], trajectory.poses[keep], covariances, trajectory.has_heading)

@@ -29,11 +29,33 @@ COLUMNS = {
 # after an unknown start
 SINCE_THE_START = {"localized after [s]": ("time_to_localized", 1, False)}
 ALL = "(all logs)"
+KINDS = ("causal", "final")
+ALIGNED = {
+    f"{kind} {what}": (f"{kind}.aligned_{key}_rmse", digits, True)
+    for kind in KINDS
+    for what, key, digits in (("pos [m]", "position", 3), ("rot [rad]", "rotation", 4))
+}
+RELATIVE = {
+    f"{kind} {what} [{unit}/{per}]": (f"{kind}.rpe_{key}_per_{per}", 4, True)
+    for kind in KINDS
+    for per in ("m", "s")
+    for what, unit, key in (("pos", "m", "position"), ("head", "rad", "heading"))
+}
+IN_SPACE = {
+    f"{kind} {what}": (f"{kind}.space_{key}", digits, pooled)
+    for kind in KINDS
+    for what, key, digits, pooled in (
+        ("pos [m]", "position_rmse", 3, True),
+        ("rot [rad]", "rotation_rmse", 4, True),
+        ("ANEES", "anees", 2, False),
+    )
+}
 SCORED = "poses scored"
 BASELINE = "dead_reckoning"
 ALIKE = 0.01  # relative difference of errors within which estimators are equally good
 
 Row = Mapping[str, Any]
+Columns = Mapping[str, tuple[str, int, bool]]
 
 
 def row_of(scores: Mapping[str, Any]) -> dict[str, Any]:
@@ -68,8 +90,22 @@ def label_of(row: Row) -> str:
     return str(row.get("label") or row["estimator"])
 
 
-def comparison_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of the table, from the rows of a comparison.
+def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, Columns]:
+    """The columns of each table that not all comparisons have, by its title: errors in space, if runs have no others, errors after
+    an alignment, if the runs have one, and relative errors, if they are asked for."""
+    found: dict[str, Columns] = {}
+    if any(_is_known(row, "space_position_rmse") and not _is_known(row, "position_rmse") for row in rows):
+        found["errors in space"] = IN_SPACE
+    aligned = dict.fromkeys(row["scoring.align"] for row in rows if row.get("scoring.align"))
+    if aligned:
+        found[f"errors after alignment by {', '.join(aligned)}"] = ALIGNED
+    if rpe:
+        found["relative errors over a metre of path, and over a second"] = RELATIVE
+    return found
+
+
+def comparison_cells(rows: Sequence[Row], shown: Columns | None = None) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of the table, from the rows of a comparison. ``shown``: other columns than :data:`COLUMNS`.
 
     RMSEs are pooled over seeds (root mean square), the rest is averaged; with several seeds the standard deviation follows after
     ±. The last rows pool each estimator over the logs with equal weights; ``runs`` is the number of successful runs of all, and a
@@ -78,7 +114,9 @@ def comparison_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
-    columns = {**SINCE_THE_START, **COLUMNS} if any(row.get("time_to_localized") for row in rows) else COLUMNS
+    columns: Columns = shown or COLUMNS
+    if shown is None and any(row.get("time_to_localized") for row in rows):
+        columns = {**SINCE_THE_START, **COLUMNS}
     lines = []
     for log in logs:
         for name in names:
@@ -95,13 +133,13 @@ def comparison_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     return ["log", "estimator", *columns, SCORED, "runs"], lines
 
 
-def comparison_table(rows: Sequence[Row]) -> Table:
+def comparison_table(rows: Sequence[Row], shown: Columns | None = None) -> Table:
     """The same as a table for the terminal."""
     from rich import box  # noqa: PLC0415 - only a terminal needs it
     from rich.table import Table  # noqa: PLC0415
     from rich.text import Text  # noqa: PLC0415
 
-    header, lines = comparison_cells(rows)
+    header, lines = comparison_cells(rows, shown)
     table = Table(box=box.SIMPLE_HEAD, header_style="bold")
     for i, name in enumerate(header):
         # wrap words to keep the table narrow; folded or truncated numbers would be worse
@@ -109,6 +147,19 @@ def comparison_table(rows: Sequence[Row]) -> Table:
     for line, after in zip(lines, [*lines[1:], None], strict=True):
         table.add_row(*(plain(cell, MESSAGE) for cell in line), end_section=after is None or after[0] != line[0])
     return table
+
+
+def unscored(rows: Sequence[Row]) -> list[str]:
+    """In words: why successful runs have no errors, a line for each log with such runs."""
+    lines = []
+    for log in dict.fromkeys(row["log"] for row in rows):
+        runs = [row for row in rows if row["log"] == log and row["status"] == "ok"]
+        without = [row for row in runs if not any(_is_known(row, f"{k}position_rmse") for k in ("", "space_"))]
+        if without and (count := max(scored_of(row) or 0 for row in without)):
+            lines.append(f"{log}: too little of the reference to score against: {count:.0f} poses")
+        elif without and all(scored_of(row) is None for row in runs):
+            lines.append(f"{log}: there is no reference to score against, so there are no errors")
+    return lines
 
 
 def verdict(rows: Sequence[Row]) -> list[str]:
@@ -119,7 +170,7 @@ def verdict(rows: Sequence[Row]) -> list[str]:
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
     lines = []
-    for kind in ("causal", "final"):
+    for kind in KINDS:
         found: dict[str, float] = {}
         for name in names:
             scores = {
@@ -155,8 +206,12 @@ def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 def scored_of(row: Row) -> float | None:
     """Number of scored poses of a run's causal trajectory, else of the final one; None without a reference."""
-    found = (row.get(f"{kind}.{what}") for kind in ("causal", "final") for what in ("scored", "space_scored"))
+    found = (row.get(f"{kind}.{what}") for kind in KINDS for what in ("scored", "space_scored"))
     return next((count for count in found if count is not None), None)
+
+
+def _is_known(row: Row, figure: str) -> bool:
+    return any(row.get(f"{kind}.{figure}") is not None for kind in KINDS)
 
 
 def _figure(row: Row, key: str) -> float | None:

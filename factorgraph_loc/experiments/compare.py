@@ -15,9 +15,17 @@ import polars as pl
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import plot_log, remove_plots
-from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
+from factorgraph_loc.evaluation.report import DEFAULT, RunFiles, Scene, write_report
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
-from factorgraph_loc.evaluation.tables import BASELINE, WARNINGS, comparison_cells, lines, markdown, row_of
+from factorgraph_loc.evaluation.tables import (
+    BASELINE,
+    WARNINGS,
+    comparison_cells,
+    further_tables,
+    lines,
+    markdown,
+    row_of,
+)
 from factorgraph_loc.experiments.output import remove_run, write_run
 from factorgraph_loc.experiments.preparation import check_prior, columns_of, fill_cache, use_of
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -27,7 +35,7 @@ from factorgraph_loc.files.temporary import require_free, sweep, writing
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.scoring import check_max_gap, check_tick_gap
+from factorgraph_loc.model.scoring import Alignment, check_max_gap, check_tick_gap
 from factorgraph_loc.processes import run_each
 from factorgraph_loc.text import quoted
 
@@ -51,6 +59,7 @@ class _Job:
     log: Log
     config: RunConfig
     folder: Path
+    align: Alignment
 
 
 @dataclass(frozen=True)
@@ -64,6 +73,8 @@ def compare(
     configs: Sequence[RunConfig],
     out: Path,
     *,
+    align: Alignment = "none",
+    rpe: bool = False,
     jobs: int | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -74,7 +85,9 @@ def compare(
     its reason; the others continue. Written into ``out``: ``results.parquet`` and ``results.csv`` (the rows), ``differences.csv``
     (see :func:`~factorgraph_loc.evaluation.statistics.differences`), ``table.md``, ``report.html`` (see
     :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png`` and ``runs/LOG/ESTIMATOR/seedK/`` with the files of
-    each run, or ``error.txt`` with the traceback. ``progress`` is called with the number of runs done and of all.
+    each run, or ``error.txt`` with the traceback. ``align``: also score after this alignment, see
+    :func:`~factorgraph_loc.evaluation.aligned.score`; ``rpe``: also show relative errors. Both are further tables in ``table.md``,
+    and further scores in the report. ``progress`` is called with the number of runs done and of all.
 
     Raises InputError, before anything runs, for no logs, no configurations, two logs of one name, two configurations of one
     estimator and seed, invalid settings or prior, a sensor that no log has, or an ``out`` that contains results without
@@ -83,7 +96,7 @@ def compare(
     configs = _without_needless_seeds(configs)
     _check(logs, configs)
     _prepare(out, overwrite, _asked(logs, configs))
-    work = [_Job(log, config, _folder(out, log.name, config)) for log in logs for config in configs]
+    work = [_Job(log, config, _folder(out, log.name, config), align) for log in logs for config in configs]
     for log in logs:
         fill_cache(
             use_of(log, c.sensors or log.rig.sensors, c.estimator, registry.settings_of(c.estimator, c.settings))
@@ -101,8 +114,8 @@ def compare(
     rows = [_row(job, outcomes[i]) for i, job in enumerate(work)]
     keys = list(dict.fromkeys(key for row in rows for key in row))
     rows = [{key: row.get(key) for key in keys} for row in rows]
-    _write_tables(rows, out)
-    _write_page(rows, work, out)
+    _write_tables(rows, out, rpe=rpe)
+    _write_page(rows, work, out, rpe=rpe)
     for log in logs:
         tracks: dict[str, Track] = {}
         for i, job in enumerate(work):
@@ -119,7 +132,7 @@ def compare(
 
 def _execute(job: _Job) -> _Outcome:
     result = run(job.log, job.config)
-    scores = write_run(result, job.log, job.folder)
+    scores = write_run(result, job.log, job.folder, align=job.align)
     return _Outcome(scores, Track.of(result))
 
 
@@ -216,15 +229,18 @@ def _row(job: _Job, outcome: _Outcome | Exception) -> dict[str, Any]:
     return row | {"status": "failed", "reason": message} | row_of({WARNINGS: list(job.log.warnings)})
 
 
-def _write_tables(rows: Sequence[Mapping[str, Any]], out: Path) -> None:
+def _write_tables(rows: Sequence[Mapping[str, Any]], out: Path, *, rpe: bool) -> None:
     table = pl.DataFrame(rows, infer_schema_length=None)
     write_parquet(table, out / "results.parquet")
     write_text(out / "results.csv", table.write_csv())
     write_text(out / "differences.csv", pl.DataFrame(differences(rows), schema=DIFFERENCES).write_csv())
-    write_text(out / "table.md", markdown(*comparison_cells(rows)))
+    text = markdown(*comparison_cells(rows))
+    for title, columns in further_tables(rows, rpe=rpe).items():
+        text += f"\n{title}\n\n{markdown(*comparison_cells(rows, columns))}"
+    write_text(out / "table.md", text)
 
 
-def _write_page(rows: Sequence[Mapping[str, Any]], work: Sequence[_Job], out: Path) -> None:
+def _write_page(rows: Sequence[Mapping[str, Any]], work: Sequence[_Job], out: Path, *, rpe: bool) -> None:
     keys = [str(i) for i in range(len(work))]
     scenes = {job.log.name: Scene.of(job.log) for job in work}
 
@@ -236,4 +252,8 @@ def _write_page(rows: Sequence[Mapping[str, Any]], work: Sequence[_Job], out: Pa
     names = list(dict.fromkeys(job.config.estimator for job in work))
     baseline = BASELINE if BASELINE in names else None
     asked = {"logs": list(scenes), "estimators": names}
-    write_report(table, files, out / _TABLES[-1], baseline=baseline, title="Comparison", experiment=asked)
+    further = [key for columns in further_tables(rows, rpe=rpe).values() for key, *_ in columns.values()]
+    metrics = (*DEFAULT, *further)
+    write_report(
+        table, files, out / _TABLES[-1], metrics=metrics, baseline=baseline, title="Comparison", experiment=asked
+    )

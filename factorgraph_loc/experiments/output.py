@@ -17,9 +17,10 @@ import numpy as np
 import polars as pl
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.aligned import score
 from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates
 from factorgraph_loc.evaluation.figures import Track
-from factorgraph_loc.evaluation.metrics import errors, score
+from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.evaluation.plots import plot_run, remove_plots
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
 from factorgraph_loc.files.models import file_name, write_text, write_toml
@@ -28,13 +29,17 @@ from factorgraph_loc.io.results import FILES, trajectory_of
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
+from factorgraph_loc.model.scoring import Alignment
 from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory, write_tum
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
 
 
-def write_run(result: RunResult, log: Log, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
-    """Score a run, write its files into the folder ``out``, and return the scores.
+def write_run(
+    result: RunResult, log: Log, out: Path, *, align: Alignment = "none", overwrite: bool = False
+) -> dict[str, Any]:
+    """Score a run, write its files into the folder ``out``, and return the scores; for ``align`` see
+    :func:`~factorgraph_loc.evaluation.aligned.score`.
 
     ``estimates.parquet`` has one row per tick and kind: ``kind`` (causal, final), ``t_ns`` (absolute), ``x``, ``y`` [m],
     ``heading`` [rad], covariances in the world frame; ``error_position`` [m], ``error_heading`` [rad, absolute] and ``nees`` at
@@ -48,7 +53,7 @@ def write_run(result: RunResult, log: Log, out: Path, *, overwrite: bool = False
     contains results and ``overwrite`` is off.
     """
     check_free(out, overwrite=overwrite)
-    scores = score(result, log)
+    scores = score(result, log, align)
     with ExitStack() as stack:
         with writing(out):
             out.parent.mkdir(parents=True, exist_ok=True)

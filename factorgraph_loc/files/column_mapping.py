@@ -206,28 +206,38 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
         raise InputError(f"{path}: contains no rows")
     parsed = _cells_of(path, content, mapping.separator)
     first_row, first = next(parsed)
+    body: Iterator[tuple[int, list[str]]] = chain([(first_row, first)], parsed)
     if not mapping.header:
+        kept = list(body)
+        of_numbers = {int(column) - 1: values for column, values in mapping.chosen().items() if column.isdecimal()}
+        # rows of other kinds may have other numbers of columns
+        first_row, first = next((one for one in kept if _is_chosen(one[1], of_numbers)), kept[0])
         header = [str(i) for i in range(1, len(first) + 1)]
+        body = iter(kept)
     else:
         named = next(_cells_of(path, comments[-1:], mapping.separator), (0, []))[1]
         # a comment with as many names as there are columns is the header, unless the first row contains the names
         in_comment = _has(named, needed) or (len(named) == len(first) and not _has(first, needed))
         header = named if in_comment else first
+        body = body if in_comment else parsed
     _require_columns(path, [*needed, *((column,) for column in mapping.where)], header, first_row)
     chosen = {header.index(column): values for column, values in mapping.chosen().items()}
     rows, table, unwanted = [], [], 0
-    body = parsed if header is first else chain([(first_row, first)], parsed)
     for row, parts in body:
-        if len(parts) != len(header):
-            raise bad_field(path, "row", ",".join(parts), f"{len(header)} values: {','.join(header)}", row=row)
-        if any(parts[i] not in values for i, values in chosen.items()):
+        if not _is_chosen(parts, chosen):
             unwanted += 1
             continue
+        if len(parts) != len(header):
+            raise bad_field(path, "row", ",".join(parts), f"{len(header)} values: {','.join(header)}", row=row)
         rows.append(row)
         table.append(parts)
     wanted = [column for column in mapping.columns.values() if column in header]
     columns = {column: [parts[header.index(column)] for parts in table] for column in wanted}
     return Cells(path, rows, columns), header, unwanted
+
+
+def _is_chosen(parts: Sequence[str], chosen: Mapping[int, set[str]]) -> bool:
+    return all(i < len(parts) and parts[i] in values for i, values in chosen.items())
 
 
 def _split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
@@ -336,30 +346,53 @@ def _paths(entry: Mapping[str, Any], before: str = "") -> Iterator[str]:
             yield before + key
 
 
+@dataclass
+class _Choice:
+    """The rows that mappings choose of a file: ``names`` of the columns by which they do, the ``count`` of all rows, the line
+    numbers of those that are ``read``, and the number of ``others``."""
+
+    names: dict[str, None]
+    count: int
+    read: set[int]
+    others: int
+
+
 class Unread:
-    """Columns by file, and rows. Several mappings may read the same file; a column that one of them reads is read."""
+    """Columns by file, and rows. Several mappings may read the same file; a column or a row that one of them reads is read."""
 
     def __init__(self) -> None:
         self._columns: dict[Path, tuple[str, ...]] = {}
-        self._rows: list[str] = []
+        self._choices: dict[Path, _Choice] = {}
 
     def note(self, mapped: Mapped) -> None:
         """Note what a mapping leaves out of its file."""
         if mapped.unwanted:
-            names = listed(mapped.mapping.where)
-            count = mapped.unwanted + mapped.passed + len(mapped.rows)
-            self._rows.append(
-                f"{mapped.path.name}: {mapped.unwanted} of {count} rows have another {names} than where says"
-            )
+            self._note_choice(mapped)
         before = self._columns.get(mapped.path, mapped.left_out)
         self._columns[mapped.path] = tuple(name for name in before if name in mapped.left_out)
+
+    def _note_choice(self, mapped: Mapped) -> None:
+        names, rows = dict.fromkeys(mapped.mapping.where), mapped.rows.tolist()
+        before = self._choices.get(mapped.path)
+        if before is None:
+            count = mapped.unwanted + mapped.passed + len(rows)
+            self._choices[mapped.path] = _Choice(names, count, set(rows), mapped.unwanted)
+            return
+        before.names |= names
+        before.others -= sum(row not in before.read for row in rows)
+        before.read |= set(rows)
 
     def warnings(self) -> list[str]:
         """A line for each choice of rows, and one for all files with the same columns."""
         files: dict[tuple[str, ...], list[Path]] = {}
         for path, names in self._columns.items():
             files.setdefault(names, []).append(path)
-        return self._rows + [
+        rows = [
+            f"{path.name}: {choice.others} of {choice.count} rows have another {listed(choice.names)} than where says"
+            for path, choice in self._choices.items()
+            if choice.others > 0
+        ]
+        return rows + [
             f"{paths[0].name}{f' and {len(paths) - 1} more files' if paths[1:] else ''}: columns that are not read: {listed(names)}"
             for names, paths in files.items()
             if names

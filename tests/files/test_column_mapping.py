@@ -106,6 +106,17 @@ def test_rows_with_values_of_other_columns(read, form, where):
     assert set(found.left_out) == {"kind", "n", "ok"} - set(where)
 
 
+def test_rows_of_other_kinds_may_have_other_numbers_of_columns(read):
+    table = "range 0.5 7 8 9\nodom 1 2\nrange 0.7 4 5 6\nodom 3 4\n"
+    given = {"header": False, "separator": " "}
+    found = read(table, columns={"a": "2"}, where={"1": "odom"}, **given)
+    np.testing.assert_array_equal(found.numbers("a", TAGS["z"]), (1.0, 3.0))
+    assert (found.unwanted, found.left_out) == (2, ("3",))
+    assert read(table, columns={"a": "5"}, where={"1": "range"}, **given).numbers("a", TAGS["z"]).tolist() == [9.0, 6.0]
+    with pytest.raises(InputError, match=r"a.csv:2: row is 'odom,1', expected 3 values: 1,2,3"):
+        read("odom 1 2\nodom 1\n", columns={"a": "2"}, where={"1": "odom"}, **given)
+
+
 def test_json_lines_of_several_kinds(read):
     lines = '{"p": {"x": 1}}\n\n[{"p": {"x": 2, "y": null}}, {"other": 3}]\n{"p": {"x": 3, "y": "4"}}\n'
     found = read(lines, "a.jsonl", optional=("b",), columns={"a": "p.x", "b": "p.y"})

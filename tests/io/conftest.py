@@ -158,15 +158,28 @@ class BagMaker:
         raw = (self.store.serialize_ros1 if self.ros1 else self.store.serialize_cdr)(message, kind)
         self.writer.write(self.connections[topic], received, raw)
 
-    def odometry(self, topic: str, ns: int, pose: tuple[float, float, float], delay: int = 0, v: float = 0.0) -> None:
+    def odometry(
+        self,
+        topic: str,
+        ns: int,
+        pose: tuple[float, float, float],
+        delay: int = 0,
+        v: float = 0.0,
+        *,
+        turned: bool = True,
+    ) -> None:
+        """Without ``turned`` the orientation is left at zeros."""
         spread = np.zeros(36)
+        place = self.pose(*pose)
+        if not turned:
+            place.orientation.w = 0.0
         self.write(
             topic,
             ns + delay,
             "nav_msgs/msg/Odometry",
             header=self.header(ns, "odom"),
             child_frame_id="base_link",
-            pose=self.make("geometry_msgs/msg/PoseWithCovariance", pose=self.pose(*pose), covariance=spread),
+            pose=self.make("geometry_msgs/msg/PoseWithCovariance", pose=place, covariance=spread),
             twist=self.make("geometry_msgs/msg/TwistWithCovariance", twist=self.twist(v, 0.0), covariance=spread),
         )
 

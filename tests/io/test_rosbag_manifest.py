@@ -4,6 +4,7 @@ import tomllib
 
 import numpy as np
 import pytest
+import tomli_w
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.io.bags.file import open_bag
@@ -44,6 +45,24 @@ def test_odometry_and_truth_are_told_apart_by_their_names(proposal):
     assert "# odometry could also be /wheel_odom" in text
     assert "# not used: /move_base/goal (geometry_msgs/msg/PoseStamped, 1 messages)" in text
     assert found.uses == {"/odom": "odometry", "/ground_truth/odom": "reference"}
+
+
+def test_odometry_without_poses_is_read_by_its_velocities(proposal, tmp_path):
+    def fill(made):
+        for i in range(3):
+            made.odometry("/odom", T0 + i * 10**8, (0.0, 0.0, 0.0), v=0.5, turned=False)
+        pose_of(made, "/robot_pose")
+        made.write("/depth", T0, "sensor_msgs/msg/Range", **range_of(made))
+
+    found, manifest, text = proposal(fill)
+    assert found.options["odometry"] == {"topic": "/odom", "use": "twist"}
+    assert "# the orientations in /odom are not set: its velocities are used, not its poses\n" in text
+    del manifest["options"]["reference"]
+    (tmp_path / "drive.toml").write_text(tomli_w.dumps(manifest))
+    log = fgloc.read_log(tmp_path / "drive.toml")
+    np.testing.assert_array_equal(log.streams["odometry"].v, (0.5, 0.5, 0.5))
+    # what the manifest leaves out is told
+    assert log.metadata["not read"] == "/depth (sonar or infrared range), /robot_pose (geometry_msgs/msg/PoseStamped)"
 
 
 def test_an_estimate_is_not_taken_for_the_truth_without_a_word(proposal):

@@ -47,21 +47,25 @@ def metric_of(key: str) -> Metric:
 
 def _of_trajectory(key: str, kind: str, what: str) -> Metric:
     sort, _, how = what.rpartition("_")
-    if sort in ("position", "space_position"):
+    if sort in ("position", "space_position", "aligned_position"):
         return Metric(key, f"{kind} {sort.replace('_', ' ')} {_HOW.get(how, how)}", "m", rms=how == "rmse")
-    if sort in ("heading", "space_rotation"):
+    if sort in ("heading", "space_rotation", "aligned_rotation"):
         title = f"{kind} {sort.replace('_', ' ')} {_HOW.get(how, how)}"
         return Metric(key, title, "°", _DEGREES, rms=how == "rmse")
-    if what == "rpe_position_per_m":
-        return Metric(key, f"{kind} drift", "m per m", rms=True)
-    if what == "rpe_heading_per_m":
-        return Metric(key, f"{kind} turn drift", "° per m", _DEGREES, rms=True)
+    if what in _DRIFTS:
+        return Metric(key, f"{kind} {_DRIFTS[what][0]}", *_DRIFTS[what][1:], rms=True)
     if what == "coverage_95":
         return Metric(key, f"{kind} truth in the 95 % ellipse", "%", 100.0, better=None)
     return Metric(key, f"{kind} {'ANEES' if what == 'anees' else what.replace('_', ' ')}", better=None)
 
 
 _HOW = {"rmse": "RMSE", "p95": "error at 95 %", "max": "largest error", "median": "median error"}
+_DRIFTS = {
+    "rpe_position_per_m": ("drift", "m per m", 1.0),
+    "rpe_heading_per_m": ("turn drift", "° per m", _DEGREES),
+    "rpe_position_per_s": ("drift", "m per s", 1.0),
+    "rpe_heading_per_s": ("turn drift", "° per s", _DEGREES),
+}
 _OTHERS = {
     m.key: m
     for m in (

@@ -127,7 +127,10 @@ def _motion(out: Proposal, bag: Bag, topics: Sequence[Topic], tree: Tree) -> Non
         out.notes.append("no topic looks like odometry, which every estimator needs: name one in [options.odometry]")
         return
     settings: dict[str, Any] = frames if ranked[0].type in TF else {}
-    if ranked[0].type == JOINTS:
+    if ranked[0].type == ODOMETRY and _has_no_pose(bag, ranked[0]):
+        settings = {"use": "twist"}
+        out.notes.append(f"the orientations in {ranked[0].name} are not set: its velocities are used, not its poses")
+    elif ranked[0].type == JOINTS:
         settings = _joints(bag, ranked[0], out.notes)
     elif pair := pairs.get(ranked[0].name):
         settings = {"use": "twist" if SPEED.search(ranked[0].name) else "pose"}
@@ -138,6 +141,15 @@ def _motion(out: Proposal, bag: Bag, topics: Sequence[Topic], tree: Tree) -> Non
         out.notes.append(f"{ranked[0].name} contains commanded velocities, not measured ones")
     out.take("odometry", ranked[0], **settings)
     _others(out, "odometry", ranked[1:])
+
+
+def _has_no_pose(bag: Bag, topic: Topic) -> bool:
+    """Whether the first message of odometry has a quaternion of zeros, as drivers leave it that tell velocities only."""
+    first = next(bag.messages([topic.name]), None)
+    if first is None:
+        return False
+    turned = first.message.pose.pose.orientation
+    return not any((turned.x, turned.y, turned.z, turned.w))
 
 
 def _pairs(topics: Sequence[Topic]) -> dict[str, str]:

@@ -22,6 +22,7 @@ from factorgraph_loc.io.bags.frames import STATIC, FrameReference, StaticFrames
 from factorgraph_loc.io.bags.landmarks import Landmarks, LandmarkTopic, PixelsOfPoints, PixelTopic
 from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, WheelMotion, YawRates, odometry
 from factorgraph_loc.io.bags.poses import POINT, POSES, Poses, ReferenceTopic, Start, StartTopic
+from factorgraph_loc.io.bags.proposed import UNUSED
 from factorgraph_loc.io.bags.tables import DescribedRows, Reads, RfidTopic, TableTopic
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.model.log import Log
@@ -140,6 +141,11 @@ class Listeners:
         self.add(options.topic, gatherer, self.stamper(options.topic, options.clock))
         return gatherer
 
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The topics that are read."""
+        return tuple(self._of)
+
     def run(self) -> None:
         """Read the bag."""
         for item in self.bag.messages(list(self._of)):
@@ -217,8 +223,16 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
         start=gathered.start.pose(t0_ns, warnings) if gathered.start else None,
         t0_ns=t0_ns,
         warnings=tuple(warnings),
-        metadata={"clock": clock} | ({"robot": "; ".join(notes)} if notes else {}),
+        metadata={"clock": clock}
+        | ({"robot": "; ".join(notes)} if notes else {})
+        | ({"not read": left_out} if (left_out := _left_out(bag, listeners)) else {}),
     )
+
+
+def _left_out(bag: Bag, listeners: Listeners) -> str:
+    """The topics with messages that the manifest does not name, and what they carry."""
+    there = [topic for topic in bag.topics.values() if topic.count and topic.name not in (*listeners.topics, STATIC)]
+    return ", ".join(f"{topic.name} ({UNUSED.get(topic.type, topic.type)})" for topic in there)
 
 
 def static_frames(listeners: Listeners) -> StaticFrames:
