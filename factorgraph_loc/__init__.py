@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream, RightSightingStream, SightingStream
     from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeStream
     from factorgraph_loc.sensors.landmarks.settings import Landmark
+    from factorgraph_loc.sensors.loops.measurement import Loops, LoopStream
     from factorgraph_loc.sensors.measurements import Exteroceptive, Odometry
     from factorgraph_loc.sensors.odometry.measurement import (
         IncrementOdometry,
@@ -75,6 +76,8 @@ __all__ = [
     "Landmark",
     "Localizer",
     "Log",
+    "LoopStream",
+    "Loops",
     "Measurement",
     "Odometry",
     "PixelSightings",
@@ -171,6 +174,7 @@ _MODULES = {
     "sensors.camera.stream": ("FeatureStream", "ImageStream", "RightSightingStream", "SightingStream"),
     "sensors.landmarks.settings": ("Landmark",),
     "sensors.landmarks.measurement": ("BearingRange", "BearingRangeStream"),
+    "sensors.loops.measurement": ("LoopStream", "Loops"),
     "sensors.odometry.measurement": (
         "IncrementOdometry",
         "VelocityOdometry",

@@ -9,6 +9,7 @@ SENSORS.own.update(
         "rfid": "factorgraph_loc.sensors.rfid:SENSOR",
         "twist": "factorgraph_loc.sensors.twist:SENSOR",
         "camera": "factorgraph_loc.sensors.camera:SENSOR",
+        "loops": "factorgraph_loc.sensors.loops:SENSOR",
     }
 )
 ESTIMATORS.own.update(

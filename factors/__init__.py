@@ -8,6 +8,7 @@ __all__ = [
     "compressed",
     "graph",
     "landmarks",
+    "loops",
     "marginal",
     "motion",
     "odometry",

@@ -1,8 +1,7 @@
 """The offline optimum: the whole log in one robust least-squares problem, solved when all is known.
 
 While measurements come it only keeps a guess, as an EKF would; its result is the final trajectory, and its causal estimates
-are never ``localized``. A start far from the optimum is met by graduated non-convexity: the robust loss begins
-wide and narrows to its own scale (Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020, here for the Geman-McClure loss).
+are never ``localized``. A start far from the optimum is met by graduated non-convexity (:mod:`.graduation`).
 
 Where points that the map lacks are estimated, such a guess drifts too far to tell which sightings belong together. There the
 smoother's solver goes ahead: its graph is the problem, its estimates are the start.
@@ -11,9 +10,9 @@ smoother's solver goes ahead: its graph is the problem, its estimates are the st
 from dataclasses import replace
 from typing import Annotated
 
-import numpy as np
 from pydantic import Field
 
+from factorgraph_loc.fusion.graduation import best_optimum, settled
 from factorgraph_loc.fusion.graph import Graph
 from factorgraph_loc.fusion.graph_estimator import GraphEstimator, SolvingBackend
 from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe, SmootherSettings
@@ -22,8 +21,6 @@ from factorgraph_loc.fusion.variables import Values, pose_key
 from factorgraph_loc.model.belief import PoseEstimate
 from factorgraph_loc.model.setup import Setup
 from factors.se2 import Array
-
-ITERATIONS_PER_WIDTH = 5
 
 
 class BatchSettings(GraphSettings):
@@ -57,19 +54,11 @@ class Batch(GraphEstimator):
 def graduated(graph: Graph, start: Values, widest: float) -> tuple[Array, Array]:
     """Poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes at the best optimum found from ``start``, with
     robust losses that begin ``widest`` times as wide."""
-    problem = graph.problem()
-    best = problem.solve(start)
-    if widest > 1.0:
-        values, width = start, widest
-        while width > 1.0:
-            values, width = graph.problem(width).solve(values, ITERATIONS_PER_WIDTH).values, width / 2.0
-        # either way may end in the worse optimum
-        best = min(best, problem.solve(values), key=lambda s: s.cost)
+    problem, best = best_optimum(graph, start, widest)
     if graph.drop_astray(graph.keyframes, best.values):
         problem = graph.problem()
         best = problem.solve(best.values)
-    covariances = graph.settle(problem, best.values)
-    return np.array([best.values[k.key] for k in graph.keyframes]), covariances
+    return settled(graph, problem, best)
 
 
 class Ahead(Incremental):
@@ -129,6 +118,8 @@ class Guessing:
     def is_open(self, keyframe: int) -> bool:
         """Whether factors may still be added to a keyframe."""
         return 0 <= keyframe < len(self._graph.keyframes)
+
+    is_kept = is_open
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
         """The optimum over the whole log."""

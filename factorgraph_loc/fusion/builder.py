@@ -11,7 +11,7 @@ filter would.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -26,7 +26,7 @@ from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.fusion.search import Search, laplace_evidence
 from factorgraph_loc.fusion.variables import Node
 from factorgraph_loc.model.measurement import Measurement
-from factorgraph_loc.sensors.base import NewVariable, Observation, Sensor
+from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation, Sensor
 from factors import se2
 from factors.graph import VectorPriorFactor
 from factors.motion import Increment, propagate
@@ -59,12 +59,16 @@ class Backend(Protocol):
     def is_open(self, keyframe: int) -> bool:
         """Whether factors may still be added to a keyframe."""
 
+    def is_kept(self, keyframe: int) -> bool:
+        """Whether a keyframe is part of the final problem."""
+
 
 @dataclass
 class _KeyframeView:
-    """What sensors see of the graph: the ``guess`` of one keyframe."""
+    """What sensors see of the graph: the ``guess`` of one keyframe. ``is_kept``: that of the backend."""
 
     graph: Graph
+    is_kept: Callable[[int], bool]
     keyframe: Keyframe
     guess: Guess
     offset: Increment | None
@@ -95,6 +99,15 @@ class _KeyframeView:
     def poses_at(self, times: Array) -> Array:
         constants = self.graph.value(MOTION, np.zeros(0))
         return self.graph.motion.poses_at(self.keyframe.odometry, times, constants)
+
+    def earlier(self, t: float) -> EarlierPose | None:
+        graph = self.graph
+        if not graph.times[graph.times.first] <= t < self.t:
+            return None
+        before = graph.before(t)
+        if before is self.keyframe or not self.is_kept(before.index):
+            return None
+        return EarlierPose(before.t, graph.part_of_step(before, t) if t > before.t else None)
 
     def on_pose(self, observation: Observation) -> Observation:
         """An observation of the pose alone, with its blocks where they are estimated to be."""
@@ -177,9 +190,10 @@ class Builder:
                 self._backend.attach(graph.newest, Addition(nodes), (graph.pose, graph.covariance))
             self._gatherer = sensor
         odometry = graph.motion.state(m.t)
-        view = _KeyframeView(graph, graph.newest, (graph.pose, graph.covariance), offset, newest=True)
+        guess = graph.pose, graph.covariance
+        view = _KeyframeView(graph, self._backend.is_kept, graph.newest, guess, offset, newest=True)
         for seen in sensor.observe(m, view):
-            if isinstance(seen, NewVariable):
+            if isinstance(seen, NewVariable | Link):
                 continue
             here = view.on_pose(seen)
             correction = here.correct(*view.guess, {}, {}, here.iterations or ITERATIONS_OF_GUESS)
@@ -226,8 +240,11 @@ class Builder:
         graph, sensor = self._graph, self._graph.sensors[m.modality]
         odometry = graph.motion.state(m.t)
         expected = self._backend.guess_of(keyframe.index) if guess is None else guess
-        view = _KeyframeView(graph, keyframe, expected, offset, newest=guess is not None)
+        view = _KeyframeView(graph, self._backend.is_kept, keyframe, expected, offset, newest=guess is not None)
         for seen in sensor.observe(m, view):
+            if isinstance(seen, Link):
+                self._add_link(seen, sensor, keyframe, addition)
+                continue
             if isinstance(seen, NewVariable):
                 self._add_block(seen, sensor, view, addition)
                 continue
@@ -250,6 +267,14 @@ class Builder:
             if keyframe is graph.newest and m.t == keyframe.t:
                 guess = mapper.take(m, keyframe, guess, self._graph_view(sensor), addition, is_new=is_new)
         return guess
+
+    def _add_link(self, link: Link, sensor: Sensor, keyframe: Keyframe, addition: Addition) -> None:
+        """A factor on a keyframe and an earlier one, which waits for the final problem if that has left the solver."""
+        earlier = self._graph.before(link.earlier)
+        node = Node((keyframe.key, earlier.key), link.factor, link.rows, sensor=sensor.modality)
+        keyframe.nodes.append(node)
+        if self._backend.is_open(earlier.index):
+            addition.nodes.append(node)
 
     def _graph_view(self, sensor: Sensor) -> GraphView:
         graph, backend = self._graph, self._backend

@@ -24,7 +24,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import NewVariable, bound_sensors
+from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, bound_sensors
 from factors import positive, rts_kernels, se2, se2_kernels
 from factors.motion import Increment
 from factors.se2 import Array
@@ -123,6 +123,9 @@ class _View:
 
     def poses_at(self, times: Array) -> Array:
         return self._ekf._poses_at(times)
+
+    def earlier(self, t: float) -> EarlierPose | None:
+        return None
 
 
 class Ekf(Filter):
@@ -239,6 +242,8 @@ class Ekf(Filter):
         self._step = self._step or self._standstill()
         sensor, view = self._sensors[m.modality], _View(self)
         for seen in sensor.observe(m, view):
+            if isinstance(seen, Link):
+                continue
             if isinstance(seen, NewVariable):
                 if seen.sightings or len(self._state.covariance) < MOST:
                     self._state = self._state.with_block(seen)

@@ -22,6 +22,7 @@ from factorgraph_loc.fusion.variables import (
     Node,
     Values,
     constants_key,
+    gather,
     index_of,
     is_landmark,
     is_point,
@@ -112,6 +113,15 @@ class Graph:
         start = keyframe.odometry if self._anchored else self.motion.state(keyframe.t)
         return self.recalibrated(self.motion.relative(start, self.motion.state(t)))
 
+    def part_of_step(self, keyframe: Keyframe, t: float) -> Increment:
+        """The motion from a keyframe to ``t``, before the next one, of which the odometry may be forgotten: the part of the step to
+        that by time, along its arc."""
+        after = self.keyframes[keyframe.index + 1]
+        assert after.from_previous is not None
+        step, share = self.recalibrated(after.from_previous), (t - keyframe.t) / (after.t - keyframe.t)
+        delta = se2.exp(share * se2.log(step.delta))
+        return Increment(delta, share * step.covariance, share * step.duration, share * step.still)
+
     def recalibrated(self, increment: Increment) -> Increment:
         """An increment under the constants of the odometry."""
         key = self.keys.get(MOTION)
@@ -166,8 +176,18 @@ class Graph:
                 return Learnt(values, landmarks, found)
         return Learnt(values, landmarks)
 
-    def problem(self, width: float = 1.0) -> Problem:
-        """All that is known as one problem; the robust losses ``width`` times as wide as they are."""
+    def convex_width(self, values: Values) -> float:
+        """How many times as wide the losses of links must be for all of them to be convex at ``values``, at least 1."""
+        linked = {name: sensor for name, sensor in self.sensors.items() if sensor.links}
+        nodes = (node for k in self.keyframes for node in k.nodes if linked and node.sensor in linked)
+        return max(
+            (linked[n.sensor].convex_width(n.factor, gather(values, n.keys)) for n in nodes if n.factor is not None),
+            default=1.0,
+        )
+
+    def problem(self, width: float = 1.0, link_width: float = 1.0) -> Problem:
+        """All that is known as one problem; the robust losses ``width`` times as wide as they are, and those of links
+        ``link_width`` times."""
         assert self.prior is not None
         body = se2.world_to_body(self.prior.pose, self.prior.covariance)
         natives: list[tuple[Factor, tuple[int, ...], gtsam.NonlinearFactor]] = []
@@ -183,7 +203,8 @@ class Graph:
                     natives.append((factor, node.keys, node.native))
                     continue
                 if node.sensor in self.sensors:
-                    final = self.sensors[node.sensor].at_end(factor, width)
+                    sensor = self.sensors[node.sensor]
+                    final = sensor.at_end(factor, link_width if sensor.links else width)
                     if final is None:
                         continue
                     factor = final

@@ -14,6 +14,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from factorgraph_loc.fusion.graduation import best_optimum, settled
 from factorgraph_loc.fusion.graph import Graph
 from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe, SmootherSettings
 from factorgraph_loc.fusion.kept import Kept
@@ -52,7 +53,8 @@ class Incremental:
         # whether the final trajectory is that of the whole problem; and the length of the window, None where all is in the solver
         self._is_whole = settings.lag is None or settings.lag == math.inf
         self._lag = None if settings.lag == math.inf else settings.lag
-        if settings.lag is None and not (self._waits or self._maps):
+        links = any(sensor.links for sensor in graph.sensors.values())
+        if settings.lag is None and not (self._waits or self._maps or links):
             self._lag = LAG
         # how long observations may wait for the solver
         every = max((sensor.solve_every for sensor in graph.sensors.values()), default=0.0)
@@ -93,7 +95,9 @@ class Incremental:
         if not self._settings.smooth:
             estimates = list(self._filtered)
         elif self._is_whole:
-            return self._optimum(graph, self.solved(graph))
+            start = self.solved(graph)
+            graph.drop_astray(graph.keyframes, start)
+            return settled(graph, *best_optimum(graph, start, 1.0))
         else:
             stalled, open_ones = isinstance(self._solver, Stalled), graph.keyframes[len(self._left) :]
             try:
@@ -116,14 +120,6 @@ class Incremental:
         known = self._waiting.values | left
         keys = [*(k.key for k in graph.keyframes), *graph.values]
         return known | {key: self._solver.value(key) for key in keys if key not in known}
-
-    @staticmethod
-    def _optimum(graph: Graph, start: Values) -> tuple[Array, Array]:
-        """Poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes at the optimum next to ``start``."""
-        graph.drop_astray(graph.keyframes, start)
-        problem = graph.problem()
-        values = problem.solve(start).values
-        return np.array([values[k.key] for k in graph.keyframes]), graph.settle(problem, values)
 
     def begin(self, newest: Keyframe) -> None:
         """Solve the graph anew: it begins, or keyframes were taken back and ``newest`` was added."""
@@ -178,6 +174,10 @@ class Incremental:
     def is_open(self, keyframe: int) -> bool:
         """Whether factors may still be added to a keyframe."""
         return max(0, len(self._left)) <= keyframe < len(self._graph.keyframes)
+
+    def is_kept(self, keyframe: int) -> bool:
+        """Whether a keyframe is part of the final problem."""
+        return self._is_whole or self.is_open(keyframe)
 
     def _update(self, nodes: Sequence[Node], values: Values) -> None:
         newest = self._graph.keyframes[-1]

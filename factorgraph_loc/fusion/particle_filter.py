@@ -34,7 +34,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import NewVariable, Observation, bound_sensors
+from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation, bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import positive, se2
 from factors.motion import Increment
@@ -97,6 +97,9 @@ class CloudView:
         constants = self.value(MOTION)
         owner = self._filter
         return owner._motion.poses_at(owner._odometry, times, np.zeros(0) if constants is None else constants)
+
+    def earlier(self, t: float) -> EarlierPose | None:
+        return None
 
     def values(self, names: Sequence[str]) -> dict[str, Array]:
         """The means of blocks that travel with the particles."""
@@ -243,6 +246,8 @@ class ParticleFilter(Filter):
             return
         sensor, view = self._sensors[m.modality], CloudView(self)
         for seen in sensor.observe(m, view):
+            if isinstance(seen, Link):
+                continue
             if isinstance(seen, NewVariable):
                 if not seen.sightings:
                     self._state = self._state.with_block(seen.name, seen.mean, seen.noise, self._rng)

@@ -33,7 +33,7 @@ from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.planning.robot import ProximitySensor
-from factorgraph_loc.sensors.base import NewVariable, bound_sensors
+from factorgraph_loc.sensors.base import Link, NewVariable, bound_sensors
 from factors import se2
 from factors.motion import Increment
 from factors.se2 import Array
@@ -118,7 +118,7 @@ class ActiveMcl(Filter):
     def _see(self, m: Measurement) -> None:
         sensor = self._sensors[m.modality]
         for seen in sensor.observe(m, _ActiveView(self)):
-            if isinstance(seen, NewVariable) or not seen.is_judged:  # strength and phase have many optima
+            if isinstance(seen, NewVariable | Link) or not seen.is_judged:  # strength and phase have many optima
                 continue
             if seen.found and sensor.finder is None:
                 # the reads are explained by none of the particles: the robot is lost

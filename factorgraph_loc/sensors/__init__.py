@@ -7,6 +7,7 @@ __all__ = [
     "interfaces",
     "known_position",
     "landmarks",
+    "loops",
     "measurements",
     "odometry",
     "pushed",

@@ -121,6 +121,26 @@ class NewVariable:
 
 
 @dataclass(frozen=True)
+class EarlierPose:
+    """A pose of an earlier time that an estimator still has: its time ``t`` [s], and the motion from it to the time in question,
+    None if these are equal."""
+
+    t: float
+    offset: Increment | None
+
+
+@dataclass(frozen=True)
+class Link:
+    """A factor on two poses: that which a measurement at ``t`` [s] refers to, its first value, and the one at ``earlier`` [s], its
+    second. ``rows``: number of residuals. Only where the view has the earlier pose."""
+
+    t: float
+    earlier: float
+    factor: Factor
+    rows: int
+
+
+@dataclass(frozen=True)
 class Binding:
     """What a sensor is bound to: a run, the robot's ``motion`` and the diagnostics.
 
@@ -167,6 +187,9 @@ class View(Protocol):
 
     def poses_at(self, times: Array) -> Array:
         """Poses (R, 3) at times (R,) relative to the pose at ``t``."""
+
+    def earlier(self, t: float) -> EarlierPose | None:
+        """The pose at or before ``t`` that a :class:`Link` may depend on; None if the estimator has none, as filters have."""
 
 
 class Finder(Protocol):
@@ -222,7 +245,8 @@ class Sensor:
     ``evidence_every`` [s]: interval of informative measurements in a search. ``lost``: reason why a track is given up.
 
     For graphs: ``keyframe_every`` [s]: interval between keyframes; ``gathers``: whether the observations on a pose are merged
-    when the next pose begins; ``solve_every`` [s]: longest delay of a solver update.
+    when the next pose begins; ``solve_every`` [s]: longest delay of a solver update; ``links``: whether its factors are on two
+    poses (:class:`Link`), of which many may be false.
     """
 
     modality: ClassVar[str]
@@ -231,12 +255,13 @@ class Sensor:
     follows_constants: ClassVar[bool] = False
     keyframe_every: ClassVar[float] = 0.09
     gathers: ClassVar[bool] = False
+    links: ClassVar[bool] = False
     evidence_every: ClassVar[float] = 1.0
     solve_every: float = 0.0
     finder: Finder | None = None
     bounds: Array | None = None
 
-    def observe(self, m: Any, view: View) -> Iterator[Observation | NewVariable]:
+    def observe(self, m: Any, view: View) -> Iterator[Observation | NewVariable | Link]:
         """The observations of a measurement; each is applied before the next is requested."""
         raise NotImplementedError
 
@@ -269,6 +294,10 @@ class Sensor:
         """A factor of this sensor for the final solution, with its robust loss ``width`` times as wide. None to leave a
         multimodal factor out while ``width`` is above 1."""
         return factor
+
+    def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:
+        """How many times as wide the loss of a link's factor must be to be convex at ``values``, at least 1."""
+        return 1.0
 
     def rewind(self, t: float) -> None:
         """Forget what came after ``t``; it will be processed again."""

@@ -2,10 +2,11 @@
 
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.loops.measurement import Loops
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.twist.measurement import Twist
 from factorgraph_loc.vision.frame import CameraFrame
 
 Odometry = VelocityOdometry | IncrementOdometry | YawRate | Twist
-Exteroceptive = BearingRange | RfidScan | PixelSightings | CameraFrame  # measurements of the robot's surroundings
+Exteroceptive = BearingRange | RfidScan | PixelSightings | CameraFrame | Loops  # of the robot's surroundings

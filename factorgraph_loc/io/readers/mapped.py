@@ -1,6 +1,7 @@
 """The reader of folders of foreign tables, described by column mappings in a manifest."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, Unread, read_mapped
-from factorgraph_loc.files.columns import Table
+from factorgraph_loc.files.columns import STAMPS, Table
 from factorgraph_loc.files.models import FileModel, add_fields, inside
 from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
 from factorgraph_loc.io.native import native
@@ -89,7 +90,7 @@ def read(path: Path | None, options: Options) -> Log:
     times = _times(path, options.odometry)
     odometry_t_ns, moves, increments = read_odometry(odometry_path, times, options.odometry, warnings, unread)
     tables = {
-        name: _table(inside(path, mapping.file, path), native_tables()[name][1][0], mapping, warnings, unread)
+        name: _table(inside(path, mapping.file, path), native_tables()[name][1], mapping, warnings, unread)
         for name in ("imu", "camera", *OTHERS)
         if (mapping := getattr(options, name)) is not None
     }
@@ -128,19 +129,23 @@ def _times(folder: Path, told: PosesFile) -> Path | None:
     return None if told.times is None else inside(folder, told.times, folder)
 
 
-def _table(path: Path, table: Table, mapping: SensorFile, warnings: list[str], unread: Unread) -> TableRows:
-    """A file as a table of the native format."""
-    shapes, columns = _shapes(table), {column.name: column for column in table.columns}
+def _table(path: Path, tables: Sequence[Table], mapping: SensorFile, warnings: list[str], unread: Unread) -> TableRows:
+    """A file as one of ``tables`` of the native format."""
+    shapes = tuple(shape for table in tables for shape in _shapes(table))
+    columns = {column.name: column for table in tables for column in table.columns}
     if isinstance(mapping, ImuFile):
         shapes, columns = (*shapes, ("t", *RATES)), columns | {name: replace(RATE, name=name) for name in RATES}
     mapped = read_mapped(path, mapping, shapes)
     unread.note(mapped)
     if mapped.passed:
-        warnings.append(f"{path}: {mapped.passed} objects without the columns of {table.name} are skipped")
+        warnings.append(f"{path}: {mapped.passed} objects without the columns of {tables[0].name} are skipped")
     known = [columns[name] for name in mapped.fields if name != "t"]
     names = {column.name: mapped.names(column) for column in known if column.kind in NAMES}
-    unknown = {column.name: np.full(len(mapped.rows), np.nan) for column in table.columns if column.may_lack}
+    unknown = {name: np.full(len(mapped.rows), np.nan) for name, column in columns.items() if column.may_lack}
     numbers = unknown | {column.name: mapped.numbers(column.name, column) for column in known if column.kind in NUMBERS}
+    for column in known:
+        if column.units is STAMPS:  # another time, by the same clock
+            numbers[column.name] = numbers[column.name] + 1e9 * mapping.clock_offset
     if isinstance(mapping, ImuFile):
         numbers = {"w": _about_z(mapped, mapping, numbers)}
     return TableRows(path, mapped.rows, mapped.stamps("t", mapping.clock_offset), numbers, names)

@@ -1,0 +1,27 @@
+"""Loops found by another program: places that are met again, of which some may be false."""
+
+from factorgraph_loc.model.sections import Section
+from factorgraph_loc.sensors.registry import Channel, SensorType
+
+__all__ = ["SENSOR", "measurement"]
+
+SENSOR = SensorType(
+    "loops",
+    channels=(
+        Channel(
+            "loops",
+            streams=("factorgraph_loc.sensors.loops.measurement:LoopStream",),
+            measurements=("factorgraph_loc.sensors.loops.measurement:Loops",),
+            tables=(
+                "factorgraph_loc.sensors.loops.measurement:LOOPS",
+                "factorgraph_loc.sensors.loops.measurement:LOOPS_BY_STAMP",
+            ),
+            assemble="factorgraph_loc.sensors.loops.tables:assemble",
+            check="factorgraph_loc.sensors.loops.tables:check",
+            section="loops",
+        ),
+    ),
+    settings={"loops": Section("factorgraph_loc.sensors.loops.settings:LoopSettings")},
+    summarize="factorgraph_loc.sensors.loops.summary:summarize",
+    bind="factorgraph_loc.sensors.loops.sensor:bind",
+)

@@ -1,0 +1,147 @@
+"""A loop that may be false: the pose at one time in the frame of an earlier one, or only that both are at one place.
+
+Its loss is that of Geman and McClure, and may be widened at first: graduated non-convexity (Yang, Antonante, Tzoumas, Carlone, RA-L
+5(2), 2020) finds which of many loops agree with each other and with the odometry.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numba
+import numpy as np
+
+from factors import positive, se2
+from factors.motion import Increment
+from factors.robust import geman_mcclure_loss, geman_mcclure_weight
+from factors.se2 import Array
+from factors.se2_kernels import arc, log, wrapped
+
+_NOWHERE = np.zeros(3)
+
+
+@dataclass(frozen=True)
+class LoopFactor:
+    """A robust factor on two poses.
+
+    ``measured`` (3,): the later pose in the frame of the earlier one, with standard deviations ``sigmas`` (3,) [m, m, rad] of its
+    body-frame perturbation; None if both are at one place, with the standard deviation ``sigmas`` (1,) [m] of each coordinate.
+    ``offset``, ``earlier_offset``: the motion from each variable's pose to that of the loop, whose error is added to the noise;
+    None if they are the same. ``robust``: scale of the loss, in standard deviations.
+
+    The values of the factor are the later pose (3,) and the earlier pose (3,).
+    """
+
+    measured: Array | None
+    sigmas: Array
+    offset: Increment | None = None
+    earlier_offset: Increment | None = None
+    robust: float = 3.0
+
+    @property
+    def rows(self) -> int:
+        """Number of residuals."""
+        return 2 if self.measured is None else 3
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened, robustly weighted residual (2,) or (3,), and its Jacobian by each pose."""
+        error, by_later, by_earlier = self.whitened(values)
+        weight = math.sqrt(geman_mcclure_weight(float(error @ error), self.robust))
+        return weight * error, [weight * by_later, weight * by_earlier]
+
+    def whitened(self, values: Sequence[Array]) -> tuple[Array, Array, Array]:
+        """Whitened residual, and its Jacobian by each pose, without robust weights."""
+        n = self.rows
+        found = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))
+        measured = _NOWHERE if self.measured is None else self.measured
+        moved = [_NOWHERE if o is None else o.delta for o in (self.offset, self.earlier_offset)]
+        _linearize(values[0], values[1], moved[0], moved[1], measured, self._whitener, *found)
+        return found
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """The robust loss."""
+        error, _, _ = self.whitened(values)
+        return float(geman_mcclure_loss(float(error @ error), self.robust))
+
+    def widened(self, width: float) -> LoopFactor:
+        """The factor with a robust loss that is ``width`` times as wide."""
+        return replace(self, robust=width * self.robust)
+
+    def convex_width(self, values: Sequence[Array]) -> float:
+        """How many times as wide the loss must be for its second derivative to be positive there, at least 1."""
+        error, _, _ = self.whitened(values)
+        return max(1.0, math.sqrt(3.0) * float(np.linalg.norm(error)) / self.robust)
+
+    @cached_property
+    def _whitener(self) -> Array:
+        """The whitener of the residual. What the odometry adds at one place has no known direction: the mean variance is added."""
+        spreads = [o.covariance for o in (self.offset, self.earlier_offset) if o is not None]
+        if self.measured is None:
+            added = sum(float(np.trace(spread[:2, :2])) / 2.0 for spread in spreads)
+            return np.eye(2) / math.sqrt(float(self.sigmas[0]) ** 2 + added)
+        noise = np.diag(np.asarray(self.sigmas, dtype=float) ** 2)
+        if self.offset is not None:
+            noise = noise + self.offset.covariance
+        if self.earlier_offset is not None:
+            back = se2.adjoint(se2.inverse(self.measured))
+            noise = noise + back @ self.earlier_offset.covariance @ back.T
+        return positive.whitener(noise)
+
+
+@numba.njit(cache=True)
+def _linearize(
+    later: Array,
+    earlier: Array,
+    offset: Array,
+    earlier_offset: Array,
+    measured: Array,
+    whitener: Array,
+    error: Array,
+    by_later: Array,
+    by_earlier: Array,
+) -> None:
+    x = _compose(later, offset)
+    rel = _between(_compose(earlier, earlier_offset), x)
+    derivative = np.zeros((len(error), 3))
+    if len(error) == 2:
+        residual = np.array((rel[0], rel[1]))
+        c, s = math.cos(rel[2]), math.sin(rel[2])
+        derivative[0, 0], derivative[0, 1], derivative[1, 0], derivative[1, 1] = c, -s, s, c
+    else:
+        off = _between(measured, rel)
+        residual = np.array(log(off[0], off[1], off[2]))
+        derivative[:] = np.linalg.inv(_right_jacobian(residual))
+    error[:] = whitener @ residual
+    whitened = whitener @ derivative
+    by_later[:] = whitened @ _adjoint(_between(offset, np.zeros(3)))
+    by_earlier[:] = -whitened @ _adjoint(_between(_compose(earlier_offset, rel), np.zeros(3)))
+
+
+@numba.njit(cache=True)
+def _compose(a: Array, b: Array) -> Array:
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return np.array((a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], wrapped(a[2] + b[2])))
+
+
+@numba.njit(cache=True)
+def _between(a: Array, b: Array) -> Array:
+    c, s = math.cos(a[2]), math.sin(a[2])
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    return np.array((c * dx + s * dy, c * dy - s * dx, wrapped(b[2] - a[2])))
+
+
+@numba.njit(cache=True)
+def _adjoint(pose: Array) -> Array:
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array(((c, -s, pose[1]), (s, c, -pose[0]), (0.0, 0.0, 1.0)))
+
+
+@numba.njit(cache=True)
+def _right_jacobian(xi: Array) -> Array:
+    angle = xi[2]
+    p, q = arc(angle)
+    r, s = (angle / 6.0, 0.5 - angle * angle / 24.0) if abs(angle) < 1e-4 else ((1.0 - p) / angle, q / angle)
+    return np.array(((p, q, r * xi[0] - s * xi[1]), (-q, p, s * xi[0] + r * xi[1]), (0.0, 0.0, 1.0)))
