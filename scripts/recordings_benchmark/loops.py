@@ -38,8 +38,8 @@ def section(options: Options) -> Report:
     assert options.data_root is not None
     report = Report("loops", options)
     report.say(
-        f"Aligned position RMSE [m] of the smoother's final trajectories. A loop is right if its places are less than {NEAR:g} m apart in the "
-        "reference, which the estimators do not see."
+        "Aligned position RMSE [m] of the smoother's final trajectories. A loop is right if its places are less than "
+        f"{NEAR:g} m apart in the reference, which no estimator sees."
     )
     jobs: list[Job] = []
     kept: list[tuple[str, float, int, int]] = []
