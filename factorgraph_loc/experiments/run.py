@@ -183,36 +183,27 @@ def run(
     )
 
 
+@dataclass
 class _CausalRun:
     """The causal part of a run."""
 
-    def __init__(
-        self,
-        guard: Guard,
-        estimator: Estimator,
-        log: Log,
-        sensors: tuple[str, ...],
-        prior: PosePrior | None,
-        ticks: Ticks,
-        progress: Callable[[float], None],
-        watch: Callable[[float, Estimator], None] | None,
-    ) -> None:
-        self._guard = guard
-        self._watch = watch
-        self._estimator = estimator
-        self._log = log
-        self._sensors = sensors
-        self._prior = prior
-        self._ticks = ticks
-        self._progress = progress
-        first, self._last = _span(log, sensors)
-        self._start = first if prior is None else prior.t
-        self._initialized = prior is None
-        self._reported = 0.0
+    guard: Guard
+    estimator: Estimator
+    log: Log
+    sensors: tuple[str, ...]
+    prior: PosePrior | None
+    ticks: Ticks
+    progress: Callable[[float], None]
+    watch: Callable[[float, Estimator], None] | None
+    estimates: list[PoseEstimate] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        first, self._last = _span(self.log, self.sensors)
+        self._start = first if self.prior is None else self.prior.t
+        self._initialized = self.prior is None
+        self._reported = self._seconds = 0.0
         self._update_t: list[float] = []
         self._update_s: list[float] = []
-        self._seconds = 0.0
-        self.estimates: list[PoseEstimate] = []
 
     def run(self) -> None:
         """Process all measurements and ticks."""
@@ -224,17 +215,17 @@ class _CausalRun:
                 continue
             self._reach(t)
             if t < self._start:
-                self._estimator.diagnostics.ignore("before the start", sum(1 for _ in group))
+                self.estimator.diagnostics.ignore("before the start", sum(1 for _ in group))
             else:
                 if not self._initialized:
                     self._initialize()
                 self._update(t, group)
         if not self._initialized:
             self._initialize()
-        for tick in self._ticks.rest():
+        for tick in self.ticks.rest():
             self._tick(tick)
         self._seconds = perf_counter() - started
-        self._progress(1.0)
+        self.progress(1.0)
 
     def timings(self, final_seconds: float, prepared: PreparedLog) -> Timings:
         """The times of the loop, of the preparation, and of the final trajectory."""
@@ -242,7 +233,7 @@ class _CausalRun:
             update_t=np.array(self._update_t),
             update_ms=np.array(self._update_s) * 1e3,
             causal_seconds=self._seconds,
-            real_time_factor=self._ticks.seconds / self._seconds,
+            real_time_factor=self.ticks.seconds / self._seconds,
             final_seconds=final_seconds,
             peak_memory_mb=_peak_memory_mb(),
             images=prepared.images,
@@ -250,59 +241,59 @@ class _CausalRun:
         )
 
     def _measurements(self) -> Iterator[Measurement]:
-        joined = getattr(self._estimator, "takes_rows", False)
-        return self._log.steps(self._sensors) if joined else self._log.measurements(self._sensors)
+        joined = getattr(self.estimator, "takes_rows", False)
+        return self.log.steps(self.sensors) if joined else self.log.measurements(self.sensors)
 
     def _reach(self, t: float) -> None:
         """What comes before a measurement at ``t``: the start, and ticks."""
         if not self._initialized and t > self._start:
             self._initialize()
-        for tick in self._ticks.before(t):
+        for tick in self.ticks.before(t):
             self._tick(tick)
 
     def _move(self, m: Measurement) -> None:
         """Take a row of motion; or some, cut where a tick is due."""
         if not isinstance(m, Rows):
             self._reach(m.t)
-            self._guard.process(self._estimator, m)
+            self.guard.process(self.estimator, m)
             return
         first, count = 0, m.count
         while first < count:
             self._reach(float(m.times[first]))
-            last = max(first + 1, int(m.times.searchsorted(self._ticks.due, "right")))
+            last = max(first + 1, int(m.times.searchsorted(self.ticks.due, "right")))
             part = m.part(first, last)
-            self._ticks.before(part.t)  # none, but it has come that far
-            self._guard.process(self._estimator, part)
+            self.ticks.before(part.t)  # none, but it has come that far
+            self.guard.process(self.estimator, part)
             first = last
 
     def _initialize(self) -> None:
-        assert self._prior is not None
+        assert self.prior is not None
         self._initialized = True
-        with self._guard.telling(f"the start at {self._prior.t:.3f} s"):
-            self._estimator.initialize(self._prior)
+        with self.guard.telling(f"the start at {self.prior.t:.3f} s"):
+            self.estimator.initialize(self.prior)
 
     def _update(self, t: float, measurements: Iterator[Measurement]) -> None:
         started = perf_counter()
         for m in measurements:
-            self._guard.process(self._estimator, m)
-        with self._guard.telling(f"the estimate at {t:.3f} s"):
-            sound(self._estimator.estimate())
+            self.guard.process(self.estimator, m)
+        with self.guard.telling(f"the estimate at {t:.3f} s"):
+            sound(self.estimator.estimate())
         self._update_s.append(perf_counter() - started)
         self._update_t.append(t)
 
     def _tick(self, t: float) -> None:
-        with self._guard.telling(f"the estimate at {t:.3f} s"):
-            e = sound(self._estimator.estimate(t))
-        self._guard.process(self._estimator, Tick(t))
+        with self.guard.telling(f"the estimate at {t:.3f} s"):
+            e = sound(self.estimator.estimate(t))
+        self.guard.process(self.estimator, Tick(t))
         # copies with the tick's time: an estimator may reuse its arrays, and an unlocalized estimate has no time
         self.estimates.append(
             PoseEstimate(t, np.array(e.pose, dtype=float), np.array(e.covariance, dtype=float), e.status, e.space)
         )
-        if self._watch is not None:
-            self._watch(t, self._estimator)
+        if self.watch is not None:
+            self.watch(t, self.estimator)
         share = (t - self._start) / max(self._last - self._start, 1e-9)
         if share >= self._reported:
-            self._progress(share)
+            self.progress(share)
             self._reported = share + 0.01
 
 

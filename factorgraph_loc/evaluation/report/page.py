@@ -7,6 +7,7 @@ unescaped string could not run. The same results give the same bytes.
 import base64
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from string import Template
@@ -107,30 +108,23 @@ def write_report(
     write_text(out, page.html(title, experiment or {}, versions or {}))
 
 
+@dataclass
 class _Page:
-    def __init__(
-        self,
-        results: Results,
-        metrics: Sequence[Metric],
-        baseline: str,
-        runs: Callable[[str], RunFiles],
-        damaged: Sequence[str],
-    ) -> None:
-        self._results = results
-        self._metrics = metrics
-        self._baseline = baseline
-        self._runs = runs
-        self._damaged = damaged
-        self._charts: list[charts.Chart] = []
-        self._sections: list[tuple[str, str]] = []
+    results: Results
+    metrics: Sequence[Metric]
+    baseline: str
+    runs: Callable[[str], RunFiles]
+    damaged: Sequence[str]
+    plotted: list[charts.Chart] = field(default_factory=list)
+    sections: list[tuple[str, str]] = field(default_factory=list)
 
     def html(self, title: str, experiment: Mapping[str, Any], versions: Mapping[str, str]) -> str:
-        results = self._results
-        drawn = read_runs(results, self._metrics[0].key, self._runs)
-        best = [results.compare(metric) for metric in self._metrics]
-        against = [results.compare(metric, self._baseline) for metric in self._metrics]
+        results = self.results
+        drawn = read_runs(results, self.metrics[0].key, self.runs)
+        best = [results.compare(metric) for metric in self.metrics]
+        against = [results.compare(metric, self.baseline) for metric in self.metrics]
         body = [
-            tag("section", summary(results, best, drawn.trust, self._damaged), class_="lead", id="summary"),
+            tag("section", summary(results, best, drawn.trust, self.damaged), class_="lead", id="summary"),
             self._overview(best),
             self._differences(against),
             self._by_log(),
@@ -150,21 +144,21 @@ class _Page:
             "drawn": drawn.logs,
             "shown": SHOWN,
             "errors": drawn.errors,
-            "charts": self._charts,
+            "charts": self.plotted,
         }
         held = join([data("page", content), data("config-texts", drawn.configs), *drawn.tracks])
-        return whole_page(title, self._sections, body, held, SCRIPTS)
+        return whole_page(title, self.sections, body, held, SCRIPTS)
 
     def _section(self, identity: str, name: str, *content: object) -> Html:
-        self._sections.append((identity, name))
+        self.sections.append((identity, name))
         return tag("section", tag("h2", name), *content, id=identity)
 
     def _figure(self, chart: charts.Chart, title: str, caption: str = "") -> Html:
-        self._charts.append(chart)
-        return figure(title, caption, data_chart=len(self._charts) - 1)
+        self.plotted.append(chart)
+        return figure(title, caption, data_chart=len(self.plotted) - 1)
 
     def _overview(self, best: Sequence[MetricComparison]) -> Html:
-        results = self._results
+        results = self.results
         several = len(results.logs) > 1
         over = "each log counted once" if several else "over the seeds"
         note = (
@@ -178,33 +172,33 @@ class _Page:
         return self._section("results", "Results", remark(note), tables.overview(results, best))
 
     def _differences(self, against: Sequence[MetricComparison]) -> Html | str:
-        if len(self._results.variants) < 2:
+        if len(self.results.variants) < 2:
             return ""
-        drawn = [(c, chart) for c in against if (chart := charts.ratios(self._results, c)) is not None]
+        drawn = [(c, chart) for c in against if (chart := charts.ratios(self.results, c)) is not None]
         figures = [self._figure(chart, c.metric.title) for c, chart in drawn]
         note = (
-            f"Each estimator minus {self._baseline}, paired by log and seed: the difference of the pooled figures, its 95 % "
+            f"Each estimator minus {self.baseline}, paired by log and seed: the difference of the pooled figures, its 95 % "
             "interval (or the range over logs), the p value of the signed-rank test after Holm's correction for the number of "
             "estimators in the column, and the effect: −1 if every log is below the baseline, +1 if every log is above. Grey: "
             "not significant, or not tested."
         )
         below = (
-            f"Log by log, as a multiple of {self._baseline}: a dot is a log, the bar the median over logs; left of 1 is less. "
+            f"Log by log, as a multiple of {self.baseline}: a dot is a log, the bar the median over logs; left of 1 is less. "
             "Grey: not significant."
         )
         return self._section(
             "differences",
-            f"Differences from {self._baseline}",
+            f"Differences from {self.baseline}",
             remark(note),
-            tables.differences(self._results, against),
+            tables.differences(self.results, against),
             remark(below),
             tag("div", *figures, class_="charts"),
         )
 
     def _by_log(self) -> Html:
         parts = [
-            tag("div", tag("h3", m.heading), tables.by_log(self._results, m), data_metric=m.heading)
-            for m in self._metrics
+            tag("div", tag("h3", m.heading), tables.by_log(self.results, m), data_metric=m.heading)
+            for m in self.metrics
         ]
         note = "The figure of each log, pooled over its seeds, and below it the range over them. ● best of the row."
         controls = tag("div", class_="controls")
@@ -213,12 +207,12 @@ class _Page:
     def _trajectories(self, drawn: RunData) -> Html | str:
         if not drawn.tracks:
             return ""
-        left = len(self._results.logs) - len(drawn.logs)
-        more = f" {left} of {len(self._results.logs)} logs are not drawn, to keep the page small." if left else ""
+        left = len(self.results.logs) - len(drawn.logs)
+        more = f" {left} of {len(self.results.logs)} logs are not drawn, to keep the page small." if left else ""
         note = (
             "Over walls (lines), tags (squares), landmarks (triangles), mapped points (dots) and the reference (broad grey). "
             "Drag to move; click, then scroll to zoom, or pinch; double-click for all. Of several seeds the one with the "
-            f"median {self._metrics[0].title} is drawn.{more}"
+            f"median {self.metrics[0].title} is drawn.{more}"
         )
         below = (
             "Below: position error (line) and twice the stated standard deviation in the direction in which it is largest "
@@ -258,9 +252,9 @@ class _Page:
 
     def _sweeps(self) -> Html | str:
         figures = []
-        for column in self._results.sweeps:
-            for metric in self._metrics[:_SWEPT]:
-                chart = charts.sweep(self._results, column, metric)
+        for column in self.results.sweeps:
+            for metric in self.metrics[:_SWEPT]:
+                chart = charts.sweep(self.results, column, metric)
                 if chart is not None:
                     figures.append(self._figure(chart, f"{metric.title} over {column.removeprefix(SWEEP)}"))
         if not figures:
@@ -269,7 +263,7 @@ class _Page:
         return self._section("sweeps", "Sweeps", remark(note), tag("div", *figures, class_="charts"))
 
     def _consistency(self, drawn: RunData) -> Html | str:
-        chart = charts.consistency(self._results, drawn.trust, drawn.nees)
+        chart = charts.consistency(self.results, drawn.trust, drawn.nees)
         if chart is None:
             return ""
         note = (
@@ -283,29 +277,29 @@ class _Page:
         return self._section("consistency", "Consistency", remark(note), self._figure(chart, "Causal ANEES", caption))
 
     def _times(self) -> Html | str:
-        found = _known(self._results, tables.TIMINGS, whole=False)
+        found = _known(self.results, tables.TIMINGS, whole=False)
         if not found:
             return ""
         note = (
             "Median over runs, and least … most. Wall-clock times of the machine that ran them: take ratios. An update is one "
             "stamp with a measurement of the surroundings; an estimator that waits for the end of the log has none."
         )
-        drawn = [(m, chart) for m in found[:1] if (chart := charts.times(self._results, m)) is not None]
+        drawn = [(m, chart) for m in found[:1] if (chart := charts.times(self.results, m)) is not None]
         figures = [self._figure(chart, m.title, "A dot is a log, the bar the median over logs.") for m, chart in drawn]
-        return self._section("times", "Times", remark(note), tables.timing(self._results, found), *figures)
+        return self._section("times", "Times", remark(note), tables.timing(self.results, found), *figures)
 
     def _warnings(self) -> Html | str:
-        if not by_text(self._results.rows):
+        if not by_text(self.results.rows):
             return ""
         note = "Warnings of the runs about logs, rigs and settings that may affect the results."
-        return self._section("warnings", "Warnings", remark(note), tables.warnings(self._results))
+        return self._section("warnings", "Warnings", remark(note), tables.warnings(self.results))
 
     def _failures(self) -> Html | str:
-        count = sum(row["status"] != "ok" for row in self._results.rows)
+        count = sum(row["status"] != "ok" for row in self.results.rows)
         if not count:
             return ""
-        note = f"{count} of {len(self._results.rows)} runs failed, and are excluded from all figures."
-        return self._section("failures", "Failures", remark(note), tables.failures(self._results))
+        note = f"{count} of {len(self.results.rows)} runs failed, and are excluded from all figures."
+        return self._section("failures", "Failures", remark(note), tables.failures(self.results))
 
     def _repeat(self, experiment: Mapping[str, Any], versions: Mapping[str, str], drawn: RunData) -> Html:
         parts: list[object] = []
