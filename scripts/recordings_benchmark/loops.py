@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from benchmarking.report import Options, Report
-from factorgraph_loc.evaluation.alignment import align
 
-from factorgraph_loc.evaluation.pairing import pairs
+from factorgraph_loc.evaluation.pairing import align, pairs
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.loops.measurement import LoopStream

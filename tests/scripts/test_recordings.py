@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from recordings_benchmark import loops
 from recordings_benchmark.listed import RECORDINGS, File, Recording, commands
 from recordings_benchmark.prepare import KINDS, prepare
 from recordings_benchmark.recordings import Job, measured
@@ -79,3 +80,14 @@ def test_a_file_that_is_missing_is_said_in_a_line_for_every_estimator(tmp_path):
         prepare(one, tmp_path, tmp_path)
     found = measured(Job(one, tmp_path, tmp_path))
     assert set(found.scores.values()) == {"in.txt: is missing, scripts/bench_recordings --fetch prints how to fetch it"}
+
+
+def test_loops_of_a_drive_and_which_of_them_are_right(tmp_path, monkeypatch):
+    lines = [f"odom2 {i} {float(i > 0)} 0 0 0.0025 0.0025 0.0001" for i in range(9)]
+    lines += [f"point2 {i} {i} 0 0 0 0 0" for i in range(9)] + ["loop 8 0 0.5", "loop 4.5 4 0.9"]
+    (tmp_path / "in.txt").write_text("\n".join(lines))
+    monkeypatch.setattr(loops, "RECORDINGS", (recording("librsf", "in.txt"),))
+    log, near = loops.log_of("one", tmp_path, tmp_path / "logs")
+    assert near.tolist() == [False, True]
+    for keep in (near, ~near):
+        assert loops.aligned_error(loops.Job(loops.chosen(log, keep), "smoother")) < 0.1
