@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ from factorgraph_loc.cli.app import app
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "scripts"))
 
-from page_commands import commands, runnable  # noqa: E402
+from page_commands import commands, runnable, tables  # noqa: E402
 
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -86,6 +87,25 @@ $ fgloc info no-command
 """
     assert commands(page) == ["fgloc info hall/", "fgloc info hall/office-1", "pip install 'factorgraph-loc[ros]'"]
     assert runnable(page) == ["fgloc info hall/office-1"]
+
+
+def test_a_tutorial_is_done_with_its_files_and_its_python(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "```console\n$ mkdir inside\n$ cd inside\n```\n```toml\n# cart.rig.toml\nname = 'cart'\n```\n```toml\nno = 'file'\n```\n"
+        "```python\nfrom pathlib import Path\nPath('copy').write_text(Path('cart.rig.toml').read_text())\n```\n"
+        "```console\n$ cat copy > again\n```\n"
+    )
+    command = [sys.executable, str(ROOT / "scripts/run_tutorial"), str(page)]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert (tmp_path / "inside/again").read_text() == "# cart.rig.toml\nname = 'cart'\n"
+    assert sorted(path.name for path in (tmp_path / "inside").iterdir()) == ["again", "cart.rig.toml", "copy"]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_blocks_of_toml_are_toml(page):
+    for block in tables(page.read_text()):
+        tomllib.loads(block)
 
 
 def test_a_tutorial_ends_with_the_command_that_fails(tmp_path):
