@@ -2,6 +2,7 @@
 files."""
 
 __all__ = [
+    "between",
     "camera",
     "chain",
     "chi_squared",

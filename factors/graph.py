@@ -7,6 +7,7 @@ variables, and an exception in a callback leaves iSAM2 in an inconsistent state.
 
 import math
 from collections.abc import Callable, Hashable, Sequence
+from functools import lru_cache
 from typing import Any, Protocol, runtime_checkable
 
 import gtsam
@@ -70,8 +71,13 @@ def jacobian_factor(factor: Factor, keys: Sequence[int], values: Sequence[Array]
     """``factor`` linearised at ``values``."""
     residual, blocks = factor.linearize(values)
     arguments: list[Any] = [part for pair in zip(keys, blocks, strict=True) for part in pair]
-    arguments += [-residual, gtsam.noiseModel.Unit.Create(len(residual))]
+    arguments += [-residual, _unit(len(residual))]
     return gtsam.JacobianFactor(*arguments)
+
+
+@lru_cache(maxsize=256)
+def _unit(size: int) -> gtsam.noiseModel.Unit:
+    return gtsam.noiseModel.Unit.Create(size)
 
 
 class PriorFactor:
@@ -116,16 +122,21 @@ class _Silenced:
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         try:
             residual, blocks = self._factor.linearize(values)
-            _check(residual, blocks, self._rows, [len(value) for value in values])
+            _check(residual, blocks, self._rows, values)
         except (ValueError, FloatingPointError, np.linalg.LinAlgError) as failure:
             self._on_failure(str(failure))
             return np.zeros(self._rows), [np.zeros((self._rows, len(value))) for value in values]
         return residual, blocks
 
 
-def _check(residual: Array, blocks: Sequence[Array], rows: int, dimensions: Sequence[int]) -> None:
-    if residual.shape != (rows,) or [b.shape for b in blocks] != [(rows, d) for d in dimensions]:
+def _check(residual: Array, blocks: Sequence[Array], rows: int, values: Sequence[Array]) -> None:
+    if residual.shape != (rows,) or [b.shape for b in blocks] != [(rows, len(value)) for value in values]:
         raise ValueError(f"shapes {residual.shape}, {[b.shape for b in blocks]}, expected {rows} rows")
-    # the sum is not finite if any value is not
-    if not math.isfinite(float(residual.sum()) + sum(float(b.sum()) for b in blocks)):
+    # a product with zeros is not a number if any value is not finite
+    if not math.isfinite(sum([np.vdot(part, _zeros(part.size)) for part in (residual, *blocks)])):
         raise ValueError("a residual or Jacobian is not finite")
+
+
+@lru_cache(maxsize=256)
+def _zeros(size: int) -> Array:
+    return np.zeros(size)

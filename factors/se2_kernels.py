@@ -38,6 +38,20 @@ def log(x: float, y: float, heading: float) -> tuple[float, float, float]:
 
 
 @numba.njit(cache=True)
+def composed(x: float, y: float, heading: float, dx: float, dy: float, turned: float) -> tuple[float, float, float]:
+    """The pose (dx, dy, turned) in the frame of another one."""
+    c, s = math.cos(heading), math.sin(heading)
+    return x + c * dx - s * dy, y + s * dx + c * dy, wrapped(heading + turned)
+
+
+@numba.njit(cache=True)
+def related(x: float, y: float, heading: float, to_x: float, to_y: float, to: float) -> tuple[float, float, float]:
+    """The pose (to_x, to_y, to) as seen from another one."""
+    c, s, dx, dy = math.cos(heading), math.sin(heading), to_x - x, to_y - y
+    return c * dx + s * dy, c * dy - s * dx, wrapped(to - heading)
+
+
+@numba.njit(cache=True)
 def moved(pose: Array, twist: Array) -> Array:
     """The pose (3,) moved by a twist in its own frame, of which the first three components are read."""
     x, y, turned = exp(twist[0], twist[1], twist[2])

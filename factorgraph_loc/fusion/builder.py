@@ -130,8 +130,7 @@ class Builder:
         if t - graph.newest.t >= self._settings.keyframe_max_interval:
             self._add_keyframe(t, None)
         before = graph.before(t)
-        since = graph.motion.relative(before.odometry, graph.motion.state(t))
-        graph.ticks.append(TickAt(t, before.index, since))
+        graph.ticks.append(TickAt(t, before.index, graph.motion.state(t)))
 
     def take(self, m: Measurement) -> bool:
         """Take a measurement; False where it is too late."""

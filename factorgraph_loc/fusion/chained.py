@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
+from functools import cache
+from typing import cast
 
 import numpy as np
 
@@ -104,9 +106,10 @@ class Chained:
         stacks: list[Stack] = []
         for placed in kinds.values():
             first, keys = placed[0]
-            if _kind(first, keys) is None or not isinstance(first, Stackable):
+            if _kind(first, keys) is None:
                 stacks.append(_Others(placed, place, self._columns))
                 continue
+            assert isinstance(first, Stackable)
             numbers = [place[keys[0]] for _, keys in placed]
             column = next((self._columns[key].start for key in keys if key in self._columns), 0)
             stacks.append(first.stack([factor for factor, _ in placed], numbers, column))
@@ -115,8 +118,14 @@ class Chained:
 
 def _kind(factor: Factor, keys: tuple[int, ...]) -> Hashable:
     """What factors have in common that are linearised by one call, None for those that are not."""
-    kind = factor.kind if isinstance(factor, Stackable) else None
-    return None if kind is None else (type(factor), kind, *(key for key in keys if not is_pose(key)))
+    kind = cast(Stackable, factor).kind if _is_stackable(type(factor)) else None
+    return None if kind is None else (type(factor), kind, *[key for key in keys if not is_pose(key)])
+
+
+@cache
+def _is_stackable(kind: type[Factor]) -> bool:
+    """Whether factors of a class become stacks; to ask that of each factor takes longer than to linearise it."""
+    return hasattr(kind, "kind") and hasattr(kind, "stack")
 
 
 class _Others:

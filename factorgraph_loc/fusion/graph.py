@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.fusion.graph_parts import Keyframe, TickAt, between_keyframes
+from factorgraph_loc.fusion.graph_parts import Keyframe, TickAt
 from factorgraph_loc.fusion.kept import Kept
 from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.mapping import Mapper
@@ -36,10 +36,14 @@ from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import NewVariable, Sensor, Term
-from factors import se2
+from factors import se2, se2_kernels
+from factors.between import between
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
-from factors.motion import Increment
+from factors.motion import ChainState, Increment
 from factors.se2 import Array
+
+STATE = len(ChainState._fields)
+NOTHING_KNOWN = np.zeros(0)  # of constants, where none are estimated
 
 
 class Graph:
@@ -122,6 +126,15 @@ class Graph:
         delta = se2.exp(share * se2.log(step.delta))
         return Increment(delta, share * step.covariance, share * step.duration, share * step.still)
 
+    def moved(self, t: float) -> tuple[Array, Array, Array]:
+        """The newest pose (3,), moved along the odometry to ``t`` if that is later, with its covariance (3, 3) in the body frame
+        and in the world frame."""
+        newest = self.newest
+        if t <= newest.t:
+            return self.pose, self.covariance, se2_kernels.body_to_world(self.pose, self.covariance)
+        start = newest.odometry if self._anchored else self.motion.state(newest.t)
+        return self.motion.moved(start, t, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
+
     def recalibrated(self, increment: Increment) -> Increment:
         """An increment under the constants of the odometry."""
         key = self.keys.get(MOTION)
@@ -156,7 +169,9 @@ class Graph:
         keys: tuple[int, ...] = (pose_key(keyframe.index - 1), keyframe.key)
         if MOTION in self.keys:
             keys = (*keys, self.keys[MOTION])
-        return self.motion.factor(keyframe.from_previous), keys
+        if keyframe.factor is None:
+            keyframe.factor = self.motion.factor(keyframe.from_previous)
+        return keyframe.factor, keys
 
     def learnt(self) -> Learnt:
         """The constants and landmarks that are estimated."""
@@ -289,11 +304,19 @@ class Graph:
         return f"the landmark {name.partition('/')[2]}" if is_landmark(key) else f"the constants of the {name}"
 
     def between(self, poses: Array, covariances: Array) -> Trajectory:
-        """The trajectory at the ticks from all keyframes: ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3)."""
-        _, *later = self.keyframes
-        steps = [self.recalibrated(k.from_previous) for k in later if k.from_previous is not None]
-        first = self.keyframes.first
-        ticks = [
-            replace(tick, keyframe=tick.keyframe - first, since=self.recalibrated(tick.since)) for tick in self.ticks
-        ]
-        return between_keyframes(ticks, steps, poses, covariances)
+        """The trajectory at the ticks from all keyframes: ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3); see
+        :func:`factors.between.between`."""
+        newest = {tick.t: tick for tick in self.ticks}
+        ticks, keyframes, first = [newest[t] for t in sorted(newest)], list(self.keyframes), self.keyframes.first
+        before = np.array([tick.keyframe - first for tick in ticks], dtype=np.int64)
+        ends = np.array([tick.odometry for tick in ticks]).reshape(-1, STATE)
+        starts = np.array([k.odometry for k in keyframes]).reshape(-1, STATE)[before]
+        deltas, noises = self.motion.relatives(starts, ends, self.value(MOTION, NOTHING_KNOWN))
+        steps = [self.recalibrated(k.from_previous) for k in keyframes[1:] if k.from_previous is not None]
+        later = (
+            np.array([step.delta for step in steps]).reshape(-1, 3),
+            np.array([step.covariance for step in steps]).reshape(-1, 3, 3),
+            np.array([step.duration for step in steps]),
+        )
+        at, spread = between(before, deltas, noises, np.abs(ends[:, 0] - starts[:, 0]), *later, poses, covariances)
+        return Trajectory(np.array([tick.t for tick in ticks]), at, se2.body_to_world(at, spread))

@@ -31,7 +31,7 @@ from factorgraph_loc.plugins import MAPPERS
 from factorgraph_loc.sensors.base import bound_motion, bound_sensors
 from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
 from factors import se2
-from factors.motion import Increment, propagate
+from factors.motion import Increment
 from factors.se2 import Array
 
 # m, m, rad: nothing is known of a start, or of where a robot is carried; the sightings that told the place come in as factors
@@ -141,9 +141,9 @@ class GraphEstimator(ABC):
             if not modes:
                 return PoseEstimate(at, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
             return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
-        pose, covariance = self._pose_at(at)
+        pose, _, covariance = graph.moved(at)
         status: Status = "ambiguous" if self._search.doubts else "localized"
-        return PoseEstimate(at, pose, se2.body_to_world(pose, covariance), status)
+        return PoseEstimate(at, pose, covariance, status)
 
     def belief(self, t: float | None = None) -> Belief:
         """The belief behind :meth:`estimate`; before the start all places that what was seen allows, and the particles of a search
@@ -176,14 +176,6 @@ class GraphEstimator(ABC):
             graph.keyframes[-1].nodes += self._builder.waiting()
             self._conclusion = _Conclusion(graph, *self._backend.final(graph))
         return self._conclusion
-
-    def _pose_at(self, t: float) -> tuple[Array, Array]:
-        """The newest pose (3,) with its body-frame covariance (3, 3), moved along the odometry to ``t``."""
-        graph = self._graph
-        if t <= graph.newest.t:
-            return graph.pose, graph.covariance
-        since = graph.since(graph.newest, t)
-        return se2.compose(graph.pose, since.delta), propagate(graph.covariance, since)
 
     def _drop_late(self, m: Measurement) -> None:
         if not isinstance(m, Tick):
@@ -238,7 +230,7 @@ class GraphEstimator(ABC):
 
     def _doubt(self, m: Measurement) -> None:
         """See whether what is seen refutes the track, and go on at the place that it tells."""
-        pose, covariance = self._pose_at(m.t)
+        pose, covariance, _ = self._graph.moved(m.t)
 
         def back(t: float, here: Array) -> Array:
             return self._placed(t, PosePrior(m.t, here, covariance))

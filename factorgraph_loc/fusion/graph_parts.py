@@ -1,19 +1,16 @@
-"""What a graph estimator is made of: its settings, keyframes, what a measurement adds, and the trajectory between keyframes."""
+"""What a graph estimator is made of: its settings, keyframes, what a measurement adds, and where the trajectory is wanted."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
-import numpy as np
 from pydantic import Field, PlainSerializer, ValidatorFunctionWrapHandler, WrapValidator
 
 from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.fusion.variables import Node, Values, pose_key
 from factorgraph_loc.model.setup import MapUse
-from factorgraph_loc.model.trajectory import Trajectory
-from factors import se2
-from factors.motion import ChainState, Increment, propagate
+from factors.graph import Factor
+from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
 
@@ -67,6 +64,7 @@ class Keyframe:
     t: float
     odometry: ChainState
     from_previous: Increment | None
+    factor: Factor | None = None  # of the odometry from the one before, once it was asked for
     nodes: list[Node] = field(default_factory=list)
 
     @property
@@ -85,36 +83,9 @@ class Addition:
     values: Values = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class TickAt:
-    """A stamp at which the trajectory is wanted, and the motion to it from the keyframe before, as the odometry reports it."""
+class TickAt(NamedTuple):
+    """A stamp at which the trajectory is wanted, the keyframe before it, and the odometry there."""
 
     t: float
     keyframe: int
-    since: Increment
-
-
-def between_keyframes(
-    ticks: Sequence[TickAt], steps: Sequence[Increment], poses: Array, covariances: Array
-) -> Trajectory:
-    """The trajectory at ``ticks`` from M keyframes: ``poses`` (M, 3), body-frame ``covariances`` (M, 3, 3), M-1 ``steps`` between.
-
-    A tick between two keyframes follows the odometry from the earlier one; what then misses the later one is spread in
-    proportion to time. The covariance goes linearly from one to the other, plus that of a bridge pinned at both ends.
-    """
-    newest: dict[float, TickAt] = {tick.t: tick for tick in ticks}
-    kept = [newest[t] for t in sorted(newest)]
-    at = np.empty((len(kept), 3))
-    spread = np.empty((len(kept), 3, 3))
-    for i, tick in enumerate(kept):
-        k = tick.keyframe
-        at[i] = se2.compose(poses[k], tick.since.delta)
-        spread[i] = propagate(covariances[k], tick.since)
-        if k < len(steps):
-            whole = steps[k]
-            share = tick.since.duration / whole.duration
-            missed = se2.log(se2.between(se2.compose(poses[k], whole.delta), poses[k + 1]))
-            at[i] = se2.compose(at[i], se2.exp(share * missed))
-            bridge = share * (1.0 - share) * whole.covariance
-            spread[i] = (1.0 - share) * covariances[k] + share * covariances[k + 1] + bridge
-    return Trajectory(np.array([tick.t for tick in kept]), at, se2.body_to_world(at, spread))
+    odometry: ChainState

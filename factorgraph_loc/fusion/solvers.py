@@ -254,6 +254,8 @@ class _Ours:
 class _Linear:
     """One of our factors, and its slot in the solver."""
 
+    __slots__ = ("node", "slot")
+
     def __init__(self, node: Node) -> None:
         self.node, self.slot = node, -1
 

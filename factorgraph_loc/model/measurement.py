@@ -189,6 +189,15 @@ class Motion(Protocol):
     def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
         """The state at ``t``, and the relative motion from ``start`` to it."""
 
+    def moved(
+        self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array
+    ) -> tuple[Array, Array, Array]:
+        """A pose (3,) with body-frame ``covariance`` (3, 3) at ``start``, moved to ``t``, for ``constants`` (P,): the pose, and its
+        covariance in the body frame and in the world frame."""
+
+    def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
+        """The relative motions between states (N, 8), for ``constants`` (P,): poses (N, 3) and covariances (N, 3, 3)."""
+
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
         """Corrected ``delta`` (3,) of an increment for ``constants`` (P,), and its Jacobian (3, P) in the tangent space."""
 

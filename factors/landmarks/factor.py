@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from factors import se2
 from factors.displaced import carried, common_error, delayed, displaced
-from factors.landmarks import kernels
+from factors.landmarks import kernels, update_kernels
 from factors.landmarks.model import (
     EXACT,
     PARAMETERS,
@@ -20,11 +21,13 @@ from factors.landmarks.model import (
     packed,
     recalibrated,
     whitened_all,
+    widened,
 )
 from factors.landmarks.stack import BearingRangeStack
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array, Integers
 
+NOTHING = np.zeros(0)  # values of constants, where none are estimated
 _NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # for a look without offset or without its covariance
 LEAST_TOLD = 1e-6  # minimum singular value of a Jacobian by a landmark, absolute [1/m] and relative to the largest one
 
@@ -56,6 +59,12 @@ class BearingRangeFactor:
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
+        plain = self.packed()
+        if plain is not None:
+            seen = self.points, self.ranges, self.bearings
+            held = values[1] if self.estimated else NOTHING
+            residual, by_pose, by_sensor = update_kernels.weighted(plain[0], *seen, values[0], held, plain[1])
+            return residual, [by_pose, by_sensor] if self.estimated else [by_pose]
         if not self.free:
             found = self._compiled(values)
             kernels.weigh(*found, self.model.robust)
@@ -86,6 +95,13 @@ class BearingRangeFactor:
         seen = self.points, self.ranges, self.bearings
         kernels.linearize(self.packed_model, values[0], changes, *seen, self.carried, spreads, *found)
         return found
+
+    def count_beyond(self, limit: float, pose: Array, covariance: Array) -> int:
+        """How many of the landmarks of a factor on the pose only have a normalised innovation squared above ``limit`` at the
+        predicted ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
+        spreads = EXACT if self.point_covariances is None else self.point_covariances
+        seen = self.points, self.ranges, self.bearings, self.carried, spreads
+        return int(kernels.beyond(self.packed_model, pose, *seen, np.ascontiguousarray(covariance), limit))
 
     def _of_values(self, error: Array, by_pose: Array, by_sensor: Array) -> list[Array]:
         """The residual, and the Jacobians by the values of the factor."""
@@ -126,7 +142,7 @@ class BearingRangeFactor:
 
     def widened(self, width: float) -> BearingRangeFactor:
         """The factor with a robust loss that is ``width`` times as wide."""
-        return replace(self, model=replace(self.model, robust=width * self.model.robust))
+        return replace(self, model=widened(self.model, width))
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
@@ -158,19 +174,19 @@ class BearingRangeFactor:
             return self
         model, offset = self.model, self.offset
         if parameters:
-            changes = np.zeros(len(PARAMETERS))
-            changes[list(self.estimated)] = parameters[0]
-            model = recalibrated(model, changes)
-            offset = delayed(offset, self.twist, float(changes[TIME_OFFSET]))
+            changes = dict(zip(self.estimated, parameters[0].tolist(), strict=True))
+            model = recalibrated(model, [changes.get(i, 0.0) for i in range(len(PARAMETERS))])
+            offset = delayed(offset, self.twist, changes.get(TIME_OFFSET, 0.0))
+        spreads, seen = (self.offset_covariance, self.point_covariances), (self.ranges, self.bearings)
         points = self.points if point is None else point[None]
-        return replace(self, model=model, points=points, offset=offset, estimated=(), free=False)
+        return BearingRangeFactor(model, points, *seen, offset, *spreads, twist=self.twist, in_look=self.in_look)
 
     def packed(self) -> tuple[Array, Integers] | None:
         """Model (11,) and places (P,) of the estimated constants, as compiled code takes them; None where the landmarks were not
         seen at the pose's time, or are not exactly where they stand."""
         if self.offset is not None or self.point_covariances is not None or self.free or self.twist is not None:
             return None
-        return packed(self.model), np.array(self.estimated, dtype=np.int64)
+        return packed(self.model), _places(self.estimated)
 
     def dof(self) -> int:
         """Number of measured ranges and bearings."""
@@ -189,6 +205,11 @@ class BearingRangeFactor:
         # the whitened residual stays zero: by_value dv + by_point dp = noise
         to_point = _inverse(blocks[-1][0])
         return point, [-to_point @ block[0] for block in blocks[:-1]], to_point @ to_point.T
+
+
+@lru_cache(maxsize=64)
+def _places(estimated: tuple[int, ...]) -> Integers:
+    return np.array(estimated, dtype=np.int64)
 
 
 def _inverse(by_point: Array) -> Array:

@@ -95,6 +95,39 @@ def weigh(error: Array, by_pose: Array, by_sensor: Array, robust: float) -> None
         by_sensor[k] *= root
 
 
+@numba.njit(cache=True, error_model="numpy")
+def beyond(
+    model: Model,
+    pose: Array,
+    points: Array,
+    ranges: Array,
+    bearings: Array,
+    carried: Carried,
+    spreads: Array,
+    covariance: Array,
+    limit: float,
+) -> int:
+    """How many landmarks have a normalised innovation squared above ``limit``, seen from a pose with body-frame ``covariance``
+    (3, 3)."""
+    count = len(points)
+    error, by_pose, by_sensor = np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros((count, 2, TIME_OFFSET + 1))
+    changes = np.zeros(TIME_OFFSET + 1)
+    linearize(model, pose, changes, points, ranges, bearings, carried, spreads, error, by_pose, by_sensor)
+    found = 0
+    for k in range(count):
+        a, b, c = 1.0, 0.0, 1.0
+        for i in range(3):
+            for j in range(3):
+                a += by_pose[k, 0, i] * covariance[i, j] * by_pose[k, 0, j]
+                b += by_pose[k, 0, i] * covariance[i, j] * by_pose[k, 1, j]
+                c += by_pose[k, 1, i] * covariance[i, j] * by_pose[k, 1, j]
+        x, y = error[k, 0], error[k, 1]
+        # rounding may take all of the difference, which is never less than that
+        determinant = max(a * c - b * b, 0.5 * (a + c))
+        found += (c * x * x - 2.0 * b * x * y + a * y * y) / determinant > limit
+    return found
+
+
 @numba.njit(cache=True)
 def linearize_all(
     model: Model,

@@ -7,7 +7,9 @@ Gaussian with the robust loss of Geman and McClure, jointly for range and bearin
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numba
 import numpy as np
@@ -131,16 +133,27 @@ def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Arr
     return error
 
 
-def recalibrated(model: BearingRangeModel, parameters: Array) -> BearingRangeModel:
+def recalibrated(model: BearingRangeModel, parameters: Sequence[float]) -> BearingRangeModel:
     """The model with corrections (6,) of :data:`PARAMETERS`: relative for the range scale; the time offset is ignored."""
-    x, y, bearing_bias, range_scale, depth_axis = _constants(model, parameters).tolist()
-    return replace(
-        model,
-        mounting=(x, y, model.mounting[2]),
-        bearing_bias=bearing_bias,
-        range_scale=range_scale,
-        depth_axis=depth_axis,
+    x, y, bearing_bias, range_scale, depth_axis, _ = parameters
+    m = model
+    return BearingRangeModel(
+        (m.mounting[0] + x, m.mounting[1] + y, m.mounting[2]),
+        m.range_scale * (1.0 + range_scale),
+        m.depth,
+        m.depth_axis + depth_axis,
+        m.range_sigma,
+        m.range_sigma_relative,
+        m.bearing_bias + bearing_bias,
+        m.bearing_sigma,
+        m.robust,
     )
+
+
+@lru_cache(maxsize=64)
+def widened(model: BearingRangeModel, width: float) -> BearingRangeModel:
+    """The model with a robust loss that is ``width`` times as wide."""
+    return replace(model, robust=width * model.robust)
 
 
 def _constants(model: BearingRangeModel, parameters: Array) -> Array:

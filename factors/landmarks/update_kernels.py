@@ -9,7 +9,8 @@ import numba
 import numpy as np
 
 from factors.landmarks.model import BEARING_SIGMA, DEPTH, PARAMETERS, RANGE_SIGMA, RELATIVE, ROBUST, TURN, whitened_into
-from factors.positive_kernels import inverse, root
+from factors.positive_kernels import inverse
+from factors.positive_kernels import root as lower_root
 from factors.robust import geman_mcclure_weight
 from factors.se2 import Array, Integers
 from factors.se2_kernels import exp
@@ -76,8 +77,30 @@ def updated(
         for k in range(count):
             weights[k] = geman_mcclure_weight(now[k, 0] ** 2 + now[k, 1] ** 2, model[ROBUST])
         there, delta, after, _ = _solved(prior, now, jacobian, columns, weights, before)
-    there = there and bool(np.all(np.isfinite(delta))) and root(after)[1]
+    there = there and bool(np.all(np.isfinite(delta))) and lower_root(after)[1]
     return there, delta, after, residual, max(0.0, nis), measured
+
+
+@numba.njit(cache=True, error_model="numpy")
+def weighted(
+    model: Array, points: Array, ranges: Array, bearings: Array, pose: Array, values: Array, indices: Integers
+) -> tuple[Array, Array, Array]:
+    """Whitened, robustly weighted residual (2K,) and its Jacobians by the pose (2K, 3) and by the constants (2K, P); arguments as
+    of :func:`updated`."""
+    count, wide = len(points), len(indices)
+    residual, jacobian = np.empty((count, 2)), np.empty((count, 2, 3 + wide))
+    _linearized(model, (points, ranges, bearings), pose, values, indices, residual, jacobian)
+    out, by_pose, by_values = np.empty(2 * count), np.empty((2 * count, 3)), np.empty((2 * count, wide))
+    for k in range(count):
+        root = math.sqrt(geman_mcclure_weight(residual[k, 0] ** 2 + residual[k, 1] ** 2, model[ROBUST]))
+        for i in range(2):
+            row = 2 * k + i
+            out[row] = root * residual[k, i]
+            for j in range(3):
+                by_pose[row, j] = root * jacobian[k, i, j]
+            for j in range(wide):
+                by_values[row, j] = root * jacobian[k, i, 3 + j]
+    return out, by_pose, by_values
 
 
 @numba.njit(cache=True, error_model="numpy")

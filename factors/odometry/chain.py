@@ -14,9 +14,11 @@ import numpy as np
 
 from factors import se2
 from factors.motion import ChainState, Increment
-from factors.odometry.kernels import State, relative
+from factors.odometry.kernels import State, carried, recalibrated, relative, relatives
 from factors.odometry.model import OdometryModel, composed
-from factors.se2 import Array
+from factors.se2 import Array, Integers
+from factors.se2_kernels import body_to_world
+from factors.se2_kernels import composed as one_composed
 
 # columns of a row: time of its effect, its kind, and its values
 _ROW = 5
@@ -120,6 +122,21 @@ class OdometryChain:
         known = self._knots, self._count, self._constants, self._noise
         end, delta, covariance, duration, still = _travelled(*known, tuple(start), t)
         return ChainState(*end), Increment(delta, covariance, duration, still)
+
+    def moved(
+        self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array, indices: Integers
+    ) -> tuple[Array, Array, Array]:
+        """A pose (3,) at ``start``, moved to ``t`` under changed ``constants`` (P,): the pose there, and its body-frame and world
+        covariances, from its body-frame ``covariance`` (3, 3)."""
+        known = self._knots, self._count, self._constants, self._noise
+        at, body, world = _moved(*known, tuple(start), t, pose, covariance, constants, indices)
+        return at, body, world
+
+    def relatives(self, starts: Array, ends: Array, constants: Array, indices: Integers) -> tuple[Array, Array]:
+        """The motions between states (N, 8), see :meth:`states`, under changed ``constants`` (P,): poses (N, 3) and covariances
+        (N, 3, 3)."""
+        deltas, covariances = relatives(self._noise, starts, ends, constants, indices)
+        return deltas, covariances
 
     def _insert(self, *row: float) -> bool:
         t = row[0]
@@ -320,6 +337,27 @@ def _travelled(
     end = _state(knots, count, t, constants)
     delta, covariance, duration, still = relative(noise, start, end)
     return end, delta, covariance, duration, still
+
+
+@numba.njit(cache=True)
+def _moved(
+    knots: Array,
+    count: int,
+    chain: Array,
+    noise: Array,
+    start: State,
+    t: float,
+    pose: Array,
+    covariance: Array,
+    constants: Array,
+    indices: Integers,
+) -> tuple[Array, Array, Array]:
+    delta, spread, duration, still = relative(noise, start, _state(knots, count, t, chain))
+    if len(indices):
+        delta = recalibrated(delta, duration - still, constants, indices)
+    at = np.array(one_composed(pose[0], pose[1], pose[2], delta[0], delta[1], delta[2]))
+    body = carried(covariance, delta, spread)
+    return at, body, body_to_world(at, body)
 
 
 @numba.njit(cache=True)

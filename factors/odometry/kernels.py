@@ -48,6 +48,21 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
 
 
 @numba.njit(cache=True)
+def relatives(noise: Array, starts: Array, ends: Array, constants: Array, indices: Integers) -> tuple[Array, Array]:
+    """:func:`relative` for states (N, 8): poses (N, 3), :func:`recalibrated` by ``constants`` (P,), and covariances (N, 3, 3)."""
+    count = len(starts)
+    deltas, covariances = np.empty((count, 3)), np.empty((count, 3, 3))
+    for k in range(count):
+        a, b = starts[k], ends[k]
+        start, end = (a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7]), (b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7])
+        delta, covariance, duration, still = relative(noise, start, end)
+        if len(indices):
+            delta = recalibrated(delta, duration - still, constants, indices)
+        deltas[k], covariances[k] = delta, covariance
+    return deltas, covariances
+
+
+@numba.njit(cache=True)
 def carried(covariance: Array, delta: Array, noise: Array) -> Array:
     """The body-frame covariance (3, 3) of a pose after the motion ``delta`` (3,) with covariance ``noise``."""
     c, s = math.cos(delta[2]), math.sin(delta[2])
@@ -127,6 +142,12 @@ def recalibrated(delta: Array, moving: float, constants: Array, indices: Integer
     x, y, phi = log(delta[0], delta[1], delta[2])
     turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * math.hypot(x, y)
     return np.array(exp(x + changes[0] * x, y + changes[0] * y, turn))
+
+
+@numba.njit(cache=True)
+def twist(delta: Array) -> Array:
+    """The logarithm (3,) of a relative pose (3,)."""
+    return np.array(log(delta[0], delta[1], delta[2]))
 
 
 @numba.njit(cache=True)

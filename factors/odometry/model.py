@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from factors import se2
 from factors.motion import ChainState, Increment
-from factors.odometry.kernels import Noise, linearize, linearize_changed, recalibrate, relative, whitener
+from factors.odometry.kernels import Noise, linearize, linearize_changed, recalibrate, relative, twist, whitener
 from factors.odometry.stack import OdometryStack
 from factors.se2 import Array
 
@@ -148,7 +148,7 @@ class OdometryFactor:
 
     def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
         self._increment = increment
-        self._arc = se2.log(increment.delta)
+        self._arc = twist(increment.delta)
         self.estimated = tuple(estimated)
         self._indices = np.array(estimated, dtype=np.int64)
         self._whitener = whitener(increment.covariance)

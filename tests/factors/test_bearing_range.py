@@ -6,7 +6,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from factors import se2
+from factors import positive, se2
 from factors.graph import silenced
 from factors.landmarks.factor import BearingRangeFactor
 from factors.landmarks.model import (
@@ -311,3 +311,31 @@ def test_a_landmark_where_the_sensor_is_has_a_place_and_a_spread(distance):
     assert np.hypot(*point) == pytest.approx(distance)
     assert np.all(np.isfinite(blocks[0]))
     assert np.all(np.linalg.eigvalsh(spread) > 0.0)
+
+
+@pytest.mark.parametrize("estimated", [(), (0, 2, 3)])
+def test_plain_looks_are_linearised_as_those_that_carry_more(estimated):
+    """One call for a look at exact landmarks from its own pose: the same as with a displacement of nothing."""
+    model = BearingRangeModel(mounting=(0.2, -0.1, 0.3), range_sigma_relative=0.1)
+    seen = np.array([[3.0, 1.0], [0.5, -4.0], [-2.0, 2.0]]), np.array((3.2, np.nan, 7.0)), np.array((0.1, -1.7, np.nan))
+    factor = BearingRangeFactor(model, *seen, estimated=estimated)
+    general = BearingRangeFactor(model, *seen, offset=np.zeros(3), estimated=estimated)
+    values = [np.array((0.1, -0.2, 0.4)), *([np.array((0.01, 0.02, -0.03))] if estimated else [])]
+    residual, blocks = factor.linearize(values)
+    expected, others = general.linearize(values)
+    np.testing.assert_allclose(residual, expected, atol=1e-12)
+    assert len(blocks) == len(others) == len(values)
+    for block, other in zip(blocks, others, strict=True):
+        np.testing.assert_allclose(block, other, atol=1e-12)
+
+
+def test_landmarks_beyond_a_gate_are_counted_by_their_own_innovations():
+    rng = np.random.default_rng(3)
+    pose, covariance = np.array((0.1, -0.2, 0.4)), np.diag((0.1, 0.2, 0.1)) ** 2
+    points = 4.0 * rng.standard_normal((20, 2))
+    ranges, bearings = predict(BearingRangeModel(), pose, points)
+    factor = BearingRangeFactor(BearingRangeModel(), points, ranges + 0.3 * rng.standard_normal(20), bearings + 0.1)
+    residual, (jacobian,) = factor.whitened([pose])
+    squared = positive.squared(residual, np.eye(2) + jacobian @ covariance @ jacobian.transpose(0, 2, 1))
+    limit = float(np.median(squared))
+    assert factor.count_beyond(limit, pose, covariance) == np.count_nonzero(squared > limit) == 10

@@ -95,6 +95,8 @@ class LandmarkObservation(ResidualObservation):
 
     def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
         """The observation on the pose only: constants are fixed, other landmarks have covariances ``spreads``."""
+        if len(self.terms) == 1 and not self.terms[0].blocks:
+            return self
         fixed = []
         for term in self.terms:
             factor = cast(BearingRangeFactor, term.factor)

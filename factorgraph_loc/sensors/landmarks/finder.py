@@ -9,6 +9,7 @@ testing them with the others: Jensfelt, Kristensen, IEEE Transactions on Robotic
 
 from __future__ import annotations
 
+import bisect
 import math
 from dataclasses import dataclass
 
@@ -25,7 +26,7 @@ from factors.landmarks.model import BearingRangeModel
 from factors.motion import ChainState
 from factors.robust import geman_mcclure_loss
 from factors.se2 import Array
-from factors.update import GATE, SightingFactor
+from factors.update import GATE
 
 DURATION = 60.0  # s of sightings that are used
 INTERVAL = 1.0  # s; closer sightings of a landmark have nearly equal errors and count once
@@ -96,18 +97,16 @@ class Relocalizer:
     def add(self, odometry: ChainState, seen: BearingRangeFactor) -> None:
         """Add landmarks seen at ``odometry``; late and repeated sightings are accepted."""
         self._model = seen.model
-        for point, distance, bearing in zip(seen.points, seen.ranges, seen.bearings, strict=True):
-            rows = self._sightings.setdefault((float(point[0]), float(point[1])), [])
-            rows[:] = [r for r in rows if r.odometry.t != odometry.t]
-            rows.append(Sighting(odometry, point, float(distance), float(bearing)))
-            rows.sort(key=lambda r: r.odometry.t)
-            rows[:] = _thinned(rows)
+        places, values = seen.points.tolist(), zip(seen.ranges.tolist(), seen.bearings.tolist(), strict=True)
+        for point, (x, y), (distance, bearing) in zip(seen.points, places, values, strict=True):
+            _insert(self._sightings.setdefault((x, y), []), Sighting(odometry, point, distance, bearing))
         self.forget(odometry.t - DURATION)
 
     def forget(self, before: float) -> None:
         """Drop the sightings older than ``before`` [s]."""
-        for key, rows in list(self._sightings.items()):
-            rows[:] = [r for r in rows if r.odometry.t >= before]
+        old = [(key, rows) for key, rows in self._sightings.items() if rows[0].odometry.t < before]
+        for key, rows in old:
+            del rows[: bisect.bisect_left(rows, before, key=_time)]
             if not rows:
                 del self._sightings[key]
 
@@ -216,6 +215,24 @@ class Relocalizer:
         return PosePrior(window.now.t, pose, covariance)
 
 
+def _time(row: Sighting) -> float:
+    return row.odometry.t
+
+
+def _insert(rows: list[Sighting], row: Sighting) -> None:
+    """Add a sighting to those of its landmark, which are in order of time, and thin them."""
+    if rows and row.odometry.t <= rows[-1].odometry.t:
+        rows[:] = [r for r in rows if r.odometry.t != row.odometry.t]
+        rows.append(row)
+        rows.sort(key=_time)
+        rows[:] = _thinned(rows)
+        return
+    # all but the last are an interval apart
+    if len(rows) > 1 and rows[-1].odometry.t < rows[-2].odometry.t + INTERVAL:
+        rows.pop()
+    rows.append(row)
+
+
 def _thinned(rows: list[Sighting]) -> list[Sighting]:
     """Sightings of one landmark that are at least an interval apart, and the last one."""
     kept = rows[:1]
@@ -259,13 +276,13 @@ class TrackMonitor:
         """The time since which most landmarks are outside, or None."""
         return self._since
 
-    def add(self, t: float, seen: SightingFactor, pose: Array, covariance: Array) -> None:
+    def add(self, t: float, seen: BearingRangeFactor, pose: Array, covariance: Array) -> None:
         """Add the landmarks of a timestamp, with the predicted ``pose`` (3,) and its body-frame ``covariance`` (3, 3)."""
-        residual, (jacobian,) = seen.whitened([pose])
-        spread = np.eye(2) + jacobian @ covariance @ jacobian.transpose(0, 2, 1)
-        squared = positive.squared(residual, spread)
-        self._stamps = [s for s in self._stamps if s[0] < t][-KEPT:]
-        self._stamps.append((t, int(np.count_nonzero(squared > BEYOND * GATE)), len(squared)))
+        beyond = seen.count_beyond(BEYOND * GATE, pose, covariance)
+        while self._stamps and self._stamps[-1][0] >= t:
+            self._stamps.pop()
+        del self._stamps[:-KEPT]
+        self._stamps.append((t, beyond, len(seen.points)))
         last = self._last()
         share = sum(s[1] for s in last) / max(1, sum(s[2] for s in last))
         if share > SHARE or (self._since is not None and share >= SHARE / 2.0):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +23,7 @@ BASELINE = 0.3  # m; minimum distance of two landmarks that are aligned
 FLAT = np.diag((1e-4, 1e-4, 1e-1))  # information of the flat prior: 1/m^2, 1/m^2, 1/rad^2
 
 
-@dataclass(frozen=True)
-class Sighting:
+class Sighting(NamedTuple):
     """A landmark seen at ``odometry``; ``point`` (2,) is its position in the map."""
 
     odometry: ChainState

@@ -121,6 +121,14 @@ class OdometryMotion:
     def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
         return self._chain.travelled(start, t)
 
+    def moved(
+        self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array
+    ) -> tuple[Array, Array, Array]:
+        return self._chain.moved(start, t, pose, covariance, constants, self._indices)
+
+    def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
+        return self._chain.relatives(starts, ends, constants, self._indices)
+
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
         """Corrected ``delta`` (3,) of an increment for ``constants`` (P,), and its Jacobian (3, P) in the tangent space."""
         delta, jacobian = kernels.changed(se2.log(increment.delta), increment.moving, constants, self._indices)

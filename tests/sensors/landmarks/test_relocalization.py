@@ -10,11 +10,13 @@ from landmark_world import simulate
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.landmarks.finder import Relocalizer, TrackMonitor, _apart
+from factorgraph_loc.sensors.landmarks.finder import Relocalizer, TrackMonitor, _apart, _insert, _thinned
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeStream
 from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks
+from factorgraph_loc.sensors.landmarks.window import Sighting
 from factorgraph_loc.sensors.odometry.motion import OdometryMotion
 from factors import se2
+from factors.motion import ChainState
 
 
 @pytest.fixture(scope="module")
@@ -188,3 +190,16 @@ def test_recorded_starts(name, data_root):
         position, heading, _ = error(log, found)
         assert position < 0.5
         assert heading < np.deg2rad(15.0)
+
+
+def test_sightings_of_a_landmark_are_thinned_as_they_come():
+    """In order of time, late, and with equal stamps: as if all were thinned at once each time."""
+    rng = np.random.default_rng(2)
+    times = np.sort(rng.uniform(0.0, 20.0, 60))
+    times[30], times[45], times[50] = times[25], times[44], 3.0
+    kept, expected = [], []
+    for t in times.tolist():
+        row = Sighting(ChainState(t, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), np.zeros(2), 1.0, 0.0)
+        _insert(kept, row)
+        expected = _thinned(sorted([*(r for r in expected if r.odometry.t != t), row], key=lambda r: r.odometry.t))
+        assert kept == expected

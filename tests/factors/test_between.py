@@ -1,0 +1,31 @@
+"""Poses between those of a row, held against the same with arrays of one pose."""
+
+import numpy as np
+
+from factors import se2
+from factors.between import between
+from factors.motion import Increment, propagate
+
+
+def spread(rng):
+    root = 0.1 * rng.standard_normal((3, 3))
+    return root @ root.T + 1e-4 * np.eye(3)
+
+
+def test_what_the_odometry_misses_the_next_pose_by_is_spread_over_the_way():
+    rng = np.random.default_rng(5)
+    poses, covariances = rng.standard_normal((3, 3)), np.array([spread(rng) for _ in range(3)])
+    steps, step_noises = 0.3 * rng.standard_normal((2, 3)), np.array([spread(rng) for _ in range(2)])
+    before, durations, lasting = np.array([0, 1, 1, 2]), np.array([0.1, 0.0, 0.4, 0.2]), np.array([0.5, 0.8])
+    deltas, noises = 0.3 * rng.standard_normal((4, 3)), np.array([spread(rng) for _ in range(4)])
+    at, around = between(before, deltas, noises, durations, steps, step_noises, lasting, poses, covariances)
+    for i, k in enumerate(before):
+        expected = se2.compose(poses[k], deltas[i])
+        wide = propagate(covariances[k], Increment(deltas[i], noises[i], durations[i]))
+        if k < 2:
+            share = durations[i] / lasting[k]
+            missed = se2.log(se2.between(se2.compose(poses[k], steps[k]), poses[k + 1]))
+            expected = se2.compose(expected, se2.exp(share * missed))
+            wide = (1.0 - share) * covariances[k] + share * covariances[k + 1] + share * (1.0 - share) * step_noises[k]
+        np.testing.assert_allclose(at[i], expected, atol=1e-12)
+        np.testing.assert_allclose(around[i], wide, atol=1e-12)
