@@ -1,0 +1,1 @@
+"""Speed beside fixed reference workloads (``scripts/bench --quick``) and beside other packages (``scripts/bench peers``)."""
