@@ -1,5 +1,6 @@
 """What ``inspect`` says about images and identified pixels."""
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -10,8 +11,10 @@ from factorgraph_loc.evaluation.inspect import inspect
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera import summary as inspect_camera
+from factorgraph_loc.sensors.camera.mounting_check import mounting_problems
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
@@ -104,3 +107,49 @@ def test_no_images(log):
     found = inspect(nothing)
     assert found.images == inspect_camera.ImageSummary(0, 0, 0, {}, "orb", 0.0, None)
     assert found.problems == ("camera is empty",)
+
+
+def turning(tmp_path, pitch, way):
+    """A robot that turns on the spot; its images turn ``way`` times as much as it does, about their centre."""
+    texture = np.random.default_rng(2).integers(0, 256, (400, 400), dtype=np.uint8)
+    texture = cv2.GaussianBlur(texture, (0, 0), 2.5)
+    texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
+    t = np.arange(12) * 0.2
+    headings = 0.2 * np.arange(12)
+    files = [tmp_path / f"turning-{k}.png" for k in range(12)]
+    for file, heading in zip(files, headings, strict=True):
+        # the floor turns clockwise as the robot turns to the left
+        turned = cv2.getRotationMatrix2D((199.5, 199.5), -np.degrees(way * heading), 1.0)
+        cv2.imwrite(str(file), cv2.warpAffine(texture, turned, (400, 400))[140:260, 120:280])
+    camera = CAMERA.model_copy(update={"pitch": pitch})
+    return Log(
+        "floor",
+        Rig(camera=camera, sensors=("odometry", "camera")),
+        World(),
+        {"odometry": VelocityStream(t, 0 * t, np.ones(12)), "camera": ImageStream(t, files)},
+        reference=Trajectory(t, np.column_stack((0 * t, 0 * t, headings))),
+    )
+
+
+@pytest.mark.parametrize(("pitch", "way"), [(np.pi / 2, 1.0), (0.0, 0.0), (-np.pi / 2, -1.0), (0.3, 0.3)])
+def test_a_camera_that_looks_where_its_rig_says(tmp_path, pitch, way):
+    assert mounting_problems(turning(tmp_path, pitch, way)) == []
+
+
+def test_a_camera_that_looks_at_the_floor_though_its_rig_says_ahead(tmp_path):
+    (problem,) = mounting_problems(turning(tmp_path, 0.0, 1.0))
+    assert re.fullmatch(
+        r"images turn (1\.00|0\.9\d) times as much as the robot, as of a camera that looks at the floor, by the rig's mounting "
+        r"-?0\.00 times: is its pitch about 1\.[3-6], not 0\.0\?",
+        problem,
+    )
+    (problem,) = mounting_problems(turning(tmp_path, np.pi / 2, 0.0))
+    assert "as of a camera that looks ahead, by the rig's mounting 1.00 times" in problem
+    (problem,) = mounting_problems(turning(tmp_path, np.pi / 2, -1.0))
+    assert "at the ceiling" in problem
+
+
+def test_without_headings_nothing_is_said_of_the_mounting(tmp_path):
+    log = turning(tmp_path, 0.0, 1.0)
+    assert mounting_problems(replace(log, reference=None)) == []
+    assert mounting_problems(replace(log, reference=replace(log.reference, has_heading=False))) == []

@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.camera.mounting_check import mounting_problems
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
 from factorgraph_loc.sensors.interfaces import Paragraph, Summary
@@ -60,7 +61,7 @@ def summarize(log: Log) -> Summary:
         text.append(
             f"identified pixels: {pixels.rows} in {pixels.frames} images, of {pixels.known} points of the map and {unknown}"
         )
-    problems = camera_problems(log, images, pixels)
+    problems = camera_problems(log, images, pixels) + mounting_problems(log)
     return Summary({"images": images, "pixels": pixels}, {}, problems, tuple(map(Paragraph, text)))
 
 
