@@ -59,6 +59,13 @@ Estimators = Annotated[
     str,
     typer.Option("--estimators", "-e", metavar="A,B", help="The estimators.", autocompletion=completion.estimators),
 ]
+FinalOnly = Annotated[
+    bool,
+    typer.Option(
+        "--final-only",
+        help="Want only the final trajectory: the smoother solves all at the end, without causal estimates.",
+    ),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing results.")]
 Sensors = Annotated[
     str | None,

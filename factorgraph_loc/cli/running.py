@@ -14,6 +14,7 @@ from factorgraph_loc.cli.options import (
     DataRoot,
     Estimator,
     Estimators,
+    FinalOnly,
     Json,
     LogName,
     LogNames,
@@ -83,6 +84,7 @@ def run(
     ] = False,
     align: Align = "none",
     rpe: Rpe = False,
+    final_only: FinalOnly = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -91,14 +93,16 @@ def run(
     from factorgraph_loc.experiments import run as experiment
     from factorgraph_loc.experiments.learning import run_and_learn
     from factorgraph_loc.experiments.output import check_free, write_plots, write_run
-    from factorgraph_loc.fusion.registry import check_names
+    from factorgraph_loc.fusion.registry import check_names, for_final_only
 
     check_names([estimator])
     check_free(out, overwrite=overwrite)  # before the computation
-    settings = parse_settings(set_ or (), [estimator])[estimator]
+    settings = parse_settings(set_ or (), [estimator])
+    if final_only:
+        settings = for_final_only(settings)
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
     config = experiment.RunConfig(
-        estimator, settings, parse_list(sensors) if sensors else None, prior, seed, max_gap, tick_gap
+        estimator, settings[estimator], parse_list(sensors) if sensors else None, prior, seed, max_gap, tick_gap
     )
     show.first_use()
     with show.progress(estimator, counted=False) as report:
@@ -144,6 +148,7 @@ def compare(
     tick_gap: TickGap = TICK_GAP,
     align: Align = "none",
     rpe: Rpe = False,
+    final_only: FinalOnly = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -151,12 +156,14 @@ def compare(
     from factorgraph_loc.evaluation.tables import comparison_table, further_tables, unscored, verdict
     from factorgraph_loc.experiments import compare as experiment
     from factorgraph_loc.experiments.run import RunConfig
-    from factorgraph_loc.fusion.registry import check_names
+    from factorgraph_loc.fusion.registry import check_names, for_final_only
 
     names = parse_list(estimators)
     check_names(names)
     experiment.check_free(out, overwrite=overwrite)  # before the logs are read
     settings = parse_settings(set_ or (), names)
+    if final_only:
+        settings = for_final_only(settings)
     chosen = parse_seeds(seeds)
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load(logs)
     used = parse_list(sensors) if sensors else None

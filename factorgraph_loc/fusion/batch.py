@@ -22,11 +22,13 @@ from factorgraph_loc.model.belief import PoseEstimate
 from factorgraph_loc.model.setup import Setup
 from factors.se2 import Array
 
+WIDEST = 8.0  # by default
+
 
 class BatchSettings(GraphSettings):
     """Settings of the batch estimator."""
 
-    widest_loss: Annotated[float, Field(ge=1.0, le=1000.0)] = 8.0
+    widest_loss: Annotated[float, Field(ge=1.0, le=1000.0)] = WIDEST
     """how many times wider than its own scale the robust loss begins; 1 for a plain robust start"""
 
 
@@ -40,15 +42,21 @@ class Batch(GraphEstimator):
         super().__init__(setup, settings)
 
     def _new_backend(self, graph: Graph) -> SolvingBackend:
-        if not any(mapper.estimates for mapper in graph.mappers):
-            return Guessing(graph, self._settings.widest_loss)
         ahead = SmootherSettings(**self._settings.model_dump(exclude={"widest_loss"}))
-        return Ahead(graph, ahead, self._settings.widest_loss)
+        return at_the_end(graph, ahead, self._settings.widest_loss)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """The guess so far: not an estimate to be scored, as the problem is only solved at the end."""
         guess = super().estimate(t)
         return guess if self._graph.prior is None else replace(guess, status="unlocalized")
+
+
+def at_the_end(graph: Graph, settings: SmootherSettings, widest: float = WIDEST) -> SolvingBackend:
+    """A backend that solves the problem at the end, with robust losses that begin ``widest`` times as wide; ``settings``: of the
+    smoother that goes ahead where points are estimated."""
+    if any(mapper.estimates for mapper in graph.mappers):
+        return Ahead(graph, settings, widest)
+    return Guessing(graph, widest)
 
 
 def graduated(graph: Graph, start: Values, widest: float) -> tuple[Array, Array]:

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import Field, PlainSerializer, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import Field, PlainSerializer, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.fusion.variables import Node, Values, pose_key
@@ -54,6 +54,15 @@ class SmootherSettings(GraphSettings):
     """updates between checks of that"""
     smooth: bool = True
     """whether the final trajectory uses all measurements, else it repeats the causal one"""
+    final_only: bool = False
+    """whether nothing is solved on the way, so that there are no causal estimates, and the whole problem at the end"""
+
+    @model_validator(mode="after")
+    def _has_a_final(self) -> "SmootherSettings":
+        if self.final_only and not (self.smooth and self.lag in (None, math.inf)):
+            given = "smooth is false" if not self.smooth else f"lag is {self.lag:g}"
+            raise ValueError(f"final_only is true, but {given}, expected one of the two")
+        return self
 
 
 @dataclass

@@ -296,3 +296,15 @@ def test_a_cache_that_is_too_large_or_no_file_is_made_again(tmp_path):
     file.unlink()
     os.mkfifo(file)
     assert keys.read_cache(file, Kept) is None
+
+
+def test_where_only_final_scores_are_shown_the_smoother_makes_no_causal_estimates(planned):
+    def settings(**content):
+        usual = {"logs": ["one"], "estimators": ["smoother"], "report": {"metrics": ["final.position_rmse"]}}
+        return [run.settings for run in planned(**usual | content)]
+
+    assert settings() == [{"final_only": True}]
+    assert settings(report={"metrics": ["final.position_rmse", "causal.anees"]}) == [{}]
+    assert settings(estimators=["ekf"]) == [{}]
+    for chosen in ({"final_only": False}, {"lag": 5.0}, {"smooth": False}):
+        assert settings(estimators=[{"name": "smoother", "settings": chosen}]) == [chosen]
