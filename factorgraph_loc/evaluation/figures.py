@@ -20,6 +20,7 @@ from factorgraph_loc.evaluation.metrics import CONFIDENCE, errors
 from factorgraph_loc.evaluation.pairing import pauses
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.reliability import Reliability
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory
@@ -47,7 +48,7 @@ class Track:
 
     ``causal`` (None if never localized), ``final`` (may be empty); ``update_ms`` (M,) of each update; ``nis``: by sensor, rows
     (K, 3) of time, normalised innovation squared and degrees of freedom; ``events``: time and text; ``max_gap`` [s]: largest
-    interval between estimates that is interpolated for errors.
+    interval between estimates that is interpolated for errors. ``reliability``: of the sensors' models, by sensor.
     """
 
     causal: Trajectory | None
@@ -56,13 +57,15 @@ class Track:
     nis: Mapping[str, Array] = field(default_factory=dict)
     events: Sequence[tuple[float, str]] = ()
     max_gap: float = MAX_GAP
+    reliability: Mapping[str, Reliability] = field(default_factory=dict)
 
     @classmethod
     def of(cls, result: RunResult) -> Track:
         """The data of a run."""
         nis = {s: np.array(rows, dtype=float).reshape(-1, 3) for s, rows in result.diagnostics.nis.items()}
         events = tuple(result.diagnostics.events)
-        return cls(result.causal(), result.final, result.timings.update_ms, nis, events, result.max_gap)
+        causal, timings = result.causal(), result.timings
+        return cls(causal, result.final, timings.update_ms, nis, events, result.max_gap, result.reliability)
 
     def kinds(self) -> tuple[tuple[str, Trajectory | None], tuple[str, Trajectory | None]]:
         """Both trajectories by name, None if there is nothing to plot."""

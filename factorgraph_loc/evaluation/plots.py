@@ -12,6 +12,7 @@ from factorgraph_loc.drawing.figures import COLOURS, grid, lay_out, legend, styl
 from factorgraph_loc.evaluation.figures import Track, consistency, mark_events, way, with_pauses, write_picture
 from factorgraph_loc.evaluation.metrics import Errors, errors
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.reliability import Reliability
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.interfaces import Marks, marks
 from factors.se2 import Array
@@ -26,6 +27,7 @@ _FILES = (
     "*-error-distribution.png",
     "*-errors-*.png",
     "*-consistency-*.png",
+    "*-reliability-*.png",
 )
 
 
@@ -47,7 +49,7 @@ def plot_run(log: Log, estimator: str, track: Track, folder: Path, name: str) ->
     """Write the plots of one run into ``folder`` and return their paths.
 
     ``NAME-trajectories.png``; ``NAME-consistency-ESTIMATOR.png``, with a reference or innovations; with a reference
-    ``NAME-errors-ESTIMATOR.png``. Without a trajectory only the first.
+    ``NAME-errors-ESTIMATOR.png``; with tags ``NAME-reliability-ESTIMATOR.png``. Without a trajectory only the first.
     """
     figures = {"trajectories": trajectories(log, {estimator: track}), **_of_one(log, estimator, track)}
     return _write(figures, folder, name)
@@ -69,6 +71,8 @@ def _of_one(log: Log, estimator: str, track: Track) -> dict[str, Figure]:
     figure = consistency(log, estimator, track)
     if figure is not None:
         figures[f"consistency-{estimator}"] = figure
+    if track.reliability:
+        figures[f"reliability-{estimator}"] = reliability_diagram(log, estimator, track.reliability)
     return figures
 
 
@@ -108,6 +112,26 @@ def overview(log: Log, odometry: Trajectory | None) -> Figure:
         axes[0, 0].plot(*way(odometry).T, label="odometry", linewidth=1.2, zorder=3, color=COLOURS[0])
         axes[0, 0].plot(*odometry.poses[0, :2], "o", label="start", color=COLOURS[0], markersize=5, zorder=4)
     legend(figure, axes[0])
+    lay_out(figure)
+    return figure
+
+
+def reliability_diagram(log: Log, estimator: str, found: Mapping[str, Reliability]) -> Figure:
+    """Detections that were observed over those that were predicted, by group, with two-sigma bars about what is predicted."""
+    figure, axes = grid(len(found), 1, 3.2 * len(found), f"{log.name}, {estimator}: observed over predicted detections")
+    for axis, one in zip(axes[:, 0], found.values(), strict=True):
+        place = np.arange(len(one.groups))
+        label = "what a right model leaves to chance (2 sigma)"
+        axis.errorbar(
+            place, np.ones(len(place)), 2.0 * one.spread / one.predicted, fmt="none", color=COLOURS[1], label=label
+        )
+        axis.plot(
+            place, one.observed / one.predicted, "o", color=COLOURS[0], label=f"{one.what}, observed over predicted"
+        )
+        axis.axhline(1.0, color="0.7", linewidth=0.8, zorder=1)
+        axis.set_xticks(place, one.groups, rotation=40, ha="right")
+        axis.set_ylim(bottom=0.0)
+    legend(figure, axes[:, 0])
     lay_out(figure)
     return figure
 

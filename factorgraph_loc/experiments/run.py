@@ -143,6 +143,8 @@ def run(
         diagnostics, learnt = estimator.diagnostics, estimator.learnt()
         if isinstance(estimator, ConcludingEstimator):
             diagnostics = estimator.final_diagnostics()
+    told = [(name, of(use, diagnostics, learnt, final)) for name, of in functions("reliability")]
+    reliability = {name: one for name, one in told if one is not None}
     versions = _versions()
     effective = {
         "log": log.name,
@@ -174,12 +176,14 @@ def run(
             *unused(log, sensors),
             *prepared.warnings,
             *(line for _, doubts in functions("doubts") for line in doubts(use, estimator.diagnostics, learnt)),
+            *(line for one in reliability.values() for line in one.doubts),
             *never_localized(log, sensors, loop.estimates, final),
             *partly_scored(log, final, config.max_gap),
             *with_pauses(log, ticks.skipped, config.tick_gap),
         ),
         causal_space=_in_space(loop.estimates),
         final_space=in_space,
+        reliability=reliability,
     )
 
 

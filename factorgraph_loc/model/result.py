@@ -1,13 +1,14 @@
 """The result of a run: causal estimates, final trajectory, diagnostics and timings."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from factorgraph_loc.model.belief import Learnt, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.reliability import Reliability
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
@@ -41,7 +42,8 @@ class RunResult:
 
     ``config``: the effective configuration, enough to repeat the run. ``t`` (N,), ``poses`` (N, 3), ``covariances`` (N, 3, 3) in
     the world frame and ``status`` (N) are the causal estimates at the ticks; ``final`` is the estimate from the whole log.
-    ``causal_space``, ``final_space``: the same in three dimensions, if the estimator has them.
+    ``causal_space``, ``final_space``: the same in three dimensions, if the estimator has them. ``reliability``: of the sensors'
+    models on this log, by sensor.
     """
 
     log: str
@@ -58,6 +60,7 @@ class RunResult:
     warnings: tuple[str, ...] = ()
     causal_space: Trajectory3 | None = None
     final_space: Trajectory3 | None = None
+    reliability: Mapping[str, Reliability] = field(default_factory=dict)
 
     @property
     def max_gap(self) -> float:

@@ -69,9 +69,10 @@ class SensorType:
 
     For runs (:class:`~factorgraph_loc.sensors.interfaces.Use`): ``check``: ``(use)``, raises InputError if log and settings do not
     fit; ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.interfaces.PreparedLog`; ``doubts``: ``(use,
-    diagnostics, learnt)``, warnings at the end; ``findable``: ``(log, sensors)``, a plural for the map elements that the channels
-    can detect and a message that none was detected, or None; ``mappable``: ``(log)``, the world layer that ``fgloc map`` can make,
-    or None.
+    diagnostics, learnt)``, warnings at the end; ``reliability``: ``(use, diagnostics, learnt, final) ->``
+    :class:`~factorgraph_loc.model.reliability.Reliability` along the final trajectory, or None; ``findable``: ``(log, sensors)``,
+    a plural for the map elements that the channels can detect and a message that none was detected, or None; ``mappable``:
+    ``(log)``, the world layer that ``fgloc map`` can make, or None.
 
     For simulated logs, whose settings have the sections ``simulation``: ``simulate``: ``(ride) ->``
     :class:`~factorgraph_loc.sensors.interfaces.Simulated`, from a :class:`~factorgraph_loc.sensors.interfaces.Ride`; ``looks``:
@@ -94,6 +95,7 @@ class SensorType:
     check: Place = ""
     prepare: Place = ""
     doubts: Place = ""
+    reliability: Place = ""
     findable: Place = ""
     mappable: Place = ""
     simulate: Place = ""

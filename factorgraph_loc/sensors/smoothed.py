@@ -13,6 +13,7 @@ import numpy as np
 
 from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
 from factors.se2 import Array
 
 WORTH = 2.0  # logs that the uncertainty of the input rig counts as: few logs tell little of a scatter
@@ -102,3 +103,17 @@ def pooled_constants(
         )
     uncertainty = first.uncertainty.model_copy(update=uncertainties)
     return settings.model_copy(update=values | {"uncertainty": uncertainty}), out
+
+
+def possible_poses(trajectory: Trajectory, t: Array, max_gap: float) -> Array:
+    """A pose (N, 3) at each time (N,) of a trajectory with covariances, drawn from the six cubature points of its distribution:
+    so means over many times are also means over what the trajectory leaves open. NaN outside and in gaps longer than ``max_gap``.
+
+    Cubature: Arasaratnam and Haykin, "Cubature Kalman filters", IEEE TAC 54(6), 2009. Always the same draws.
+    """
+    poses = trajectory.at(t, max_gap=max_gap)
+    covariances = np.nan_to_num(trajectory.covariances_at(t, max_gap=max_gap)) + 1e-12 * np.eye(3)
+    rng = np.random.default_rng(0)
+    axis, sign = rng.integers(0, 3, len(t)), rng.choice((-1.0, 1.0), len(t))
+    root = np.linalg.cholesky(covariances)[np.arange(len(t)), :, axis]
+    return np.asarray(poses + np.sqrt(3.0) * sign[:, None] * root)

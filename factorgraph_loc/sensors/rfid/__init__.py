@@ -58,6 +58,7 @@ SENSOR = SensorType(
     bind="factorgraph_loc.sensors.rfid.bound:bind",
     summarize="factorgraph_loc.sensors.rfid.summary:summarize",
     doubts="factorgraph_loc.sensors.rfid.describe:doubts",
+    reliability="factorgraph_loc.sensors.rfid.reliability:reliability",
     findable="factorgraph_loc.sensors.rfid.describe:findable",
     mappable="factorgraph_loc.sensors.rfid.describe:mappable",
     draw="factorgraph_loc.sensors.rfid.draw:draw",

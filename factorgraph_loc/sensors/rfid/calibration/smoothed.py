@@ -1,10 +1,9 @@
 """Detection models learnt from logs without a reference, along the trajectories that the smoother found.
 
-The likelihood of the reads is averaged over the poses that the smoother thinks possible: each pose with rounds is placed at one of
-the six cubature points of its distribution (Arasaratnam and Haykin, "Cubature Kalman filters", IEEE TAC 54(6), 2009), drawn at
-random, so that all are there alike. Tags that are probably not where the map has them are left out. A beam is fitted in all its
-parameters, and a logistic model in all its coefficients; a grid keeps its shape, and changes as estimators change it on the way
-(:mod:`factors.rfid.adjustment`).
+The likelihood of the reads is averaged over the poses that the smoother thinks possible
+(:func:`~factorgraph_loc.sensors.smoothed.possible_poses`). Tags that are probably not where the map has them are left out. A beam
+is fitted in all its parameters, and a logistic model in all its coefficients; a grid keeps its shape, and changes as estimators
+change it on the way (:mod:`factors.rfid.adjustment`).
 """
 
 from collections.abc import Sequence
@@ -24,7 +23,7 @@ from factorgraph_loc.sensors.rfid.calibration.pairs import BLOCKS, TagPairs, pai
 from factorgraph_loc.sensors.rfid.calibration.refit import Refit, refit_beam, refit_logistic
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, rounds_of
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings
-from factorgraph_loc.sensors.smoothed import Corrections, Smoothed, pooled
+from factorgraph_loc.sensors.smoothed import Corrections, Smoothed, pooled, possible_poses
 from factorgraph_loc.text import quoted
 from factors.rfid.adjustment import MOST_CERTAIN, PARAMETERS, rates
 from factors.rfid.model import FEATURES, BeamModel, DetectionModel, GridModel, LogisticModel
@@ -94,13 +93,9 @@ def _rounds(one: Smoothed, settings: RfidSettings) -> Rounds:
             "expected 2 or more to learn from without a reference"
         )
     assert one.log.reference is not None
-    rng = np.random.default_rng(0)
-    root = np.linalg.cholesky(one.log.reference.covariances_at(found.t, max_gap=REFERENCE_GAP) + 1e-12 * np.eye(3))
-    axis, sign = rng.integers(0, 3, len(found.t)), rng.choice((-1.0, 1.0), len(found.t))
-    away = np.sqrt(3.0) * sign[:, None] * root[np.arange(len(found.t)), :, axis]
     return replace(
         found,
-        poses=found.poses + away,
+        poses=possible_poses(one.log.reference, found.t, REFERENCE_GAP),
         hits=found.hits[:, kept],
         tags=replace(found.tags, points=found.tags.points[kept], facing=found.tags.facing[kept]),
         names=tuple(name for name, keep in zip(found.names, kept, strict=True) if keep),
