@@ -6,6 +6,7 @@ __all__ = [
     "log",
     "measurement",
     "planar",
+    "reliability",
     "result",
     "rig",
     "scoring",

@@ -55,7 +55,7 @@ def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Traje
     stream = log.streams.get("rfid")
     if settings is None or "rfid" not in use.sensors or not isinstance(stream, RfidStream) or not len(stream.t):
         return None
-    if not log.world.tags or len(final) < 2 or final.covariances is None or use.estimator == "dead_reckoning":
+    if not log.world.tags or len(final) < 2 or final.covariances is None or "rfid" not in use.modalities:
         return None
     doubted = diagnostics.dead_tags.keys() | diagnostics.moved_tags.keys()
     kept = [name for name in log.world.tags if name not in doubted]
