@@ -62,6 +62,7 @@ def build_map(
     tag_height: float | None = None,
     prior: str | None = None,
     drop_dead: bool = False,
+    points: Settings | None = None,
     rig: RigLike | None = None,
     world: WorldLike | None = None,
     overwrite: bool = False,
@@ -71,7 +72,7 @@ def build_map(
     For the arguments see :class:`~factorgraph_loc.experiments.maps.MapOptions`.
     """
     maps.picture_beside(Path(out), overwrite=overwrite)
-    options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead)
+    options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead, points or {})
     made = maps.make_map(one(log, rig, world), options)
     made.write(Path(out), overwrite=overwrite)
     return made

@@ -8,6 +8,7 @@ from factorgraph_loc.api.given import LogLike, RigLike, WorldLike, one
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.particles import particles_of
 from factorgraph_loc.exports import foxglove, rerun_scene
+from factorgraph_loc.exports.points import write_ply
 from factorgraph_loc.exports.runs import Particles, StoredRun, find_runs, is_results, read_runs
 from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write_g2o
 from factorgraph_loc.files.shipped import manifests
@@ -16,7 +17,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.text import listed, quoted
 
-FORMATS = (".mcap", ".tum", ".kitti", ".g2o")
+FORMATS = (".mcap", ".tum", ".kitti", ".g2o", ".ply")
 L = TypeVar("L", bound=LogLike)
 
 
@@ -45,9 +46,10 @@ def export(
     rig: RigLike | None = None,
     world: WorldLike | None = None,
 ) -> list[Path]:
-    """Write runs for Foxglove, or the final trajectory of a run or the reference of a log for other programs; return the files.
+    """Write runs for Foxglove, or the final trajectory of a run, the reference of a log or the points of its map for other
+    programs; return the files.
 
-    ``results``: as for :func:`view`. ``out``: its suffix selects the format: .mcap, .tum, .kitti or .g2o.
+    ``results``: as for :func:`view`. ``out``: its suffix selects the format: .mcap, .tum, .kitti, .g2o or .ply.
     """
     require_format(Path(out))
     log, runs = stored(_listed(results), lambda name: one(name, rig, world))
@@ -111,6 +113,10 @@ def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
     """Write a log and its runs, or a trajectory, in the format of the suffix; return the files."""
     if out.suffix == ".mcap":
         foxglove.write_mcap(log, runs, out)
+    elif out.suffix == ".ply":
+        if log.world.points is None:
+            raise InputError(f"{log.name}: its map has no points to write, expected one with points (--world)")
+        write_ply(log.world.points, out)
     elif out.suffix == ".g2o":
         run = _only(runs, out)
         sensors = run.folder.config.sensors or log.rig.sensors

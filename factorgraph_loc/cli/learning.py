@@ -130,8 +130,10 @@ def map_(
 
     picture = maps.picture_beside(out, overwrite=overwrite)  # before the log is read
     loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
-    settings = parse_settings(set_ or (), [estimator])[estimator]
-    options = maps.MapOptions(of, estimator, settings, extend, poses, tag_height, prior, drop_dead)
+    settings = parse_settings(set_ or (), [estimator], [maps.POINTS])
+    options = maps.MapOptions(
+        of, estimator, settings[estimator], extend, poses, tag_height, prior, drop_dead, settings[maps.POINTS]
+    )
     made = maps.make_map(loaded, options, partial(show.progress, counted=False))
     made.write(out, overwrite=overwrite)
     for warning in made.warnings:
@@ -173,7 +175,8 @@ def tell(found: Made) -> tuple[str, ...]:
         _table(("tag", *COLUMNS), _rows(found.made, found.open))
         return (found.made.summary("tags"), *_notes(found))
     return (
-        f"{found.points} points are in the new map, with {found.observations} observations in {found.keyframes} keyframes",
+        f"{found.points} points are in the new map, with {found.observations} observations in {found.keyframes} keyframes"
+        + (f", {found.fused} of them known before" if found.fused else ""),
         f"reprojection residual: {found.rms:.2f} px root mean square, {found.mad:.2f} px median",
         f"parallax {found.parallax:.3f} rad, standard deviation in the worst direction {found.sigma:.3f} m (medians)",
         f"the cameras were moved by {found.shifted:.3f} m and {found.turned:.4f} rad (medians)",

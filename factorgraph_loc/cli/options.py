@@ -146,17 +146,21 @@ def parse_list(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def parse_settings(texts: Sequence[str], estimators: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """``smoother.lag=10`` as {"smoother": {"lag": 10}}; InputError for an estimator that is not run."""
+def parse_settings(
+    texts: Sequence[str], estimators: Sequence[str], others: Sequence[str] = ()
+) -> dict[str, dict[str, Any]]:
+    """``smoother.lag=10`` as {"smoother": {"lag": 10}}; InputError for an estimator that is not run. ``others``: names that are
+    no estimators."""
     from factorgraph_loc.fusion.registry import check_names
 
-    settings: dict[str, dict[str, Any]] = {name: {} for name in estimators}
+    settings: dict[str, dict[str, Any]] = {name: {} for name in (*estimators, *others)}
     for text in texts:
         name, value = key_and_value(text, "--set")
         estimator, *keys = name.split(".")
         if not keys or not all(keys):
             raise InputError(f"--set is {quoted(text)}, expected NAME.key=value, such as smoother.lag=10")
-        check_names([estimator])
+        if estimator not in others:
+            check_names([estimator])
         if estimator not in settings:
             raise InputError(f"--set is {quoted(text)}, but {estimator} is not run here; run: {listed(estimators)}")
         table = settings[estimator]

@@ -84,7 +84,7 @@ def export(
             "--out",
             "-o",
             metavar="FILE",
-            help="The file to write; its suffix selects the format: .mcap (Foxglove), .tum, .kitti or .g2o.",
+            help="The file to write; its suffix selects the format: .mcap (Foxglove), .tum, .kitti, .g2o or .ply (map).",
         ),
     ],
     reader: Reader = None,

@@ -16,13 +16,14 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import beside
 from factorgraph_loc.experiments.preparation import first_odometry, resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.files.models import replacing
+from factorgraph_loc.files.models import parse_model, replacing
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.io.native.world_file import write_world
 from factorgraph_loc.mapping import map_figure, mapping, tag_mapping
 from factorgraph_loc.mapping.camera_poses import posed_frames
 from factorgraph_loc.mapping.mapping import LandmarkMap
-from factorgraph_loc.mapping.point_mapping import PointReport, map_points
+from factorgraph_loc.mapping.point_mapping import PointReport, PointSettings, map_points
+from factorgraph_loc.mapping.point_maps import merged, thinned
 from factorgraph_loc.mapping.tag_mapping import MadeTags
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import Log, StartPose
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SUFFIX = ".world.toml"
+POINTS = "points"
 MAPPERS = ("batch", "smoother", "ekf")  # the estimators that estimate landmarks
 START_SIGMA = 1e-3  # m and rad; without a map the start defines the frame
 TURN_SIGMA, SHIFT_SIGMA = 0.01, 0.02  # rad, m: of a reference without covariances, for points
@@ -61,7 +63,8 @@ class MapOptions:
     """How a map is made.
 
     ``of``: landmarks, tags or points; None: points if the log has images, landmarks if it has sightings of them, else tags.
-    ``estimator`` and ``settings``: for landmarks. ``extend``: keep the log's map, and add what it lacks; not for points.
+    ``estimator`` and ``settings``: for landmarks; ``points``: settings of points, fields of
+    :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`. ``extend``: keep the log's map, and add what it lacks.
     ``poses``: of the robot, for tags and points: reference, or odometry, with estimation of the poses; None: the reference if
     there is one. ``tag_height`` [m]: of tags that the log's map lacks; None: that of the antennas. ``drop_dead``: write the log's
     map without the tags that are believed dead, and map nothing. ``prior``: see
@@ -76,6 +79,7 @@ class MapOptions:
     tag_height: float | None = None
     prior: str | None = None
     drop_dead: bool = False
+    points: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -131,12 +135,17 @@ def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points
     """What is mapped. Raises InputError for options of another kind of map."""
     of_landmarks = bool(options.settings) or options.estimator != MAPPERS[0]
     of_tags = options.tag_height is not None
-    of_others = of_landmarks or of_tags or options.extend
+    of_others = of_landmarks or of_tags
     of, there = options.of, _mappable(log)
-    if of == "points" and of_others:
-        raise InputError("--estimator, --set, --extend and --tag-height are for other maps, but points are mapped here")
-    if of == "points" or (of is None and not of_others and "points" in there):
+    if of == POINTS and of_others:
+        raise InputError(
+            "--estimator, --set of an estimator and --tag-height are for other maps, but points are mapped here"
+        )
+    extends = not options.extend or log.world.points is not None
+    if of == POINTS or (of is None and not of_others and extends and POINTS in there):
         return "points"
+    if options.points:
+        raise InputError("--set points... is for maps of points, but others are mapped here")
     if of not in (None, "landmarks", "tags"):
         raise InputError(f"--of is {quoted(of)}, expected landmarks, tags or points")
     if of == "tags" or (of is None and "landmarks" not in there and "tags" in there):
@@ -224,6 +233,9 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
         raise InputError(f"{log.name}: its rig {log.rig.name} has no [camera], so that its images cannot be mapped")
     if "points" not in _mappable(log):
         raise InputError(f"{log.name}: has no images (camera), so that there are no points to map")
+    if options.extend and log.world.points is None:
+        raise InputError(f"{log.name}: has no map of points that could be extended; leave --extend out")
+    settings = parse_model(PointSettings, options.points, "--set points")
     warnings: tuple[str, ...] = ()
     frame = OF_REFERENCE
     if not _along_reference(options, there=log.reference is not None or log.reference3 is not None):
@@ -232,10 +244,16 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
         seen, doubts = with_features(log, camera.frontend, lambda share: report(share, 1.0))
     posed = posed_frames(seen, TURN_SIGMA, SHIFT_SIGMA)
     with stages("points") as report:
-        made = map_points(camera.model(), posed, progress=lambda share: report(share, 1.0))
-    world = log.world.model_copy(update={"name": f"{log.name}-map", "points": made.points})
-    draw = partial(map_figure.point_figure, log.name, made.points, posed.cameras.positions, world.walls)
-    return MadeMap(world, frame, made.report, (*(warnings or log.warnings), *doubts), draw)
+        made = map_points(camera.model(), posed, settings, progress=lambda share: report(share, 1.0))
+    points, fused = made.points, 0
+    if options.extend and log.world.points is not None:
+        points, fused = merged(log.world.points, points)
+    if settings.most is not None:
+        points = thinned(points, settings.most)
+    world = log.world.model_copy(update={"name": f"{log.name}-map", "points": points})
+    draw = partial(map_figure.point_figure, log.name, points, posed.cameras.positions, world.walls)
+    details = replace(made.report, points=len(points), fused=fused)
+    return MadeMap(world, frame, details, (*(warnings or log.warnings), *doubts), draw)
 
 
 def _along_reference(options: MapOptions, *, there: bool) -> bool:

@@ -7,10 +7,13 @@ kept, with descriptors from a few directions.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.mapping import bundle
 from factorgraph_loc.mapping.bundle import Bundle
 from factorgraph_loc.mapping.camera_poses import PosedFrames
@@ -28,28 +31,33 @@ GATE = 3.0  # standard deviations of the distance to an epipolar line
 NARROW, WIDE = 3.0, 25.0  # px, bounds of that gate
 
 
-@dataclass(frozen=True)
-class PointSettings:
-    """``distance`` [m] and ``angle`` [rad] between keyframes, 0 for all frames. ``focal``: whether to adjust the focal length.
+class PointSettings(FileModel):
+    """How points are mapped, and which of them are kept."""
 
-    A point is kept if it is seen in ``observations`` keyframes, under a ``parallax`` [rad] at least, with a standard deviation
-    of at most ``sigma`` [m] in its worst direction; it keeps the descriptors of at most ``views`` keyframes.
-    """
-
-    distance: float = 0.1
-    angle: float = 0.1
+    distance: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.1
+    """distance between keyframes; 0 for all frames"""
+    angle: Annotated[float, Field(ge=0.0, le=3.2), InUnit("rad")] = 0.1
+    """angle between keyframes; 0 for all frames"""
     focal: bool = False
-    observations: int = 3
-    parallax: float = PARALLAX
-    sigma: float = 0.2
-    views: int = 4
+    """whether to adjust the focal length"""
+    observations: Annotated[int, Field(ge=2, le=1000)] = 3
+    """number of keyframes that a point must be seen in"""
+    parallax: Annotated[float, Field(ge=1e-4, le=3.0), InUnit("rad")] = PARALLAX
+    """smallest angle between the rays to a point"""
+    sigma: Annotated[float, Field(ge=1e-6, le=100.0), InUnit("m")] = 0.2
+    """largest standard deviation of a point, in its worst direction"""
+    views: Annotated[int, Field(ge=1, le=100)] = 4
+    """number of keyframes whose descriptors a point keeps, at most"""
+    most: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
+    """number of points in the map, at most: the best determined ones, in as many places as possible; by default all"""
 
 
 @dataclass(frozen=True)
 class PointReport:
     """Counts at each stage; errors of the kept observations: root mean square and median absolute value [px] of their
     coordinates; medians of the parallax [rad] and of the points' worst standard deviation [m]; median corrections of the camera
-    poses, ``shifted`` [m] and ``turned`` [rad]; the ``focal`` length fx [px].
+    poses, ``shifted`` [m] and ``turned`` [rad]; the ``focal`` length fx [px]; ``fused``: number of points that an
+    extended map had already.
     """
 
     keyframes: int
@@ -65,6 +73,7 @@ class PointReport:
     shifted: float
     turned: float
     focal: float
+    fused: int = 0
 
 
 @dataclass(frozen=True, eq=False)

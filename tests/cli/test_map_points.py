@@ -100,3 +100,37 @@ def test_images_without_poses(fgloc, gallery_on_disk, tmp_path):
     result = fgloc("images", log, "--map", "0:4", "--query", "A=1:3", "--feature", "sift", "-o", tmp_path / "out")
     assert result.exit_code == 2
     assert "of 10 images have no pose" in result.stderr
+
+
+def test_a_map_is_thinned_extended_and_exported(fgloc, gallery_on_disk, tmp_path):
+    log, few, both = gallery_on_disk(), tmp_path / "few.world.toml", tmp_path / "both.world.toml"
+    assert fgloc("map", log, "-o", few, "--set", "points.most=40").exit_code == 0
+    assert len(read_world(few).points) == 40
+    result = fgloc("map", log, "--world", few, "--extend", "--of", "points", "-o", both, "--json")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    assert report["points"] == len(read_world(both).points) > 60
+    assert 30 <= report["fused"] <= 40
+    result = fgloc("export", log, "--world", both, "-o", tmp_path / "both.ply")
+    assert result.exit_code == 0, result.output
+    header, _, body = (tmp_path / "both.ply").read_text().partition("end_header\n")
+    assert f"element vertex {report['points']}\n" in header
+    rows = np.array([line.split() for line in body.splitlines()], dtype=float)
+    np.testing.assert_allclose(rows[:, :3], read_world(both).points.positions, atol=1e-6)
+    assert (rows[:, 4] >= 1).all()
+
+
+def test_settings_of_points(fgloc, gallery_on_disk, tmp_path):
+    out, log = tmp_path / "a.world.toml", gallery_on_disk()
+    for arguments, message in (
+        (("--set", "points.moast=3"), "unknown key moast"),
+        (("--set", "points.most=0"), "most"),
+        (("--of", "points", "--extend"), "no map of points that could be extended"),
+        (("--of", "landmarks", "--set", "points.most=3"), "is for maps of points"),
+    ):
+        result = fgloc("map", log, "-o", out, *arguments)
+        assert result.exit_code == 2
+        assert message in result.stderr
+    result = fgloc("export", log, "-o", tmp_path / "a.ply")
+    assert result.exit_code == 2
+    assert "has no points to write" in result.stderr

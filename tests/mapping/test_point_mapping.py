@@ -66,7 +66,7 @@ def test_the_report_tells_what_was_done(look):
 
 def test_views_differ_and_are_few(look):
     sight = look(np.random.default_rng(2))
-    points = map_points(sight.model, posed(sight), replace(ALL, views=3)).points
+    points = map_points(sight.model, posed(sight), ALL.model_copy(update={"views": 3})).points
     counts = np.bincount(points.owners, minlength=len(points))
     assert (counts.min(), counts.max()) == (3, 3)
     assert points.descriptors.shape == (len(points.owners), 16)
@@ -77,9 +77,9 @@ def test_views_differ_and_are_few(look):
 def test_points_seen_too_seldom_or_known_too_badly_are_dropped(look):
     sight = look(np.random.default_rng(3))
     with pytest.raises(RunFailedError, match="seen in 13 keyframes"):
-        map_points(sight.model, posed(sight), replace(ALL, observations=13))
+        map_points(sight.model, posed(sight), ALL.model_copy(update={"observations": 13}))
     with pytest.raises(RunFailedError, match="known to 1e-06 m"):
-        map_points(sight.model, posed(sight), replace(ALL, sigma=1e-6))
+        map_points(sight.model, posed(sight), ALL.model_copy(update={"sigma": 1e-6}))
 
 
 def test_images_from_one_place_give_no_map(look):

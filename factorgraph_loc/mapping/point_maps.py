@@ -1,0 +1,165 @@
+"""Maps of points as wholes: the points of two drives in one map, and fewer points where there are many.
+
+Two points are one if their positions agree within their covariances, if each looks more like the other than like any other
+candidate, and not less alike than views of one point do within the first map. Their errors may be common, such as those of one
+reference, so they are fused by covariance intersection with equal weights (Julier, Uhlmann, American Control Conference 1997),
+which is consistent for any correlation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.vision.matching import distance_matrix
+from factors import positive
+from factors.se2 import Array
+
+Integers = NDArray[np.int64]
+
+GATE = 16.27  # 99.9 % of chi-square with three degrees of freedom
+FARTHEST = 0.5  # m between two estimates of one point
+ALIKE = 90.0  # percentile of the differences of views of one point, above which points are not one
+COMPARED = 2000  # points whose views are compared to learn that
+CELL = 0.5  # m: thinning keeps points in as many such cells as it can
+LEAST = 1e-6  # m: standard deviation of exact points when they are compared
+
+
+def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
+    """The points of both maps, those of one place and look as one, and the number of these. Points of ``first`` keep their names,
+    others that have no view keep theirs, which must be new. InputError for features of different kinds."""
+    kinds = {points.feature for points in (first, second) if points.feature}
+    if len(kinds) > 1:
+        raise InputError(f"the maps have points of the features {' and '.join(sorted(kinds))}, expected one kind")
+    pairs = _same(first, second)
+    old, new = pairs[:, 0], pairs[:, 1]
+    positions, covariances = first.positions.copy(), first.covariances.copy()
+    if len(pairs):
+        informations = [positive.inverse(_spread(points, which)) for points, which in ((first, old), (second, new))]
+        covariances[old] = positive.inverse((informations[0] + informations[1]) / 2.0)
+        told = [i @ p[..., None] for i, p in zip(informations, (positions[old], second.positions[new]), strict=True)]
+        positions[old] = (covariances[old] @ ((told[0] + told[1]) / 2.0))[..., 0]
+    fused = replace(first, positions=positions, covariances=covariances)
+    others = np.setdiff1d(np.arange(len(second)), new)
+    owners = np.full(len(second), -1, dtype=np.int64)
+    owners[new], owners[others] = old, len(first) + np.arange(len(others))
+    return _joined(fused, second, others, owners), len(pairs)
+
+
+def thinned(points: PointMap, most: int) -> PointMap:
+    """At most ``most`` of the points that have views, the best determined ones in as many places as possible, and all others."""
+    seen = np.unique(points.owners)
+    if len(seen) <= most:
+        return points
+    sigma = _worst(points.covariances)
+    cells = np.floor(points.positions[seen] / CELL).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    order = np.lexsort((sigma[seen], cell.ravel()))
+    ordered = cell.ravel()[order]
+    starts = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
+    rank = np.empty(len(seen), dtype=np.int64)
+    rank[order] = np.arange(len(seen)) - np.repeat(starts, np.diff(np.append(starts, len(seen))))
+    kept = seen[np.lexsort((sigma[seen], rank))[:most]]
+    return chosen(points, np.sort(np.concatenate((kept, np.setdiff1d(np.arange(len(points)), seen)))))
+
+
+def chosen(points: PointMap, which: Integers) -> PointMap:
+    """The points with indices ``which``, with their views."""
+    place = np.full(len(points), -1, dtype=np.int64)
+    place[which] = np.arange(len(which))
+    views = np.flatnonzero(place[points.owners] >= 0)
+    return PointMap(
+        tuple(points.names[i] for i in which.tolist()),
+        points.positions[which],
+        points.covariances[which],
+        points.feature if len(views) else "",
+        place[points.owners[views]],
+        points.descriptors[views],
+        points.seen_from[views],
+        points.sizes[views],
+    )
+
+
+def _joined(first: PointMap, second: PointMap, others: Integers, owners: Integers) -> PointMap:
+    """The points of ``first`` and the ``others`` of ``second``, whose views have new ``owners`` (P,) by point."""
+    named = {second.names[i] for i in np.setdiff1d(others, second.owners).tolist()}
+    if double := sorted(named & set(first.names)):
+        raise InputError(f"the point {double[0]} is in both maps without a view, expected different names")
+    taken, number, names = {*first.names, *named}, 0, list(first.names)
+    for i in others.tolist():
+        name = second.names[i]
+        while name in taken and name not in named:
+            name, number = f"p{len(first) + number}", number + 1
+        taken.add(name)
+        names.append(name)
+    parts = [points for points in (first, second) if len(points.owners)] or [first]
+    return PointMap(
+        tuple(names),
+        np.concatenate((first.positions, second.positions[others])),
+        np.concatenate((first.covariances, second.covariances[others])),
+        first.feature or second.feature,
+        np.concatenate((first.owners, owners[second.owners])),
+        np.concatenate([points.descriptors for points in parts]),
+        np.concatenate((first.seen_from, second.seen_from)),
+        np.concatenate((first.sizes, second.sizes)),
+    )
+
+
+def _same(first: PointMap, second: PointMap) -> Integers:
+    """Pairs (M, 2) of points of both maps that are one."""
+    none = np.empty((0, 2), dtype=np.int64)
+    if not (len(first.owners) and len(second.owners)):
+        return none
+    views, others = _views(first), _views(second)
+    limit = _limit(first, views)
+    near = cKDTree(second.positions).query_ball_point(first.positions, FARTHEST)
+    rows = []
+    for i, candidates in enumerate(near):
+        which = np.array([j for j in candidates if len(others[j])], dtype=np.int64)
+        if not len(views[i]) or not len(which):
+            continue
+        spread = _spread(second, which) + _spread(first, np.array([i]))
+        agree = positive.squared(second.positions[which] - first.positions[i], spread) < GATE
+        for j in which[agree].tolist():
+            apart = distance_matrix(
+                first.descriptors[views[i]], second.descriptors[others[j]], binary=first.feature == "orb"
+            )
+            rows.append((float(apart.min()), i, j))
+    pairs: list[tuple[int, int]] = []
+    ours: set[int] = set()
+    theirs: set[int] = set()
+    for least, i, j in sorted(rows):
+        if least <= limit and i not in ours and j not in theirs:
+            pairs.append((i, j))
+        ours.add(i)
+        theirs.add(j)
+    return np.array(sorted(pairs), dtype=np.int64) if pairs else none
+
+
+def _views(points: PointMap) -> list[Integers]:
+    """The views of each point."""
+    order = np.argsort(points.owners, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(points.owners, minlength=len(points)))[:-1])
+
+
+def _limit(points: PointMap, views: list[Integers]) -> float:
+    """How different views of one point are, of those that look most alike; 0 where no point has two."""
+    least = []
+    for mine in [mine for mine in views if len(mine) > 1][:COMPARED]:
+        apart = distance_matrix(points.descriptors[mine], points.descriptors[mine], binary=points.feature == "orb")
+        least.append(float(apart[np.triu_indices(len(mine), 1)].min()))
+    return float(np.percentile(least, ALIKE)) if least else 0.0
+
+
+def _spread(points: PointMap, which: Integers) -> Array:
+    return points.covariances[which] + LEAST**2 * np.eye(3)
+
+
+def _worst(covariances: Array) -> Array:
+    """Standard deviations (P,) in the worst direction."""
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0)))
