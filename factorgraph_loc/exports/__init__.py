@@ -1,3 +1,3 @@
 """Results for other programs: viewers (Rerun, Foxglove), trajectories (TUM, KITTI) and pose graphs (g2o)."""
 
-__all__ = ["foxglove", "rerun_scene", "runs", "trajectories"]
+__all__ = ["foxglove", "points", "rerun_scene", "runs", "trajectories"]

@@ -6,6 +6,7 @@ __all__ = [
     "map_figure",
     "mapping",
     "point_mapping",
+    "point_maps",
     "tag_mapping",
     "triangulation",
 ]
