@@ -2,57 +2,49 @@
 
 from factorgraph_loc.plugins import ESTIMATORS, FILES, MAPPERS, READERS, SENSORS
 
-SENSORS.own.update(
-    {
-        "odometry": "factorgraph_loc.sensors.odometry:SENSOR",
-        "landmarks": "factorgraph_loc.sensors.landmarks:SENSOR",
-        "rfid": "factorgraph_loc.sensors.rfid:SENSOR",
-        "twist": "factorgraph_loc.sensors.twist:SENSOR",
-        "camera": "factorgraph_loc.sensors.camera:SENSOR",
-        "loops": "factorgraph_loc.sensors.loops:SENSOR",
-    }
-)
-ESTIMATORS.own.update(
-    {
-        "dead_reckoning": "factorgraph_loc.fusion.dead_reckoning:DeadReckoning",
-        "ekf": "factorgraph_loc.fusion.ekf:Ekf",
-        "particle_filter": "factorgraph_loc.fusion.particle_filter:ParticleFilter",
-        "switching": "factorgraph_loc.fusion.switching:Switching",
-        "monoslam": "factorgraph_loc.slam.monoslam:Monoslam",
-        "smoother": "factorgraph_loc.fusion.smoother:Smoother",
-        "batch": "factorgraph_loc.fusion.batch:Batch",
-        "space_batch": "factorgraph_loc.slam.space_batch:SpaceBatch",
-    }
-)
+SENSORS.own |= {
+    "odometry": "factorgraph_loc.sensors.odometry:SENSOR",
+    "landmarks": "factorgraph_loc.sensors.landmarks:SENSOR",
+    "rfid": "factorgraph_loc.sensors.rfid:SENSOR",
+    "twist": "factorgraph_loc.sensors.twist:SENSOR",
+    "camera": "factorgraph_loc.sensors.camera:SENSOR",
+    "loops": "factorgraph_loc.sensors.loops:SENSOR",
+}
+ESTIMATORS.own |= {
+    "dead_reckoning": "factorgraph_loc.fusion.dead_reckoning:DeadReckoning",
+    "ekf": "factorgraph_loc.fusion.ekf:Ekf",
+    "particle_filter": "factorgraph_loc.fusion.particle_filter:ParticleFilter",
+    "switching": "factorgraph_loc.fusion.switching:Switching",
+    "monoslam": "factorgraph_loc.slam.monoslam:Monoslam",
+    "smoother": "factorgraph_loc.fusion.smoother:Smoother",
+    "batch": "factorgraph_loc.fusion.batch:Batch",
+    "space_batch": "factorgraph_loc.slam.space_batch:SpaceBatch",
+}
 MAPPERS.own["points"] = "factorgraph_loc.slam.point_mapper:bind"
-READERS.own.update(
-    {
-        "native": "factorgraph_loc.io.native.native",
-        "euroc": "factorgraph_loc.io.readers.euroc",
-        "kitti_odometry": "factorgraph_loc.io.readers.kitti_odometry",
-        "mapped": "factorgraph_loc.io.readers.mapped",
-        "mrclam": "factorgraph_loc.io.readers.mrclam",
-        "plaza": "factorgraph_loc.io.readers.plaza",
-        "rf_robot": "factorgraph_loc.io.readers.rf_robot",
-        "rosbag": "factorgraph_loc.io.bags.rosbag",
-        "sevenscenes": "factorgraph_loc.io.readers.sevenscenes",
-        "starry_night": "factorgraph_loc.io.readers.starry_night",
-        "trajectory": "factorgraph_loc.io.readers.trajectory",
-        "tum_rgbd": "factorgraph_loc.io.readers.tum_rgbd",
-        "utias_woods": "factorgraph_loc.io.readers.utias_woods",
-    }
-)
-FILES.update(
-    {
-        "read_rig": "factorgraph_loc.io.native.rig_file:read_rig",
-        "write_rig": "factorgraph_loc.io.native.rig_file:write_rig",
-        "read_world": "factorgraph_loc.io.native.world_file:read_world",
-        "write_world": "factorgraph_loc.io.native.world_file:write_world",
-        "read_trajectory": "factorgraph_loc.io.trajectories:read_trajectory",
-        "write_kitti": "factorgraph_loc.exports.trajectories:write_kitti",
-        "to_evo": "factorgraph_loc.io.trajectories:to_evo",
-        "from_evo": "factorgraph_loc.io.trajectories:from_evo",
-        "to_ros": "factorgraph_loc.io.trajectories:to_ros",
-        "from_ros": "factorgraph_loc.io.trajectories:from_ros",
-    }
-)
+READERS.own |= {
+    "native": "factorgraph_loc.io.native.native",
+    "euroc": "factorgraph_loc.io.readers.euroc",
+    "kitti_odometry": "factorgraph_loc.io.readers.kitti_odometry",
+    "mapped": "factorgraph_loc.io.readers.mapped",
+    "mrclam": "factorgraph_loc.io.readers.mrclam",
+    "plaza": "factorgraph_loc.io.readers.plaza",
+    "rf_robot": "factorgraph_loc.io.readers.rf_robot",
+    "rosbag": "factorgraph_loc.io.bags.rosbag",
+    "sevenscenes": "factorgraph_loc.io.readers.sevenscenes",
+    "starry_night": "factorgraph_loc.io.readers.starry_night",
+    "trajectory": "factorgraph_loc.io.readers.trajectory",
+    "tum_rgbd": "factorgraph_loc.io.readers.tum_rgbd",
+    "utias_woods": "factorgraph_loc.io.readers.utias_woods",
+}
+FILES |= {
+    "read_rig": "factorgraph_loc.io.native.rig_file:read_rig",
+    "write_rig": "factorgraph_loc.io.native.rig_file:write_rig",
+    "read_world": "factorgraph_loc.io.native.world_file:read_world",
+    "write_world": "factorgraph_loc.io.native.world_file:write_world",
+    "read_trajectory": "factorgraph_loc.io.trajectories:read_trajectory",
+    "write_kitti": "factorgraph_loc.exports.trajectories:write_kitti",
+    "to_evo": "factorgraph_loc.io.trajectories:to_evo",
+    "from_evo": "factorgraph_loc.io.trajectories:from_evo",
+    "to_ros": "factorgraph_loc.io.trajectories:to_ros",
+    "from_ros": "factorgraph_loc.io.trajectories:from_ros",
+}

@@ -15,4 +15,5 @@ __all__ = [
     "statistics",
     "tables",
     "trajectories",
+    "warned",
 ]

@@ -4,8 +4,8 @@ from typing import Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation import metrics
-from factorgraph_loc.evaluation.tables import WARNINGS
 from factorgraph_loc.evaluation.trajectories.score import score_paths
+from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import Alignment

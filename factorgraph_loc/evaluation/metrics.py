@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.evaluation import pairing, space
 from factorgraph_loc.evaluation.pairing import TOLERANCE, pairs, pauses, rms
-from factorgraph_loc.evaluation.tables import WARNINGS
+from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log

@@ -1,5 +1,4 @@
-"""The table of a comparison: a row for each log and estimator, then each estimator over all logs; and warnings about results, which
-are stored with the scores of a run and in its row, and printed once for all runs concerned."""
+"""The table of a comparison: a row for each log and estimator, then each estimator over all logs."""
 
 from __future__ import annotations
 
@@ -14,7 +13,6 @@ from factorgraph_loc.text import MESSAGE, plain
 if TYPE_CHECKING:
     from rich.table import Table
 
-WARNINGS = "warnings"  # key of the scores (a list), and of a row (one text, one line each; None without any)
 # column: key of the score, digits, whether it is pooled as a root mean square (else averaged)
 COLUMNS = {
     "causal pos [m]": ("causal.position_rmse", 3, True),
@@ -56,38 +54,6 @@ ALIKE = 0.01  # relative difference of errors within which estimators are equall
 
 Row = Mapping[str, Any]
 Columns = Mapping[str, tuple[str, int, bool]]
-
-
-def row_of(scores: Mapping[str, Any]) -> dict[str, Any]:
-    """The scores of a run as cells of a row: lists are omitted, except for the warnings, which become one text."""
-    cells = {name: value for name, value in scores.items() if not isinstance(value, list)}
-    return cells | {WARNINGS: "\n".join(scores.get(WARNINGS) or ()) or None}
-
-
-def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """The runs concerned by each warning, in order of appearance."""
-    found: dict[str, list[Row]] = {}
-    for row in rows:
-        for text in (row.get(WARNINGS) or "").split("\n"):
-            if text:
-                found.setdefault(text, []).append(row)
-    return found
-
-
-def lines(rows: Sequence[Row]) -> list[str]:
-    """Each warning once, with the estimators concerned unless these are all that ran on the logs."""
-    told = []
-    for text, concerned in by_text(rows).items():
-        logs = {row["log"] for row in concerned}
-        all_of_them = dict.fromkeys(label_of(row) for row in rows if row["log"] in logs)
-        some = dict.fromkeys(label_of(row) for row in concerned)
-        told.append(text if len(some) == len(all_of_them) else f"{text} ({', '.join(some)})")
-    return told
-
-
-def label_of(row: Row) -> str:
-    """The label of the estimator in the results."""
-    return str(row.get("label") or row["estimator"])
 
 
 def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, Columns]:

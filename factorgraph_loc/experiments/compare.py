@@ -17,15 +17,8 @@ from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import plot_log, remove_plots
 from factorgraph_loc.evaluation.report import DEFAULT, RunFiles, Scene, write_report
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
-from factorgraph_loc.evaluation.tables import (
-    BASELINE,
-    WARNINGS,
-    comparison_cells,
-    further_tables,
-    lines,
-    markdown,
-    row_of,
-)
+from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, further_tables, markdown
+from factorgraph_loc.evaluation.warned import WARNINGS, lines, row_of
 from factorgraph_loc.experiments.output import remove_run, write_run
 from factorgraph_loc.experiments.preparation import check_prior, columns_of, fill_cache, use_of
 from factorgraph_loc.experiments.run import RunConfig, run

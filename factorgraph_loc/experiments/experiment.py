@@ -11,7 +11,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.tables import lines
+from factorgraph_loc.evaluation.warned import lines
 from factorgraph_loc.experiments.execute import Outcome
 from factorgraph_loc.experiments.experiment_file import Experiment, read_experiment
 from factorgraph_loc.experiments.plan import MOST_RUNS, PlannedRun, TooManyRunsError, plan

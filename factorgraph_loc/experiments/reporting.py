@@ -13,7 +13,7 @@ import polars as pl
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
-from factorgraph_loc.evaluation.tables import WARNINGS
+from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.experiments.experiment import Prepared
 from factorgraph_loc.experiments.keys import code_version, library_versions
 from factorgraph_loc.experiments.plan import PlannedRun

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from factorgraph_loc.errors import InputError, RunFailedError
-from factorgraph_loc.evaluation.tables import row_of
+from factorgraph_loc.evaluation.warned import row_of
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files.temporary import sweep
 

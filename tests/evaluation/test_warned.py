@@ -1,6 +1,6 @@
 """Warnings in the rows of runs, and each told once."""
 
-from factorgraph_loc.evaluation.tables import lines, row_of
+from factorgraph_loc.evaluation.warned import lines, row_of
 
 
 def row(log, estimator, *warnings, seed=0):

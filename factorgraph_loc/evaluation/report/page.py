@@ -31,7 +31,7 @@ from factorgraph_loc.evaluation.report.results import (
 )
 from factorgraph_loc.evaluation.report.summary import summary
 from factorgraph_loc.evaluation.report.tracks import KINDS
-from factorgraph_loc.evaluation.tables import by_text
+from factorgraph_loc.evaluation.warned import by_text
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.text import listed, quoted
 from factorgraph_loc.version import __version__

@@ -25,7 +25,7 @@ from factorgraph_loc.evaluation.report import tracks
 from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.report.scene import Scene
 from factorgraph_loc.evaluation.report.tracks import KINDS, Series
-from factorgraph_loc.evaluation.tables import label_of
+from factorgraph_loc.evaluation.warned import label_of
 from factorgraph_loc.model.scoring import RULE
 from factors.se2 import Array
 

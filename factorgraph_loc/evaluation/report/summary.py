@@ -35,13 +35,8 @@ def _extent(results: Results) -> Html:
     seeds = {row["seed"] for row in results.rows}
     outcome = "All succeeded." if not failed else tag("strong", f"{failed} of them failed.")
     several = f" and up to {len(seeds)} seeds each" if len(seeds) > 1 else ""
-    return join(
-        (
-            f"{_count(len(results.variants), 'estimator')} on {_count(len(results.logs), 'log')}{several}: "
-            f"{_count(len(results.rows), 'run')}. ",
-            outcome,
-        )
-    )
+    compared = f"{_count(len(results.variants), 'estimator')} on {_count(len(results.logs), 'log')}{several}"
+    return join((f"{compared}: {_count(len(results.rows), 'run')}. ", outcome))
 
 
 def _best(c: MetricComparison) -> Html:
@@ -60,15 +55,8 @@ def _best(c: MetricComparison) -> Html:
     if tied:
         parts += ["It is not significantly different from that of ", _list(tied), ". "]
     if worse:
-        told = [
-            join(
-                [
-                    tag("strong", v),
-                    f" ({c.metric.text(c.contrasts[v].difference, sign=True)}{unit}, p {p_value(c.p[v])})",
-                ]
-            )
-            for v in worse
-        ]
+        apart = {v: c.metric.text(c.contrasts[v].difference, sign=True) for v in worse}
+        told = [join([tag("strong", v), f" ({apart[v]}{unit}, p {p_value(c.p[v])})"]) for v in worse]
         parts += ["It differs significantly from that of ", _and(told), "."]
     missing = [v for v in c.pooled if c.contrasts.get(v) is not None and c.contrasts[v].count < c.pooled[c.best].count]
     if missing:
@@ -91,44 +79,26 @@ def _trust(trust: Mapping[str, tuple[float, float, float]]) -> list[Html]:
 
 
 def _cautions(results: Results, comparisons: Sequence[MetricComparison]) -> list[Html]:
-    told: list[Html] = []
-    if results.outdated:
-        by_it = join(
-            [_list(results.outdated), f" {_is(results.outdated)} scored by another rule than that of this version"]
-        )
-        told.append(
-            join(
-                [
-                    by_it,
-                    ", and not compared: run the experiment again."
-                    if results.is_mixed
-                    else ": not comparable with newer results.",
-                ]
-            )
-        )
+    told: list[tuple[object, ...]] = []
+    if outdated := results.outdated:
+        rule = f" {_is(outdated)} scored by another rule than that of this version"
+        mixed, alone = ", and not compared: run the experiment again.", ": not comparable with newer results."
+        told.append((_list(outdated), rule, mixed if results.is_mixed else alone))
     if poor := results.unscored():
-        told.append(
-            join([f"Fewer than {SCORED} poses of ", _list(poor), " have a reference: nothing is scored there."])
-        )
+        told.append((f"Fewer than {SCORED} poses of ", _list(poor), " have a reference: nothing is scored there."))
     found = [c for comparison in comparisons for c in comparison.contrasts.values()]
     if found and all(c.p is None for c in found):
         units = f"{ENOUGH_LOGS} logs, or {ENOUGH_LOGS} seeds of one log"
-        told.append(join([f"With fewer than {units}, nothing is tested: read the figures log by log."]))
+        told.append((f"With fewer than {units}, nothing is tested: read the figures log by log.",))
     untold = [c for c in comparisons if not c.can_tell and any(p is not None for p in c.p.values())]
     if untold:
         tested = [c for c in untold[0].contrasts.values() if c.p is not None]
         most = max(tested, key=lambda c: c.count)
-        told.append(
-            join(
-                [
-                    f"{most.count} {most.units} are too few for {len(tested)} comparisons: whatever the difference, it cannot "
-                    "become significant."
-                ]
-            )
-        )
+        few = f"{most.count} {most.units} are too few for {len(tested)} comparisons: "
+        told.append((f"{few}whatever the difference, it cannot become significant.",))
     if all(score(row, c.metric.key) is None for row in results.rows for c in comparisons):
-        told.append(join(["No run has any of the requested scores."]))
-    return told
+        told.append(("No run has any of the requested scores.",))
+    return [join(parts) for parts in told]
 
 
 def _count(count: int, what: str) -> str:

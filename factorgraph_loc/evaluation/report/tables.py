@@ -8,7 +8,8 @@ from factorgraph_loc.drawing.markup import Html, join, table, tag
 from factorgraph_loc.evaluation.inference import Pooled
 from factorgraph_loc.evaluation.report.metrics import Metric, number
 from factorgraph_loc.evaluation.report.results import MetricComparison, Results, Row, score
-from factorgraph_loc.evaluation.tables import by_text, counted, label_of
+from factorgraph_loc.evaluation.tables import counted
+from factorgraph_loc.evaluation.warned import by_text, label_of
 from factorgraph_loc.fitting.shares import wilson
 
 TIMINGS = (
