@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from in_short import blank_pictures, in_short, runs_here  # noqa: F401 - fixtures
 
 import factorgraph_loc as fgloc
 

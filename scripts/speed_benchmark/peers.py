@@ -21,6 +21,16 @@ from speed_benchmark.ours import CONFIGS, LOG
 from speed_benchmark.problems import problem_of
 
 SCRIPTS = Path(__file__).parents[1]
+_IMPORT = """
+import importlib, json, sys
+lacking = {}
+for package in sys.argv[1:]:
+    try:
+        importlib.import_module(package)
+    except Exception as error:
+        lacking[package] = str(error)
+print(json.dumps(lacking))
+"""
 LONGEST = 1800.0  # s that a program may take
 
 
@@ -48,14 +58,14 @@ PEERS = (
 )
 
 
-def missing(python: str, packages: Sequence[str]) -> list[str]:
-    """Those of ``packages`` that an interpreter lacks. Raises InputError if there is no such interpreter."""
-    code = "import sys, importlib.util as i; print(*(p for p in sys.argv[1:] if i.find_spec(p) is None))"
+def missing(python: str, packages: Sequence[str]) -> dict[str, str]:
+    """Those of ``packages`` that an interpreter cannot import, and why. Raises InputError if there is no such interpreter."""
     try:
-        done = subprocess.run([python, "-c", code, *packages], capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError) as error:
+        done = subprocess.run([python, "-c", _IMPORT, *packages], capture_output=True, text=True, check=True)
+        found: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
+    except (OSError, subprocess.CalledProcessError, ValueError, IndexError) as error:
         raise InputError(f"--peers: {python} is no Python that can be called") from error
-    return done.stdout.split()
+    return found
 
 
 def measure(commands: Sequence[Sequence[str]], rounds: int) -> list[dict[str, float]]:
@@ -104,7 +114,7 @@ def compare_peers(python: str, data_root: Path | None, rounds: int) -> None:
         raise InputError(f"{LOG} is not in the folder of recorded data, see fgloc datasets")
     lacking = missing(python, sorted({peer.package for peer in PEERS if peer.package}))
     if lacking:
-        print(f"left out, as {python} lacks them: {', '.join(lacking)}")
+        print(f"left out: {'; '.join(f'{package} ({why})' for package, why in lacking.items())}")
     peers = [peer for peer in PEERS if peer.package not in lacking]
     labels = [label for label in CONFIGS if any(peer.ours == label for peer in peers)]
     if data_root is not None:

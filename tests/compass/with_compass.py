@@ -3,15 +3,17 @@
 import dataclasses
 import json
 import math
-import subprocess
-import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from compass.settings import CompassSettings
 from compass.stream import HEADINGS, Heading, HeadingStream
+from in_short import blank_pictures, in_short, runs_here  # noqa: F401 - fixtures
+from typer.testing import CliRunner
 
 import factorgraph_loc as fgloc
+from factorgraph_loc.cli.app import app
 from factorgraph_loc.io.bags.file import open_bag
 from factorgraph_loc.io.bags.manifest import propose
 from factorgraph_loc.io.bags.proposed import manifest_of, manifest_text
@@ -22,7 +24,6 @@ from factors import se2
 
 T = np.arange(50) / 10.0
 UNIX = 1_700_000_000_000_000_000
-FGLOC = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
 RIG = fgloc.Rig(
     name="cart", sensors=("odometry", "compass"), compass=CompassSettings(bias=0.1, uncertainty={"bias": 0.3})
 )
@@ -39,8 +40,10 @@ def made_log() -> fgloc.Log:
     return fgloc.Log("arc", RIG, fgloc.World(), streams, fgloc.Trajectory(T, truth), start, t0_ns=UNIX)
 
 
-def command(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*FGLOC, *map(str, words)], capture_output=True, text=True, check=False)
+def command(*words: object) -> SimpleNamespace:
+    """What a command prints, and its exit code."""
+    done = CliRunner().invoke(app, [str(word) for word in words])
+    return SimpleNamespace(stdout=done.stdout, stderr=done.stderr, returncode=done.exit_code)
 
 
 def test_its_channel_and_its_table_are_known():

@@ -121,7 +121,8 @@ def test_programs_are_called_and_the_table_has_the_ratios():
 
 
 def test_what_is_missing_is_told(monkeypatch):
-    assert peers.missing(sys.executable, ["numpy", "no_such_package"]) == ["no_such_package"]
+    lacking = {"no_such_package": "No module named 'no_such_package'"}
+    assert peers.missing(sys.executable, ["json", "no_such_package"]) == lacking
     with pytest.raises(InputError, match="--peers: nowhere is no Python that can be called"):
         peers.missing("nowhere", ["numpy"])
     with pytest.raises(InputError, match="ValueError: no filter"):
