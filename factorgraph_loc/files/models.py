@@ -239,7 +239,9 @@ def inside(root: Path, name: str, source: object, expected: str = "") -> Path:
         raise bounded.NoFileNameError(f"{source}: path {quoted(name)} cannot be the name of a file") from error
     if leaves:
         told = f", expected {expected}" if expected else ""
-        raise InputError(f"{source}: path {quoted(name)} leaves its folder {root}{told}")
+        plain_path = Path(os.path.normpath(root.absolute() / name))
+        link = f" by a link, to {quoted(str(path))}" if plain_path.is_relative_to(root.absolute()) else ""
+        raise InputError(f"{source}: path {quoted(name)} leaves its folder {root}{link}{told}")
     kind = bounded.kind(path, source)
     if kind not in ("", "a file", "a folder"):
         raise InputError(f"{source}: path {quoted(name)} is {kind}, expected a regular file")

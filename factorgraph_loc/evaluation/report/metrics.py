@@ -63,8 +63,8 @@ _HOW = {"rmse": "RMSE", "p95": "error at 95 %", "max": "largest error", "median"
 _DRIFTS = {
     "rpe_position_per_m": ("drift", "m per m", 1.0),
     "rpe_heading_per_m": ("turn drift", "° per m", _DEGREES),
-    "rpe_position_per_s": ("drift", "m per s", 1.0),
-    "rpe_heading_per_s": ("turn drift", "° per s", _DEGREES),
+    "rpe_position_per_s": ("drift per second", "m per s", 1.0),
+    "rpe_heading_per_s": ("turn drift per second", "° per s", _DEGREES),
 }
 _OTHERS = {
     m.key: m
