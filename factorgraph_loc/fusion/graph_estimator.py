@@ -2,7 +2,8 @@
 
 Before the start the last measurements are kept until they tell one place; then they are taken in from their first on. So they are
 where the start is known but for its heading; the graph then begins at that start. On the way, when what is seen refutes the track
-and tells another place, the graph goes back to where that began, and goes on there after a step of unknown length.
+and tells another place, the graph goes back to where that began, and goes on there after a step of unknown length. What is taken in
+once more is so in slices, counted in work and not in seconds; until the graph has caught up it does not claim to be localized.
 """
 
 from __future__ import annotations
@@ -36,6 +37,9 @@ from factors.se2 import Array
 
 # m, m, rad: nothing is known of a start, or of where a robot is carried; the sightings that told the place come in as factors
 UNKNOWN = np.diag((10.0, 10.0, math.pi)) ** 2
+
+
+REPLAYED, TICK = 300, 2  # work of which so much is done at once, and that of a tick; see `Sensor.work`
 
 
 class SolvingBackend(Backend, Protocol):
@@ -95,6 +99,7 @@ class GraphEstimator(ABC):
         self._builder = Builder(self._graph, self._backend, self._search, settings)
         # the last measurements, in the order in which they were taken, with what the diagnostics say of them
         self._recent: deque[tuple[Measurement, Written]] = deque()
+        self._behind: deque[Measurement] = deque()  # what was seen and is still to be taken in, after a track has begun
         self._conclusion: _Conclusion | None = None  # the end, until something is taken
 
     @abstractmethod
@@ -124,8 +129,13 @@ class GraphEstimator(ABC):
             self._drop_late(measurement)
         else:
             on_time = measurement.t >= graph.t
-            self._take(measurement)
-            if on_time and not isinstance(measurement, Tick):
+            if self._behind:
+                self._behind.append(measurement)
+                graph.t = max(graph.t, measurement.t)
+                self._catch_up()
+            else:
+                self._take(measurement)
+            if on_time and not self._behind:
                 self._doubt(measurement)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
@@ -142,7 +152,7 @@ class GraphEstimator(ABC):
                 return PoseEstimate(at, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
             return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
         pose, _, covariance = graph.moved(at)
-        status: Status = "ambiguous" if self._search.doubts else "localized"
+        status: Status = "ambiguous" if self._search.doubts or self._behind else "localized"
         return PoseEstimate(at, pose, covariance, status)
 
     def belief(self, t: float | None = None) -> Belief:
@@ -212,8 +222,8 @@ class GraphEstimator(ABC):
                 self._drop_late(m)
                 return
         graph.t = max(graph.t, m.t)
-        told = not isinstance(m, Tick) and self._search.look(m, self._motion.state(m.t))
-        if not told and self._search.newest is None and start is None:
+        told = self._search.advance() if isinstance(m, Tick) else self._search.look(m, self._motion.state(m.t))
+        if not told and self._search.newest is None and not self._search.waits and start is None:
             return  # the run begins with the first measurement that tells something
         self._remember(m)
         best = self._search.best if told else None
@@ -271,5 +281,19 @@ class GraphEstimator(ABC):
 
     def _replay(self, measurements: list[Measurement]) -> None:
         self._search.begin_track(found=True)
-        for m in measurements:
+        self._behind.extend(measurements)
+        self._graph.t = max(m.t for m in measurements)
+        self._catch_up()
+
+    @property
+    def _taken_until(self) -> float:
+        """The time until which all that came has been taken in."""
+        return min((m.t for m in self._behind), default=self._graph.t)
+
+    def _catch_up(self) -> None:
+        """Go on with what is taken in once more, for one slice of work."""
+        work = REPLAYED
+        while self._behind and work > 0:
+            m = self._behind.popleft()
+            work -= TICK if isinstance(m, Tick) else self._graph.sensors[m.modality].work
             self._take(m)

@@ -32,7 +32,8 @@ class HeadingSearch:
         self._kept.append(m)
         while self._kept[0].t < m.t - START_KEPT:
             self._kept.popleft()
-        if isinstance(m, Tick) or not self._search.look(m, self._motion.state(m.t)):
+        told = self._search.advance() if isinstance(m, Tick) else self._search.look(m, self._motion.state(m.t))
+        if not told:
             return None
         found = self._search.best
         return None if found is None else self._begun(found, m.t)

@@ -25,7 +25,8 @@ def prefix(poses: Array, rng: np.random.Generator, least: int, cell: Array = CEL
     order = rng.permutation(len(poses))
     _, first = np.unique(cell_numbers(poses[order], cell), return_index=True)
     occupied = np.searchsorted(np.sort(first), np.arange(1, len(poses) + 1), side="left")
-    reached = np.arange(1, len(poses) + 1) >= np.maximum(enough(occupied), least)
+    needed = enough(np.arange(len(first) + 1))[occupied]
+    reached = np.arange(1, len(poses) + 1) >= np.maximum(needed, least)
     return np.asarray(order[: int(np.argmax(reached)) + 1] if reached.any() else order)
 
 

@@ -31,7 +31,7 @@ from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings
 from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation, bound_sensors
@@ -192,12 +192,24 @@ class ParticleFilter(Filter):
             self._search.start.settle()
         super()._take(m)
 
+    def _begin(self, m: Measurement) -> None:
+        super()._begin(m)
+        if isinstance(m, Tick) and self._search.advance():
+            self._t, self._odometry, self._moves = m.t, self._motion.state(m.t), True
+            found = self._found(m.t)
+            if found is not None:
+                self._state = found
+                self._records.append(self._record())
+
     def _seek(self, m: Measurement) -> Cloud | None:
         return self._found(self._t) if self._search.look(m, self._odometry) else None
 
-    def _found(self, since: float) -> Cloud:
-        """Particles drawn from what the search tells; once that is one place a track begins, with what was seen ``since`` then."""
-        poses = self._search.sample(self._rng, self._settings.particles)
+    def _found(self, since: float) -> Cloud | None:
+        """Particles drawn from what the search tells, None where it tells nothing; once that is one place a track begins, with what
+        was seen ``since`` then."""
+        poses = self._search.sample(self._rng, self._settings.particles, self._odometry)
+        if not len(poses):
+            return None
         if self._search.best is None:
             return replace(self._cloud(poses), localized=False)
         self._search.begin_track(found=True)
@@ -242,7 +254,7 @@ class ParticleFilter(Filter):
     def _see(self, m: Measurement) -> None:
         if not self._state.localized:
             if self._search.look(m, self._odometry):
-                self._state = self._found(self._t)
+                self._state = self._found(self._t) or self._state
             return
         sensor, view = self._sensors[m.modality], CloudView(self)
         for seen in sensor.observe(m, view):
@@ -262,13 +274,24 @@ class ParticleFilter(Filter):
                 self._search.expect(sensor, here, self._odometry, view)
             evidence = self._weigh(seen)
             self._search.keep(sensor, here, self._odometry, partial(float, evidence))
+        self._doubt(m)
+
+    def _pass(self, tick: Tick) -> None:
+        if self._state.localized:
+            self._doubt(tick)
+        elif self._search.advance():
+            self._state = self._found(self._t) or self._state
+
+    def _doubt(self, m: Measurement) -> None:
+        """See whether what is seen refutes the particles, and put them where it tells."""
+        view = CloudView(self)
         refuted = self._search.refuted(m, self._odometry, view.pose, view.covariance, self._pose_back)
         if refuted is not None:
             # for the final trajectory: since then the track was elsewhere
             self._records = [r.lost() if r.t >= refuted.since else r for r in self._records]
             self.diagnostics.event(self._t, f"lost: {refuted.why} since {refuted.since:.1f} s")
             self._lost = True
-            self._state = self._found(refuted.since)
+            self._state = self._found(refuted.since) or self._state
 
     def _pose_back(self, t: float, pose: Array) -> Array:
         """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""

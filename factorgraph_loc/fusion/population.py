@@ -6,13 +6,18 @@ Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001,
 narrow places. Their number follows the size of the places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). At each
 resampling some are drawn anywhere once more,
 with hardly any weight: they bring back a place that was given up for tags that were silent or misplaced.
+
+All this is done in slices, whose size is counted in work and not in seconds: what was seen waits until it is its turn, and
+until then the population stands where it was. So a search over a large hall goes on beside whatever else is to be done.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable
+from collections import deque
+from collections.abc import Generator, Hashable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,6 +50,20 @@ WIDE = 3.0  # m: standard deviation of all particles, of which a share of 1 - CL
 NARROW, CLEAR_FOR, CLEAR_FOR_WIDE = 0.4, 2.0, 10.0
 
 
+# Work: of one tag or landmark that one particle looks at it is 1, some nanoseconds.
+CHUNK = 1_000_000  # of what is done at once
+PARTICLE = 50  # of a particle that is weighed, besides what it looks at
+RESAMPLED = 100  # of a particle in each half of a resampling
+
+
+class _Waiting(NamedTuple):
+    """An observation that waits, and the log of its probability under a track that the population competes with."""
+
+    odometry: ChainState
+    observation: Observation
+    rival: float
+
+
 class Population:
     """Places where the robot may be; see the module. ``bounds`` (2, 2): lower and upper corner [m] of where it may be, unless
     ``start`` tells that."""
@@ -59,11 +78,30 @@ class Population:
         self._motion, self._bounds, self._rng, self._start = motion, bounds, rng, start
         self._cloud: Cloud | None = None
         self._odometry: ChainState | None = None
+        self._begun: ChainState | None = None  # at the last observation whose turn has come
         self._hypotheses: tuple[Mode, ...] | None = ()
         self._log_evidence = 0.0
         self._telling = 0  # observations of things that were there
         self._things: set[Hashable] = set()
         self._clear_since = math.inf
+        self._waiting: deque[_Waiting] = deque()
+        self._running: Generator[float, None, None] | None = None
+        self._rival = 0.0
+
+    @property
+    def odometry(self) -> ChainState | None:
+        """The odometry at the last observation that was taken."""
+        return self._odometry
+
+    @property
+    def waits(self) -> bool:
+        """Whether something was added that has not been taken to its end."""
+        return self._running is not None or bool(self._waiting)
+
+    @property
+    def rival_evidence(self) -> float:
+        """Log-probability of all observations so far under the track that the population competes with."""
+        return self._rival
 
     @property
     def hypotheses(self) -> tuple[Mode, ...]:
@@ -88,23 +126,48 @@ class Population:
         """Log-probability of all observations so far for a robot that began anywhere."""
         return self._log_evidence
 
-    def add(self, odometry: ChainState, observation: Observation) -> bool:
-        """Take an observation made when the odometry was at ``odometry``; False if it is left out, as it is older than the last."""
-        if self._odometry is not None and odometry.t < self._odometry.t:
+    def add(self, odometry: ChainState, observation: Observation, rival: float = 0.0) -> bool:
+        """Have an observation wait that was made when the odometry was at ``odometry``; False if it is left out, as it is older
+        than the last. ``rival``: the log of its probability under a track."""
+        newest = self._waiting[-1].odometry if self._waiting else self._begun
+        if newest is not None and odometry.t < newest.t:
             return False
+        self._waiting.append(_Waiting(odometry, observation, rival))
+        return True
+
+    def advance(self, work: float = math.inf) -> bool:
+        """Take what waits, until that was so much ``work``; whether one observation at least was taken to its end."""
+        done = False
+        while work > 0.0 and (self._running is not None or self._waiting):
+            if self._running is None:
+                first = self._waiting.popleft()
+                self._begun, self._running = first.odometry, self._taken(first)
+            cost = next(self._running, None)
+            if cost is None:
+                self._running, done = None, True
+            else:
+                work -= cost
+        return done
+
+    def _taken(self, new: _Waiting) -> Generator[float, None, None]:
+        """Take an observation, telling the work of each part of it."""
+        odometry, observation = new.odometry, new.observation
         if self._cloud is None or self._odometry is None:
             area = float(np.prod(self._bounds[1] - self._bounds[0]))
             count = int(np.clip(DENSITY * area * 2.0 * math.pi, FEWEST_AT_FIRST, MOST))
-            self._cloud = _cloud(self._anywhere(count, odometry), np.full(count, -math.log(count)))
-        elif odometry.t > self._odometry.t:
-            self._predict(self._cloud, self._odometry, odometry)
-        self._odometry = odometry
-        self._weigh(observation, odometry.t)
+            cloud = _cloud(self._anywhere(count, odometry), np.full(count, -math.log(count)))
+        else:
+            cloud = self._cloud
+            if odometry.t > self._odometry.t:
+                cloud = self._predicted(cloud, self._odometry, odometry)
+        cloud, evidence = yield from self._weighed(cloud, new)
+        self._cloud, self._odometry = cloud, odometry
+        self._log_evidence += evidence
+        self._rival += new.rival
         self._hypotheses = None
         self._telling += observation.found > 0
         self._things.update(observation.things)
         self._clear_since = min(self._clear_since, odometry.t) if self._is_clear() else math.inf
-        return True
 
     @property
     def particles(self) -> tuple[Array, Array]:
@@ -146,35 +209,37 @@ class Population:
         position = math.sqrt(np.linalg.eigvalsh(mode.covariance[:2, :2])[-1])
         return float(max(position / WIDEST_POSITION, math.sqrt(mode.covariance[2, 2]) / WIDEST_HEADING))
 
-    def _predict(self, cloud: Cloud, start: ChainState, end: ChainState) -> None:
+    def _predicted(self, cloud: Cloud, start: ChainState, end: ChainState) -> Cloud:
         increment = self._motion.relative(start, end)
         root = positive.root(NOISE * increment.covariance)
         noise = self._rng.standard_normal(cloud.poses.shape) @ root.T
-        self._cloud = replace(cloud, poses=se2.compose(se2.compose(cloud.poses, increment.delta), se2.exp(noise)))
+        return replace(cloud, poses=se2.compose(se2.compose(cloud.poses, increment.delta), se2.exp(noise)))
 
-    def _weigh(self, observation: Observation, t: float) -> None:
-        left = 1.0
+    def _weighed(self, cloud: Cloud, new: _Waiting) -> Generator[float, None, tuple[Cloud, float]]:
+        """The cloud after an observation, and the log of the mean of its likelihood."""
+        left, evidence = 1.0, 0.0
         while left > 0.0:
-            cloud = self._cloud
-            assert cloud is not None
-            likelihood = weighable(observation.log_likelihood(cloud.poses, {}), cloud.log_weights, t)
+            likelihood = yield from _likelihood(cloud, new.observation)
+            likelihood = weighable(likelihood, cloud.log_weights, new.odometry.t)
             share = largest_share(cloud.log_weights, likelihood, left, ENOUGH * effective_size(cloud.log_weights))
             weighed = cloud.log_weights + share * likelihood
             highest = float(weighed.max())
-            self._log_evidence += highest + math.log(float(np.sum(np.exp(weighed - highest))))
-            self._cloud = replace(cloud, log_weights=normalised(weighed))
+            evidence += highest + math.log(float(np.sum(np.exp(weighed - highest))))
+            cloud = replace(cloud, log_weights=normalised(weighed))
             left -= share
-            if effective_size(self._cloud.log_weights) < RESAMPLE_BELOW * len(cloud.poses):
-                self._resample(self._cloud)
+            if effective_size(cloud.log_weights) < RESAMPLE_BELOW * len(cloud.poses):
+                cloud = yield from self._resampled(cloud, new.odometry)
+        return cloud, evidence
 
-    def _resample(self, cloud: Cloud) -> None:
-        assert self._odometry is not None
+    def _resampled(self, cloud: Cloud, now: ChainState) -> Generator[float, None, Cloud]:
         rows = systematic(cloud.weights, self._rng, min(MOST, GROWTH * len(cloud.poses)))
         rows = rows[kld.prefix(cloud.poses[rows], self._rng, FEWEST)]
-        poses = np.concatenate((kld.jittered(cloud.poses, rows, self._rng), self._anywhere(FRESH, self._odometry)))
+        yield RESAMPLED * len(cloud.poses)
+        poses = np.concatenate((kld.jittered(cloud.poses, rows, self._rng), self._anywhere(FRESH, now)))
         log_weights = np.full(len(poses), math.log((1.0 - ELSEWHERE) / len(rows)))
         log_weights[len(rows) :] = math.log(ELSEWHERE / FRESH)
-        self._cloud = _cloud(poses, log_weights)
+        yield RESAMPLED * len(poses)
+        return _cloud(poses, log_weights)
 
     def _anywhere(self, count: int, now: ChainState) -> Array:
         """Poses (N, 3) where the robot may have come to by ``now``, as far as its start tells it: else evenly over the bounds and
@@ -189,3 +254,15 @@ class Population:
 
 def _cloud(poses: Array, log_weights: Array) -> Cloud:
     return Cloud(poses, np.zeros((len(poses), 0)), log_weights, localized=False)
+
+
+def _likelihood(cloud: Cloud, observation: Observation) -> Generator[float, None, Array]:
+    """The log-likelihood (N,) of the particles, some of them at a time."""
+    each = PARTICLE + observation.work
+    count = max(1, CHUNK // each)
+    parts = []
+    for first in range(0, len(cloud.poses), count):
+        part = cloud.poses[first : first + count]
+        parts.append(observation.log_likelihood(part, {}))
+        yield float(each * len(part))
+    return np.concatenate(parts)

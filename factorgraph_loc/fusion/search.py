@@ -3,7 +3,8 @@
 Sensors that tell a place by themselves have finders. Where one only says how likely a place is, as RFID does, particles that begin
 anywhere are weighed by what all sensors see (:mod:`.population`), so that their evidence adds up. On the way what was seen is kept
 with the track's own evidence; when the track comes under suspicion the same search begins among what was seen since then, and
-refutes the track if "somewhere else" has become so much likelier than it.
+refutes the track if "somewhere else" has become so much likelier than it. The particles are weighed in slices
+(:meth:`Search.advance`), beside the track, so that no measurement has to wait for the search.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 
 from factorgraph_loc.fusion.population import Population
 from factorgraph_loc.model.belief import Mode, PosePrior
-from factorgraph_loc.model.measurement import Motion
+from factorgraph_loc.model.measurement import Motion, Tick
 from factorgraph_loc.sensors.base import Observation, Sensor, View
 from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
 from factors import positive, se2
@@ -28,6 +29,7 @@ from factors.update import Correction
 DURATION = 60.0  # s of observations that are kept
 REFUTING = 8.0  # log of the odds that a track must lose by: kidnappings are rare
 BEFORE = 2.0  # s before a suspicion in which a change may lie
+SLICE = 4_000_000  # of work (:mod:`.population`) that is done at a measurement or a tick
 APART = 16.0  # squared Mahalanobis distance to the track, beyond which it is another place
 
 
@@ -87,12 +89,22 @@ class Search:
         if sensor is None:
             return False
         told = finder is not None and finder.look(m, odometry)
-        if self._population is not None and self._is_due(sensor, odometry.t):
-            seen = sensor.evidence(m)
-            told = (seen is not None and self._population.add(odometry, seen)) or told
         if told:
             self._newest = odometry
-        return told
+        if self._population is not None and self._is_due(sensor, odometry.t):
+            seen = sensor.evidence(m)
+            if seen is not None:
+                self._population.add(odometry, seen)
+        return self.advance() or told
+
+    def advance(self) -> bool:
+        """Go on with what waits, for one slice of work; whether that told something of a place."""
+        if self._population is None or not self._population.advance(SLICE):
+            return False
+        reached = self._population.odometry
+        if reached is not None and (self._newest is None or reached.t > self._newest.t):
+            self._newest = reached
+        return True
 
     @property
     def newest(self) -> ChainState | None:
@@ -104,9 +116,18 @@ class Search:
         """The one place that is clear, at its time; None where there is none."""
         for finder in self._finders.values():
             found = finder.best
-            if found is not None and not (self._population is not None and self._population.denies(found)):
+            if found is not None and not self._denied(found):
                 return found
         return None if self._population is None else self._population.best
+
+    @property
+    def waits(self) -> bool:
+        """Whether there is something that was seen and not weighed yet."""
+        return self._population is not None and self._population.waits
+
+    def _denied(self, place: PosePrior) -> bool:
+        """Whether the particles tell against a place, or have not yet seen what told it."""
+        return self._population is not None and (self._population.waits or self._population.denies(place))
 
     def modes(self, t: float) -> list[Mode]:
         """Where the robot may be at ``t``, the likeliest place first; none where what was seen tells none. Of a start whose
@@ -123,19 +144,28 @@ class Search:
 
     def particles(self, t: float) -> tuple[Array, Array] | None:
         """Poses (N, 3) at ``t`` and weights (N,) of the particles that are anywhere, if these lead the search."""
-        if self._population is None or self._newest is None or self._at_once() is not None:
+        reached = None if self._population is None else self._population.odometry
+        if self._population is None or reached is None or self._at_once() is not None:
             return None
         poses, weights = self._population.particles
-        return se2.compose(poses, self._motion.relative(self._newest, self._motion.state(t)).delta), weights
+        return se2.compose(poses, self._motion.relative(reached, self._motion.state(t)).delta), weights
 
-    def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Poses (N, 3) at the last measurement, drawn from what is known; none where nothing was seen."""
+    def sample(self, rng: np.random.Generator, count: int, now: ChainState) -> Array:
+        """Poses (N, 3) when the odometry is at ``now``, drawn from what is known; none where nothing was seen."""
         leading = self._at_once()
-        if leading is None and self._population is not None:
-            return self._population.sample(rng, count)
-        if leading is None:
-            leading = next((f for f in self._finders.values() if f.newest is not None), None)
-        return np.empty((0, 3)) if leading is None else leading.sample(rng, count)
+        if leading is None and self._population is not None and self._population.odometry is not None:
+            poses, reached = self._population.sample(rng, count), self._population.odometry
+        else:
+            if leading is None:
+                leading = next((f for f in self._finders.values() if f.newest is not None), None)
+            if leading is None:
+                return np.empty((0, 3))
+            poses, reached = leading.sample(rng, count), leading.newest
+        if reached is None or reached.t >= now.t:
+            return poses
+        since = self._motion.relative(reached, now)
+        noise = positive.draws(since.covariance, len(poses), rng)
+        return np.asarray(se2.compose(se2.compose(poses, since.delta), se2.exp(noise)))
 
     @property
     def doubts(self) -> bool:
@@ -158,25 +188,27 @@ class Search:
         while self._kept[0].odometry.t < odometry.t - DURATION:
             self._kept.popleft()
         if self._population is not None:
-            self._population.add(odometry, seen)
+            self._population.add(*self._kept[-1])
 
     def refuted(
         self, m: Any, odometry: ChainState, pose: Array, covariance: Array, pose_at: Callable[[float, Array], Array]
     ) -> Refuted | None:
-        """Why a track is wrong, if it is, after a measurement was applied to it; :attr:`best` is where the robot is.
+        """Why a track is wrong, if it is, after a measurement was applied to it, or at a tick; :attr:`best` is where the robot is.
 
-        ``pose`` (3,) with body-frame ``covariance`` (3, 3): of the track at the measurement. ``pose_at(t, best)``: where the robot
-        was at ``t`` if it is at ``best`` (3,) now.
+        ``pose`` (3,) with body-frame ``covariance`` (3, 3): of the track at the measurement, where the odometry is at
+        ``odometry``. ``pose_at(t, best)``: where the robot was at ``t`` if it is at ``best`` (3,) now.
         """
+        if isinstance(m, Tick):
+            return self._refuted_by_all(odometry, pose, covariance, pose_at) if self.waits else None
         finder = self._finders.get(m.modality)
         if finder is not None:
             since = finder.refuted_since(m, odometry, pose, covariance)
             if since is not None:
                 return Refuted(self._sensors[m.modality].lost, since)
-        return self._refuted_by_all(pose, covariance, pose_at)
+        return self._refuted_by_all(odometry, pose, covariance, pose_at)
 
     def _refuted_by_all(
-        self, pose: Array, covariance: Array, pose_at: Callable[[float, Array], Array]
+        self, odometry: ChainState, pose: Array, covariance: Array, pose_at: Callable[[float, Array], Array]
     ) -> Refuted | None:
         doubting = {s: since for s in self._sensors.values() if (since := s.suspicious_since) is not None}
         if not doubting or self._bounds is None:
@@ -187,19 +219,25 @@ class Search:
             assert self._population is not None
             for row in self._kept:
                 if row.odometry.t >= self._since:
-                    self._population.add(row.odometry, row.observation)
-        best = self._population.best
+                    self._population.add(*row)
+        best = self._population.best if self.advance() else None
         if best is None:
             return None
+        best = self._brought(best, odometry)
         if not _is_apart(best, pose, covariance):
             for sensor in doubting:
                 sensor.accept()
             self._population = None
             return None
-        track = sum(row.evidence for row in self._kept if row.odometry.t >= self._since)
-        if self._population.log_evidence - track <= REFUTING:
+        if self._population.log_evidence - self._population.rival_evidence <= REFUTING:
             return None
         return Refuted(next(iter(doubting)).lost, self._change(best, pose_at))
+
+    def _brought(self, best: PosePrior, now: ChainState) -> PosePrior:
+        """A place where the odometry is at ``now``."""
+        since = self._motion.relative(self._motion.state(best.t), now)
+        pose = se2.compose(best.pose, since.delta)
+        return PosePrior(now.t, pose, best.covariance + se2.body_to_world(pose, since.covariance))
 
     def _change(self, best: PosePrior, pose_at: Callable[[float, Array], Array]) -> float:
         """When the robot must have come to the other place: from then on what was seen is likelier there, before on the track."""
@@ -222,8 +260,8 @@ class Search:
 
     def _hypotheses(self) -> tuple[ChainState | None, Sequence[Mode]]:
         leading = self._at_once()
-        if leading is None and self._population is not None:
-            return self._newest, self._population.hypotheses if self._newest is not None else ()
+        if leading is None and self._population is not None and self._population.odometry is not None:
+            return self._population.odometry, self._population.hypotheses
         if leading is None:
             leading = next((f for f in self._finders.values() if f.newest is not None), None)
         return (None, ()) if leading is None else (leading.newest, leading.hypotheses)

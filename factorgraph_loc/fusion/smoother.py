@@ -40,4 +40,4 @@ class Smoother(GraphEstimator):
     def forget(self, before: float) -> None:
         """Forget the trajectory before then, as far as it has left a window whose ``lag`` is set; else all is kept."""
         if isinstance(self._backend, Incremental):
-            self._backend.forget(min(before, self._graph.t - self._settings.max_delay))
+            self._backend.forget(min(before, self._taken_until - self._settings.max_delay))

@@ -151,6 +151,10 @@ class Filter(ABC):
     def _see(self, m: Any) -> None:
         """Take what a sensor saw at the state's time."""
 
+    def _pass(self, tick: Tick) -> None:
+        """At a tick, once the state is there: go on with what waits, if anything does."""
+        return
+
     @abstractmethod
     def _estimate(self) -> PoseEstimate:
         """Mean and covariance of the state."""
@@ -219,6 +223,7 @@ class Filter(ABC):
         self._move(m.t)
         if isinstance(m, Tick):
             self._ticks.append(m.t)
+            self._pass(m)
         else:
             self._see(m)
         self._records.append(self._record())

@@ -12,7 +12,7 @@ from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.sensors.rfid.whole import whole_scans
 from factorgraph_loc.text import listed
-from factors.rfid.detection import TagReadCounts
+from factors.rfid.counts import TagReadCounts
 from factors.rfid.model import RfidModel
 from factors.se2 import Array
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.model import RfidModel, probability
 from factors.se2 import Array
 

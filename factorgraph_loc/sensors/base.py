@@ -54,6 +54,10 @@ class Observation(Protocol):
     @property
     def found(self) -> int: ...
     @property
+    def work(self) -> int:
+        """How many things are looked at to tell the likelihood of one pose, about."""
+
+    @property
     def things(self) -> frozenset[Hashable]:
         """Identifiers of the detected things."""
 
@@ -242,6 +246,7 @@ class Sensor:
     ``modality``: of its measurements. ``constants``: those that are estimated, as a block named after the modality;
     ``follows_constants``: whether their covariance is needed during the run. ``finder``: localizes without a prediction.
     ``bounds`` (2, 2) [m]: lower and upper corner of the area where the robot may be, for a sensor that can only weigh poses.
+    ``work``: of taking a measurement into a graph, about, where that of a tag is 1.
     ``evidence_every`` [s]: interval of informative measurements in a search. ``lost``: reason why a track is given up.
 
     For graphs: ``keyframe_every`` [s]: interval between keyframes; ``gathers``: whether the observations on a pose are merged
@@ -257,6 +262,7 @@ class Sensor:
     gathers: ClassVar[bool] = False
     links: ClassVar[bool] = False
     evidence_every: ClassVar[float] = 1.0
+    work: int = 10
     solve_every: float = 0.0
     finder: Finder | None = None
     bounds: Array | None = None
@@ -306,6 +312,9 @@ class Sensor:
         """Start a new track at ``t``; later measurements will be processed again."""
 
 
+WORK = 20  # for a residual: its robust loss takes as long as so many tags
+
+
 @dataclass(frozen=True)
 class ResidualObservation:
     """An observation made of residual factors (:class:`~factors.update.SightingFactor`) of one sensor.
@@ -322,6 +331,10 @@ class ResidualObservation:
     @property
     def found(self) -> int:
         return sum(term.rows for term in self.terms)
+
+    @property
+    def work(self) -> int:
+        return WORK * self.found
 
     @property
     def things(self) -> frozenset[Hashable]:

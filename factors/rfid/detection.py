@@ -20,7 +20,11 @@ from numpy.typing import NDArray
 from factors import se2
 from factors.rfid import adjustment
 from factors.rfid import kernels as rfid_kernels
-from factors.rfid.model import Packed, RfidModel
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.index import TagIndex, tag_index, within
+from factors.rfid.kernels import terms
+from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed, RfidModel
+from factors.rfid.places import Places, in_reach
 from factors.rfid.tables import (
     Array32,
     Changes,
@@ -32,7 +36,9 @@ from factors.rfid.tables import (
     levels,
     make_tables,
 )
-from factors.se2 import Array
+from factors.se2 import Array, Integers
+
+SPARE = 0.5  # m: around the tags that matter to a pose are those that matter to its neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,49 +56,6 @@ class TagArray:
         return np.where(known[:, None], np.column_stack((np.cos(angle), np.sin(angle))), 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class TagReadCounts:
-    """Read counts of T tags by K antennas, each at its own pose.
-
-    ``offsets`` (K, 3): the robot's pose at the measurement, in the frame of the likelihood's pose; ``antennas`` (K,): indices in
-    the model; ``rounds`` (K,): inventory rounds; ``hits`` (K, T): number of rounds that read each tag. ``odds`` (T,): prior
-    log-odds that each tag is dead or moved (:class:`~factors.rfid.tag_states.TagStates`), ``-inf`` for as surveyed, the default.
-    ``elsewhere`` (T,): tempered log-likelihood of what was seen of the tag if so, relative to a silence out of reach; by default
-    that of a dead tag: 0, or ``-inf`` if it was read.
-    """
-
-    offsets: Array
-    antennas: NDArray[np.int64]
-    rounds: NDArray[np.int64]
-    hits: NDArray[np.int64]
-    odds: Array = field(default_factory=lambda: np.empty(0))
-    elsewhere: Array = field(default_factory=lambda: np.empty(0))
-
-    def __post_init__(self) -> None:
-        if not len(self.odds):
-            object.__setattr__(self, "odds", np.full(self.hits.shape[1], -np.inf))
-        if not len(self.elsewhere):
-            object.__setattr__(self, "elsewhere", np.where(self.hits.any(axis=0), -np.inf, 0.0))
-
-    def moved(self, offset: Array) -> TagReadCounts:
-        """The counts relative to the pose that lies ``offset`` (3,) before theirs."""
-        return replace(self, offsets=rfid_kernels.moved(offset, self.offsets))
-
-
-def together(parts: list[TagReadCounts]) -> TagReadCounts:
-    """Merge counts relative to one pose, in order of time; the odds are those of the first, what they tell of tags adds up."""
-    if len(parts) == 1:
-        return parts[0]
-    return TagReadCounts(
-        np.concatenate([p.offsets for p in parts]),
-        np.concatenate([p.antennas for p in parts]),
-        np.concatenate([p.rounds for p in parts]),
-        np.concatenate([p.hits for p in parts]),
-        parts[0].odds,
-        np.sum([p.elsewhere for p in parts], axis=0),
-    )
-
-
 class Score(NamedTuple):
     """Tempered likelihoods of N poses. ``nll`` (N,); ``gradient`` (N, 3) and ``information`` (N, 3, 3) by body-frame perturbation;
     ``expected`` (N,) and ``variance`` (N,): mean and variance of ``nll`` for a correct model and pose. The variance is proportional
@@ -103,6 +66,24 @@ class Score(NamedTuple):
     information: Array
     expected: Array
     variance: Array
+
+
+class NearTags(NamedTuple):
+    """Tags that matter to some poses: the ``looks`` at them, and as ``arrays`` points, normals, and those of the looks;
+    ``unlisted``: negative log-likelihood, its mean and variance, tempered, of all others together."""
+
+    looks: TagReadCounts
+    arrays: tuple[Array, Array, Array, Integers, Integers, Integers, Array, Array]
+    unlisted: tuple[float, float, float]
+
+
+class _Last(NamedTuple):
+    """The tags that mattered last, in a box from ``low`` to ``high`` (2,)."""
+
+    looks: TagReadCounts
+    low: Array
+    high: Array
+    near: NearTags
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +98,7 @@ class RfidLikelihood:
     packed: Packed = field(init=False, repr=False)
     parameters: Array = field(init=False, repr=False)
     _unadjusted: RfidLikelihood = field(init=False, repr=False)
+    _last: list[_Last] = field(init=False, repr=False, default_factory=list)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "packed", self.model.packed())
@@ -130,17 +112,20 @@ class RfidLikelihood:
         object.__setattr__(out, "parameters", np.asarray(parameters, dtype=float))
         return out
 
+    def prepare(self) -> None:
+        """Make the tables now, which is done once, and not when they are first needed."""
+        for name in ("_tables", "_adjusted_logs", "_places"):
+            getattr(self._unadjusted, name)
+
     def joint_score(self, pose: Array, parameters: Array, looks: TagReadCounts) -> Score:
         """Likelihood, gradient (1, 3 + 2 M) and information (1, 3 + 2 M, 3 + 2 M) at one pose (3,), by its body-frame perturbation
         and the ``parameters`` (2 M,) of the detection models."""
         size = 3 + len(parameters)
         gradient, information = np.empty(size), np.empty((size, size))
-        tags = (self.tags.points, self.tags.normals)
-        where, seen, states = (looks.offsets, looks.antennas), (looks.rounds, looks.hits), (looks.odds, looks.elsewhere)
         packed, pose = adjustment.adjusted(self._unadjusted.packed, parameters), np.asarray(pose, dtype=float)
-        tempering = self.model.tempering
-        told = adjustment.score(packed, pose, *tags, *where, *seen, *states, tempering, gradient, information)
-        nll, expected, variance = (np.array([value]) for value in told)
+        near = self.around(pose[None], looks, packed)
+        told = adjustment.score(packed, pose, *near.arrays, self.model.tempering, gradient, information)
+        nll, expected, variance = (np.array([a + b]) for a, b in zip(told, near.unlisted, strict=True))
         return Score(nll, gradient[None], information[None], expected, variance)
 
     def score(self, poses: Array, looks: TagReadCounts) -> Score:
@@ -148,10 +133,29 @@ class RfidLikelihood:
         poses = np.ascontiguousarray(np.atleast_2d(poses), dtype=float)
         n = len(poses)
         out = Score(np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n), np.empty(n))
-        tags = (self.tags.points, self.tags.normals)
-        where, seen, states = (looks.offsets, looks.antennas), (looks.rounds, looks.hits), (looks.odds, looks.elsewhere)
-        rfid_kernels.score(self.packed, poses, *tags, *where, *seen, *states, self.model.tempering, *out)
-        return out
+        near = self.around(poses, looks, self.packed)
+        rfid_kernels.score(self.packed, poses, *near.arrays, self.model.tempering, *out)
+        nll, expected, variance = near.unlisted
+        return out._replace(nll=out.nll + nll, expected=out.expected + expected, variance=out.variance + variance)
+
+    def around(self, poses: Array, looks: TagReadCounts, packed: Packed, margin: float = 0.0) -> NearTags:
+        """The tags that are in reach of poses (N, 3), or of others within a ``margin`` [m] of these, and those that are listed."""
+        if looks.tags is None:
+            return NearTags(looks, (self.tags.points, self.tags.normals, *looks.arrays), (0.0, 0.0, 0.0))
+        reach = margin + _reach(packed, looks)
+        low, high = poses[:, :2].min(axis=0) - reach, poses[:, :2].max(axis=0) + reach
+        last = self._unadjusted._last
+        if last and last[0].looks is looks and np.all(last[0].low <= low) and np.all(last[0].high >= high):
+            return last[0].near
+        low, high = low - SPARE, high + SPARE
+        tags = np.union1d(within(self._unadjusted._index, low, high), looks.tags)
+        listed = looks.listing(tags)
+        of_tags = self.tags.points[tags], self.tags.normals[tags]
+        count = self.model.tempering * (len(self.tags.points) - len(tags))
+        nll, _, _, mean, spread = terms(packed, NEGLIGIBLE_LOGIT, 1.0, 0, int(looks.rounds.sum()))
+        found = NearTags(listed, (*of_tags, *listed.arrays), (count * nll, count * mean, count * spread))
+        last[:] = [_Last(looks, low, high, found)]
+        return found
 
     def displaced(self, poses: Array, looks: TagReadCounts, tags: NDArray[np.int64], shifts: Array) -> Array:
         """Tempered log-likelihood (U, K) of what was seen of U ``tags`` if each were ``shifts`` (K, 2) from where the map has it,
@@ -160,7 +164,8 @@ class RfidLikelihood:
         points = np.repeat(self.tags.points[tags], len(shifts), axis=0)
         points[:, :2] += np.tile(shifts, (len(tags), 1))
         array = TagArray(points, np.repeat(self.tags.facing[tags], len(shifts)))
-        hits = np.repeat(looks.hits[:, tags], len(shifts), axis=1)
+        listed = looks.listing(np.union1d(looks.listed, tags))
+        hits = np.repeat(listed.hits[:, np.searchsorted(listed.listed, tags)], len(shifts), axis=1)
         level = np.repeat(self._unadjusted._tables.level[:, tags], len(shifts), axis=1)
         # in double precision, as the last bit of a single decides in which cell of a table a tag is
         each = np.zeros((count, len(poses)))
@@ -181,33 +186,39 @@ class RfidLikelihood:
         return np.asarray(mean.reshape(len(tags), len(shifts)))
 
     def log_likelihood(self, poses: Array, looks: TagReadCounts, parameters: Array | None = None) -> Array:
-        """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.tables`): for particles.
+        """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.tables`, :mod:`factors.rfid.anywhere`):
+        for particles.
 
         ``parameters`` (N, 2 M): of the detection models at each pose, by default its own.
         """
         poses = np.ascontiguousarray(poses, dtype=float)
-        certain, uncertain, which = self._by_certainty(poses, looks, parameters)
-        if len(which):
-            add_mixed(uncertain, looks.odds[which], looks.elsewhere[which], self.model.tempering, certain)
-        return certain
-
-    def _by_certainty(
-        self, poses: Array, looks: TagReadCounts, parameters: Array | None
-    ) -> tuple[Array, Array32, NDArray[np.int64]]:
-        """The log-likelihood at poses (N, 3) in two parts: tempered, of what is certain to be as surveyed, (N,); and untempered, of
-        U tags that may not be, each by itself if it is, above that of a silence out of reach, (U, N), with the places (U,) of these
-        tags in the map."""
+        if parameters is None and not self.parameters.any() and not looks.offsets.any():
+            places = self._unadjusted._places
+            if places is not None and places.is_wide(poses):
+                return places.log_likelihood(poses, looks)
         if parameters is None:
             parameters = self._of_poses(len(poses))
         largest = 1.0 if parameters is None else float(np.exp(parameters[:, 0::2].max(initial=0.0)))
-        out = np.zeros(len(poses))
-        near = self.near(poses, looks, largest) | looks.hits.any(axis=0)
+        packed = self._unadjusted.packed
+        tables = self._unadjusted._tables
+        around = self.around(poses, looks, packed._replace(reach=largest * packed.reach))
+        looks, tags = around.looks, self.tags
+        if looks.tags is not None:
+            tags = TagArray(around.arrays[0], self.tags.facing[looks.tags])
+            tables = tables._replace(level=tables.level[:, looks.tags])
+        reach = _reach(packed._replace(reach=largest * packed.reach), looks)
+        near = _in_box(tags.points, poses, reach) | looks.hits.any(axis=0)
         which = np.flatnonzero((looks.odds > -np.inf) & (looks.elsewhere > -np.inf) & near)
         apart = np.full(len(looks.odds), -1, dtype=np.int64)
         apart[which] = np.arange(len(which))
+        out = np.zeros(len(poses))
         each = np.zeros((len(which), len(poses)), dtype=np.float32)
-        self._add(poses, looks, self.tags, self._unadjusted._tables, apart, out, each, parameters)
-        return self.model.tempering * out, each, which
+        self._add(poses, looks, tags, tables, apart, out, each, parameters)
+        out *= self.model.tempering
+        out -= around.unlisted[0]
+        if len(which):
+            add_mixed(each, looks.odds[which], looks.elsewhere[which], self.model.tempering, out)
+        return out
 
     def _add(
         self,
@@ -244,24 +255,44 @@ class RfidLikelihood:
     def _adjusted_logs(self) -> list[Array32]:
         return [adjusted_logs(self.packed, peak) for peak in self.packed.peak]
 
-    def near(self, poses: Array, looks: TagReadCounts, largest: float = 1.0, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Which tags (T,) may be in reach of an antenna from any of the poses, within a ``margin`` [m]; ``largest``: factor of all
-        ranges."""
-        packed = self._unadjusted.packed
-        way = margin + float(np.max(np.hypot(looks.offsets[:, 0], looks.offsets[:, 1]), initial=0.0))
-        reach = way + float(np.max(largest * packed.reach[packed.which] + np.hypot(*packed.antennas[:, :2].T)))
+    def reachable(self, poses: Array, looks: TagReadCounts, margin: float) -> NDArray[np.int64]:
+        """Places in the map, ascending, of the tags within a ``margin`` [m] of the reach of an antenna from any of the poses."""
+        reach = margin + _reach(self.packed, looks)
         low, high = poses[:, :2].min(axis=0), poses[:, :2].max(axis=0)
-        return np.asarray(
-            np.all((self.tags.points[:, :2] > low - reach) & (self.tags.points[:, :2] < high + reach), axis=1)
-        )
+        tags = within(self._unadjusted._index, low - reach, high + reach)
+        points = self.tags.points[tags, :2]
+        beyond = np.maximum(np.maximum(low - points, points - high), 0.0)
+        return np.asarray(tags[np.hypot(*beyond.T) < reach])
+
+    @cached_property
+    def _index(self) -> TagIndex:
+        return tag_index(self.tags.points)
 
     @cached_property
     def _tables(self) -> Tables:
         return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
+    def work(self, looks: TagReadCounts) -> int:
+        """How many tags are looked at, by all antennas, to tell the likelihood of one pose among poses that are far apart."""
+        places = self._unadjusted._places
+        if places is None:
+            return 4 * len(looks.antennas) * len(self.tags.points)
+        return places.work(looks)
+
+    @cached_property
+    def reached(self) -> float:
+        """How many tags are in reach of a pose among them, on average."""
+        packed = self._unadjusted.packed
+        reach = np.max(packed.reach[packed.which] + np.hypot(*packed.antennas[:, :2].T), initial=0.0)
+        return in_reach(self.tags.points[:, :2], float(reach))
+
+    @cached_property
+    def _places(self) -> Places | None:
+        return Places.of(self.model, self.packed, self._unadjusted._tables, self.tags.points)
+
     def by_tag(self, pose: Array, looks: TagReadCounts) -> tuple[Array, Array, Array]:
-        """The contribution of each tag at one pose (3,): tempered negative log-likelihood (T,), its gradient (T, 2) by the tag's
-        position in the world, and information (T, 2, 2)."""
+        """The contribution of each tag, all of the map being listed, at one pose (3,): tempered negative log-likelihood (T,),
+        its gradient (T, 2) by the tag's position in the world, and information (T, 2, 2)."""
         count = len(self.tags.points)
         nll, gradient, information = np.zeros(count), np.zeros((count, 2)), np.zeros((count, 2, 2))
         arrays = (looks.offsets, looks.antennas, looks.rounds, looks.hits)
@@ -276,3 +307,15 @@ class RfidLikelihood:
         poses = np.ascontiguousarray(poses, dtype=float)
         rfid_kernels.probabilities(self.packed, antenna, poses, self.tags.points, self.tags.normals, out)
         return out
+
+
+def _reach(packed: Packed, looks: TagReadCounts) -> float:
+    """How far [m] the antennas reach at most from the pose that looks are relative to."""
+    way = float(np.max(np.hypot(looks.offsets[:, 0], looks.offsets[:, 1]), initial=0.0))
+    return way + float(np.max(packed.reach[packed.which] + np.hypot(*packed.antennas[:, :2].T)))
+
+
+def _in_box(points: Array, poses: Array, reach: float) -> NDArray[np.bool_]:
+    """Which points (T, 3) are within ``reach`` [m] of the box that holds poses (N, 3)."""
+    low, high = poses[:, :2].min(axis=0), poses[:, :2].max(axis=0)
+    return np.asarray(np.all((points[:, :2] > low - reach) & (points[:, :2] < high + reach), axis=1))

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factors.compressed import compressed
-from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import RfidLikelihood, Score
 from factors.rfid.phase import PhaseLikelihood, PhaseReads, PhaseScore
 from factors.rfid.strength import RssiLikelihood, RssiReads, RssiScore
 from factors.se2 import Array
@@ -37,13 +38,20 @@ class RfidFactor:
         return ROWS + len(self.estimated)
 
     @property
+    def work(self) -> int:
+        """How many reads and misses are looked at to tell the likelihood of one pose, about."""
+        if isinstance(self.likelihood, RfidLikelihood) and isinstance(self.seen, TagReadCounts):
+            return self.likelihood.work(self.seen)
+        return len(self.seen.antennas)
+
+    @property
     def is_phase(self) -> bool:
         """Whether it is a phase likelihood, which has many local optima, centimetres apart."""
         return isinstance(self.likelihood, PhaseLikelihood)
 
     def with_odds(self, odds: Array) -> RfidFactor:
         """The factor with other log-odds (T,) that each tag is dead; for read counts only."""
-        return replace(self, seen=replace(self.seen, odds=odds)) if isinstance(self.seen, TagReadCounts) else self
+        return replace(self, seen=self.seen.with_odds(odds)) if isinstance(self.seen, TagReadCounts) else self
 
     def fixed(self, values: Array) -> RfidFactor:
         """The same on the pose alone, with the ``values`` (P,) of what is estimated."""

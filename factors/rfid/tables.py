@@ -82,8 +82,10 @@ def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
         detection = model.models[antenna.model]
         if packed.kinds[antenna.model] == LOGISTIC:
             continue
-        for j, height in enumerate(heights - antenna.z):
-            key = (antenna.model, antenna.pitch, round(float(height) / LEVEL))
+        steps, which = np.unique(np.rint((heights - antenna.z) / LEVEL).astype(np.int64), return_inverse=True)
+        found = np.zeros(len(steps), dtype=np.int64)
+        for j, step in enumerate(steps.tolist()):
+            key = (antenna.model, antenna.pitch, step)
             if key not in numbers:
                 numbers[key] = len(tables)
                 half = math.ceil(detection.reach / CELL)
@@ -91,7 +93,8 @@ def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
                 _fill(packed, i, key[2] * LEVEL, half, table)
                 tables.append(table)
                 halves.append(half)
-            level[i, j] = numbers[key]
+            found[j] = numbers[key]
+        level[i] = found[which]
     sizes = np.array([t.size for t in tables], dtype=np.int64)
     logits = np.concatenate([t.ravel() for t in tables]) if tables else np.empty(0, np.uint16)
     return Tables(

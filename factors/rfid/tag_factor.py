@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compressed import compressed
-from factors.rfid.detection import RfidLikelihood, TagReadCounts
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import RfidLikelihood
 from factors.rfid.kernels import of_tag, placed, terms
 from factors.rfid.model import Packed
 from factors.se2 import Array

@@ -49,14 +49,16 @@ def _log_sum(rows: Array) -> Array:
 
 
 class TagStates:
-    """The states of T tags. ``dead`` and ``moved``: prior probabilities, together below 1, that a tag is so."""
+    """The states of T tags. ``dead`` and ``moved``: prior probabilities, together below 1, that a tag is so; ``prior``: the
+    log-odds of both."""
 
     def __init__(self, count: int, dead: float, moved: float) -> None:
         self.shifts = displacements()
         each = _log(moved / len(self.shifts))
         prior = np.array((math.log(1.0 - dead - moved), _log(dead), *(each for _ in self.shifts)))
         self._weights = np.tile(prior, (count, 1))  # logarithms, not normalised
-        self._odds = np.full(count, _log(dead + moved) - prior[0])
+        self.prior = float(_log(dead + moved) - prior[0])
+        self._odds = np.full(count, self.prior)
         # time, tags, and what they told of each state
         self._told: deque[tuple[float, NDArray[np.int64], NDArray[np.float32]]] = deque()
         self._heard = -math.inf
@@ -66,10 +68,19 @@ class TagStates:
         """Log-odds (T,) of dead or moved against as surveyed."""
         return self._odds.copy()
 
+    def odds_of(self, tags: NDArray[np.int64]) -> Array:
+        """Those (U,) of U ``tags``."""
+        return np.asarray(self._odds[tags])
+
     @property
     def heard(self) -> float:
         """Time of the last read [s], ``-inf`` if there was none."""
         return self._heard
+
+    @property
+    def doubtful(self) -> NDArray[np.int64]:
+        """The tags that are more likely dead or moved than not."""
+        return np.flatnonzero(self._odds > 0.0)
 
     @property
     def suspects(self) -> dict[int, float]:

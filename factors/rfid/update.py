@@ -11,7 +11,8 @@ import numpy as np
 from factors import positive, se2, se2_kernels
 from factors.odometry.kernels import FAR, ROUNDING
 from factors.rfid import kernels as rfid_kernels
-from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import RfidLikelihood, Score
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Packed
 from factors.se2 import Array, Integers
@@ -66,12 +67,16 @@ def updated(
     likelihood, looks = factor.likelihood, factor.seen
     if factor.estimated or not isinstance(likelihood, RfidLikelihood) or not isinstance(looks, TagReadCounts):
         return scored_update(factor, pose, values, covariance, iterations)
-    tags, seen = likelihood.tags, (looks.offsets, looks.antennas, looks.rounds, looks.hits, looks.odds, looks.elsewhere)
-    arguments = (likelihood.packed, (tags.points, tags.normals), seen, float(likelihood.model.tempering))
+    farthest = iterations * float(np.hypot(*LARGEST_STEP[:2]))
+    near = likelihood.around(pose[None], looks, likelihood.packed, farthest)
+    arguments = (likelihood.packed, near.arrays[:2], near.arrays[2:], float(likelihood.model.tempering))
     try:
-        return TagUpdate(*_updated(*arguments, pose, covariance, iterations), values)
+        found = _updated(*arguments, pose, covariance, iterations)
     except np.linalg.LinAlgError:  # rounding made it singular
-        return TagUpdate(*_updated(*arguments, pose, positive.nearest(covariance), iterations), values)
+        found = _updated(*arguments, pose, positive.nearest(covariance), iterations)
+    at, posterior, nis, dof, excess, variance, evidence = found
+    nll, expected, spread = near.unlisted
+    return TagUpdate(at, posterior, nis, dof, excess + nll - expected, variance + spread, evidence - nll, values)
 
 
 def scored_update(factor: RfidFactor, pose: Array, values: Array, covariance: Array, iterations: int) -> TagUpdate:

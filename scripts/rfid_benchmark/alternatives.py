@@ -26,7 +26,8 @@ from factorgraph_loc.simulation.settings import preset
 from factors import se2
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.odometry.model import OdometryFactor
-from factors.rfid.detection import RfidLikelihood, TagReadCounts
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import RfidLikelihood
 from factors.rfid.factor import RfidFactor
 from factors.se2 import Array
 

@@ -22,7 +22,8 @@ from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings
 from factorgraph_loc.sensors.rfid.tag_map import extent
 from factors import se2
-from factors.rfid.detection import RfidLikelihood, TagReadCounts
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import RfidLikelihood
 from factors.se2 import Array
 from rfid_benchmark.grid_filter import GridFilter
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from time import process_time
 from typing import Any, Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from benchmarking.statistics import first_held
 from benchmarking.trials import BEFORE, HOLD, JUMP, is_right
 
 from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.fusion.base import Estimator
 from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.simulation import simulate
@@ -27,12 +29,14 @@ Kind = Literal["unknown start", "kidnapping"]
 class SimulatedTrial:
     """One trial. ``seconds``: from the first scan (at the new place) until the estimate is correct and stays so for 10 s,
     whatever its status; ``claimed``: until it first is ``localized`` (correct and localized again, after a kidnapping); NaN if
-    never. ``false``: the first claim is wrong; after a kidnapping: it is localized at the deadline without being correct."""
+    never. ``false``: the first claim is wrong; after a kidnapping: it is localized at the deadline without being correct.
+    ``busy_ms``: processor time of each tenth of a second of the log, which holds at most one scan of the presets."""
 
     seed: int
     seconds: float
     claimed: float
     false: bool
+    busy_ms: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,19 @@ class SimulatedTrialJob:
     sensors: tuple[str, ...] | None = None
 
 
+class Clock:
+    """Processor time between the ticks of a run."""
+
+    def __init__(self) -> None:
+        self._last = process_time()
+        self.busy_ms: list[float] = []
+
+    def __call__(self, t: float, estimator: Estimator) -> None:
+        now = process_time()
+        self.busy_ms.append(1e3 * (now - self._last))
+        self._last = now
+
+
 def run_simulated_trials(job: SimulatedTrialJob) -> list[SimulatedTrial]:
     """The trials of a job; jobs can be sent to other processes."""
     trial = start_trial if job.kind == "unknown start" else kidnapping_trial
@@ -56,20 +73,23 @@ def run_simulated_trials(job: SimulatedTrialJob) -> list[SimulatedTrial]:
 
 def start_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     """The beginning of a drive, from an unknown start, long enough to hold a correct estimate at three deadlines."""
-    log = simulate(_lasting(job.simulation, 3.0 * job.deadline + HOLD + 1.0), seed)
-    result = run(log, RunConfig(job.estimator, job.settings, job.sensors, prior="unknown", seed=seed))
+    log = simulate(lasting(job.simulation, 3.0 * job.deadline + HOLD + 1.0), seed)
+    clock = Clock()
+    result = run(log, RunConfig(job.estimator, job.settings, job.sensors, prior="unknown", seed=seed), watch=clock)
     first = float(log.streams["rfid"].t[0])
     good = is_right(result, log)
     claims = np.flatnonzero(np.array(result.status) == "localized")
     claimed = float(result.t[claims[0]]) - first if len(claims) else math.nan
-    return SimulatedTrial(seed, _held(result, good, first), claimed, bool(len(claims)) and not bool(good[claims[0]]))
+    false = bool(len(claims)) and not bool(good[claims[0]])
+    # without the first, which begins before the run
+    return SimulatedTrial(seed, held(result, good, first), claimed, false, tuple(clock.busy_ms[1:]))
 
 
 def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     """A robot that drives from a known start and is then moved to its position a minute later, or the first one after that which
     is 3 m away."""
     after = 3.0 * job.deadline + HOLD + 1.0
-    log = simulate(_lasting(job.simulation, BEFORE + 2.0 * APART + after), seed)
+    log = simulate(lasting(job.simulation, BEFORE + 2.0 * APART + after), seed)
     assert log.reference is not None
     here = log.reference.at(np.array([BEFORE]))[0]
     later = (log.reference.t >= BEFORE + APART) & (log.reference.t <= BEFORE + 2.0 * APART)
@@ -81,19 +101,19 @@ def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     stamps = carried.streams["rfid"].t
     first = float(stamps[stamps > max(before.streams["rfid"].t)][0])
     good = is_right(result, carried)
-    seconds = _held(result, good, first)
+    seconds = held(result, good, first)
     localized = np.array(result.status) == "localized"
     at_deadline = int(np.searchsorted(result.t, first + job.deadline).clip(max=len(result.t) - 1))
     late = not seconds <= job.deadline
     false = late and bool(localized[at_deadline]) and not bool(good[at_deadline])
-    return SimulatedTrial(seed, seconds, _held(result, good & localized, first), false)
+    return SimulatedTrial(seed, seconds, held(result, good & localized, first), false)
 
 
-def _held(result: RunResult, good: np.typing.NDArray[np.bool_], first: float) -> float:
+def held(result: RunResult, good: np.typing.NDArray[np.bool_], first: float) -> float:
     """Seconds from ``first`` until ``good`` (N,) holds."""
     later = result.t >= first - 1e-9
     return first_held(result.t[later], good[later], HOLD) - first
 
 
-def _lasting(settings: SimulationSettings, duration: float) -> SimulationSettings:
+def lasting(settings: SimulationSettings, duration: float) -> SimulationSettings:
     return settings.model_copy(update={"drive": settings.drive.model_copy(update={"duration": duration})})

@@ -15,7 +15,8 @@ from factors.landmarks.model import BearingRangeModel
 from factors.landmarks.model import predict as predict_landmarks
 from factors.rfid import kernels as rfid_kernels
 from factors.rfid import update as rfid_update
-from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, RfidModel
 from factors.update import landmark_update, linearized_update, robust_update

@@ -19,7 +19,8 @@ from factorgraph_loc.sensors.rfid.settings import AntennaSettings, BeamSettings,
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate
 from factors import se2
-from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import RfidLikelihood, TagArray
 
 SENSORS = ("odometry", "rfid")
 KNOWN = RunConfig("particle_filter", {"particles": 1500, "smooth": False}, SENSORS)

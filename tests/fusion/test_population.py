@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.fusion import kld
-from factorgraph_loc.fusion.population import Population
+from factorgraph_loc.fusion.population import CHUNK, PARTICLE, Population
 from factorgraph_loc.fusion.search import laplace_evidence
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.rig import Rig
@@ -16,7 +16,8 @@ from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNo
 from factorgraph_loc.sensors.rfid.bound import TagObservation
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factors import se2
-from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.factor import RfidFactor
 from factors.update import Correction
 
@@ -50,13 +51,15 @@ class World:
     def seeker(self):
         return Population(self.motion, BOUNDS, np.random.default_rng(self.rng.integers(2**32)))
 
-    def scan(self, seeker):
+    def scan(self, seeker, advances=True):
         if self.t > 0.0:
             self.motion.add(VelocityOdometry(self.t, SPEED, self.turn))
         n = self.antennas
         looks = TagReadCounts(np.zeros((n, 3)), np.arange(n), np.ones(n, dtype=np.int64), self.hits())
         factor = RfidFactor(self.told, looks)
         seeker.add(self.motion.state(self.t), TagObservation(self.t, factor, int(looks.hits.sum()), looks))
+        if advances:
+            seeker.advance()
         at, self.t = self.truth, self.t + STEP
         self.truth = se2.compose(at, se2.exp(np.array((SPEED, 0.0, self.turn)) * STEP))
         return at
@@ -172,3 +175,44 @@ def test_an_evidence_of_zero_is_an_evidence():
     spread = np.eye(3)
     known = Correction(np.ones(3), spread, np.empty((0, 1)), 1.0, 1, evidence=0.0)
     assert laplace_evidence(Unasked(), np.zeros(3), spread, known) == 0.0
+
+
+def test_slices_of_any_size_tell_the_same():
+    """What is found depends on what was seen alone, and not on how the work was cut."""
+    worlds = [World(scattered(5), 5) for _ in range(2)]
+    whole, sliced = (world.seeker() for world in worlds)
+    for _ in range(6):
+        worlds[0].scan(whole)
+    for _ in range(6):
+        worlds[1].scan(sliced, advances=False)
+    assert sliced.waits
+    assert sliced.best is None
+    slices = 0
+    while sliced.waits:
+        sliced.advance(1.0)
+        slices += 1
+    assert slices > 20
+    assert np.array_equal(sliced.particles[0], whole.particles[0])
+    assert np.array_equal(sliced.particles[1], whole.particles[1])
+    assert sliced.log_evidence == whole.log_evidence
+
+
+def test_no_slice_takes_more_than_its_work():
+    class Counted:
+        t, found, things, work = 0.0, 1, frozenset(), 1000
+        weighed = 0
+
+        def log_likelihood(self, poses, values):
+            self.weighed += len(poses)
+            return -0.5 * np.sum(poses[:, :2] ** 2, axis=1)
+
+    observation = Counted()
+    world = World(scattered(1), 1)
+    seeker = world.seeker()
+    assert seeker.add(world.motion.state(0.0), observation)
+    most = 0
+    while seeker.waits:
+        before = observation.weighed
+        seeker.advance(1.0)
+        most = max(most, observation.weighed - before)
+    assert 0 < most * (observation.work + PARTICLE) <= CHUNK

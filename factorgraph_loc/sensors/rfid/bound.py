@@ -21,11 +21,13 @@ from factorgraph_loc.sensors.rfid.tag_map import extent
 from factors import positive, se2
 from factors.graph import Factor
 from factors.rfid import update as rfid_update
-from factors.rfid.detection import RfidLikelihood, TagReadCounts, together
+from factors.rfid.counts import TagReadCounts, together
+from factors.rfid.detection import RfidLikelihood
 from factors.rfid.factor import RfidFactor
 from factors.se2 import Array
 from factors.update import Correction
 
+SCAN = 50  # work of a scan, besides that of the tags in reach
 NO_RESIDUAL = np.empty((0, 1))
 
 
@@ -49,14 +51,14 @@ class TagObservation:
         return self.here is not None
 
     @property
+    def work(self) -> int:
+        return self.factor.work
+
+    @property
     def things(self) -> frozenset[Hashable]:
         """The tags that were read, by index in the map."""
         looks = self.factor.seen
-        return (
-            frozenset(np.flatnonzero(looks.hits.any(axis=0)).tolist())
-            if isinstance(looks, TagReadCounts)
-            else frozenset()
-        )
+        return frozenset(looks.heard.tolist()) if isinstance(looks, TagReadCounts) else frozenset()
 
     def at_its_time(self) -> Self | None:
         """The reads and misses at their own time; None for strength and phase, whose likelihoods are multimodal."""
@@ -116,7 +118,11 @@ class TagSensor(Sensor):
         self.constants = constants
         self._blocks = (self.modality,) if constants.names else ()
         self.tags = KnownTags(setup, diagnostics)
-        self.bounds = extent(setup.world, self.tags.map.tags) if self.tags.likelihood is not None else None
+        self.bounds = None
+        if self.tags.likelihood is not None:
+            self.tags.likelihood.prepare()
+            self.work = SCAN + round(self.tags.likelihood.reached)
+            self.bounds = extent(setup.world, self.tags.map.tags)
         self._diagnostics = diagnostics
         self._signals = TagSignals(setup, self.tags)
         self._monitor, self._silence = ScanMonitor(), SilenceMonitor()

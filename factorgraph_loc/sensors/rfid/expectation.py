@@ -12,7 +12,8 @@ from factorgraph_loc.sensors.interfaces import Array32, Places
 from factorgraph_loc.sensors.rfid.forecast import ScanTables, log_weights, make_tables
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
-from factors.rfid.detection import RfidLikelihood, TagReadCounts
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import RfidLikelihood
 from factors.se2 import Array
 
 ROUNDS_PER_SECOND = 2.0  # default rate

@@ -12,11 +12,11 @@ from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.tag_map import TagMap, tag_map
 from factors import positive, se2
-from factors.rfid.detection import RfidLikelihood, TagReadCounts
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import RfidLikelihood
 from factors.rfid.tag_states import FARTHEST, TagStates
 from factors.se2 import Array, Integers
 
-REACHING = 1.5  # times the reach of the antennas: tags that a longer range than the rig's might bring into reach
 CONFIRMED = (
     1.0  # s until a read counts as evidence on the state of its tag: a track that it contradicts may be doubted by then
 )
@@ -77,7 +77,7 @@ class KnownTags:
             diagnostics.ignore("antenna that the rig lacks", rows.count(-1))
         if not len(used) or not self.map.names:
             return None
-        hits = np.zeros((len(used), len(self.map.names)), dtype=np.int64)
+        reads: list[tuple[int, int]] = []
         unknown = 0
         # count a tag once per round
         for number, name in dict.fromkeys(zip(m.antenna.tolist(), m.tags, strict=True)):
@@ -85,34 +85,39 @@ class KnownTags:
             if place is None:
                 unknown += 1
             elif rows[number] >= 0:
-                hits[rows[number], place] += 1
+                reads.append((rows[number], place))
         if unknown:
             diagnostics.ignore("tag not in the map", unknown)
-        heard = hits.any(axis=0)
-        self.states.hear(m.t, np.flatnonzero(heard))
+        row, read = np.array(reads, dtype=np.int64).reshape(-1, 2).T
+        self.states.hear(m.t, np.unique(read))
         self._tell()
-        odds = self.states.odds
+        tags = np.union1d(read, self.states.doubtful)
+        hits = np.zeros((len(used), len(tags)), dtype=np.int64)
+        np.add.at(hits, (row, np.searchsorted(tags, read)), 1)
+        odds = self.states.odds_of(tags)
         # what is read of a tag that is believed to have moved tells nothing of an unknown pose
-        elsewhere = np.where(heard & (odds <= 0.0), -np.inf, 0.0)
-        return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere)
+        elsewhere = np.where(hits.any(axis=0) & (odds <= 0.0), -np.inf, 0.0)
+        prior = self.states.prior
+        return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere, tags, prior)
 
     def told(self, looks: TagReadCounts, pose: Array, covariance: Array, likelihood: RfidLikelihood) -> TagEvidence:
         """What looks tell of the tags in reach at a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3); ``likelihood``:
         with the detection models as they are estimated to be."""
         root = WIDENED * math.sqrt(3.0) * positive.root(covariance)
         poses = se2.compose(pose, se2.exp(np.concatenate((root.T, -root.T))))
-        near = likelihood.near(poses, looks, REACHING, FARTHEST) | looks.hits.any(axis=0)
-        tags = np.flatnonzero(near & (looks.odds > -np.inf))
+        tags = np.union1d(likelihood.reachable(poses, looks, FARTHEST), looks.heard)
+        tags = tags[self.states.odds_of(tags) > -np.inf]
         shifts = np.concatenate((np.zeros((1, 2)), self.states.shifts))
-        return TagEvidence(
-            tags, likelihood.displaced(poses, looks, tags, shifts), np.asarray(looks.hits[:, tags].any(axis=0))
-        )
+        return TagEvidence(tags, likelihood.displaced(poses, looks, tags, shifts), np.isin(tags, looks.heard))
 
     def with_states(self, looks: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
         """The looks at tags that may be dead or moved, of which they tell ``evidence``."""
-        elsewhere = looks.elsewhere.copy()
-        elsewhere[evidence.tags] = self.states.expect(evidence.tags, evidence.told)
-        return replace(looks, elsewhere=elsewhere)
+        looks = looks.listing(np.union1d(looks.listed, evidence.tags))
+        at = np.searchsorted(looks.listed, evidence.tags)
+        odds, elsewhere = looks.odds.copy(), looks.elsewhere.copy()
+        odds[at] = self.states.odds_of(evidence.tags)
+        elsewhere[at] = self.states.expect(evidence.tags, evidence.told)
+        return replace(looks, odds=odds, elsewhere=elsewhere)
 
     def learn(self, t: float, evidence: TagEvidence) -> None:
         """Learn of the tags that were not read at ``t``, and of those that were read :data:`CONFIRMED` ago."""

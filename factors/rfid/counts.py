@@ -1,0 +1,99 @@
+"""Reads and misses of tags as counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.rfid import kernels as rfid_kernels
+from factors.se2 import Array, Integers
+
+
+@dataclass(frozen=True, eq=False)
+class TagReadCounts:
+    """Read counts of tags by K antennas, each at its own pose.
+
+    ``offsets`` (K, 3): the robot's pose at the measurement, in the frame of the likelihood's pose; ``antennas`` (K,): indices in
+    the model; ``rounds`` (K,): inventory rounds. ``tags`` (C,): places in the map, ascending, of the tags that are listed; None,
+    the default, if all of the map are. ``hits`` (K, C): number of rounds that read each of them; the others were not read.
+    ``odds`` (C,): prior log-odds that each is dead or moved (:class:`~factors.rfid.tag_states.TagStates`), ``-inf`` for as
+    surveyed, the default; ``others``: those of the tags that are not listed. ``elsewhere`` (C,): tempered log-likelihood of what
+    was seen of the tag if so, relative to a silence out of reach; by default that of a dead tag: 0, or ``-inf`` if it was read.
+    """
+
+    offsets: Array
+    antennas: NDArray[np.int64]
+    rounds: NDArray[np.int64]
+    hits: NDArray[np.int64]
+    odds: Array = field(default_factory=lambda: np.empty(0))
+    elsewhere: Array = field(default_factory=lambda: np.empty(0))
+    tags: Integers | None = None
+    others: float = -np.inf
+
+    def __post_init__(self) -> None:
+        if not len(self.odds):
+            object.__setattr__(self, "odds", np.full(self.hits.shape[1], -np.inf))
+        if not len(self.elsewhere):
+            object.__setattr__(self, "elsewhere", np.where(self.hits.any(axis=0), -np.inf, 0.0))
+
+    @property
+    def arrays(self) -> tuple[Array, Integers, Integers, Integers, Array, Array]:
+        """Offsets, antennas, rounds, hits, odds and elsewhere."""
+        return self.offsets, self.antennas, self.rounds, self.hits, self.odds, self.elsewhere
+
+    @property
+    def listed(self) -> Integers:
+        """Places (C,) in the map of the tags that are listed."""
+        return np.arange(self.hits.shape[1]) if self.tags is None else self.tags
+
+    @property
+    def heard(self) -> Integers:
+        """Places in the map of the tags that were read, ascending."""
+        return np.asarray(self.listed[self.hits.any(axis=0)])
+
+    def moved(self, offset: Array) -> TagReadCounts:
+        """The counts relative to the pose that lies ``offset`` (3,) before theirs."""
+        return replace(self, offsets=rfid_kernels.moved(offset, self.offsets))
+
+    def listing(self, tags: Integers) -> TagReadCounts:
+        """The same with ``tags`` listed, ascending, which are among them all that are listed now."""
+        if self.tags is None or len(tags) == len(self.tags):
+            return self
+        at = np.searchsorted(tags, self.tags)
+        hits = np.zeros((len(self.hits), len(tags)), dtype=np.int64)
+        hits[:, at] = self.hits
+        odds, elsewhere = np.full(len(tags), self.others), np.zeros(len(tags))
+        odds[at], elsewhere[at] = self.odds, self.elsewhere
+        return replace(self, hits=hits, odds=odds, elsewhere=elsewhere, tags=tags)
+
+    def with_odds(self, odds: Array) -> TagReadCounts:
+        """The same with log-odds ``odds`` (T,) of all tags of the map."""
+        return replace(self, odds=odds if self.tags is None else odds[self.tags])
+
+
+def together(parts: list[TagReadCounts]) -> TagReadCounts:
+    """Merge counts relative to one pose, in order of time; the odds are those of the first that lists a tag, what they tell of tags
+    adds up."""
+    if len(parts) == 1:
+        return parts[0]
+    tags = parts[0].tags
+    if tags is not None:
+        tags = np.unique(np.concatenate([p.listed for p in parts]))
+        odds = np.full(len(tags), parts[0].others)
+        for p in reversed(parts):
+            odds[np.searchsorted(tags, p.listed)] = p.odds
+        parts = [p.listing(tags) for p in parts]
+    else:
+        odds = parts[0].odds
+    return TagReadCounts(
+        np.concatenate([p.offsets for p in parts]),
+        np.concatenate([p.antennas for p in parts]),
+        np.concatenate([p.rounds for p in parts]),
+        np.concatenate([p.hits for p in parts]),
+        odds,
+        np.sum([p.elsewhere for p in parts], axis=0),
+        tags,
+        parts[0].others,
+    )

@@ -1,0 +1,158 @@
+"""A hall of 100 x 60 m: unknown starts, two kidnappings in one run, and what a scan costs in maps of all sizes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from benchmarking.report import Options, Report, share_text
+from benchmarking.trials import BEFORE, HOLD, JUMP, is_right
+
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.simulation import simulate
+from factorgraph_loc.simulation.settings import SimulationSettings, preset
+from rfid_benchmark.simulated_trials import (
+    Clock,
+    SimulatedTrial,
+    SimulatedTrialJob,
+    held,
+    lasting,
+    run_simulated_trials,
+)
+
+SEEDS = 5
+FIRST = 3000  # first seed, not used by other sections
+ESTIMATORS = ("smoother", "particle_filter")
+TAGS = (500, 10_000)
+START, RETURN = 15.0, 20.0  # s
+DENSITY, SIZES = 500 / 6000, (100, 1000, 10_000)  # tags per m^2, and in all
+RATIO = 0.6  # depth over width
+SCANS = 60.0  # s of a drive on which scans are timed
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run: ``what`` is a start, two kidnappings, or the time of scans."""
+
+    what: str
+    estimator: str
+    tags: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Returns:
+    """Seconds until the estimate was right after each of two kidnappings, NaN if never; ``false``: localized at a deadline without
+    being right; ``worst`` [m]: largest error of the final trajectory; ``busy_ms``: see :class:`.SimulatedTrial`."""
+
+    seconds: tuple[float, ...]
+    false: bool
+    worst: float
+    busy_ms: tuple[float, ...]
+
+
+def hall(tags: int, width: float = 100.0) -> SimulationSettings:
+    """Shelves with tags in a hall."""
+    return preset("warehouse", {"world": {"width": width, "depth": RATIO * width, "tags": tags}})
+
+
+def section(options: Options) -> Report:
+    report = Report("hall", options)
+    seeds = range(FIRST, FIRST + options.count(SEEDS))
+    jobs = [
+        Job(what, name, tags, seed)
+        for what in ("start", "return")
+        for tags in TAGS
+        for name in ESTIMATORS
+        for seed in seeds
+    ]
+    jobs += [Job("scan", name, tags, FIRST) for name in ESTIMATORS for tags in SIZES]
+    outcomes = report.collect(measured, jobs, [f"{j.what}, {j.estimator}, {j.tags} tags, seed {j.seed}" for j in jobs])
+    report.say(
+        f"{len(seeds)} runs of each kind in a hall of 100 x 60 m, each in a new world. *Right in time*: within {START:.0f} s of an "
+        f"unknown start, within {RETURN:.0f} s of each of two kidnappings, and for 10 s from then on. *Busy*: processor time of a "
+        "tenth of a second of the log, which holds at most one scan with its estimate: 99.9 % of them, and the largest"
+    )
+    rows: list[tuple[str, ...]] = []
+    groups: dict[tuple[str, int, str], list[Any]] = {}
+    for i in sorted(outcomes):
+        groups.setdefault((jobs[i].what, jobs[i].tags, jobs[i].estimator), []).append(outcomes[i])
+    for (what, tags, name), found in groups.items():
+        if what != "scan":
+            rows.append((what, f"{tags:,}", name, *row(found)))
+    heads = ("", "tags", "estimator", "right in time", "median [s]", "false claims")
+    report.table((*heads, "busy [ms]", "largest final error [m]"), rows)
+    times = {(name, tags): found[0] for (what, tags, name), found in groups.items() if what == "scan"}
+    report.say(f"Processor time of a scan with its estimate, median [ms], at {DENSITY:.3f} tags per m^2")
+    cells = [
+        (name, *(f"{times[name, tags]:.2f}" if (name, tags) in times else "–" for tags in SIZES)) for name in ESTIMATORS
+    ]
+    report.table(("estimator", *(f"{tags:,} tags" for tags in SIZES)), cells)
+    return report
+
+
+def row(found: list[SimulatedTrial | Returns]) -> tuple[str, ...]:
+    starts = [t for t in found if isinstance(t, SimulatedTrial)]
+    returns = [t for t in found if isinstance(t, Returns)]
+    seconds = [t.seconds for t in starts] + [s for t in returns for s in t.seconds]
+    deadline = START if starts else RETURN
+    busy = np.concatenate([t.busy_ms for t in found])
+    known = np.where(np.isnan(seconds), np.inf, seconds)
+    worst = f"{max(t.worst for t in returns):.2f}" if returns else "–"
+    return (
+        share_text(int(np.sum(known <= deadline)), len(known)),
+        f"{np.median(known):.1f}",
+        share_text(sum(t.false for t in found), len(found)),
+        f"{np.percentile(busy, 99.9):.0f} / {busy.max():.0f}",
+        worst,
+    )
+
+
+def measured(job: Job) -> SimulatedTrial | Returns | float:
+    """The outcome of a job; the time of a scan for jobs of that kind."""
+    # exclude compilation
+    run(simulate(preset("office", {"drive": {"duration": 10.0}}), 1), RunConfig(job.estimator, prior="unknown"))
+    if job.what == "start":
+        return run_simulated_trials(
+            SimulatedTrialJob("unknown start", hall(job.tags), (job.seed,), job.estimator, START)
+        )[0]
+    return returns(job) if job.what == "return" else scan_ms(job)
+
+
+def returns(job: Job) -> Returns:
+    """A known start, and two kidnappings to random places of the same hall."""
+    after = 2.0 * RETURN + HOLD
+    world = hall(job.tags).model_copy(update={"world_seed": job.seed})
+    parts = [cut(simulate(lasting(world, BEFORE), 3 * job.seed), 0.0, BEFORE)]
+    for k in (1, 2):
+        parts.append(cut(simulate(lasting(world, after), 3 * job.seed + k), 0.0, after))
+    log, moved = parts[0], []
+    for part in parts[1:]:
+        moved.append(log.span()[1] + JUMP)
+        log = join(log, part, gap=JUMP)
+    clock = Clock()
+    result = run(log, RunConfig(job.estimator, prior="reference", seed=job.seed), watch=clock)
+    good, localized = is_right(result, log), np.array(result.status) == "localized"
+    seconds, false = [], False
+    for begin in moved:
+        until = result.t < min((m for m in moved if m > begin), default=math.inf)
+        seconds.append(held(result, good & until, begin))
+        at = int(np.searchsorted(result.t, begin + RETURN))
+        false |= bool(localized[at]) and not bool(good[at])
+    assert log.reference is not None
+    truth = log.reference.at(result.final.t, max_gap=0.1)
+    error = np.hypot(*(result.final.poses[:, :2] - truth[:, :2]).T)
+    return Returns(tuple(seconds), false, float(np.nanmax(error)), tuple(clock.busy_ms[1:]))
+
+
+def scan_ms(job: Job) -> float:
+    """Median processor time [ms] of the tenths of a second that hold a scan."""
+    width = math.sqrt(job.tags / DENSITY / RATIO)
+    log = simulate(lasting(hall(job.tags, width), SCANS), job.seed)
+    clock = Clock()
+    run(log, RunConfig(job.estimator, prior="reference", seed=job.seed), watch=clock)
+    scans = len(np.unique(log.streams["rfid"].t))
+    return float(np.median(np.sort(clock.busy_ms[1:])[-scans:]))

@@ -1,0 +1,96 @@
+"""Counts that list only some tags of a map tell what counts of all tags tell."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factors.rfid.counts import TagReadCounts, together
+from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.factor import RfidFactor
+from factors.rfid.model import Antenna, BeamModel, RfidModel
+from factors.rfid.update import updated
+
+ANTENNAS = tuple(Antenna(0.2, 0.1 * k, 1.2, 1.5 * k) for k in range(4))
+POSE = np.array((40.0, 20.0, 0.4))
+PRIOR = -2.7
+
+
+def scene(seed=0):
+    """A likelihood with 400 tags, and looks at POSE that list all tags, and only those that were read or are in doubt."""
+    rng = np.random.default_rng(seed)
+    count = 400
+    points = np.column_stack((rng.uniform(0.0, (80.0, 40.0), (count, 2)), np.full(count, 1.2)))
+    likelihood = RfidLikelihood(RfidModel(ANTENNAS, (BeamModel(),), tempering=0.8), TagArray(points, np.zeros(count)))
+    chance = np.stack([likelihood.probabilities(POSE[None], k)[0] for k in range(len(ANTENNAS))])
+    hits = (rng.random(chance.shape) < chance).astype(np.int64)
+    offsets = rng.normal(size=(len(ANTENNAS), 3)) * 0.1
+    odds, elsewhere = np.full(count, PRIOR), np.where(hits.any(axis=0), -5.0, 0.0)
+    odds[::9] = 1.0
+    rounds = np.ones(len(ANTENNAS), dtype=np.int64)
+    whole = TagReadCounts(offsets, np.arange(len(ANTENNAS)), rounds, hits, odds, elsewhere)
+    tags = np.flatnonzero(hits.any(axis=0) | (odds != PRIOR))
+    listed = {"hits": hits[:, tags], "odds": odds[tags], "elsewhere": elsewhere[tags]}
+    return likelihood, whole, replace(whole, **listed, tags=tags, others=PRIOR)
+
+
+def test_few_tags_are_looked_at():
+    likelihood, _, some = scene()
+    near = likelihood.around(POSE[None], some, likelihood.packed)
+    assert len(some.listed) < len(near.looks.listed) < 200
+    reachable = likelihood.reachable(POSE[None], some, 1.5)
+    assert 10 < len(reachable) < 150
+
+
+@pytest.mark.parametrize("parameters", [np.zeros(2), np.array((0.2, -0.5))])
+def test_scores_are_the_same(parameters):
+    likelihood, whole, some = scene()
+    adjusted = likelihood.adjusted(parameters)
+    for pose in (POSE, POSE + np.array((6.0, -4.0, 1.0)), POSE + np.array((500.0, 0.0, 0.0))):
+        for a, b in zip(adjusted.score(pose, whole), adjusted.score(pose, some), strict=True):
+            assert b == pytest.approx(a, rel=1e-9, abs=1e-9)
+        joint = (likelihood.joint_score(pose, parameters, looks) for looks in (whole, some))
+        for a, b in zip(*joint, strict=True):
+            assert b == pytest.approx(a, rel=1e-9, abs=1e-9)
+
+
+def test_updates_are_the_same():
+    likelihood, whole, some = scene()
+    start, covariance = POSE + np.array((0.5, -0.4, 0.2)), np.diag((0.5, 0.5, 0.3)) ** 2
+    a, b = (updated(RfidFactor(likelihood, looks), start, np.zeros(0), covariance) for looks in (whole, some))
+    assert b.pose == pytest.approx(a.pose, abs=1e-9)
+    for name in ("covariance", "nis", "excess_nll", "variance", "evidence"):
+        assert getattr(b, name) == pytest.approx(getattr(a, name), rel=1e-9)
+
+
+@pytest.mark.parametrize("spread", [0.3, 15.0])
+def test_particles_weigh_the_same(spread):
+    likelihood, whole, some = scene()
+    poses = POSE + np.random.default_rng(1).normal(size=(200, 3)) * (spread, spread, 0.3)
+    parameters = np.random.default_rng(2).normal(size=(200, 2)) * (0.1, 0.3)
+    for each in (None, parameters):
+        a, b = (likelihood.log_likelihood(poses, looks, each) for looks in (whole, some))
+        assert b == pytest.approx(a, abs=1e-3)  # each tag that may have moved is added in single precision
+
+
+def test_what_scans_tell_of_tags_is_the_same():
+    likelihood, whole, some = scene()
+    tags, shifts = likelihood.reachable(POSE[None], some, 1.5), np.array(((0.0, 0.0), (1.0, -0.5)))
+    poses = POSE + np.random.default_rng(1).normal(size=(6, 3)) * 0.1
+    told = [likelihood.displaced(poses, looks, tags, shifts) for looks in (whole, some)]
+    assert told[0] == pytest.approx(told[1], abs=1e-12)
+
+
+def test_merged_counts_list_what_any_of_them_lists():
+    _, whole, some = scene(0)
+    _, other, fewer = scene(1)
+    fewer = replace(fewer, odds=np.full(len(fewer.listed), 3.0))
+    whole_of_two, of_two = together([whole, other]), together([some, fewer])
+    assert set(of_two.listed) == set(some.listed) | set(fewer.listed)
+    at = np.searchsorted(of_two.listed, some.listed)
+    assert np.array_equal(of_two.odds[at], some.odds)
+    assert np.array_equal(of_two.hits, whole_of_two.hits[:, of_two.listed])
+    assert of_two.elsewhere == pytest.approx(whole_of_two.elsewhere[of_two.listed])
+    assert set(of_two.heard) == set(np.flatnonzero(whole_of_two.hits.any(axis=0)))
+    final = of_two.with_odds(np.arange(400.0))
+    assert np.array_equal(final.odds, of_two.listed)
