@@ -8,6 +8,7 @@ __all__ = [
     "GridModel",
     "LogisticModel",
     "adjustment",
+    "counts",
     "detection",
     "factor",
     "kernels",

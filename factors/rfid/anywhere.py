@@ -36,7 +36,7 @@ class PlaceTables(NamedTuple):
     none: Array
 
 
-class Silence(NamedTuple):
+class TagSilence(NamedTuple):
     """What a tag that nobody reads tells, by its place in the robot's frame: ``untold`` (H, S, S), log-likelihood above that out of
     reach; ``folded`` (H, S, S): the same, tempered, of a tag that may be dead or moved with log-odds ``odds``; ``reach`` [m]."""
 
@@ -47,7 +47,7 @@ class Silence(NamedTuple):
 
 
 class Listed(NamedTuple):
-    """The W tags that have tables of their own in no :class:`Silence`: ``number`` (T,), which of them a tag of the index is, -1 for
+    """The W tags that have tables of their own in no :class:`TagSilence`: ``number`` (T,), which of them a tag of the index is, -1 for
     others; log-odds ``odds`` (W,) and ``elsewhere`` (W,) as in :mod:`factors.rfid.tag_states`; the reads of tag w are
     ``first[w]`` to ``first[w + 1]`` of ``antennas`` (R,) and ``hits`` (R,); ``far`` (W,): its log-likelihood out of reach."""
 
@@ -77,7 +77,7 @@ def place_tables(model: RfidModel, packed: Packed, tables: Tables) -> PlaceTable
     return PlaceTables(gain, missed, level.reshape(-1).astype(np.int64), reach, tables.logs[0].copy())
 
 
-def silence(tables: PlaceTables, antennas: Integers, rounds: Integers, odds: float, tempering: float) -> Silence:
+def silence(tables: PlaceTables, antennas: Integers, rounds: Integers, odds: float, tempering: float) -> TagSilence:
     """That of ``rounds`` (K,) of ``antennas`` (K,)."""
     untold: NDArray[np.float32] = np.zeros(tables.missed.shape[1:], dtype=np.float32)
     for antenna, count in zip(antennas.tolist(), rounds.tolist(), strict=True):
@@ -89,7 +89,7 @@ def silence(tables: PlaceTables, antennas: Integers, rounds: Integers, odds: flo
     half = (untold.shape[1] - 1) // 2
     telling = np.argwhere((np.abs(own) > NO_MATTER).any(axis=0)) - half
     reach = CELL * (float(np.max(np.hypot(*telling.T), initial=0.0)) + 1.0)
-    return Silence(untold, folded, odds, min(reach, tables.reach))
+    return TagSilence(untold, folded, odds, min(reach, tables.reach))
 
 
 @numba.njit(cache=True)
@@ -99,7 +99,7 @@ def log_likelihood(
     points: Array,
     levels: Integers,
     tables: PlaceTables,
-    silent: Silence,
+    silent: TagSilence,
     listed: Listed,
     tempering: float,
     out: Array,

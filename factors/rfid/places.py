@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from factors.rfid import anywhere
-from factors.rfid.anywhere import Listed, PlaceTables, Silence
+from factors.rfid.anywhere import Listed, PlaceTables, TagSilence
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.index import TagIndex, tag_index
 from factors.rfid.model import Packed, RfidModel
@@ -36,7 +36,7 @@ class Places:
     index: TagIndex
     points: Array
     levels: Integers
-    _last: dict[tuple[object, ...], Silence] = field(default_factory=dict)
+    _last: dict[tuple[object, ...], TagSilence] = field(default_factory=dict)
 
     @classmethod
     def of(cls, model: RfidModel, packed: Packed, antennas: Tables, points: Array) -> Places | None:
@@ -67,7 +67,7 @@ class Places:
         anywhere.log_likelihood(poses, *of_map, self.tables, silent, listed, self.tempering, out)
         return out
 
-    def _silence(self, looks: TagReadCounts) -> Silence:
+    def _silence(self, looks: TagReadCounts) -> TagSilence:
         """What a silence tells, for the odds that most tags have; that of the last looks is kept."""
         odds = looks.others if looks.tags is not None else float(np.sort(looks.odds)[len(looks.odds) // 2])
         key = (looks.antennas.tobytes(), looks.rounds.tobytes(), odds)
