@@ -47,7 +47,7 @@ class TagSilence(NamedTuple):
 
 
 class Listed(NamedTuple):
-    """The W tags that have tables of their own in no :class:`TagSilence`: ``number`` (T,), which of them a tag of the index is, -1 for
+    """The W tags that are in no :class:`TagSilence`: ``number`` (T,), which of them a tag of the index is, -1 for
     others; log-odds ``odds`` (W,) and ``elsewhere`` (W,) as in :mod:`factors.rfid.tag_states`; the reads of tag w are
     ``first[w]`` to ``first[w + 1]`` of ``antennas`` (R,) and ``hits`` (R,); ``far`` (W,): its log-likelihood out of reach."""
 
