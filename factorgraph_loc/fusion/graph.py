@@ -99,7 +99,7 @@ class Graph:
     @property
     def newest(self) -> Keyframe:
         """The newest keyframe."""
-        return self.keyframes[-1]
+        return self.keyframes.last
 
     def append(self, keyframe: Keyframe) -> None:
         """Add a keyframe after all others."""

@@ -34,6 +34,11 @@ class Kept(Sequence[T], Generic[T]):
     def __delitem__(self, numbers: slice) -> None:
         del self._items[self._place(numbers)]
 
+    @property
+    def last(self) -> T:
+        """The newest item."""
+        return self._items[-1]
+
     def append(self, item: T) -> None:
         """Add one at the end."""
         self._items.append(item)

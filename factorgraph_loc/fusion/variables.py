@@ -5,9 +5,9 @@ A variable is a pose (3,), or a vector: constants of a sensor that are estimated
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
+from types import TracebackType
 
 import gtsam
 import numpy as np
@@ -79,13 +79,15 @@ class Node:
         return any(is_pose(key) for key in self.keys)
 
 
-@contextmanager
-def gtsam_errors() -> Iterator[None]:
-    """Whatever GTSAM throws, and what cannot be linearised for it, as RuntimeError."""
-    try:
-        yield
-    except (IndexError, ValueError) as error:
-        raise RuntimeError(str(error)) from error
+class gtsam_errors:  # noqa: N801 - used as a function
+    """A context in which whatever GTSAM throws, and what cannot be linearised for it, becomes a RuntimeError."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if isinstance(error, (IndexError, ValueError)):
+            raise RuntimeError(str(error)) from error
 
 
 def retract(key: int, value: Array, step: Array) -> Array:
