@@ -40,7 +40,7 @@ def test_nothing_is_learnt_of_a_start_that_nothing_measures(log):
     sigmas = []
 
     def watch(_, estimator):
-        sigmas.append(np.sqrt(np.diag(estimator._incremental._solver.covariance(pose_key(0)))))
+        sigmas.append(np.sqrt(np.diag(estimator._backend._solver.covariance(pose_key(0)))))
 
     run(log, RunConfig("smoother", {"landmarks": "unknown"}, prior=START), watch=watch)
     assert np.allclose(sigmas, SIGMA, rtol=1e-4)
@@ -93,7 +93,7 @@ def test_our_factors_are_linearised_where_isam2_linearises(skip, lag, log):
     moved = set()
 
     def watch(_, estimator):
-        solver = estimator._incremental._solver
+        solver = estimator._backend._solver
         assert isinstance(solver, FullHistory if lag is None else Window)
         isam = solver._isam if lag is None else solver._smoother.getISAM2()
         assert set(isam.getLinearizationPoint().keys()) == set(solver._ours.at)
