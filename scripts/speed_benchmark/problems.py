@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -40,7 +41,9 @@ def landmark_log(seconds: float) -> Log:
     """A drive through an office whose walls carry landmarks, seen by a camera that measures depths."""
     world = {"tags": 1, "landmarks": 30}
     settings = {"world": world, "drive": {"duration": seconds}, "rig": RIG, "sightings": SIGHTINGS}
-    return simulate(preset("office", settings), SEED)
+    log = simulate(preset("office", settings), SEED)
+    streams = {name: log.streams[name] for name in SENSORS}  # no tags
+    return replace(log, streams=streams, rig=log.rig.model_copy(update={"sensors": SENSORS}))
 
 
 def problem_of(log: Log) -> Problem:

@@ -79,6 +79,7 @@ def read_ratios(path: Path) -> dict[str, float]:
 def quick(out: Path, against: Path | None) -> int:
     """Measure, print the table, and store it; the exit code is 1 if a ratio is worse than the one of ``against``."""
     stored = read_ratios(against) if against is not None else {}
+    out.parent.mkdir(parents=True, exist_ok=True)
     pairs = workloads()
     found = measure(pairs)
     ratios = {name: ours / reference for name, (ours, reference) in found.items()}

@@ -40,6 +40,7 @@ def test_references_localize(problem, loop):
 
 @pytest.mark.parametrize("label", ["EKF", "batch"])
 def test_ours_solve_the_same_problem(log, problem, label):
+    assert set(log.streams) == {"odometry", "bearing_range"}  # nothing that the references do not have
     found = measured(log, problem, CONFIGS[label])
     assert found["position"] < 0.15
     assert found["seconds"] > 0.0
@@ -85,10 +86,10 @@ def test_a_quarter_more_than_before_is_a_loss(tmp_path, monkeypatch, capsys, our
         return lambda: {"EKF": Pair(lambda: seconds, lambda: 1.0, "numpy EKF")}
 
     monkeypatch.setattr(quick, "workloads", pairs(2.0))
-    assert quick.quick(tmp_path / "before.json", None) == 0
+    assert quick.quick(tmp_path / "new/before.json", None) == 0
     monkeypatch.setattr(quick, "workloads", pairs(ours))
     capsys.readouterr()
-    assert quick.quick(tmp_path / "now.json", tmp_path / "before.json") == code
+    assert quick.quick(tmp_path / "now.json", tmp_path / "new/before.json") == code
     told = capsys.readouterr().out
     assert f"| EKF | {ours:.3f} | numpy EKF | 1.000 | {ours:.2f} | 2.00 |" in told
     assert ("slower than before: EKF: 2.60, was 2.00" in told) == bool(code)
