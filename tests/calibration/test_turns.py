@@ -59,6 +59,21 @@ def test_the_antennas_are_learnt_without_a_reference(found):
     assert found.turns[-1] < 0.3 < found.turns[0]
 
 
+def test_independent_reads_keep_their_tempering(found):
+    (tempering,) = (c for c in found.knowledge.constants if c.name == "tempering")
+    assert not tempering.kept
+    assert tempering.fitted > 0.85
+    assert found.rig.rfid.tempering == 1.0
+
+
+def test_bursts_lower_the_tempering(tmp_path):
+    """Fades of five seconds, of which a rig without them knows nothing."""
+    faults = {"fading": {"duration": 5.0, "share": 0.4}}
+    log = simulate(preset("office", {"drive": {"duration": 90.0}, "faults": faults}), 3)
+    turns = learn_by_turns([log], log.rig, smoothed, tmp_path / "cart")
+    assert 0.12 < turns.knowledge.rig.rfid.tempering < 0.5
+
+
 def test_priors_come_from_the_scatter_between_logs(found):
     prior = found.rig.rfid.models["default"].prior
     assert 0.005 < prior.range_scale < 0.03

@@ -19,9 +19,10 @@ from factorgraph_loc.sensors.calibrating import Settled
 from factorgraph_loc.sensors.odometry.calibration.constants import REFERENCE_GAP
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor
 from factorgraph_loc.sensors.rfid.calibration.learn import CALIBRATED, floor_of, written
-from factorgraph_loc.sensors.rfid.calibration.pairs import BLOCKS, TagPairs, pairs_of
+from factorgraph_loc.sensors.rfid.calibration.pairs import BLOCKS, TagPairs, modelled, pairs_of
 from factorgraph_loc.sensors.rfid.calibration.refit import Refit, refit_beam, refit_logistic
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, rounds_of
+from factorgraph_loc.sensors.rfid.calibration.tempering import bursts
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings
 from factorgraph_loc.sensors.smoothed import Corrections, Smoothed, pooled, possible_poses
 from factorgraph_loc.text import quoted
@@ -29,6 +30,7 @@ from factors.rfid.adjustment import MOST_CERTAIN, PARAMETERS, rates
 from factors.rfid.model import FEATURES, BeamModel, DetectionModel, GridModel, LogisticModel
 
 MIN_READS = 100.0  # weighted reads that a model is learnt from
+BURSTS = 1.3  # rounds that are worth one; less is no reason to change the tempering
 VAGUE = 0.5  # relative standard error of a parameter that is not told
 KEPT = "kept: learnt from reads and misses along the smoothed trajectories"
 
@@ -72,8 +74,40 @@ def relearn_rfid(smoothed: Sequence[Smoothed], rig: Rig, first: Rig, grids: Path
         constants += found
         spreads = {kind: min(one.spread, 1.0) for kind, one in told.items()}
         models[name] = written(changed, name, grids).model_copy(update={"prior": CALIBRATED.model_copy(update=spreads)})
-    changes_of = {"models": {name: models[name] for name in names}, "false_read": floor.false_read, "miss": floor.miss}
-    return Settled({"rfid": settings.model_copy(update=changes_of)}, constants, notes)
+    changed_models = [models[name].model() for name in names]
+    together, error = bursts(pairs, modelled(changed_models, [names.index(name) for name in which], pairs), floor)
+    constants.append(_tempering(together, error, started.tempering))
+    return Settled(
+        {
+            "rfid": settings.model_copy(
+                update={
+                    "models": {name: models[name] for name in names},
+                    "false_read": floor.false_read,
+                    "miss": floor.miss,
+                    "tempering": constants[-1].value,
+                }
+            )
+        },
+        constants,
+        notes,
+    )
+
+
+def _tempering(together: float, error: float, before: float) -> FittedConstant:
+    """The tempering for rounds of which so many are worth an independent one, if that is less than ``before``."""
+    kept = together > BURSTS and together * before > 1.0
+    return FittedConstant(
+        "rfid",
+        "tempering",
+        before=before,
+        fitted=1.0 / together,
+        error=max(error / together**2, 1e-4),
+        gain=0.0,
+        kept=kept,
+        why="kept: reads and misses come in bursts" if kept else "not kept: bursts ask for no lower one",
+        per_log=(),
+        uncertainty=None,
+    )
 
 
 def with_priors(settings: RfidSettings, first: RfidSettings) -> RfidSettings:
