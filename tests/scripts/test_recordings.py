@@ -1,10 +1,12 @@
 """Recordings of other people: the list, the commands that fetch them, and how small files of each kind become logs."""
 
 import re
+import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from recordings_benchmark import loops
+from recordings_benchmark import by_hand, loops
 from recordings_benchmark.listed import RECORDINGS, File, Recording, commands
 from recordings_benchmark.prepare import KINDS, prepare
 from recordings_benchmark.recordings import Job, measured
@@ -29,6 +31,33 @@ TUM = "# of a camera that looks along x\n0 0 0 1 -0.5 0.5 -0.5 0.5\n1 1 0 1 -0.5
 def recording(kind, *names, **options):
     files = tuple(File("someone/something", "0" * 40, f"data/{name}", name) for name in names)
     return Recording("one", "One", "none", "wheels", "", kind, files, options=options)
+
+
+def test_what_is_typed_by_hand_for_each_recording(tmp_path):
+    jobs = by_hand.jobs_of(tmp_path, tmp_path)
+    assert [job.recording.name for job in jobs] == [one.name for one in RECORDINGS]
+    for job in jobs:
+        for name, text in job.files.items():
+            assert "{" not in re.sub(r"= \{ [^{}]* \}", "", text), name
+            tomllib.loads(text)
+        assert all("{" not in command and "--prior= " not in command for command in job.commands)
+    by_name = {job.recording.name: job for job in jobs}
+    assert sorted(by_name["m3500-skewed"].files) == ["anchors.world.toml", "run.toml"]
+    assert "--prior=-4.83,0.36,-3.12 " in by_name["corridor"].commands[0]
+
+
+def test_commands_are_typed_and_what_they_reach_is_told(tmp_path):
+    for name in ("a.tum", "b.tum"):
+        (tmp_path / name).write_text(TUM)
+    commands = ("fgloc score b.tum a.tum -o out",)
+    job = by_hand.Job(
+        recording("trajectory", "a.tum", "b.tum"), tmp_path, tmp_path / "made", {"x.toml": "a = 1"}, commands
+    )
+    done = by_hand.measured(job)
+    assert done.result == "0.000 after sim3"
+    assert 0.0 < done.seconds < 60.0
+    with pytest.raises(RuntimeError, match=r"fgloc info nothing: error: nothing: is neither"):
+        by_hand.measured(replace(job, commands=("fgloc info nothing",)))
 
 
 def test_every_recording_names_files_at_a_commit_and_how_they_are_read():
