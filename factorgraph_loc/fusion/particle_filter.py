@@ -333,11 +333,15 @@ class ParticleFilter(Filter):
 
     def _record(self) -> Record:
         estimate = self._estimate()
-        last = next((r.t for r in reversed(self._records) if r.cloud is not None), -np.inf)
-        # also where the particles jump, as there is nothing to interpolate
-        jumped = bool(self.diagnostics.events) and self.diagnostics.events[-1][0] == self._t
-        keep = self._smooth and (jumped or self._t >= last + self._settings.smoothing_interval - 1e-9)
+        keep = self._smooth and self._is_due()
         return Record(self._t, self._odometry, estimate.pose, estimate.covariance, self._state if keep else None)
+
+    def _is_due(self) -> bool:
+        """Whether a cloud is to be kept for smoothing; also where the particles jump, as there is nothing to interpolate."""
+        if self.diagnostics.events and self.diagnostics.events[-1][0] == self._t:
+            return True
+        last = next((r.t for r in reversed(self._records) if r.cloud is not None), -math.inf)
+        return self._t >= last + self._settings.smoothing_interval - 1e-9
 
     def _increment(self, start: Record, end: Record) -> Increment:
         return self._motion.relative(start.odometry, end.odometry)
