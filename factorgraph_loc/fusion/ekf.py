@@ -24,7 +24,8 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, bound_sensors
+from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable
+from factorgraph_loc.sensors.binding import bound_sensors
 from factors import positive, rts_kernels, se2, se2_kernels
 from factors.motion import Increment
 from factors.se2 import Array

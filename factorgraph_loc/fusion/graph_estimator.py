@@ -29,7 +29,7 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.plugins import MAPPERS
-from factorgraph_loc.sensors.base import bound_motion, bound_sensors
+from factorgraph_loc.sensors.binding import bound_motion, bound_sensors
 from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
 from factors import se2
 from factors.motion import Increment

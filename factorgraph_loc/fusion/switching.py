@@ -21,7 +21,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import bound_motion
+from factorgraph_loc.sensors.binding import bound_motion
 from factors import positive, se2
 from factors.motion import ChainState, Increment, propagate
 from factors.se2 import Array

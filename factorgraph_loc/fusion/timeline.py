@@ -19,7 +19,8 @@ from factorgraph_loc.model.diagnostics import Diagnostics, Written
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import Sensor, bound_motion
+from factorgraph_loc.sensors.base import Sensor
+from factorgraph_loc.sensors.binding import bound_motion
 from factors import se2, se2_kernels
 from factors.motion import ChainState, Increment
 from factors.se2 import Array

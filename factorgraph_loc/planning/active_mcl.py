@@ -33,7 +33,8 @@ from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.planning.robot import ProximitySensor
-from factorgraph_loc.sensors.base import Link, NewVariable, bound_sensors
+from factorgraph_loc.sensors.base import Link, NewVariable
+from factorgraph_loc.sensors.binding import bound_sensors
 from factors import se2
 from factors.motion import Increment
 from factors.se2 import Array

@@ -2,6 +2,7 @@
 
 __all__ = [
     "base",
+    "binding",
     "calibrating",
     "camera",
     "interfaces",

@@ -19,7 +19,6 @@ from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.sensors.known_position import KnownPosition
-from factorgraph_loc.sensors.registry import functions
 from factors import se2
 from factors.graph import Factor
 from factors.marginal import Marginalized
@@ -397,25 +396,3 @@ class ResidualObservation:
             held = tuple(values[name] for name in term.blocks), tuple(spreads.get(name) for name in term.blocks)
             terms.append(Term(Marginalized(cast(SightingFactor, term.factor), *held), (), term.rows))
         return ResidualObservation(self.t, tuple(terms))
-
-
-def bound_motion(setup: Setup, diagnostics: Diagnostics, *, self_calibration: bool = False) -> Motion:
-    """The motion sensor of a run."""
-    _, predict = next(functions("predict"))
-    return cast(Motion, predict(setup.rig, setup.sensors, diagnostics, self_calibration=self_calibration))
-
-
-def bound_sensors(
-    setup: Setup,
-    motion: Motion,
-    diagnostics: Diagnostics,
-    *,
-    use: MapUse = "known",
-    points: MapUse = "known",
-    calibration: Calibration = "all",
-) -> dict[str, Sensor]:
-    """The exteroceptive sensors of a run by modality. ``use``: how landmarks of the map are used, ``points``: how its points are
-    used."""
-    binding = Binding(setup, motion, diagnostics, use, points, calibration)
-    sensors: list[Sensor | None] = [bind(binding) for _, bind in functions("bind")]
-    return {sensor.modality: sensor for sensor in sensors if sensor is not None}

@@ -16,7 +16,7 @@ from package_tables import FACES, HEIGHT, MODULES, ROOT, imported, named, names_
 EXCEPTIONS: set[tuple[str, str]] = set()
 
 # what estimators and sensors know of each other
-CONTRACT = {f"factorgraph_loc.sensors.{name}" for name in ("base", "known_position", "registry")}
+CONTRACT = {f"factorgraph_loc.sensors.{name}" for name in ("base", "binding", "known_position", "registry")}
 IMPORTS = {module: imported(module) for module in MODULES}
 # what is imported, by whom: by our modules, by the package of another that the docs show, by commands, and by readers of the docs
 NAMED = {(module, *found) for module in MODULES for found in named(module)}

@@ -7,7 +7,8 @@ import numpy as np
 from factorgraph_loc import BearingRange, Rig, World
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.base import Binding, bound_motion
+from factorgraph_loc.sensors.base import Binding
+from factorgraph_loc.sensors.binding import bound_motion
 from factorgraph_loc.sensors.landmarks.bound import bind
 
 
