@@ -22,8 +22,8 @@ class TagLooks:
     """K antenna observations of T tags, ordered by time. An observation is what one antenna read in some inventory rounds.
 
     ``names``: T EPCs; ``t`` (K,) [s]; ``antennas`` (K,): indices in the ``model``; ``rounds`` (K,); ``hits`` (K, T).
-    ``heights`` (T,) [m] and ``facing`` (T,) [rad] in the world, NaN where unknown; ``positions`` (T, 2): from the log's map,
-    NaN where it has none.
+    ``heights`` (T,) [m], assumed if not ``has_height`` (T,); ``facing`` (T,) [rad] in the world, NaN where unknown; ``positions``
+    (T, 2): from the log's map, NaN where it has none.
     """
 
     model: RfidModel
@@ -35,6 +35,7 @@ class TagLooks:
     heights: Array
     facing: Array
     positions: Array
+    has_height: NDArray[np.bool_]
 
     def along(self, poses: Array, which: NDArray[np.bool_] | slice = slice(None)) -> TagReadCounts:
         """Read counts of the observations ``which``, from robot ``poses`` (K', 3) in the world, relative to the world's origin."""
@@ -67,6 +68,7 @@ def tag_looks(log: Log, height: float | None = None) -> TagLooks:
     rows.sort(key=lambda row: row[0])
     t, antenna, rounds, hits = zip(*rows, strict=True)
     others = len(names) - len(given.names)
+    has_height = np.append(np.ones(len(given.names), dtype=bool), np.full(others, height is not None))
     if height is None:
         height = float(np.mean([a.z for a in model.antennas]))
     return TagLooks(
@@ -79,6 +81,7 @@ def tag_looks(log: Log, height: float | None = None) -> TagLooks:
         np.concatenate((given.tags.points[:, 2], np.full(others, height))),
         np.concatenate((given.tags.facing, np.full(others, np.nan))),
         np.concatenate((given.tags.points[:, :2], np.full((others, 2), np.nan))),
+        has_height,
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.mapping import mapping
 from factorgraph_loc.mapping.mapping import LandmarkMap
+from factorgraph_loc.mapping.tag_focusing import focused
 from factorgraph_loc.mapping.tag_looks import TagLooks, tag_looks
 from factorgraph_loc.mapping.tag_search import TagMode, TagPosterior, search, sigma
 from factorgraph_loc.mapping.tag_slam import tag_slam
@@ -121,6 +122,7 @@ def _along_reference(log: Log, looks: TagLooks) -> tuple[dict[int, LearntPoint],
         for tag, one in enumerate(found)
         if one.is_located
     }
+    learnt = focused(log, looks, learnt)
     facing = looks.facing.copy()
     for tag in learnt:
         if np.isnan(facing[tag]):

@@ -73,6 +73,26 @@ def test_along_the_reference_errors_are_as_large_as_stated():
     assert low < every.mean() < high
 
 
+PHASES = {"phase": {"sigma": 0.1, "flips": 0.2}, "rig": {"rfid": {"phase": {"max_range": 4.0}}}}
+
+
+def test_phases_along_the_reference_make_tags_more_exact():
+    """Were errors Gaussian, their mean square would exceed the bound once in a thousand."""
+    log = simulate(preset("office", SMALL | PHASES), 3)
+    without = log.rig.model_copy(update={"rfid": log.rig.rfid.model_copy(update={"phase": None})})
+    coarse, fine = (map_tags(replace(log, rig=rig), "reference", None) for rig in (without, log.rig))
+    assert len(fine.world.tags) == len(coarse.world.tags) == 8
+    assert fine.rms < 0.6 * coarse.rms
+    assert squares(fine, log.world.tags).mean() < chi2.ppf(0.999, 16) / 8
+
+
+def test_tags_of_unknown_height_are_not_moved_by_their_phases():
+    log = simulate(preset("office", SMALL | PHASES), 3)
+    without = log.rig.model_copy(update={"rfid": log.rig.rfid.model_copy(update={"phase": None})})
+    both = [map_tags(replace(log, rig=rig, world=World()), "reference", None).world.tags for rig in (without, log.rig)]
+    assert both[0] == both[1]
+
+
 def test_from_odometry_alone_tags_and_way_are_found(room):
     """In the frame of the true start. Eight correlated squares: their mean has no exact distribution, so the bound is wide."""
     start = PosePrior(0.0, room.reference.poses[0], 1e-6 * np.eye(3))

@@ -94,7 +94,7 @@ class _Focus:
         parts: list[PhaseReads] = []
         first_window = 0
         for log in logs:
-            parts.append(_reads_of(log, tags.index, names, first_window))
+            parts.append(phase_reads(log, tags.index, names, first_window=first_window))
             first_window = 1 + int(parts[-1].windows.max(initial=first_window))
         reads = PhaseReads(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PhaseReads)))
         model = PhaseModel(rfid.model().antennas, kappa=1.0, tempering=1.0)
@@ -163,9 +163,12 @@ def along_reference(
     return stream, rows, t[rows], poses[rows], antenna[rows], tag[rows]
 
 
-def _reads_of(log: Log, tags: Mapping[str, int], antennas: Mapping[str, int], first_window: int) -> PhaseReads:
-    """The reads with a phase, in windows numbered from ``first_window``."""
+def phase_reads(
+    log: Log, tags: Mapping[str, int], antennas: Mapping[str, int], window: float = WINDOW, first_window: int = 0
+) -> PhaseReads:
+    """The reads with a phase along the reference, relative to the world's origin, in windows of ``window`` seconds, numbered
+    from ``first_window``. ``tags`` and ``antennas``: indices by name. Raises InputError like :func:`along_reference`."""
     stream, rows, t, poses, antenna, tag = along_reference(log, tags, antennas)
-    windows = first_window + np.floor((t - t.min(initial=np.inf)) / WINDOW).astype(np.int64)
+    windows = first_window + np.floor((t - t.min(initial=np.inf)) / window).astype(np.int64)
     reads = PhaseReads(poses, antenna, tag, stream.phase[rows], stream.frequency[rows], windows)
     return reads.chosen(np.isfinite(reads.phase) & np.isfinite(reads.frequency))
