@@ -17,6 +17,7 @@ import numpy as np
 from factorgraph_loc.mapping.tag_looks import TagLooks
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.rfid.calibration.phase import phase_reads
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
@@ -31,10 +32,14 @@ REACH, FARTHEST = 3.0, 1.0  # standard deviations of the prior, and m, that are 
 SELECTIONS = 3  # the reads used depend on the position that they improve
 ITERATIONS, CONVERGED = 20, 1e-4  # m
 FEWEST = 20  # reads
+INTERPOLATED, LONGEST = 0.05, 2.0  # s between interpolated poses, and at most between keyframes
 
 
-def focused(log: Log, looks: TagLooks, learnt: Mapping[int, LearntPoint]) -> dict[int, LearntPoint]:
-    """The ``learnt`` positions by tag, improved by the phases of the reads along the log's reference.
+def focused(
+    log: Log, looks: TagLooks, learnt: Mapping[int, LearntPoint], keyframes: Trajectory | None = None
+) -> dict[int, LearntPoint]:
+    """The ``learnt`` positions by tag, improved by the phases of the reads along the log's reference, or along the estimated
+    ``keyframes``, which are interpolated.
 
     Those of tags whose height is not known, or that have too few reads with a phase, stay as they are; all if the rig has no
     ``[rfid.phase]``.
@@ -42,6 +47,11 @@ def focused(log: Log, looks: TagLooks, learnt: Mapping[int, LearntPoint]) -> dic
     rfid, stream = log.rig.of(RfidSettings), log.streams.get("rfid")
     if rfid.phase is None or not isinstance(stream, RfidStream) or not np.isfinite(stream.phase).any():
         return dict(learnt)
+    if keyframes is not None:
+        t = np.arange(keyframes.t[0], keyframes.t[-1], INTERPOLATED)
+        poses = keyframes.at(t, max_gap=LONGEST)
+        there = np.isfinite(poses[:, 0])
+        log = replace(log, reference=Trajectory(t[there], poses[there]))
     model = replace(rfid.phase.model(rfid.model().antennas), tempering=TEMPERING)
     antennas = {name: i for i, name in enumerate(rfid.all_antennas())}
     wanted = {name: i for i, name in enumerate(looks.names) if i in learnt and looks.has_height[i]}

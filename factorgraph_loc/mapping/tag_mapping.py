@@ -18,6 +18,7 @@ from factorgraph_loc.mapping.tag_search import TagMode, TagPosterior, search, si
 from factorgraph_loc.mapping.tag_slam import tag_slam
 from factorgraph_loc.model.belief import LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.settings import Landmark
 from factorgraph_loc.sensors.rfid.map import Tag
@@ -82,7 +83,8 @@ def map_tags(
             prior = PosePrior(log.span()[0], np.zeros(3), START_SIGMA**2 * np.eye(3))
             looks = replace(looks, facing=np.full(len(given), np.nan))
         slam = tag_slam(log, looks, prior, known, progress)
-        learnt, facing, found, way = slam.tags, slam.facing, slam.found, slam.poses
+        learnt = focused(log, looks, slam.tags, Trajectory(slam.t, slam.poses))
+        facing, found, way = slam.facing, slam.found, slam.poses
     if not learnt and not extend:
         raise RunFailedError(f"{log.name}: no tag was read often enough, from different enough places, to be located")
     names = looks.names
