@@ -66,7 +66,7 @@ def focused(
 
 def _focused(model: PhaseModel, reads: PhaseReads, height: float, prior: LearntPoint) -> LearntPoint:
     """The position of the only tag of ``reads``, which are relative to the world's origin."""
-    information: Array = np.linalg.inv(prior.covariance)
+    information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
     found = prior
     for _ in range(SELECTIONS):
         tag = TagArray(np.array([(*found.position, height)]), np.full(1, np.nan))
@@ -74,10 +74,10 @@ def _focused(model: PhaseModel, reads: PhaseReads, height: float, prior: LearntP
         near = likelihood.near(np.zeros(3), reads)
         if len(near.tags) < FEWEST:
             break
-        start: Array = found.position - prior.position
+        start = found.position - prior.position
         off = _best(likelihood, near, start, information, _lattice(prior.covariance) - start)
         off, curvature = _refined(likelihood, near, start, information, off)
-        found = LearntPoint(found.position + off, np.linalg.inv(curvature))
+        found = LearntPoint(found.position + off, np.asarray(np.linalg.inv(curvature), dtype=np.float64))
     return found
 
 
@@ -102,7 +102,7 @@ def _refined(
     likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, information: Array, off: Array
 ) -> tuple[Array, Array]:
     """The displacement (2,) at the nearest optimum, and the information (2, 2) there."""
-    curvature: Array = information
+    curvature = information
     for _ in range(ITERATIONS):
         score = likelihood.score(np.array((*-off, 0.0)), reads)
         curvature = score.information[0, :2, :2] + information
