@@ -20,7 +20,6 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.rfid.calibration.phase import phase_reads
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
-from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factors.rfid.detection import TagArray
 from factors.rfid.phase import PhaseLikelihood, PhaseModel, PhaseReads
 from factors.se2 import Array
@@ -44,8 +43,8 @@ def focused(
     Those of tags whose height is not known, or that have too few reads with a phase, stay as they are; all if the rig has no
     ``[rfid.phase]``.
     """
-    rfid, stream = log.rig.of(RfidSettings), log.streams.get("rfid")
-    if rfid.phase is None or not isinstance(stream, RfidStream) or not np.isfinite(stream.phase).any():
+    rfid = log.rig.of(RfidSettings)
+    if rfid.phase is None:
         return dict(learnt)
     if keyframes is not None:
         t = np.arange(keyframes.t[0], keyframes.t[-1], INTERPOLATED)
