@@ -22,8 +22,7 @@ Floats = Array32 | Array
 CELL = 0.05  # m
 FACINGS = 9  # knots of the facing's cosine
 NEGLIGIBLE = 15.0  # log of the ratio of two likelihoods of which the smaller one does not count
-STEP = 0.01  # of the logit, in the tables of logarithms
-LEVEL = 0.04  # m: tags at the same height, to so much, share a table
+STEP, LEVEL = 0.01, 0.04  # of the logit, in the tables of logarithms; m of height within which tags share a table
 SHIFTS = np.linspace(-4.0, 4.0, 161)  # of a peak's logit, each with tables of logarithms of its own
 
 
