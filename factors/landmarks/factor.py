@@ -132,9 +132,9 @@ class BearingRangeFactor:
 
     def log_likelihood(self, poses: Array, parameters: Array | None = None) -> Array:
         """The log-likelihood (N,), up to a constant, of ``poses`` (N, 3) at the time of the measurement, each with its own
-        corrections ``parameters`` (N, P) of the constants ``estimated``; see :func:`~factors.landmarks.model.log_likelihood`."""
+        ``parameters`` (N, 6) of the sensor; see :func:`~factors.landmarks.model.log_likelihood`."""
         seen = self.points, self.ranges, self.bearings
-        return log_likelihood(self.model, poses, *seen, parameters, self.point_covariances, self.estimated)
+        return log_likelihood(self.model, poses, *seen, parameters, self.point_covariances)
 
     def weight(self, squared: Array) -> Array:
         """The robust weight of squared whitened residuals."""

@@ -15,7 +15,8 @@ import numba
 import numpy as np
 
 from factors import se2
-from factors.se2 import Array, Integers
+from factors.robust import geman_mcclure_loss
+from factors.se2 import Array
 
 # the constants of a sensor that can be estimated: those of its model, and the time offset [s] of its timestamps
 PARAMETERS = ("x", "y", "bearing_bias", "range_scale", "depth_axis", "time_offset")
@@ -24,9 +25,6 @@ EXACT = np.empty((0, 2, 2))  # covariances of exactly known points
 # indices in the result of packed(), after the constants that PARAMETERS change
 TURN, RANGE_SIGMA, RELATIVE, BEARING_SIGMA, DEPTH, ROBUST = range(TIME_OFFSET, TIME_OFFSET + 6)
 MINIMUM_COSINE = 0.1  # limit of the field of view of depth sensors
-NEAREST = 1e-6  # m: what is nearer is that far away
-TURNS = 2.0 * math.pi
-ALL = tuple(range(len(PARAMETERS)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,7 +255,7 @@ def _seen(
     distance; the gradient direction of the range; and the inverse standard deviation of the range."""
     range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma = model
     range_error, bearing_error, weight = 0.0, 0.0, 0.0
-    distance = max(math.hypot(sx, sy), NEAREST)
+    distance = max(math.hypot(sx, sy), 1e-6)
     vx, vy = (ahead_x, ahead_y) if depth else (sx / distance, sy / distance)
     if not math.isnan(measured_range):
         weight = 1.0 / math.hypot(range_sigma, range_sigma_relative * measured_range)
@@ -276,71 +274,64 @@ def log_likelihood(
     bearings: Array,
     parameters: Array | None = None,
     point_covariances: Array | None = None,
-    estimated: tuple[int, ...] = ALL,
 ) -> Array:
     """Log-likelihood (N,), up to a constant, of K measurements (K,) of points (K, 2) at ``poses`` (N, 3).
 
-    ``parameters`` (N, P): corrections, as in :func:`recalibrated`, of those of :data:`PARAMETERS` with the indices ``estimated``,
-    for each pose. ``point_covariances`` (K, 2, 2) of an inexact map are added to the noise, propagated from each pose.
+    ``parameters`` (N, 6): corrections of :data:`PARAMETERS`, as in :func:`recalibrated`, for each pose. ``point_covariances``
+    (K, 2, 2) of an inexact map are added to the noise, propagated from each pose.
     """
-    changes = np.zeros((1, 0)) if parameters is None else parameters
-    indices = np.array(estimated if parameters is not None else (), dtype=np.int64)
-    spreads = EXACT if point_covariances is None else np.ascontiguousarray(point_covariances, dtype=float)
-    out = np.empty(len(poses))
-    _weigh(packed(model), poses, changes, indices, points, ranges, bearings, spreads, out)
-    return out
+    changes = np.zeros((1, len(PARAMETERS))) if parameters is None else parameters
+    constants = np.broadcast_to(_constants(model, changes), (len(poses), TIME_OFFSET))
+    noise = (model.range_sigma, model.range_sigma_relative, model.bearing_sigma)
+    squared = np.empty((len(poses), len(points)))
+    sensor = (model.mounting[2], noise, model.depth)
+    if point_covariances is None:
+        _squared(poses, constants, *sensor, points, ranges, bearings, EXACT, squared, np.empty((0, 0)))
+        return -np.asarray(np.sum(geman_mcclure_loss(squared, model.robust), axis=-1))
+    widths = np.empty_like(squared)
+    spreads = np.ascontiguousarray(point_covariances, dtype=float)
+    _squared(poses, constants, *sensor, points, ranges, bearings, spreads, squared, widths)
+    return -np.asarray(np.sum(geman_mcclure_loss(squared, model.robust) + widths, axis=-1))
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _weigh(
-    model: Array,
+@numba.njit(cache=True)
+def _squared(
     poses: Array,
-    changes: Array,
-    indices: Integers,
+    constants: Array,
+    turn: float,
+    noise: tuple[float, float, float],
+    depth: bool,
     points: Array,
     ranges: Array,
     bearings: Array,
     spreads: Array,
-    out: Array,
+    squared: Array,
+    widths: Array,
 ) -> None:
-    """:func:`log_likelihood` for a :func:`packed` model, into ``out`` (N,); ``changes`` (N, P), or (1, P) for all poses.
+    """Squared whitened residuals ``squared`` (N, K) of sensors with their own ``constants`` (N, 5).
 
-    For points with covariances ``spreads`` (K, 2, 2) the noise is widened by them.
+    For points with covariances ``spreads`` (K, 2, 2) the noise is widened, and ``widths`` (N, K) is the logarithm of the ratio of
+    the determinants' roots.
     """
-    count, depth, turn = len(points), model[DEPTH] > 0.0, model[TURN]
-    by_bearing, scale2 = 1.0 / model[BEARING_SIGMA], model[ROBUST] ** 2
-    weights, now = np.empty(count), np.zeros(TIME_OFFSET + 1)
-    for k in range(count):
-        weights[k] = 0.0 if math.isnan(ranges[k]) else 1.0 / math.hypot(model[RANGE_SIGMA], model[RELATIVE] * ranges[k])
+    range_sigma, range_sigma_relative, bearing_sigma = noise
     for i in range(len(poses)):
-        row = changes[i] if len(changes) > 1 else changes[0]
-        for j in range(len(indices)):
-            now[indices[j]] = row[j]
-        scale = model[3] * (1.0 + now[3])
-        vx, vy = 0.0, 0.0
-        if depth:
-            vx, vy = math.cos(turn + model[4] + now[4]), math.sin(turn + model[4] + now[4])
         c, s = math.cos(poses[i, 2]), math.sin(poses[i, 2])
-        total = 0.0
-        for k in range(count):
+        x, y, bearing_bias, range_scale, depth_axis = constants[i]
+        ahead_x, ahead_y = math.cos(turn + depth_axis), math.sin(turn + depth_axis)
+        model = (range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma)
+        for k in range(len(points)):
             dx, dy = points[k, 0] - poses[i, 0], points[k, 1] - poses[i, 1]
-            sx, sy = c * dx + s * dy - model[0] - now[0], c * dy - s * dx - model[1] - now[1]
-            distance = max(math.sqrt(sx * sx + sy * sy), NEAREST)
-            if not depth:
-                vx, vy = sx / distance, sy / distance
-            range_error = bearing_error = 0.0
-            if weights[k] > 0.0:
-                range_error = (scale * (vx * sx + vy * sy) - ranges[k]) * weights[k]
-            seen = not math.isnan(bearings[k])
-            if seen:
-                angle = math.atan2(sy, sx) - turn + model[2] + now[2] - bearings[k]
-                bearing_error = (angle - TURNS * math.ceil((angle - math.pi) / TURNS)) * by_bearing
-            squared = range_error * range_error + bearing_error * bearing_error
+            sx, sy = c * dx + s * dy - x, c * dy - s * dx - y
+            range_error, bearing_error, distance, vx, vy, weight = _seen(
+                sx, sy, turn, model, depth, ahead_x, ahead_y, ranges[k], bearings[k]
+            )
+            squared[i, k] = range_error**2 + bearing_error**2
             if len(spreads):
                 # by the point, in the robot's axes: the range grows along v, the bearing perpendicular to the line of sight
-                by_range, across = scale * weights[k], by_bearing / distance if seen else 0.0
+                by_range = range_scale * weight
+                by_bearing = 0.0 if math.isnan(bearings[k]) else 1.0 / (distance * bearing_sigma)
                 ax, ay = by_range * (c * vx - s * vy), by_range * (s * vx + c * vy)
-                bx, by = across * (-s * sx - c * sy) / distance, across * (c * sx - s * sy) / distance
+                bx, by = by_bearing * (-s * sx - c * sy) / distance, by_bearing * (c * sx - s * sy) / distance
                 xx, xy, yy = spreads[k, 0, 0], spreads[k, 0, 1], spreads[k, 1, 1]
                 rr = 1.0 + ax * (xx * ax + xy * ay) + ay * (xy * ax + yy * ay)
                 rb = ax * (xx * bx + xy * by) + ay * (xy * bx + yy * by)
@@ -348,7 +339,5 @@ def _weigh(
                 # rounding may cancel the difference completely, which is never less than that
                 determinant = max(rr * bb - rb * rb, 0.5 * (rr + bb))
                 mixed = bb * range_error**2 - 2.0 * rb * range_error * bearing_error + rr * bearing_error**2
-                squared = mixed / determinant
-                total -= 0.5 * math.log(determinant)
-            total -= 0.5 * squared / (1.0 + squared / scale2)
-        out[i] = total
+                squared[i, k] = mixed / determinant
+                widths[i, k] = 0.5 * math.log(determinant)

@@ -71,7 +71,8 @@ class LandmarkObservation(ResidualObservation):
         for term in self.terms:
             factor, at, parameters = cast(BearingRangeFactor, term.factor), poses, None
             if factor.estimated and term.blocks[0] in values:
-                parameters = values[term.blocks[0]]
+                parameters = np.zeros((len(poses), len(PARAMETERS)))
+                parameters[:, list(factor.estimated)] = values[term.blocks[0]]
             if factor.free:  # an error of the landmark's position is equivalent to one of the robot's
                 places = values[term.blocks[-1]]
                 factor, at = replace(factor, points=places[:1]), poses.copy()
