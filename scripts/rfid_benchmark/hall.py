@@ -56,7 +56,9 @@ class Returns:
 
 def hall(tags: int, width: float = 100.0) -> SimulationSettings:
     """Shelves with tags in a hall."""
-    return preset("warehouse", {"world": {"width": width, "depth": RATIO * width, "tags": tags}})
+    # with a short drive, as all looks of a long one at 10,000 tags are more than a simulation may have
+    world = {"width": width, "depth": RATIO * width, "tags": tags}
+    return preset("warehouse", {"world": world, "drive": {"duration": SCANS}})
 
 
 def section(options: Options) -> Report:
