@@ -90,8 +90,8 @@ def test_a_kidnapping_is_recovered_from():
 
 
 def test_what_is_localized_elsewhere_is_false(room, monkeypatch):
-    def elsewhere(log, config):
-        result = run(log, config)
+    def elsewhere(log, config, watch=None):
+        result = run(log, config, watch=watch)
         return replace(result, poses=result.poses + np.array((2.0, 0.0, 0.0)))
 
     monkeypatch.setattr(simulated_trials, "run", elsewhere)
