@@ -44,7 +44,7 @@ class StackedFactor:
     """One row sqrt(2 nll) for each antenna and tag, with numerical derivatives."""
 
     def __init__(self, likelihood: RfidLikelihood, looks: TagReadCounts) -> None:
-        self._likelihood, self._looks = likelihood, looks
+        self._likelihood, self._looks = likelihood, looks.listing(np.arange(len(likelihood.tags.points)))
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         steps = STEP * np.concatenate((np.eye(3), -np.eye(3)))
@@ -71,7 +71,7 @@ class GaussianFactor:
     def __init__(self, likelihood: RfidLikelihood, looks: TagReadCounts, fields: Sequence[tuple[Array, Array]]) -> None:
         rows, tags = np.nonzero(looks.hits)
         antennas = looks.antennas[rows]
-        self._points = likelihood.tags.points[tags, :2]
+        self._points = likelihood.tags.points[looks.listed[tags], :2]
         places = np.array([(a.x, a.y, a.yaw) for a in likelihood.model.antennas])
         self._places = se2.compose(looks.offsets[rows], places[antennas]) if len(rows) else np.empty((0, 3))
         self._means = np.array([fields[a][0] for a in antennas]).reshape(-1, 2)

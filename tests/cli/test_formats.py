@@ -34,9 +34,9 @@ def test_the_tutorial(hall, fgloc, monkeypatch):
     for line in re.search(r"```text\n(.*?)```", PAGE, re.DOTALL).group(1).splitlines():
         assert line in first.stdout
     assert "2105 reads of 39 tags of the map" in first.stdout
-    (offset,) = re.findall(r"```toml\n(clock_offset = .*?\n)```", PAGE)
+    (offset,) = re.findall(r"\$ sed -i '/\^\.options\.odometry/a (clock_offset = \d+)' monday\.toml", PAGE)
     text = Path("monday.toml").read_text()
-    Path("monday.toml").write_text(text.replace("[options.odometry]\n", f"[options.odometry]\n{offset}"))
+    Path("monday.toml").write_text(text.replace("[options.odometry]\n", f"[options.odometry]\n{offset}\n"))
     second = fgloc("info", "monday.toml")
     assert "do not overlap" not in second.stdout
     assert "clocks agree" not in second.stdout

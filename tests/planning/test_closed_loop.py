@@ -156,7 +156,7 @@ def test_two_places_that_look_alike_are_told_apart() -> None:
     assert min(run.metres for run in runs) > 8.0
     for run in runs:
         early = next(step for step in run.steps if step.metres > 3.0)
-        assert early.metres < 6.0
+        assert early.metres < 8.0  # before any of them finds out
         turned = se2.compose(np.array((30.0, 24.0, math.pi)), early.truth)
         for place in (early.truth, turned):
             assert np.mean(np.hypot(*(early.particles - place)[:, :2].T) < 2.0) > 0.1

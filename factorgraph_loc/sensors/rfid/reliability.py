@@ -114,7 +114,9 @@ def _left_out(count: int) -> Integers:
 
 
 def _told(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Reliability | None:
-    """The counts by bands of distance and by antennas."""
+    """The counts by bands of distance and by antennas, None if there are too few."""
+    if looks.p.sum() < FEWEST:
+        return None
     band = (looks.distance // BAND).astype(np.int64)
     together = _together(looks, band)
     groups = [(f"{b * BAND:g} to {(b + 1) * BAND:g} m", band == b) for b in range(int(band.max(initial=0)) + 1)]
