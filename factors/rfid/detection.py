@@ -143,11 +143,12 @@ class RfidLikelihood:
         if looks.tags is None:
             return NearTags(looks, (self.tags.points, self.tags.normals, *looks.arrays), (0.0, 0.0, 0.0))
         reach = margin + _reach(packed, looks)
-        low, high = poses[:, :2].min(axis=0) - reach, poses[:, :2].max(axis=0) + reach
+        # on a grid, so that the same tags count whatever was looked at before: to the last bit, sums depend on them
+        low = SPARE * np.floor((poses[:, :2].min(axis=0) - reach) / SPARE)
+        high = SPARE * np.ceil((poses[:, :2].max(axis=0) + reach) / SPARE)
         last = self._unadjusted._last
-        if last and last[0].looks is looks and np.all(last[0].low <= low) and np.all(last[0].high >= high):
+        if last and last[0].looks is looks and np.all(last[0].low == low) and np.all(last[0].high == high):
             return last[0].near
-        low, high = low - SPARE, high + SPARE
         tags = np.union1d(within(self._unadjusted._index, low, high), looks.tags)
         listed = looks.listing(tags)
         of_tags = self.tags.points[tags], self.tags.normals[tags]

@@ -54,6 +54,18 @@ def test_scores_are_the_same(parameters):
             assert b == pytest.approx(a, rel=1e-9, abs=1e-9)
 
 
+def test_scores_do_not_depend_on_what_was_looked_at_before():
+    """To the last bit, and with the same tags."""
+    likelihood, _, some = scene()
+    first = likelihood.around(POSE[None], some, likelihood.packed).looks.listed, likelihood.score(POSE, some)
+    for pose in POSE + np.linspace(-1.0, 1.0, 9)[:, None] * (1.0, 0.5, 0.0):
+        likelihood.score(pose, some)
+        assert len(likelihood.around(POSE[None], some, likelihood.packed).looks.listed) == len(first[0])
+        likelihood.score(pose, some)
+        for a, b in zip(first[1], likelihood.score(POSE, some), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
 def test_updates_are_the_same():
     likelihood, whole, some = scene()
     start, covariance = POSE + np.array((0.5, -0.4, 0.2)), np.diag((0.5, 0.5, 0.3)) ** 2
