@@ -38,7 +38,7 @@ from factors.rfid.tables import (
 )
 from factors.se2 import Array, Integers
 
-SPARE = 0.5  # m: around the tags that matter to a pose are those that matter to its neighbours
+SPARE = 0.5  # m: tags are looked up in a box on a grid of this size, which neighbouring poses share
 
 
 @dataclass(frozen=True, eq=False)
