@@ -16,6 +16,11 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.text import well_formed
 from factors.se2 import Array, Integers
 
+NOT_READ, RIG_NOTES = (
+    "not read",
+    "robot",
+)  # keys of the metadata: what the reader leaves out; on the rig that it makes itself
+
 
 @dataclass(frozen=True)
 class StartPose:
@@ -31,7 +36,8 @@ class Log:
     """A log. ``streams`` by channel; ``t0_ns``: absolute time of t = 0 in nanoseconds.
 
     ``reference3``: the reference trajectory in three dimensions, if the robot does not move on a floor. ``warnings``: one line
-    for each problem that the reader corrected or skipped. ``metadata``: licence, origin and so on.
+    for each problem that the reader corrected or skipped. ``metadata``: licence, origin and so on,
+    and what :data:`NOT_READ` and :data:`RIG_NOTES` say.
     """
 
     name: str

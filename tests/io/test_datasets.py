@@ -124,6 +124,23 @@ def test_tum_poses_are_those_of_the_camera(tum_rgbd, one):
     np.testing.assert_allclose(in_camera(log, ahead[None]), ((0.0, 0.0, 3.0),), atol=1e-9)
 
 
+def test_what_a_fixed_format_has_beside_what_is_read_is_told(euroc, tum_rgbd, kitti_odometry, one):
+    assert "not read" not in one(euroc, reader="euroc").metadata
+    (euroc / "mav0" / "imu0").mkdir()
+    truth = euroc / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    header, *rows = truth.read_text().splitlines()
+    truth.write_text("\n".join([f"{header}, v_RS_R_x [m s^-1]", *(f"{row},0.1" for row in rows)]))
+    assert one(euroc, reader="euroc").metadata["not read"] == "imu0, data.csv: v_RS_R_x [m s^-1]"
+    assert one(truth).metadata["not read"] == "data.csv: v_RS_R_x [m s^-1]"
+    truth.write_text("\n".join(f"{row},0.1" for row in rows))
+    assert one(truth).metadata["not read"] == "data.csv: column 9"
+    (tum_rgbd / "depth.txt").touch()
+    assert one(tum_rgbd, reader="tum_rgbd").metadata["not read"] == "depth.txt"
+    image(kitti_odometry / "sequences" / "03" / "image_0" / "000000.png")
+    log = one(kitti_odometry, reader="kitti_odometry", options={"sequence": 3, "camera": 2})
+    assert log.metadata["not read"] == "image_0"
+
+
 def test_kitti_cameras_stand_beside_the_first(kitti_odometry, one):
     log = one(kitti_odometry, reader="kitti_odometry", options={"sequence": 3, "camera": 2})
     np.testing.assert_allclose(log.reference3.t, (0.0, 0.1036224), atol=1e-9)

@@ -90,6 +90,12 @@ def test_plaza_odometry_of_one_stamp_is_one_motion(read_plaza):
     assert ":DR: 1 increments have the timestamp of the row before them" in log.warnings[0]
 
 
+def test_arrays_that_are_not_read_are_told(read_plaza, read_woods):
+    assert read_plaza(DRp=np.zeros((2, 3))).metadata["not read"] == "DRp, TD: column 2"
+    assert read_woods(v_var=0.01).metadata["not read"] == "v_var"
+    assert "not read" not in read_woods().metadata
+
+
 PLAZA_BAD = {
     "field missing": ({"DR": None}, "DR is missing"),
     "shape": ({"TL": np.zeros((2, 2))}, "TL has shape (2, 2)"),
@@ -124,7 +130,10 @@ def test_values_and_their_order_are_as_scipy_reads_them(tmp_path, compressed):
     rng = np.random.default_rng(1)
     kinds = {f"a{kind}": rng.integers(0, 100, (2, 3, 4)).astype(kind) for kind in ("i1", "u2", "i4", "f4", "f8", "u8")}
     savemat(tmp_path / "all.mat", {**kinds, "one": 3.0, "none": np.zeros((0, 3))}, do_compression=compressed)
-    found = read_arrays(tmp_path / "all.mat", {**dict.fromkeys(kinds, (2, 3, 4)), "one": (1, 1), "none": (None, 3)})
+    found, others = read_arrays(
+        tmp_path / "all.mat", {**dict.fromkeys(kinds, (2, 3, 4)), "one": (1, 1), "none": (None, 3)}
+    )
+    assert others == []
     for name, array in loadmat(tmp_path / "all.mat", variable_names=list(found)).items():
         if name in found:
             np.testing.assert_array_equal(found[name], array)

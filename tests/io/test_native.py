@@ -166,6 +166,13 @@ def test_no_odometry(native, refused):
     refused(native, "has no odometry, which every estimator needs")
 
 
+def test_an_empty_run_file_alone_is_said_to_be_empty(native, refused):
+    """As `fgloc manifest BAG > run.toml` leaves one when it fails."""
+    (native / "odometry.csv").unlink()
+    (native / "run.toml").write_text("\n")
+    refused(native, "run.toml: is empty, expected a manifest, or odometry.csv beside it")
+
+
 def test_a_table_that_links_outside(native, refused, tmp_path):
     (native / "odometry.csv").rename(tmp_path / "elsewhere.csv")
     (native / "odometry.csv").symlink_to(tmp_path / "elsewhere.csv")

@@ -8,6 +8,7 @@ import numpy as np
 from rosbag_drive import MS, T0, add_frames, transform
 
 from factorgraph_loc.io.bags.camera import Images
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factors.camera.model import mounting
 
 
@@ -160,12 +161,16 @@ def test_the_camera_of_the_bag(maker, read_drive):
     assert log.rig.sensors == ("odometry", "camera")
 
 
-def test_a_lens_with_more_terms_and_a_camera_without_a_place(maker, read_drive):
+def test_a_lens_with_more_terms_and_a_camera_without_a_place(maker, read_drive, one):
     add_info(maker, **{"d": np.array((0.1, 0.0, 0.0, 0.0, 0.7))})
     add_image(maker, T0, np.zeros((480, 640)), "mono8")
+    options = {"odometry": {"topic": "/odom"}, "camera": CAMERA}
     told = read_drive(maker, camera=CAMERA).metadata["robot"]
     assert "tf_static has no mounting of lens on base_link" in told
     assert "only k1, k2, p1, p2 are used, not [0.7]" in told
+    assert (
+        "robot" not in one(maker.path, reader="rosbag", options=options, rig=DEFAULT_RIG).metadata
+    )  # that is another robot
 
 
 def test_a_lens_that_is_none(maker, refuse_drive):

@@ -25,7 +25,7 @@ from factorgraph_loc.io.bags.poses import POINT, POSES, Poses, ReferenceTopic, S
 from factorgraph_loc.io.bags.proposed import UNUSED
 from factorgraph_loc.io.bags.tables import DescribedRows, Reads, RfidTopic, TableTopic
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
-from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.log import NOT_READ, RIG_NOTES, Log
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
@@ -211,7 +211,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     if gathered.sightings:
         streams["sightings"] = gathered.sightings.stream(t0_ns, warnings)
     streams |= {name: rows.stream(t0_ns, warnings) for name, rows in gathered.others.items()}
-    notes: list[str] = []  # on the bag's own rig, which one in the manifest replaces
+    notes: list[str] = []  # on the bag's own rig
     rig = _rig(streams, gathered, options, frames, notes)
     name = bag.path.resolve().stem
     return Log(
@@ -224,8 +224,8 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
         t0_ns=t0_ns,
         warnings=tuple(warnings),
         metadata={"clock": clock}
-        | ({"robot": "; ".join(notes)} if notes else {})
-        | ({"not read": left_out} if (left_out := _left_out(bag, listeners)) else {}),
+        | ({RIG_NOTES: "; ".join(notes)} if notes else {})
+        | ({NOT_READ: left_out} if (left_out := _left_out(bag, listeners)) else {}),
     )
 
 

@@ -60,7 +60,9 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     warnings: list[str] = []
     tables = read_tables(path, warnings)
     if "odometry" not in tables:
-        raise InputError(f"{path}: has no odometry, which every estimator needs")
+        if not run_path.read_text(encoding="utf-8").strip():
+            raise InputError(f"{run_path}: is empty, expected a manifest, or odometry.csv beside it")
+        raise InputError(f"{path}: has no odometry, which every estimator needs, expected rows in odometry.csv")
     rig = rig_of(run, run_path)
     require_span([(rows.path, rows.rows, rows.t_ns) for rows in tables.values()])
     t0_ns = min(int(rows.t_ns.min()) for rows in tables.values())

@@ -15,6 +15,7 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.models import FileModel, inside, parse_model
 from factorgraph_loc.files.yaml import read_yaml
+from factorgraph_loc.io.readers.left_out import beside, columns_after, not_read
 from factorgraph_loc.io.readers.pose_file import EUROC, ORTHONORMAL, later, read_image_list, read_poses
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -74,6 +75,9 @@ def read(path: Path | None, options: Options) -> Log:
         reference3=later(poses, t_ns, t0_ns),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
+        metadata=not_read(
+            [*beside(folder, (camera.name, truth.parent.name)), *columns_after(truth, len(EUROC))],
+        ),
     )
 
 

@@ -15,6 +15,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.images import size_of_file
 from factorgraph_loc.files.models import FileModel, inside, parse_model, read_text
 from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.io.readers.left_out import beside, not_read
 from factorgraph_loc.io.readers.pose_file import later, read_kitti, read_times
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -61,6 +62,7 @@ def read(path: Path | None, options: Options) -> Log:
         reference3=later(poses, poses_ns, t0_ns),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
+        metadata=not_read(beside(folder, (images.name, times.name, calib.name))),
     )
 
 

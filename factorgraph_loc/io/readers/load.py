@@ -21,7 +21,7 @@ from factorgraph_loc.io.readers import registry as readers
 from factorgraph_loc.io.readers.manifests import Manifest, StartSettings, find_data_root, read_manifest
 from factorgraph_loc.io.readers.pose_file import is_pose_file
 from factorgraph_loc.maps.markers import MarkerSettings
-from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.log import RIG_NOTES, Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.text import listed, one_line
@@ -195,13 +195,14 @@ def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log
     options = with_wheels_of(source.rig, options)
     log = chosen.read(source.path, parse_model(chosen.options, options, f"options of reader {source.reader}"))
     name = "-".join([source.name or log.name, *(f"{key}{options[key]}" for key in naming)])
+    told = {key: text for key, text in log.metadata.items() if source.rig is None or key != RIG_NOTES}
     log = replace(
         log,
         name=name,
         rig=source.rig or log.rig,
         world=source.world or log.world,
         start=source.start.pose(log.t0_ns) if source.start else log.start,
-        metadata={**log.metadata, **source.metadata},
+        metadata={**told, **source.metadata},
     )
     require_bounds(log)
     if source.markers is not None:

@@ -27,23 +27,28 @@ NUMERIC = range(6, 16)  # array classes double to uint64; others are texts, cell
 COMPLEX = 0x0800
 
 
-def read_matlab(path: Path, fields: Mapping[str, int]) -> dict[str, Array]:
-    """The arrays (N, K) of ``fields`` (name -> K); InputError names file and field of a missing or invalid array."""
-    arrays = read_arrays(path, {name: (None, width) for name, width in fields.items()})
+def read_matlab(path: Path, fields: Mapping[str, int]) -> tuple[dict[str, Array], list[str]]:
+    """The arrays (N, K) of ``fields`` (name -> K), and the names of all others; InputError names file and field of a missing or
+    invalid array."""
+    arrays, others = read_arrays(path, {name: (None, width) for name, width in fields.items()})
     for name, array in arrays.items():
         if len(array) == 0:
             raise InputError(f"{path}: {name} contains no rows")
-    return arrays
+    return arrays, others
 
 
-def read_arrays(path: Path, shapes: Mapping[str, tuple[int | None, ...]]) -> dict[str, Array]:
-    """The arrays of ``shapes`` (name -> size along each axis, None for any); InputError as in :func:`read_matlab`."""
+def read_arrays(path: Path, shapes: Mapping[str, tuple[int | None, ...]]) -> tuple[dict[str, Array], list[str]]:
+    """The arrays of ``shapes`` (name -> size along each axis, None for any), and the names of all others; InputError as in
+    :func:`read_matlab`."""
     content = bounded.read_bytes(path, bounded.DATA)
     found: dict[str, Array | None] = {}
+    others = []
     with bounded.foreign(path, WHAT):
         for name, matrix in _matrices(content, path):
             if name in shapes:
                 found[name] = matrix.numbers()
+            else:
+                others.append(name)
     arrays = {}
     for name, shape in shapes.items():
         if name not in found:
@@ -54,7 +59,7 @@ def read_arrays(path: Path, shapes: Mapping[str, tuple[int | None, ...]]) -> dic
         if array.ndim != len(shape) or not all(n in (None, m) for n, m in zip(shape, array.shape, strict=True)):
             raise InputError(f"{path}: {name} has shape {array.shape}, expected numbers in {_described(shape)}")
         arrays[name] = array
-    return arrays
+    return arrays, others
 
 
 @dataclass(frozen=True)

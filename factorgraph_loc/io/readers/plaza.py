@@ -11,6 +11,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, parse_model
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
+from factorgraph_loc.io.readers.left_out import not_read
 from factorgraph_loc.io.readers.matlab import read_matlab
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
@@ -40,7 +41,7 @@ def read(path: Path | None, options: Options) -> Log:
     """The run in the file ``path``, by default that of the gtsam wheel; t = 0 at the first row of its ground truth. InputError
     names file, field and row (counted from 1 within the field)."""
     file = path or shipped(options.run)
-    fields = read_matlab(file, FIELDS)
+    fields, others = read_matlab(file, FIELDS)
     warnings: list[str] = []
     for name, columns in (("GT", "t x y heading"), ("DR", "t distance dtheta"), ("TD", "t 2 beacon range")):
         for i, column in enumerate(columns.split()):
@@ -60,6 +61,7 @@ def read(path: Path | None, options: Options) -> Log:
         reference=Trajectory(checks.seconds(truth_ns, t0_ns), poses, has_heading=HAS_HEADING[options.run]),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
+        metadata=not_read([*others, "TD: column 2"]),
     )
 
 

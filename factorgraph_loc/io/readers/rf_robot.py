@@ -18,6 +18,7 @@ from factorgraph_loc.files.columns import require_span
 from factorgraph_loc.files.models import FileModel, inside, parse_model, read_text
 from factorgraph_loc.files.tables import read_cells
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
+from factorgraph_loc.io.readers.left_out import not_read
 from factorgraph_loc.io.readers.pose_file import read_columns
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
@@ -36,6 +37,7 @@ ANTENNAS = ("first", "second", "third")
 TAG_COLUMNS = ("epc", "x_m", "y_m", "z_m", "facing_deg")
 TAG_FIELDS = {"x_m": TAGS["x"], "y_m": TAGS["y"], "z_m": TAGS["z"], "facing_deg": TAGS["facing"]}
 READ_FIELDS = ("number", "EPC", "port", "carrier MHz", "phase degrees", "RSSI dBm", "reader clock us", "host clock us")
+LEFT_OUT = (READ_FIELDS[0], READ_FIELDS[6])
 BOUNDS = {"carrier MHz": (840.0, 960.0), "phase degrees": (0.0, 360.0), "RSSI dBm": (-120.0, 20.0)}
 ROUND_GAP = 0.05  # s between inventory rounds of an antenna
 THINNING = 4  # the reference has 200 Hz
@@ -70,7 +72,7 @@ def read(path: Path | None, options: Options) -> Log:
         reference=Trajectory(reference.t[::THINNING], reference.poses[::THINNING]),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
-        metadata={"odometry": f"{simulated_odometry.DESCRIPTION}; seed {options.odometry_seed}"},
+        metadata={"odometry": f"{simulated_odometry.DESCRIPTION}; seed {options.odometry_seed}"} | not_read(LEFT_OUT),
     )
 
 

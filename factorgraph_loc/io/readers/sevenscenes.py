@@ -17,6 +17,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.bounded import IMAGE, opened
 from factorgraph_loc.files.images import size_of_file
 from factorgraph_loc.files.models import FileModel, InUnit, inside, read_text
+from factorgraph_loc.io.readers.left_out import beside, not_read
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory3 import Trajectory3
@@ -58,7 +59,7 @@ def read(path: Path | None, options: Options) -> Log:
         world=World(name=path.resolve().name),
         streams={"camera": ImageStream(t, images)},
         reference3=Trajectory3(t, poses[:, :3, 3], poses[:, :3, :3]),
-        metadata={"stamps": f"nominal, {options.rate:g} Hz: the recording has none"},
+        metadata={"stamps": f"nominal, {options.rate:g} Hz: the recording has none"} | not_read(_others(path)),
     )
 
 
@@ -67,6 +68,12 @@ def _frames(folder: Path) -> list[Path]:
     if not images:
         raise InputError(f"{folder}: contains no images frame-*.color.jpg or frame-*.color.png")
     return [inside(folder, image.name, folder) for image in images]
+
+
+def _others(folder: Path) -> list[str]:
+    """What else there is for each frame, such as depth images, and beside the frames."""
+    kinds = {name.split(".", 1)[-1] if name.startswith("frame-") else name for name in beside(folder, ())}
+    return sorted(kinds - {*IMAGES, POSE})
 
 
 def _pose(path: Path) -> Array:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, parse_model
+from factorgraph_loc.io.readers.left_out import not_read
 from factorgraph_loc.io.readers.matlab import read_arrays
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import Log
@@ -57,7 +58,7 @@ def read(path: Path | None, _: Options) -> Log:
     """The run, with points named 1 to 20 and a vehicle in space. InputError names file, field and column (from 1)."""
     if path is None:
         raise InputError("starry_night: the path of starry_night_dataset.mat is missing")
-    fields = read_arrays(path, SHAPES)
+    fields, others = read_arrays(path, SHAPES)
     count = fields["t"].shape[1]
     if count < 2:
         raise InputError(f"{path}: t has {count} columns, expected 2 or more")
@@ -94,6 +95,7 @@ def read(path: Path | None, _: Options) -> Log:
         reference3=Trajectory3(t, positions, Rotation.from_rotvec(turns).as_matrix()),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
+        metadata=not_read(others),
     )
 
 

@@ -15,8 +15,9 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import inside
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
+from factorgraph_loc.io.readers.left_out import columns_after, not_read
 from factorgraph_loc.io.readers.mapped_poses import after_rest
-from factorgraph_loc.io.readers.pose_file import read_pose_file, stamps_of
+from factorgraph_loc.io.readers.pose_file import EUROC, read_pose_file, stamps_of
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.planar import RISE, TILT, Turned, on_floor
 from factorgraph_loc.model.rig import Rig
@@ -57,7 +58,8 @@ def read(path: Path | None, options: Options) -> Log:
         options = options.model_copy(update={"axes": "optical"})
     turn = options.standing()
     space = Trajectory3(checks.seconds(t_ns, t0_ns), found.positions @ turn.T, turn @ found.rotations @ turn.T)
-    bare = Log(path.stem, Rig(name=path.stem, sensors=()), World(name=path.stem), {}, t0_ns=t0_ns)
+    told = not_read(columns_after(path, len(EUROC)))
+    bare = Log(path.stem, Rig(name=path.stem, sensors=()), World(name=path.stem), {}, t0_ns=t0_ns, metadata=told)
     if options.use == "reference" and not is_told and not _is_flat(space):
         return replace(bare, reference3=space, warnings=tuple(warnings))
     poses = on_floor(path, found.positions, found.rotations, warnings, options)

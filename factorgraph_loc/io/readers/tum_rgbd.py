@@ -6,6 +6,7 @@ from pathlib import Path
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, inside
+from factorgraph_loc.io.readers.left_out import beside, not_read
 from factorgraph_loc.io.readers.pose_file import TUM, later, read_image_list, read_poses
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -44,4 +45,5 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
         reference3=later(poses, t_ns, t0_ns),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
+        metadata=not_read(beside(path, ("rgb", "rgb.txt", "groundtruth.txt"))),
     )

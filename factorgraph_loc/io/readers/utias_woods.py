@@ -10,6 +10,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, InUnit, parse_model
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
+from factorgraph_loc.io.readers.left_out import not_read
 from factorgraph_loc.io.readers.matlab import read_matlab
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
@@ -37,7 +38,7 @@ def read(path: Path | None, options: Options) -> Log:
     """The run, with landmarks named 1 to 17. InputError names file, field and row (from 1)."""
     if path is None:
         raise InputError("utias_woods: the path of dataset2.mat is missing")
-    fields = read_matlab(path, FIELDS)
+    fields, others = read_matlab(path, FIELDS)
     count = len(fields["t"])
     for name in (*SERIES, "r", "b"):
         if len(fields[name]) != count:
@@ -65,6 +66,7 @@ def read(path: Path | None, options: Options) -> Log:
         reference=read_reference(path, series, t, rows, keep),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
+        metadata=not_read(others),
     )
 
 
