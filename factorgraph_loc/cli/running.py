@@ -89,7 +89,6 @@ def run(
     json: Json = False,
 ) -> None:
     """Run one estimator on one log; write trajectories, estimates, scores and plots."""
-    from factorgraph_loc.calibration.report import constants_table
     from factorgraph_loc.experiments import run as experiment
     from factorgraph_loc.experiments.learning import run_and_learn
     from factorgraph_loc.experiments.output import check_free, write_plots, write_run
@@ -122,6 +121,8 @@ def run(
     _print_consistency(scores)
     _print_learnt(result)
     if learnt:
+        from factorgraph_loc.calibration.report import constants_table
+
         show.line("learnt from the log, for the final trajectory alone:")
         show.table(*constants_table(learnt))
     _print_events(result)

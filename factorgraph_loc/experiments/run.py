@@ -1,12 +1,14 @@
 """One run of an estimator on a log: process measurements in the order of arrival, and store and time the estimates."""
 
 import importlib.metadata
+import math
 import platform
 import resource
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import groupby
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from itertools import groupby, takewhile
 from operator import attrgetter
 from pathlib import Path
 from time import perf_counter
@@ -14,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.experiments.doubts import findable, never_localized, partly_scored, with_pauses
 from factorgraph_loc.experiments.preparation import (
     KNOWN,
@@ -25,6 +27,7 @@ from factorgraph_loc.experiments.preparation import (
     use_of,
     used_sensors,
 )
+from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, SpaceEstimator, finds_heading
 from factorgraph_loc.fusion.guarded import Guard, sound, sound_space, sound_trajectory
@@ -41,6 +44,9 @@ from factorgraph_loc.sensors.registry import functions, moving
 from factorgraph_loc.text import listed
 from factorgraph_loc.version import __version__
 from factors.se2 import Array
+
+_REHEARSAL = 2.0  # s of a log
+_REHEARSED: set[tuple[str, tuple[str, ...]]] = set()  # estimators with their sensors, in this process
 
 
 @dataclass(frozen=True)
@@ -120,6 +126,7 @@ def run(
     report = progress or (lambda _: None)
     prepared = prepare(use, lambda share: report(0.5 * share))
     before = 0.5 if prepared.images else 0.0
+    _rehearse(config, setup, settings, prepared.log, prior)
     ticks = Ticks(_begin(log, sensors, prior), config.tick_gap)
     loop = _CausalRun(
         guard,
@@ -187,9 +194,28 @@ def run(
     )
 
 
+def _rehearse(
+    config: RunConfig, setup: model_setup.Setup, settings: FileModel, log: Log, prior: PosePrior | None
+) -> None:
+    """Let an estimator that is thrown away work on the first seconds, so that compiled functions are loaded, or compiled, before
+    times are taken. Once in a process for each estimator and its sensors; an error comes again in the run itself."""
+    kind = config.estimator, setup.sensors
+    if kind in _REHEARSED:
+        return
+    _REHEARSED.add(kind)
+    begin = _begin(log, setup.sensors, prior)
+    guard = Guard(config.estimator)
+    with suppress(FglocError), guard, guard.quiet():
+        estimator = registry.create(config.estimator, replace(setup, rng=np.random.default_rng(config.seed)), settings)
+        ticks = Ticks(begin, config.tick_gap)
+        _CausalRun(guard, estimator, log, setup.sensors, prior, ticks, end=begin + _REHEARSAL).run()
+        with guard.telling("the final trajectory"):
+            estimator.trajectory()
+
+
 @dataclass
 class _CausalRun:
-    """The causal part of a run."""
+    """The causal part of a run, up to ``end``."""
 
     guard: Guard
     estimator: Estimator
@@ -197,8 +223,9 @@ class _CausalRun:
     sensors: tuple[str, ...]
     prior: PosePrior | None
     ticks: Ticks
-    progress: Callable[[float], None]
-    watch: Callable[[float, Estimator], None] | None
+    progress: Callable[[float], None] = lambda _: None
+    watch: Callable[[float, Estimator], None] | None = None
+    end: float = math.inf
     estimates: list[PoseEstimate] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -246,7 +273,8 @@ class _CausalRun:
 
     def _measurements(self) -> Iterator[Measurement]:
         joined = getattr(self.estimator, "takes_rows", False)
-        return self.log.steps(self.sensors) if joined else self.log.measurements(self.sensors)
+        steps = self.log.steps(self.sensors) if joined else self.log.measurements(self.sensors)
+        return takewhile(lambda m: m.t <= self.end, steps)
 
     def _reach(self, t: float) -> None:
         """What comes before a measurement at ``t``: the start, and ticks."""

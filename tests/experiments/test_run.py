@@ -49,6 +49,27 @@ def test_an_update_is_one_stamp(log, fake):
     assert result.timings.peak_memory_mb > 10.0
 
 
+@pytest.mark.parametrize("name", ["ekf", "particle_filter"])
+def test_a_first_run_is_rehearsed_and_no_result_depends_on_it(log, name, monkeypatch):
+    log = replace(log, start=StartPose(0.0, np.zeros(3), np.full(3, 0.1)))
+    estimator = estimator_type(name)
+    process = estimator.process
+    taken = {}
+    monkeypatch.setattr(
+        estimator, "process", lambda self, m: (taken.setdefault(id(self), []).append(m.t), process(self, m))
+    )
+    monkeypatch.setattr("factorgraph_loc.experiments.run._REHEARSED", set())
+    monkeypatch.setattr("factorgraph_loc.experiments.run._REHEARSAL", 0.8)
+    first = run(log, RunConfig(name, seed=3))
+    rehearsal, itself = taken.values()
+    assert 0.0 < max(rehearsal) <= 0.8 < max(itself)
+    taken.clear()
+    second = run(log, RunConfig(name, seed=3))
+    assert len(taken) == 1
+    assert np.array_equal(first.poses, second.poses)
+    assert np.array_equal(first.covariances, second.covariances)
+
+
 @pytest.mark.parametrize("start", [None, 0.72])
 @pytest.mark.parametrize("name", ["dead_reckoning", "ekf", "smoother"])
 def test_rows_of_odometry_may_come_at_once(log, name, start, monkeypatch):
