@@ -2,6 +2,7 @@
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.odometry.kernels import carried
 from factors.se2 import Array, Integers
@@ -17,6 +18,7 @@ def between(
     steps: Array,
     step_noises: Array,
     step_durations: Array,
+    elsewhere: NDArray[np.bool_],
     poses: Array,
     covariances: Array,
 ) -> tuple[Array, Array]:
@@ -25,14 +27,15 @@ def between(
 
     ``deltas`` (T, 3), ``noises`` (T, 3, 3) and ``durations`` (T,) [s]: of the motion from there; ``steps`` (M-1, 3) and so on: of
     that from each pose to the next. What the odometry then misses the next pose by is spread in proportion to time. The covariance
-    goes linearly from one to the other, plus that of a bridge pinned at both ends.
+    goes linearly from one to the other, plus that of a bridge pinned at both ends. ``elsewhere`` (M-1,): whether the robot was
+    carried to the next pose, which tells nothing of those before.
     """
     count = len(before)
     at, spreads = np.empty((count, 3)), np.empty((count, 3, 3))
     for i in range(count):
         k = before[i]
         x, y, heading = composed(poses[k, 0], poses[k, 1], poses[k, 2], deltas[i, 0], deltas[i, 1], deltas[i, 2])
-        if k < len(steps):
+        if k < len(steps) and not elsewhere[k]:
             share = durations[i] / step_durations[k]
             a, b, c = composed(poses[k, 0], poses[k, 1], poses[k, 2], steps[k, 0], steps[k, 1], steps[k, 2])
             a, b, c = related(a, b, c, poses[k + 1, 0], poses[k + 1, 1], poses[k + 1, 2])

@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc.fusion.changes import Change, is_known
 from factorgraph_loc.fusion.graph_parts import Keyframe, TickAt
 from factorgraph_loc.fusion.kept import Kept
 from factorgraph_loc.fusion.layout import MOTION
@@ -40,6 +41,7 @@ from factors import se2, se2_kernels
 from factors.between import between
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.motion import ChainState, Increment
+from factors.odometry.model import OdometryFactor
 from factors.se2 import Array
 
 STATE = len(ChainState._fields)
@@ -65,6 +67,7 @@ class Graph:
         self.keyframes: Kept[Keyframe] = Kept()
         self.times: Kept[float] = Kept()
         self.ticks: list[TickAt] = []
+        self.changes: tuple[Change, ...] = ()  # when the robot was carried elsewhere
         self._anchored = False  # whether the odometry of the first keyframe counts: rows of before it may still come
         self._damping = 0.0  # the largest that covariances were computed with
         self.t = -math.inf
@@ -164,13 +167,14 @@ class Graph:
         return Node(keys, term.factor, term.rows, sensor=sensor)
 
     def odometry_factor(self, keyframe: Keyframe) -> tuple[Factor, tuple[int, ...]]:
-        """The factor from the keyframe before, and its keys."""
+        """The factor from the keyframe before, and its keys. The constants of the odometry do not tell how a robot is carried."""
         assert keyframe.from_previous is not None
         keys: tuple[int, ...] = (pose_key(keyframe.index - 1), keyframe.key)
-        if MOTION in self.keys:
+        if MOTION in self.keys and not keyframe.is_elsewhere:
             keys = (*keys, self.keys[MOTION])
         if keyframe.factor is None:
-            keyframe.factor = self.motion.factor(keyframe.from_previous)
+            increment = keyframe.from_previous
+            keyframe.factor = OdometryFactor(increment) if keyframe.is_elsewhere else self.motion.factor(increment)
         return keyframe.factor, keys
 
     def learnt(self) -> Learnt:
@@ -304,10 +308,12 @@ class Graph:
         return f"the landmark {name.partition('/')[2]}" if is_landmark(key) else f"the constants of the {name}"
 
     def between(self, poses: Array, covariances: Array) -> Trajectory:
-        """The trajectory at the ticks from all keyframes: ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3); see
-        :func:`factors.between.between`."""
+        """The trajectory from all keyframes, ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3), at the ticks, but for those
+        at which nobody knows where the robot was; see :func:`factors.between.between`."""
         newest = {tick.t: tick for tick in self.ticks}
-        ticks, keyframes, first = [newest[t] for t in sorted(newest)], list(self.keyframes), self.keyframes.first
+        stamps = np.array(sorted(newest))
+        ticks = [newest[t] for t in stamps[is_known(stamps, self.changes)].tolist()]
+        keyframes, first = list(self.keyframes), self.keyframes.first
         before = np.array([tick.keyframe - first for tick in ticks], dtype=np.int64)
         ends = np.array([tick.odometry for tick in ticks]).reshape(-1, STATE)
         starts = np.array([k.odometry for k in keyframes]).reshape(-1, STATE)[before]
@@ -317,6 +323,7 @@ class Graph:
             np.array([step.delta for step in steps]).reshape(-1, 3),
             np.array([step.covariance for step in steps]).reshape(-1, 3, 3),
             np.array([step.duration for step in steps]),
+            np.array([k.is_elsewhere for k in keyframes[1:]], dtype=np.bool_),
         )
         at, spread = between(before, deltas, noises, np.abs(ends[:, 0] - starts[:, 0]), *later, poses, covariances)
         return Trajectory(np.array([tick.t for tick in ticks]), at, se2.body_to_world(at, spread))

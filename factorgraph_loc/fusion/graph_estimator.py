@@ -22,7 +22,7 @@ from factorgraph_loc.fusion.builder import Backend, Builder
 from factorgraph_loc.fusion.graph import Graph
 from factorgraph_loc.fusion.graph_parts import GraphSettings, Keyframe
 from factorgraph_loc.fusion.mapping import Mapper
-from factorgraph_loc.fusion.search import DURATION, Search
+from factorgraph_loc.fusion.search import DURATION, Refuted, Search
 from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, gaussian_belief
 from factorgraph_loc.model.diagnostics import NOTHING_WRITTEN, Diagnostics, Written
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -250,11 +250,11 @@ class GraphEstimator(ABC):
         if refuted is not None and best is not None:
             what = f"lost: {refuted.why} since {refuted.since:.1f} s; goes on at another place"
             self.diagnostics.events.append((self._graph.t, what))
-            self._go_on(refuted.since, best)
+            self._go_on(refuted, best)
 
-    def _go_on(self, since: float, best: PosePrior) -> None:
-        """Take back what was added since then, and add it once more at the ``best`` place."""
-        graph = self._graph
+    def _go_on(self, refuted: Refuted, best: PosePrior) -> None:
+        """Take back what was added since the track was wrong, and add it once more at the ``best`` place."""
+        graph, since = self._graph, refuted.since
         index = max(1, bisect.bisect_left(graph.times, since, graph.times.first))
         while not self._backend.is_open(index - 1):
             index += 1
@@ -264,8 +264,10 @@ class GraphEstimator(ABC):
         graph.ticks = [tick for tick in graph.ticks if tick.keyframe < index and tick.t < t]
         pose = self._placed(t, best)
         jump = Increment(se2.between(self._backend.guess_of(index - 1)[0], pose), UNKNOWN, t - graph.newest.t)
-        keyframe = Keyframe(index, t, self._motion.state(t), jump)
+        keyframe = Keyframe(index, t, self._motion.state(t), jump, is_elsewhere=True)
         graph.append(keyframe)
+        earlier = [change for change in graph.changes if change[0] < t]
+        graph.changes = (*earlier, (min(refuted.change[0], t), max(refuted.change[1], t)))
         graph.pose, graph.covariance = pose, UNKNOWN
         self._builder.clear()
         for sensor in graph.sensors.values():

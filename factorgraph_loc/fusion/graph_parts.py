@@ -74,6 +74,7 @@ class Keyframe:
     odometry: ChainState
     from_previous: Increment | None
     factor: Factor | None = None  # of the odometry from the one before, once it was asked for
+    is_elsewhere: bool = False  # the robot was carried there from the one before
     nodes: list[Node] = field(default_factory=list)
 
     @property

@@ -24,11 +24,12 @@ from pydantic import Field
 
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion import kld
+from factorgraph_loc.fusion.changes import Change, is_known
 from factorgraph_loc.fusion.cloud import Cloud, largest_share, normalised, systematic, vector_moments, weighable
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.search import Search
-from factorgraph_loc.fusion.timeline import Filter, FilterSettings
+from factorgraph_loc.fusion.timeline import Filter, FilterSettings, Taken
 from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -130,6 +131,7 @@ class ParticleFilter(Filter):
         self._search = Search(self._sensors, self._motion, setup.rng)
         self._search.remember()
         self._lost = False
+        self._changes: list[tuple[float, Change]] = []  # of the robot's place, each with when it was found out
 
     def belief(self, t: float | None = None) -> Belief:
         """The particles with their weights, and the Gaussians of their modes; of all, once the place is known."""
@@ -166,9 +168,12 @@ class ParticleFilter(Filter):
             records = [r for r in records if r.t >= kept[0].t]
             if kept[-1] is not self._records[-1]:
                 kept.append(replace(self._records[-1], cloud=self._state))
+            changes = [change for _, change in self._changes]
+            known = is_known(np.array([r.t for r in records]), changes)
+            records = [r for r, told in zip(records, known.tolist(), strict=True) if told]
             rng = copy.deepcopy(self._smoothing_rng)
             simulation = BackwardSimulation(
-                kept, self._increment, self._moved, rng, self._settings.smoothing_trajectories
+                kept, self._increment, self._moved, rng, self._settings.smoothing_trajectories, changes
             )
             found = [simulation.at(r) for r in records]
         poses = np.array([pose for pose, _ in found]).reshape(-1, 3)
@@ -292,7 +297,12 @@ class ParticleFilter(Filter):
             self._records = [r.lost() if r.t >= refuted.since else r for r in self._records]
             self.diagnostics.event(self._t, f"lost: {refuted.why} since {refuted.since:.1f} s")
             self._lost = True
+            self._changes.append((self._t, refuted.change))
             self._state = self._found(refuted.since) or self._state
+
+    def _go_back(self, taken: Taken) -> None:
+        super()._go_back(taken)
+        self._changes = [(found, change) for found, change in self._changes if found <= self._t]
 
     def _pose_back(self, t: float, pose: Array) -> Array:
         """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph_loc.fusion.ancestors import draw_ancestors
+from factorgraph_loc.fusion.changes import Change
 from factorgraph_loc.fusion.cloud import Cloud, pose_moments, systematic
 from factors import positive, se2
 from factors.motion import ChainState, Increment
@@ -45,7 +46,7 @@ class BackwardSimulation:
     """``count`` trajectories through the clouds at the records ``kept``.
 
     ``increment(start, end)``: the motion between two records; ``moved(cloud, increment)``: poses (N, 3) after it, without noise,
-    and their transition (3, 3+P) from body-frame perturbation and constants.
+    and their transition (3, 3+P) from body-frame perturbation and constants. ``changes``: when the robot was carried elsewhere.
     """
 
     def __init__(
@@ -55,8 +56,10 @@ class BackwardSimulation:
         moved: Callable[[Cloud, Increment], tuple[Array, Array]],
         rng: np.random.Generator,
         count: int,
+        changes: Sequence[Change] = (),
     ) -> None:
         self._kept, self._increment, self._moved, self._rng = kept, increment, moved, rng
+        self._changes = changes
         self._t = np.array([r.t for r in kept])
         clouds = [r.cloud for r in kept if r.cloud is not None]
         cloud, kernel = clouds[-1].density()
@@ -71,6 +74,8 @@ class BackwardSimulation:
     def at(self, record: Record) -> tuple[Array, Array]:
         """Mean (3,) and covariance (3, 3) in the world's frame of the trajectories at a record between two kept ones."""
         k = int(np.searchsorted(self._t, record.t, side="right")) - 1
+        if any(self._t[k] < after <= record.t for _, after in self._changes):
+            return self._carried_back(self._drawn[k + 1], self._increment(record, self._kept[k + 1]))
         since = self._increment(self._kept[k], record)
         poses, _ = self._moved(self._drawn[k], since)
         extra = np.zeros((3, 3))
@@ -79,8 +84,12 @@ class BackwardSimulation:
             share = since.duration / whole.duration
             poses = se2.compose(poses, se2.exp(share * self._missed[k]))
             extra = share * (1.0 - share) * whole.covariance
-        mean, covariance = pose_moments(poses, np.full(len(poses), 1.0 / len(poses)))
-        return mean, covariance + se2.body_to_world(mean, extra)
+        return _spread(poses, extra)
+
+    @staticmethod
+    def _carried_back(after: Cloud, increment: Increment) -> tuple[Array, Array]:
+        """The same at a record from which ``increment`` leads to a cloud, where those before tell nothing."""
+        return _spread(se2.compose(after.poses, se2.inverse(increment.delta)), increment.covariance)
 
     def _step(self, cloud: Cloud, increment: Increment, after: Cloud) -> tuple[Cloud, Array]:
         """Where the states ``after`` came from, and the noise (M, 3) of the motion in between."""
@@ -114,8 +123,16 @@ class BackwardSimulation:
         if jumped.any() and cloud.localized:
             poses[jumped] = cloud.poses[systematic(cloud.weights, self._rng, int(jumped.sum()))]
         elif jumped.any():
-            poses[jumped] = se2.compose(after.poses[jumped], se2.inverse(increment.delta))
+            noise = positive.draws(increment.covariance, int(jumped.sum()), self._rng)
+            poses[jumped] = se2.compose(after.poses[jumped], se2.inverse(se2.compose(increment.delta, se2.exp(noise))))
         drawn = replace(after, poses=poses, constants=constants)
         missed = se2.log(se2.between(self._moved(drawn, increment)[0], after.poses))
-        missed[jumped] = 0.0
+        if cloud.localized:
+            missed[jumped] = 0.0
         return drawn, missed
+
+
+def _spread(poses: Array, extra: Array) -> tuple[Array, Array]:
+    """Mean (3,) and covariance (3, 3) in the world's frame of poses (N, 3), each with a body-frame covariance ``extra`` (3, 3)."""
+    mean, covariance = pose_moments(poses, np.full(len(poses), 1.0 / len(poses)))
+    return mean, covariance + se2.body_to_world(mean, extra)

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from factorgraph_loc.fusion.changes import Change
 from factorgraph_loc.fusion.population import Population
 from factorgraph_loc.model.belief import Mode, PosePrior
 from factorgraph_loc.model.measurement import Motion, Tick
@@ -28,7 +29,8 @@ from factors.update import Correction
 
 DURATION = 60.0  # s of observations that are kept
 REFUTING = 8.0  # log of the odds that a track must lose by: kidnappings are rare
-BEFORE = 2.0  # s before a suspicion in which a change may lie
+BEFORE = 2.0  # s before a suspicion, or before what speaks for a change, in which it may lie
+UNSURE = 5.0  # a change may be at a time for which the log of its likelihood is so much below the highest
 SLICE = 4_000_000  # of work (:mod:`.population`) that is done at a measurement or a tick
 APART = 16.0  # squared Mahalanobis distance to the track, beyond which it is another place
 
@@ -42,10 +44,11 @@ class WeighedObservation(NamedTuple):
 
 
 class Refuted(NamedTuple):
-    """Why a track is given up, and since when it was wrong."""
+    """Why a track is given up, and since when it was wrong; ``change``: between which times the robot left it."""
 
     why: str
     since: float
+    change: Change
 
 
 class Search:
@@ -58,6 +61,7 @@ class Search:
         self._bounds = None if not bounds else np.array((np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]))
         self._population = self._new_population(None)
         self._kept: deque[WeighedObservation] = deque()
+        self._looked: deque[float] = deque()  # when finders' sensors told something on the way
         self._last: dict[str, float] = {}  # when a sensor last told something new of a place
         self._newest: ChainState | None = None
         self._since = -math.inf
@@ -176,6 +180,9 @@ class Search:
         """An observation is about to be applied to a track."""
         if sensor.finder is not None:
             sensor.finder.follow(observation, odometry, view)
+            self._looked.append(odometry.t)
+            while self._looked[0] < odometry.t - DURATION:
+                self._looked.popleft()
 
     def keep(
         self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: Callable[[], float]
@@ -204,7 +211,8 @@ class Search:
         if finder is not None:
             since = finder.refuted_since(m, odometry, pose, covariance)
             if since is not None:
-                return Refuted(self._sensors[m.modality].lost, since)
+                before = max((t for t in self._looked if t < since), default=-math.inf)
+                return Refuted(self._sensors[m.modality].lost, since, (before, since))
         return self._refuted_by_all(odometry, pose, covariance, pose_at)
 
     def _refuted_by_all(
@@ -231,7 +239,7 @@ class Search:
             return None
         if self._population.log_evidence - self._population.rival_evidence <= REFUTING:
             return None
-        return Refuted(next(iter(doubting)).lost, self._change(best, pose_at))
+        return Refuted(next(iter(doubting)).lost, *self._change(best, pose_at))
 
     def _brought(self, best: PosePrior, now: ChainState) -> PosePrior:
         """A place where the odometry is at ``now``."""
@@ -239,14 +247,25 @@ class Search:
         pose = se2.compose(best.pose, since.delta)
         return PosePrior(now.t, pose, best.covariance + se2.body_to_world(pose, since.covariance))
 
-    def _change(self, best: PosePrior, pose_at: Callable[[float, Array], Array]) -> float:
-        """When the robot must have come to the other place: from then on what was seen is likelier there, before on the track."""
-        kept = [row for row in self._kept if row.odometry.t >= self._since - BEFORE]
-        gains = [
-            float(row.observation.log_likelihood(pose_at(row.odometry.t, best.pose)[None], {})[0]) - row.evidence
-            for row in kept
-        ]
-        return kept[int(np.argmax(np.cumsum(gains[::-1])[::-1]))].odometry.t
+    def _change(self, best: PosePrior, pose_at: Callable[[float, Array], Array]) -> tuple[float, Change]:
+        """When the robot must have come to the other place: from then on what was seen is likelier there, before on the track. And
+        between which observations that may have been."""
+        times: list[float] = []
+        likelihoods: list[float] = []  # logarithms, of a change just before each time
+        total, highest, earliest = 0.0, -math.inf, self._since
+        for row in reversed(self._kept):
+            t = row.odometry.t
+            if t < earliest - BEFORE:
+                break
+            total += float(row.observation.log_likelihood(pose_at(t, best.pose)[None], {})[0]) - row.evidence
+            times.append(t)
+            likelihoods.append(total)
+            highest = max(highest, total)
+            if total >= highest - UNSURE:
+                earliest = min(earliest, t)
+        possible = np.flatnonzero(np.array(likelihoods) >= highest - UNSURE)
+        before = max((row.odometry.t for row in self._kept if row.odometry.t < times[possible[-1]]), default=-math.inf)
+        return times[int(np.argmax(likelihoods))], (before, times[possible[0]])
 
     def begin_track(self, *, found: bool) -> None:
         """A track begins: where the search ``found`` it, with what was seen again that led there, or where it was said to."""

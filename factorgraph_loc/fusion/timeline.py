@@ -35,7 +35,7 @@ class FilterSettings(FileModel):
     """whether the final trajectory uses all measurements, else it repeats the causal one"""
 
 
-class _Taken(NamedTuple):
+class Taken(NamedTuple):
     """A measurement with what there was before it: the filter's state, time and odometry, and how many records and ticks; and what
     the diagnostics say of it."""
 
@@ -77,7 +77,7 @@ class Filter(ABC):
         self._moves = False
         self._ticks: list[float] = []
         self._records: list[Any] = []
-        self._taken: deque[_Taken] = deque()  # the last ones, as far back as one may be late
+        self._taken: deque[Taken] = deque()  # the last ones, as far back as one may be late
 
     def initialize(self, prior: PosePrior) -> None:
         """Start from a Gaussian."""
@@ -228,7 +228,7 @@ class Filter(ABC):
         else:
             self._see(m)
         self._records.append(self._record())
-        self._taken.append(_Taken(m, *before, self.diagnostics.since(mark)))
+        self._taken.append(Taken(m, *before, self.diagnostics.since(mark)))
         while self._taken[0].measurement.t < m.t - self._max_delay:
             self._taken.popleft()
 
@@ -249,7 +249,7 @@ class Filter(ABC):
         if not isinstance(m, Tick):
             self.diagnostics.drop_late(m.modality, m.count)
 
-    def _go_back(self, taken: _Taken) -> None:
+    def _go_back(self, taken: Taken) -> None:
         self._state, self._t, self._odometry = taken.state, taken.t, taken.odometry
         del self._records[taken.records :], self._ticks[taken.ticks :]
         self.diagnostics.take_back(taken.written)

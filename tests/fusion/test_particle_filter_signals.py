@@ -101,9 +101,9 @@ def test_kidnapped():
     result = run(carried, config("phase", settings={"particles": 800}))
     assert events(result) == ["lost", "recovered"]
     assert position_errors(result, carried)[result.t > 30.0].max() < 0.4
-    # afterwards it is known when the robot was carried, to within two scans
-    away = np.abs(result.final.t - 15.0) > 1.5
-    assert final_errors(result, carried)[away].max() < 0.6
+    # of what lies between the two places nothing is told
+    assert np.nanmax(final_errors(result, carried)) < 0.6
+    assert 0.5 < np.diff(result.final.t).max() < 3.0
     dated = float(result.diagnostics.events[0][1].split("since ")[1].removesuffix(" s"))
     assert 14.0 < dated < 17.0
 
