@@ -41,7 +41,6 @@ from factors import se2, se2_kernels
 from factors.between import between
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.motion import ChainState, Increment
-from factors.odometry.model import OdometryFactor
 from factors.se2 import Array
 
 STATE = len(ChainState._fields)
@@ -174,7 +173,8 @@ class Graph:
             keys = (*keys, self.keys[MOTION])
         if keyframe.factor is None:
             increment = keyframe.from_previous
-            keyframe.factor = OdometryFactor(increment) if keyframe.is_elsewhere else self.motion.factor(increment)
+            make = self.motion.exact_factor if keyframe.is_elsewhere else self.motion.factor
+            keyframe.factor = make(increment)
         return keyframe.factor, keys
 
     def learnt(self) -> Learnt:

@@ -220,5 +220,8 @@ class Motion(Protocol):
     def factor(self, increment: Increment) -> Factor:
         """An increment as a factor on two poses, and on the constants if there are any."""
 
+    def exact_factor(self, increment: Increment) -> Factor:
+        """An increment without constants as a factor on two poses."""
+
     def native(self, keys: tuple[int, int], increment: Increment) -> gtsam.NonlinearFactor:
         """An increment without constants as a GTSAM factor on two poses."""

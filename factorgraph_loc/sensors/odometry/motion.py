@@ -166,6 +166,10 @@ class OdometryMotion:
         """An increment as a factor on two poses, and on the constants if there are any."""
         return OdometryFactor(increment, self.constants.indices)
 
+    def exact_factor(self, increment: Increment) -> OdometryFactor:
+        """An increment without constants as a factor on two poses."""
+        return OdometryFactor(increment)
+
     def native(self, keys: tuple[int, int], increment: Increment) -> gtsam.NonlinearFactor:
         """An increment without constants as a GTSAM factor on two poses."""
         return between_factor(*keys, increment)
