@@ -229,11 +229,12 @@ class Incremental:
             raise IndeterminateError(key)
         return value
 
-    def _marginal(self, key: int, graph: Graph | None = None) -> tuple[Array, Array]:
-        """Estimate and covariance of a variable; ``graph``: where to report, of a copy."""
+    def _marginal(self, key: int, spread: Array | None = None, graph: Graph | None = None) -> tuple[Array, Array]:
+        """Estimate and covariance of a variable; ``spread``: its covariance, if that is known; ``graph``: where to report, of a
+        copy."""
         value = self._value(key)
         try:
-            covariance = self._solver.covariance(key)
+            covariance = self._solver.covariance(key) if spread is None else spread
         except RuntimeError:
             covariance = np.full((1, 1), np.nan)
         if positive.is_clear(covariance):
@@ -258,11 +259,13 @@ class Incremental:
         while self._graph.keyframes[end].t < now - lag:
             end += 1
         leaving = self._graph.keyframes[count:end]
+        keys = [k.key for k in leaving]
         try:
+            # of a start of the whole problem the covariance is not asked; a window with points takes long to eliminate
+            spreads = {} if self._is_whole or self._maps else self._solver.covariances(keys)
             for k in leaving:
-                # of a start of the whole problem the covariance is not asked
-                known = (self._value(k.key), self._filtered[k.index][1]) if self._is_whole else self._marginal(k.key)
-                self._left.append(known)
+                spread = self._filtered[k.index][1] if self._is_whole else spreads.get(k.key)
+                self._left.append(self._marginal(k.key, spread))
             for key in constants:
                 self._graph.values[key], self._graph.spreads[key] = self._marginal(key)
         except RuntimeError:

@@ -151,6 +151,18 @@ class Window:
         with gtsam_errors():
             return np.asarray(self._smoother.marginalCovariance(key))
 
+    def covariances(self, poses: Sequence[int]) -> dict[int, Array]:
+        """Marginal covariances of poses by key, from one elimination of the window; none where that fails."""
+        order, known = gtsam.Ordering(), self.linear()[0]
+        for key in poses:
+            order.push_back(key)
+        try:
+            root = known.marginalMultifrontalBayesNet(order, function=gtsam.EliminateQR).matrix()[0]
+            rows = np.linalg.inv(root).reshape(len(poses), 3, -1)
+        except (RuntimeError, ValueError, np.linalg.LinAlgError):
+            return {}
+        return dict(zip(poses, rows @ rows.transpose(0, 2, 1), strict=True))
+
     def estimates(self) -> gtsam.Values:
         return self._smoother.calculateEstimate()
 

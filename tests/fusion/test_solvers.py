@@ -73,6 +73,20 @@ def test_a_window_that_is_built_anew_counts_nothing_twice(monkeypatch):
     assert np.max(squared) < 1.0  # the points are linearised at another update
 
 
+def test_covariances_of_poses_at_once_are_those_of_each(log):
+    compared = []
+
+    def watch(_, estimator):
+        solver = estimator._backend._solver
+        if not compared and estimator._graph.newest.index > 40:
+            poses = [pose_key(estimator._graph.newest.index - back) for back in (9, 8, 4)]
+            at_once = solver.covariances(poses)
+            compared.extend(np.allclose(at_once[key], solver.covariance(key), rtol=1e-7) for key in poses)
+
+    run(log, RunConfig("smoother", {"lag": 6.0}, prior=START), watch=watch)
+    assert compared == [True, True, True]
+
+
 def test_what_is_absent_is_marginalised_out_of_a_summary():
     graph, at = gtsam.NonlinearFactorGraph(), gtsam.Values()
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array((0.1, 0.1, 0.02)))
