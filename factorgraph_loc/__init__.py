@@ -19,7 +19,15 @@ if TYPE_CHECKING:
     from factorgraph_loc.api.experimenting import active, experiment, report, status
     from factorgraph_loc.api.learning import build_map, calibrate, features, images
     from factorgraph_loc.api.logs import convert, datasets, info, manifest, simulate
-    from factorgraph_loc.api.lookups import known_estimators, known_readers, known_rigs, known_sensors, new_rig
+    from factorgraph_loc.api.lookups import (
+        known_estimators,
+        known_policies,
+        known_presets,
+        known_readers,
+        known_rigs,
+        known_sensors,
+        new_rig,
+    )
     from factorgraph_loc.api.results import export, view
     from factorgraph_loc.api.running import Run, compare, run
     from factorgraph_loc.errors import FglocError, InputError, RunFailedError
@@ -116,6 +124,8 @@ __all__ = [
     "images",
     "info",
     "known_estimators",
+    "known_policies",
+    "known_presets",
     "known_readers",
     "known_rigs",
     "known_sensors",
@@ -147,7 +157,15 @@ _MODULES = {
     "api.experimenting": ("active", "experiment", "report", "status"),
     "api.learning": ("features", "images", "build_map", "calibrate"),
     "api.logs": ("convert", "datasets", "info", "manifest", "simulate"),
-    "api.lookups": ("known_estimators", "new_rig", "known_readers", "known_rigs", "known_sensors"),
+    "api.lookups": (
+        "known_estimators",
+        "new_rig",
+        "known_policies",
+        "known_presets",
+        "known_readers",
+        "known_rigs",
+        "known_sensors",
+    ),
     "api.results": ("export", "view"),
     "api.running": ("Run", "compare", "run"),
     "errors": ("FglocError", "InputError", "RunFailedError"),

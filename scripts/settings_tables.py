@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from factorgraph_loc.api.lookups import describe_preset, known_policies
 from factorgraph_loc.files.settings import Setting, default_text, settings_in, values_text
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.readers import reader
@@ -12,7 +13,7 @@ from factorgraph_loc.sensors.registry import about, sections_of, sensor
 
 def tables() -> list[str]:
     """The lines of all tables, with their headings."""
-    return [*_estimators(), *_rig(), *_readers()][:-1]
+    return [*_estimators(), *_rig(), *_readers(), *_simulations(), *_active()][:-1]
 
 
 def _estimators() -> list[str]:
@@ -40,6 +41,16 @@ def _readers() -> list[str]:
         options = settings_in(reader(name).options)
         lines += [f"### {name}", "", reader(name).about, "", *(_table(options) if options else ["No options.", ""])]
     return lines
+
+
+def _simulations() -> list[str]:
+    settings = [s for s in describe_preset("office").settings if s.key != "name"]
+    told = "The values are those of the preset `office`; `fgloc presets NAME` prints those of another one."
+    return ["## Simulated logs", "", told, "", *_table(settings)]
+
+
+def _active() -> list[str]:
+    return ["## Active robots", "", *_table(known_policies().settings)]
 
 
 def _table(settings: Sequence[Setting]) -> list[str]:

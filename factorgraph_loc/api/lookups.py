@@ -1,4 +1,5 @@
-"""``fgloc estimators``, ``sensors``, ``readers`` and ``rigs`` as functions: what there is to choose from."""
+"""``fgloc estimators``, ``sensors``, ``readers``, ``presets``, ``policies`` and ``rigs`` as functions: what there is to choose
+from."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,10 +16,12 @@ from factorgraph_loc.io.native import rig_file as first
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig, rig_text
 from factorgraph_loc.io.readers import reader
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.planning.policies import POLICIES
+from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
 from factorgraph_loc.sensors.registry import about, sections_of, sensor
 from factorgraph_loc.sensors.tables import tables_of_sensor
-from factorgraph_loc.simulation import PRESETS, preset
+from factorgraph_loc.simulation.settings import ABOUT, PRESETS, SimulationSettings, preset
 
 ADVICE = "`fgloc sensors NAME` prints all keys of a sensor, with bounds."
 
@@ -42,6 +45,23 @@ class SensorDescription:
     channels: tuple[str, ...]
     tables: Mapping[str, tuple[Column, ...]]
     rig: Mapping[str, tuple[Setting, ...]]
+
+
+@dataclass(frozen=True)
+class PresetDescription:
+    """A preset of simulations: one sentence on it, and its settings except those of its rig."""
+
+    name: str
+    about: str
+    settings: tuple[Setting, ...]
+
+
+@dataclass(frozen=True)
+class PoliciesDescription:
+    """A sentence on each policy of active robots, and the settings that they share."""
+
+    policies: Mapping[str, str]
+    settings: tuple[Setting, ...]
 
 
 def known_estimators() -> list[Description]:
@@ -74,6 +94,24 @@ def describe_sensor(name: str) -> SensorDescription:
         tuple(channel.name for channel in found.channels),
         {table.name: table.columns for table in tables_of_sensor(found)},
         {section: tuple(settings) for section, settings in sections_of(found).items()},
+    )
+
+
+def known_presets() -> list[PresetDescription]:
+    """The presets of simulations, each with its settings."""
+    return [describe_preset(name) for name in PRESETS]
+
+
+def describe_preset(name: str) -> PresetDescription:
+    """The description of a preset of simulations; InputError for an unknown one."""
+    settings = settings_in(SimulationSettings, default=preset(name))
+    return PresetDescription(name, ABOUT[name], tuple(s for s in settings if not s.key.startswith("rig.")))
+
+
+def known_policies() -> PoliciesDescription:
+    """The policies of active robots, and the settings of their runs."""
+    return PoliciesDescription(
+        {name: about for name, (about, _) in POLICIES.items()}, tuple(settings_in(ActiveSettings))
     )
 
 

@@ -14,6 +14,7 @@ from factorgraph_loc.cli import (
     inspecting,
     learning,
     lookups,
+    rigs,
     running,
     scoring,
     show,
@@ -78,6 +79,8 @@ app.command()(inspecting.datasets)
 app.command()(lookups.estimators)
 app.command()(lookups.sensors)
 app.command()(lookups.readers)
+app.command()(lookups.presets)
+app.command()(lookups.policies)
 app.command()(inspecting.info)
 app.command()(inspecting.convert)
 app.command()(inspecting.manifest)
@@ -91,7 +94,7 @@ app.command("map")(learning.map_)
 app.command()(images.images)
 app.command()(simulating.simulate)
 app.command()(experimenting.active)
-app.add_typer(lookups.rigs_app, name="rigs")
+app.add_typer(rigs.app, name="rigs")
 app.add_typer(experimenting.app, name="experiment")
 app.add_typer(images.features, name="features")
 

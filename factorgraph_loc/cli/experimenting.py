@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from factorgraph_loc.cli import show
+from factorgraph_loc.cli import completion, show
 from factorgraph_loc.cli.options import DataRoot, Json, Out, Overwrite, key_and_value, parse_list
 from factorgraph_loc.cli.simulating import nested_changes
 from factorgraph_loc.errors import InputError
@@ -243,18 +243,31 @@ def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[li
 
 def active(
     world: Annotated[
-        str, typer.Argument(metavar="WORLD", help="A preset of `fgloc simulate`, or a TOML file of its settings.")
+        str,
+        typer.Argument(
+            metavar="WORLD",
+            help="A preset of `fgloc simulate`, or a TOML file of its settings.",
+            autocompletion=completion.preset,
+        ),
     ],
     out: Out,
     policy: Annotated[
         str,
         typer.Option(
             metavar="A,B",
-            help="information, paper_literal, random, patrol, nearest_tags; the others are compared with the first.",
+            help=f"{', '.join(completion.POLICIES)}; the others are compared with the first.",
+            autocompletion=completion.policies,
         ),
     ] = "information",
     estimator: Annotated[
-        str, typer.Option("--estimator", "-e", metavar="A,B", help="active_mcl, particle_filter, smoother.")
+        str,
+        typer.Option(
+            "--estimator",
+            "-e",
+            metavar="A,B",
+            help=f"{', '.join(completion.ACTIVE_ESTIMATORS)}.",
+            autocompletion=completion.active_estimators,
+        ),
     ] = "active_mcl",
     seeds: Annotated[str, typer.Option(metavar="FIRST:END", help="Seeds, END not included; or one number.")] = "0",
     max_metres: Annotated[
@@ -265,7 +278,9 @@ def active(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; may be repeated.",
+            help="Setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; `fgloc policies` lists those of robot "
+            "and policy, `fgloc presets WORLD` those of the world. May be repeated.",
+            autocompletion=completion.active_setting,
         ),
     ] = None,
     jobs: Annotated[int | None, typer.Option(help="Number of processes; by default one per core.", min=1)] = None,

@@ -56,7 +56,7 @@ def images(
     for name in names:
         extractor(name, count)
     evaluation.check_free(out, overwrite=overwrite)  # before the computation
-    loaded = LogOptions(reader, reader_option, data_root, rig, None).load_one(log)
+    loaded = LogOptions(reader, reader_option, data_root, rig).load_one(log)
     with show.progress("images", counted=False) as report:
         results = evaluation.evaluate_images(loaded, names, count, mapped, queries, lambda share: report(share, 1.0))
     evaluation.write_results(loaded.name, results, out)

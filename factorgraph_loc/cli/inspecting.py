@@ -15,10 +15,7 @@ from factorgraph_loc.cli.options import (
     Json,
     LogName,
     LogOptions,
-    Reader,
-    ReaderOption,
-    RigFile,
-    WorldFile,
+    takes_log_options,
 )
 from factorgraph_loc.errors import InputError
 
@@ -48,13 +45,11 @@ def datasets(data_root: DataRoot = None, json: Json = False) -> None:
     show.table(("name", "reader", "present", "title"), rows)
 
 
+@takes_log_options
 def info(
     log: LogName,
-    reader: Reader = None,
-    reader_option: ReaderOption = None,
-    data_root: DataRoot = None,
-    rig: RigFile = None,
-    world: WorldFile = None,
+    *,
+    source: LogOptions,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", metavar="FILE", help="Picture (PNG) of the log from above; not of a ROS bag."),
@@ -67,14 +62,14 @@ def info(
     from factorgraph_loc.io.bags.file import is_bag
     from factorgraph_loc.io.readers import read_manifest, verify
 
-    if reader is None and is_bag(Path(log)) and Path(log).exists():
+    if source.reader is None and is_bag(Path(log)) and Path(log).exists():
         info_of_bag(Path(log), json)
         return
     known = manifests()
-    if reader is None and log in known:
-        for fault in verify(read_manifest(known[log]), data_root):
+    if source.reader is None and log in known:
+        for fault in verify(read_manifest(known[log]), source.data_root):
             show.note(f"warning: {fault}")
-    logs = LogOptions(reader, reader_option, data_root, rig, world).load([log])
+    logs = source.load([log])
     if out is not None:
         _draw(logs, out)
     inspections = [inspect(loaded) for loaded in logs]
@@ -91,24 +86,22 @@ def info(
         show.line(f"wrote {out}")
 
 
+@takes_log_options
 def convert(
     log: LogName,
     out: Annotated[
         Path, typer.Argument(metavar="OUT", help="Folder to write, or a ROS bag: a name with .bag, .mcap or .db3.")
     ],
     format: Annotated[Format, typer.Option(help="Format of the tables.")] = Format.csv,
-    reader: Reader = None,
-    reader_option: ReaderOption = None,
-    data_root: DataRoot = None,
-    rig: RigFile = None,
-    world: WorldFile = None,
+    *,
+    source: LogOptions,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the log that OUT is.")] = False,
     json: Json = False,
 ) -> None:
     """Write a log as a folder in the native format, or as a ROS bag."""
     from factorgraph_loc.io.write import write_log
 
-    loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
+    loaded = source.load_one(log)
     for warning in loaded.warnings:
         show.note(f"warning: {warning}")
     files = write_log(loaded, out, format=format.value, overwrite=overwrite)

@@ -13,19 +13,15 @@ import typer
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import (
-    DataRoot,
     Json,
     LogName,
     LogNames,
     LogOptions,
     Overwrite,
     Prior,
-    Reader,
-    ReaderOption,
-    RigFile,
     Settings,
-    WorldFile,
     parse_settings,
+    takes_log_options,
 )
 
 OutRig = Annotated[
@@ -39,14 +35,12 @@ OutWorld = Annotated[
 COLUMNS = ("given x [m]", "y [m]", "learnt x [m]", "y [m]", "sigma [m]", "distance [m]", "verdict")
 
 
+@takes_log_options
 def calibrate(
     logs: LogNames,
     out: OutRig,
-    reader: Reader = None,
-    reader_option: ReaderOption = None,
-    data_root: DataRoot = None,
-    rig: RigFile = None,
-    world: WorldFile = None,
+    *,
+    source: LogOptions,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -55,7 +49,7 @@ def calibrate(
     from factorgraph_loc.calibration import report
 
     page = learning.report_beside(out, overwrite=overwrite)  # before the logs are read
-    loaded = LogOptions(reader, reader_option, data_root, rig, world).load(logs)
+    loaded = source.load(logs)
     show.first_use()
     with show.progress("calibrating", counted=True) as progress:
         found = learning.calibrate(loaded, out, overwrite=overwrite, progress=progress)
@@ -79,6 +73,7 @@ def calibrate(
     show.line(f"the rig is in {out}, the report in {page}")
 
 
+@takes_log_options
 def map_(
     log: LogName,
     out: OutWorld,
@@ -117,11 +112,8 @@ def map_(
     ] = False,
     prior: Prior = None,
     set_: Settings = None,
-    reader: Reader = None,
-    reader_option: ReaderOption = None,
-    data_root: DataRoot = None,
-    rig: RigFile = None,
-    world: WorldFile = None,
+    *,
+    source: LogOptions,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -129,7 +121,7 @@ def map_(
     from factorgraph_loc.experiments import maps
 
     picture = maps.picture_beside(out, overwrite=overwrite)  # before the log is read
-    loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
+    loaded = source.load_one(log)
     settings = parse_settings(set_ or (), [estimator], [maps.POINTS])
     options = maps.MapOptions(
         of, estimator, settings[estimator], extend, poses, tag_height, prior, drop_dead, settings[maps.POINTS]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -114,11 +116,11 @@ Settings = Annotated[
 class LogOptions:
     """The options for reading logs."""
 
-    reader: str | None
-    reader_option: Sequence[str] | None
-    data_root: Path | None
-    rig: Path | None
-    world: Path | None
+    reader: Reader = None
+    reader_option: ReaderOption = None
+    data_root: DataRoot = None
+    rig: RigFile = None
+    world: WorldFile = None
 
     def load(self, names: Sequence[str]) -> list[Log]:
         """The logs of several names; a name may refer to several logs."""
@@ -139,6 +141,24 @@ class LogOptions:
         if len(logs) > 1:
             raise InputError(f"{name} refers to {len(logs)} logs, expected one: {listed(log.name for log in logs)}")
         return logs[0]
+
+
+def takes_log_options(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with the options of :class:`LogOptions` on the command line, in place of its parameter ``source``."""
+    given = inspect.signature(command, eval_str=True)
+    hints = get_type_hints(LogOptions, include_extras=True)
+    defaults = {field.name: field.default for field in fields(LogOptions)}
+    options = [given.parameters["source"].replace(name=n, default=d, annotation=hints[n]) for n, d in defaults.items()]
+    told = [one for p in given.parameters.values() for one in (options if p.name == "source" else [p])]
+
+    @wraps(command)
+    def expanded(**values: Any) -> None:
+        source = LogOptions(**{name: values.pop(name) for name in defaults})
+        command(**values, source=source)
+
+    expanded.__signature__ = given.replace(parameters=told)  # type: ignore[attr-defined] # what Typer reads
+    expanded.__annotations__ = {one.name: one.annotation for one in told}
+    return expanded
 
 
 def parse_list(text: str) -> tuple[str, ...]:

@@ -11,7 +11,6 @@ import typer
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import (
     Align,
-    DataRoot,
     Estimator,
     Estimators,
     FinalOnly,
@@ -23,16 +22,13 @@ from factorgraph_loc.cli.options import (
     Out,
     Overwrite,
     Prior,
-    Reader,
-    ReaderOption,
-    RigFile,
     Rpe,
     Sensors,
     Settings,
     TickGap,
-    WorldFile,
     parse_list,
     parse_settings,
+    takes_log_options,
 )
 from factorgraph_loc.experiments.seeds import parse_seeds
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP
@@ -61,6 +57,7 @@ SPACE_COLUMNS = {
 }
 
 
+@takes_log_options
 def run(
     log: LogName,
     estimator: Estimator,
@@ -69,11 +66,8 @@ def run(
     prior: Prior = None,
     seed: Annotated[int, typer.Option(help="Seed of the random generator.", min=0)] = 0,
     set_: Settings = None,
-    reader: Reader = None,
-    reader_option: ReaderOption = None,
-    data_root: DataRoot = None,
-    rig: RigFile = None,
-    world: WorldFile = None,
+    *,
+    source: LogOptions,
     max_gap: MaxGap = MAX_GAP,
     tick_gap: TickGap = TICK_GAP,
     learn: Annotated[
@@ -99,7 +93,7 @@ def run(
     settings = parse_settings(set_ or (), [estimator])
     if final_only:
         settings = for_final_only(settings)
-    loaded = LogOptions(reader, reader_option, data_root, rig, world).load_one(log)
+    loaded = source.load_one(log)
     config = experiment.RunConfig(
         estimator, settings[estimator], parse_list(sensors) if sensors else None, prior, seed, max_gap, tick_gap
     )
@@ -131,6 +125,7 @@ def run(
     show.line(f"results are in {out}")
 
 
+@takes_log_options
 def compare(
     logs: LogNames,
     estimators: Estimators,
@@ -140,11 +135,8 @@ def compare(
     sensors: Sensors = None,
     prior: Prior = None,
     set_: Settings = None,
-    reader: Reader = None,
-    reader_option: ReaderOption = None,
-    data_root: DataRoot = None,
-    rig: RigFile = None,
-    world: WorldFile = None,
+    *,
+    source: LogOptions,
     max_gap: MaxGap = MAX_GAP,
     tick_gap: TickGap = TICK_GAP,
     align: Align = "none",
@@ -166,7 +158,7 @@ def compare(
     if final_only:
         settings = for_final_only(settings)
     chosen = parse_seeds(seeds)
-    loaded = LogOptions(reader, reader_option, data_root, rig, world).load(logs)
+    loaded = source.load(logs)
     used = parse_list(sensors) if sensors else None
     configs = [
         RunConfig(name, settings[name], used, prior, seed, max_gap, tick_gap) for name in names for seed in chosen

@@ -39,7 +39,12 @@ def simulate(
     tags: Annotated[int | None, typer.Option(metavar="N", help="Number of tags.")] = None,
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="A setting, e.g. faults.misplaced=0.1; may be repeated."),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="A setting, e.g. faults.misplaced=0.1; `fgloc presets NAME` lists them. May be repeated.",
+            autocompletion=completion.simulation_setting,
+        ),
     ] = None,
     recorded: Annotated[
         str | None,
@@ -73,7 +78,7 @@ def simulate(
     settings = settings_of(what, changes)
     looks = None
     if recorded is not None:
-        looks = recorded_looks(LogOptions(None, None, data_root, None, None).load([recorded]))
+        looks = recorded_looks(LogOptions(data_root=data_root).load([recorded]))
     written = []
     for number in chosen:
         folder = out if seeds is None else out / file_name(f"{settings.name}-{number}")

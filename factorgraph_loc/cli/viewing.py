@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from factorgraph_loc.cli import show
-from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, Reader, ReaderOption, RigFile, WorldFile
+from factorgraph_loc.cli.options import Json, LogOptions, takes_log_options
 
 if TYPE_CHECKING:
     from factorgraph_loc.exports.runs import Particles, StoredRun
@@ -27,6 +27,7 @@ What = Annotated[
 ]
 
 
+@takes_log_options
 def view(
     what: What,
     rrd: Annotated[
@@ -35,17 +36,14 @@ def view(
     particles: Annotated[
         bool, typer.Option("--particles", help="Repeat runs of particle filters to show their particles.")
     ] = False,
-    reader: Reader = None,
-    reader_option: ReaderOption = None,
-    data_root: DataRoot = None,
-    rig: RigFile = None,
-    world: WorldFile = None,
+    *,
+    source: LogOptions,
     json: Json = False,
 ) -> None:
     """Show a log and its runs over time, in Rerun."""
     from factorgraph_loc.api import results
 
-    log, runs = results.stored(what, LogOptions(reader, reader_option, data_root, rig, world).load_one)
+    log, runs = results.stored(what, source.load_one)
     results.show(log, runs, rrd, _particles(log, runs) if particles else {})
     if json:
         show.document(shown(log, runs) | {"file": None if rrd is None else str(rrd)})
@@ -76,6 +74,7 @@ def shown(log: Log, runs: list[StoredRun]) -> dict[str, Any]:
     return {"log": log.name, "runs": {run.name: str(run.folder.path) for run in runs}}
 
 
+@takes_log_options
 def export(
     what: What,
     out: Annotated[
@@ -87,18 +86,15 @@ def export(
             help="The file to write; its suffix selects the format: .mcap (Foxglove), .tum, .kitti, .g2o or .ply (map).",
         ),
     ],
-    reader: Reader = None,
-    reader_option: ReaderOption = None,
-    data_root: DataRoot = None,
-    rig: RigFile = None,
-    world: WorldFile = None,
+    *,
+    source: LogOptions,
     json: Json = False,
 ) -> None:
     """Write runs for Foxglove, or the final trajectory of a run or the reference of a log for other programs."""
     from factorgraph_loc.api import results
 
     results.require_format(out)
-    log, runs = results.stored(what, LogOptions(reader, reader_option, data_root, rig, world).load_one)
+    log, runs = results.stored(what, source.load_one)
     files = results.write(log, runs, out)
     if json:
         show.document(shown(log, runs) | {"files": [str(file) for file in files]})

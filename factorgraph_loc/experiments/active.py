@@ -115,7 +115,7 @@ def seek(
     Raises InputError, before anything runs, for an unknown or repeated policy or estimator, or an ``out`` that contains results
     without ``overwrite``; and if all runs are refused for their input.
     """
-    _check_names("policy", policies, POLICIES)
+    _check_names("policy", policies, tuple(POLICIES))
     _check_names("estimator", estimators, ESTIMATORS)
     settings = ActiveSettings() if settings is None else settings
     check_free(out, overwrite=overwrite)

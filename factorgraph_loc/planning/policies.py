@@ -9,8 +9,9 @@ just done one. Only policies that compare candidates use paths to distant places
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -213,21 +214,21 @@ class NearestTags:
         return Choice(s.candidates[int(np.argmax(values))], s.settings.policy.replan, values)
 
 
-POLICIES = ("information", "paper_literal", "random", "patrol", "nearest_tags")
+# what each policy does, and how it is made
+POLICIES: Mapping[str, tuple[str, Callable[[], Policy]]] = {
+    "information": ("The largest expected reduction of entropy minus the cost.", Information),
+    "paper_literal": ("The same with the sign as printed in the paper.", partial(Information, sign=-1.0)),
+    "random": ("Any of the arcs, short straight paths and turns in place, to its end.", Random),
+    "patrol": ("Straight on until a wall is near, then where most is free; back only if nothing else is free.", Patrol),
+    "nearest_tags": ("Towards the nearest tags, on average over the belief.", NearestTags),
+}
 
 
 def make_policy(name: str) -> Policy:
     """A policy by name. Raises InputError for an unknown name."""
     if name not in POLICIES:
         raise InputError(f"no policy is called {quoted(name)}{nearest(name, list(POLICIES))}")
-    made: dict[str, Policy] = {
-        "information": Information(),
-        "paper_literal": Information(sign=-1.0),
-        "random": Random(),
-        "patrol": Patrol(),
-        "nearest_tags": NearestTags(),
-    }
-    return made[name]
+    return POLICIES[name][1]()
 
 
 def usable(paths: Sequence[Path], free: Array, sight: float) -> tuple[tuple[Path, ...], Array]:

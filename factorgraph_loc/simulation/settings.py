@@ -23,24 +23,28 @@ Surface = Literal["wall", "shelf", "floor"]
 
 
 class WorldSettings(FileModel):
-    """A plan of ``width`` x ``depth`` metres from the origin; ``hall``: one empty room; ``corridors``: an H with a half-turn
-    symmetry and three hanging tags, which alone distinguish its ends.
-
-    ``tags``: their number, or ``density`` per m^2, on ``surfaces`` (``shelf`` includes furniture) at ``tag_height``; ``even``:
-    at equal distances along the walls, symmetric on both sides, rather than at random. ``landmarks``: number on the walls.
-    ``points``: number of named points on walls and furniture for a camera.
-    """
+    """A plan of rooms from the origin, and what is in it: either ``tags`` or ``density``."""
 
     plan: Literal["office", "hall", "warehouse", "corridors"] = "office"
+    """hall: one empty room; corridors: an H with a half-turn symmetry and three hanging tags, which alone distinguish its ends"""
     width: Annotated[float, Field(ge=2.0, le=500.0), InUnit("m")] = 20.0
+    """size along x"""
     depth: Annotated[float, Field(ge=2.0, le=500.0), InUnit("m")] = 12.0
+    """size along y"""
     tags: Annotated[int, Field(ge=0, le=MOST_TAGS)] | None = None
+    """number of tags"""
     density: Annotated[float, Field(ge=1e-4, le=100.0), InUnit("tags per m^2")] | None = None
+    """density of tags, instead of their number"""
     surfaces: Annotated[tuple[Surface, ...], Field(min_length=1)] = ("wall", "shelf")
+    """where tags are; shelf includes furniture"""
     tag_height: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 1.2
+    """height of the tags that are not on the floor"""
     even: bool = False
+    """whether tags are at equal distances along the walls, symmetric on both sides, rather than at random"""
     landmarks: Annotated[int, Field(ge=0, le=10_000)] = 0
+    """number of landmarks on the walls"""
     points: Annotated[int, Field(ge=0, le=10_000)] = 0
+    """number of named points on walls and furniture for a camera"""
 
     @model_validator(mode="after")
     def _has_one_number(self) -> WorldSettings:
@@ -57,41 +61,50 @@ class WorldSettings(FileModel):
 
 
 class DriveSettings(FileModel):
-    """A drive between random places. ``rate``: of the reference. ``clearance``: of the path from walls."""
+    """A drive between random places."""
 
     duration: Annotated[float, Field(ge=1.0, le=14_400.0), InUnit("s")] = 600.0
+    """duration of the log"""
     speed: Annotated[float, Field(ge=0.01, le=3.0), InUnit("m/s")] = 0.5
+    """highest speed"""
     turn_rate: Annotated[float, Field(ge=0.01, le=6.0), InUnit("rad/s")] = 1.0
+    """highest turn rate"""
     rate: Annotated[float, Field(ge=10.0, le=50.0), InUnit("1/s")] = 10.0
+    """poses of the reference per second"""
     clearance: Annotated[float, Field(ge=0.25, le=2.0), InUnit("m")] = 0.3
+    """least distance of the path from walls"""
 
 
 class ImageSettings(FileModel):
-    """Images of the rendered building: frame ``rate``, ``exposure`` time, noise variance ``read_noise``^2 + ``shot_noise``
-    times the pixel value (0 to 255), relative brightness variation ``gain_drift`` over some ten seconds, and relative loss
-    ``vignetting`` of brightness at the corners.
-    """
+    """Images of the rendered building. The noise of a pixel of value v (0 to 255) has the variance ``read_noise``^2 +
+    ``shot_noise`` v."""
 
     rate: Hertz = 5.0
+    """images per second"""
     exposure: Annotated[float, Field(ge=0.0, le=0.2), InUnit("s")] = 0.005
+    """exposure time, which blurs what moves; stamps are in the middle of it"""
     read_noise: Annotated[float, Field(ge=0.0, le=50.0), InUnit("of 255")] = 1.5
+    """standard deviation of a dark pixel"""
     shot_noise: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    """additional variance of a pixel per unit of its value"""
     gain_drift: Annotated[float, Field(ge=0.0, le=0.5)] = 0.1
+    """relative amplitude of each of three waves of the brightness, of 8 to 29 s"""
     vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = 0.3
+    """relative loss of brightness at the corners"""
 
 
 class SimulationSettings(FileModel):
-    """All settings but the seed. ``rounds_per_second``: inventory rounds of each antenna. ``rig``: given to estimators, and
-    used to simulate reads and sightings. ``world_seed``: seed of the world, its appearance and its survey, to simulate several
-    drives in one world; by default the seed of the log. Sensors register further sections: ``sightings``, ``rssi`` and
-    ``phase`` of reads, ``faults`` of them, ``pixels``.
-    """
+    """All settings but the seed. Sensors register further sections: ``sightings``, ``rssi`` and ``phase`` of reads, ``faults`` of
+    them, ``pixels``."""
 
     name: str = "office"
+    """name of the log"""
     world: WorldSettings
     world_seed: Annotated[int, Field(ge=0, le=2**63 - 1)] | None = None
+    """seed of the world, its appearance and its survey, for several drives in one world; by default the seed of the log"""
     drive: DriveSettings = DriveSettings()
     rounds_per_second: Hertz = 2.0
+    """inventory rounds of each antenna"""
     images: ImageSettings = ImageSettings()
     rig: Rig
 
@@ -204,6 +217,15 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "world": {"plan": "corridors", "width": 30.0, "depth": 24.0, "tags": 3},
         "rig": RACKHAM_RIG,
     },
+}
+
+ABOUT: Mapping[str, str] = {
+    "office": "Rooms on both sides of a corridor, doors, furniture; tags on walls and furniture.",
+    "sparse": "The same with fewer tags.",
+    "bursty": "The same as office; each antenna loses each tag for 2 s on average, a fifth of the time.",
+    "corridor": "One corridor, the same from both ends; tags evenly on both sides.",
+    "warehouse": "Rows of shelves with tags.",
+    "symmetric": "Corridors in the shape of an H with a half-turn symmetry; three tags hang in them.",
 }
 
 

@@ -17,6 +17,7 @@ from benchmarking.report import Options, Report
 
 from recordings_benchmark.listed import RECORDINGS, Recording
 
+REASONS = ("to score against", "never localized")
 LIST = Path(__file__).with_name("by_hand.toml")
 
 
@@ -67,8 +68,8 @@ def section(options: Options) -> Report:
         typed = "<br>".join(f"`{command.replace('|', '')}`" for command in job.commands)
         written = ", ".join(job.files) or "-"
         row = (job.recording.name, written, typed or "-", str(len(job.commands)))
-        rows.append((*row, f"{done.seconds:.0f}" if job.commands else "-", done.result or reason))
-    report.table(("log", "files to write", "commands", "number", "processor [s]", "position RMSE [m]"), rows)
+        rows.append((*row, f"{done.seconds / 60.0:.1f}" if job.commands else "-", done.result or reason))
+    report.table(("log", "files to write", "commands", "number", "processor [min]", "position RMSE [m]"), rows)
     return report
 
 
@@ -114,7 +115,8 @@ def _result(out: Path, told: str) -> str:
         rows = list(csv.DictReader(file))
     scored = [row for row in rows if row["final.position_rmse"]]
     if not scored:
-        return next((line.partition(": ")[2] for line in told.splitlines() if "to score against" in line), "")
+        lines = [*told.splitlines(), *(line for row in rows for line in row["warnings"].splitlines())]
+        return next((line.partition(": ")[2] for line in lines if any(reason in line for reason in REASONS)), "")
     return "; ".join(f"{row['estimator']} {_errors(row)}" for row in scored)
 
 

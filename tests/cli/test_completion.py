@@ -8,10 +8,14 @@ import pytest
 import shellingham
 
 from factorgraph_loc.cli import completion
+from factorgraph_loc.files.settings import settings_in
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.fusion.registry import settings_type
+from factorgraph_loc.planning import closed_loop
+from factorgraph_loc.planning.policies import POLICIES
+from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.plugins import ESTIMATORS
-from factorgraph_loc.simulation import PRESETS
+from factorgraph_loc.simulation import PRESETS, SimulationSettings
 
 FGLOC = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
 
@@ -28,6 +32,15 @@ def completed(line: str) -> list[str]:
 def test_the_names_are_those_of_the_registries():
     assert set(completion.PRESETS) == set(PRESETS)
     assert completion.logs("") == list(manifests())
+    assert tuple(POLICIES) == completion.POLICIES
+    assert closed_loop.ESTIMATORS == completion.ACTIVE_ESTIMATORS
+
+
+def test_the_settings_of_simulations_and_active_runs_are_those_of_the_models():
+    keys = {s.key for s in settings_in(SimulationSettings) if not s.key.startswith("rig.")}
+    assert set(completion.simulation_settings()) == keys
+    found = completion.active_setting("")
+    assert {key.removesuffix("=") for key in found} == keys | {s.key for s in settings_in(ActiveSettings)}
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -54,6 +67,11 @@ def test_the_settings_are_those_of_the_models(name):
         ("fgloc run plaza2 -e ekf --sensors odometry,rfid,r", ["odometry,rfid,rssi"]),
         ("fgloc info data --reader m", ["mapped", "mrclam"]),
         ("fgloc estimators sm", ["smoother"]),
+        ("fgloc simulate office --set world.ta", ["world.tags=", "world.tag_height="]),
+        ("fgloc active sy", ["symmetric"]),
+        ("fgloc active symmetric --policy random,p", ["random,paper_literal", "random,patrol"]),
+        ("fgloc active symmetric --set policy.per_", ["policy.per_metre=", "policy.per_second="]),
+        ("fgloc presets w", ["warehouse"]),
         ("fgloc run no-such-log", []),  # the shell goes on with files
     ],
 )
@@ -67,9 +85,11 @@ def test_completion_loads_no_numerical_libraries():
         "from factorgraph_loc.cli import completion\n"
         "assert completion.logs('plaza') and completion.estimators('ekf,') and completion.preset('')\n"
         "assert completion.setting('smoother.') and completion.reader('m')\n"
-        "print(sorted({'numpy', 'gtsam', 'polars', 'scipy', 'pydantic'} & set(sys.modules)))"
+        "print(sorted({'numpy', 'gtsam', 'polars', 'scipy', 'pydantic'} & set(sys.modules)))\n"
+        "assert completion.simulation_setting('faults.') and completion.active_setting('policy.')\n"
+        "print(sorted({'numpy', 'gtsam', 'polars', 'scipy'} & set(sys.modules)))"
     )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n[]\n"
 
 
 @pytest.mark.parametrize(

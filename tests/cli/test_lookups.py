@@ -14,8 +14,10 @@ import pytest
 
 from factorgraph_loc.fusion.registry import settings_of
 from factorgraph_loc.io.readers import reader
+from factorgraph_loc.planning.policies import POLICIES
 from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
 from factorgraph_loc.sensors.registry import channels
+from factorgraph_loc.simulation import PRESETS, preset
 
 
 def test_the_list_names_all_estimators(fgloc):
@@ -85,6 +87,35 @@ def test_the_list_of_readers(fgloc):
     assert [one["name"] for one in found] == list(READERS)
     assert all(one["about"] in fgloc("readers").stdout for one in found)
     assert "did you mean rosbag?" in fgloc("readers", "rosbags").stderr
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_has_its_own_values(fgloc, name):
+    found = json.loads(fgloc("presets", name, "--json").stdout)
+    values = {one["key"]: one["default"] for one in found["settings"]}
+    settings = preset(name)
+    expected = (settings.world.plan, settings.world.tags, settings.faults.fading.share)
+    assert (values["world.plan"], values["world.tags"], values["faults.fading.share"]) == expected
+    assert not [key for key in values if key.startswith("rig.")]
+    printed = fgloc("presets", name)
+    assert f"fgloc rigs show {name}" in printed.stdout
+    assert all(one["meaning"] in printed.stdout for one in found["settings"])
+
+
+def test_the_list_of_presets(fgloc):
+    found = json.loads(fgloc("presets", "--json").stdout)
+    assert [one["name"] for one in found] == list(PRESETS)
+    assert all(one["about"] in fgloc("presets").stdout for one in found)
+    assert "did you mean office?" in fgloc("presets", "offce").stderr
+
+
+def test_policies_and_what_is_set_of_active_runs(fgloc):
+    found = json.loads(fgloc("policies", "--json").stdout)
+    assert list(found["policies"]) == list(POLICIES)
+    printed = fgloc("policies").stdout
+    assert all(about in printed for about in found["policies"].values())
+    assert "policy.horizon" in printed
+    assert "above 0 to 100 m" in printed
 
 
 @pytest.mark.parametrize("columns", [90, 140])

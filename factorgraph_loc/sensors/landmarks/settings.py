@@ -73,12 +73,14 @@ class BearingRangeSettings(SensorSettings):
 
 
 class SightingSettings(FileModel):
-    """Visibility of landmarks: ``rate`` measurements per second, up to ``max_range``, within ``field_of_view`` [rad] about the
-    sensor's axis, and not through walls."""
+    """Visibility of landmarks, not through walls."""
 
     rate: Hertz = 2.0
+    """measurements per second"""
     max_range: Metres = 6.0
+    """distance up to which landmarks are seen"""
     field_of_view: Annotated[float, Field(ge=0.01, le=6.3), InUnit("rad")] = 6.3
+    """angle about the sensor's axis within which they are seen"""
 
 
 class Landmark(FileModel):
