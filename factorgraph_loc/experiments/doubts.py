@@ -6,7 +6,7 @@ import numpy as np
 
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
 from factorgraph_loc.evaluation.pairing import pairs
-from factorgraph_loc.model.belief import PoseEstimate
+from factorgraph_loc.model.belief import Status
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.registry import functions
@@ -51,12 +51,11 @@ def findable(log: Log, sensors: Sequence[str]) -> list[tuple[str, str]]:
     return [found for _, function in functions("findable") if (found := function(log, sensors))]
 
 
-def never_localized(
-    log: Log, sensors: Sequence[str], estimates: Sequence[PoseEstimate], final: Trajectory
-) -> tuple[str, ...]:
-    """Warnings for an unknown start that was never resolved, in terms of what ``sensors`` observe in the map."""
-    found = {e.status for e in estimates}
-    if "localized" in found or (len(final) and estimates[-1].status == "unlocalized"):  # or it has no causal estimates
+def never_localized(log: Log, sensors: Sequence[str], status: Sequence[Status], final: Trajectory) -> tuple[str, ...]:
+    """Warnings for an unknown start that was never resolved, in terms of what ``sensors`` observe in the map; ``status``: of
+    each causal estimate."""
+    found = set(status)
+    if "localized" in found or (len(final) and status[-1] == "unlocalized"):  # or it has no causal estimates
         return ()
     kinds = findable(log, sensors)
     names = " and ".join(name for name, _ in kinds)

@@ -1,11 +1,12 @@
 """One run of an estimator on a log: process measurements in the order of arrival, and store and time the estimates."""
 
+import bisect
 import importlib.metadata
 import math
 import platform
 import resource
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import groupby, takewhile
@@ -18,6 +19,7 @@ import numpy as np
 
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.experiments.doubts import findable, never_localized, partly_scored, with_pauses
+from factorgraph_loc.experiments.garbage import only_new_searched
 from factorgraph_loc.experiments.preparation import (
     KNOWN,
     at_origin,
@@ -27,18 +29,18 @@ from factorgraph_loc.experiments.preparation import (
     use_of,
     used_sensors,
 )
+from factorgraph_loc.experiments.told import Told
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, SpaceEstimator, finds_heading
 from factorgraph_loc.fusion.guarded import Guard, sound, sound_space, sound_trajectory
 from factorgraph_loc.io.checks import require_bounds, require_one_span
 from factorgraph_loc.model import setup as model_setup
-from factorgraph_loc.model.belief import PoseEstimate, PosePrior
+from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Measurement, Rows, Tick
 from factorgraph_loc.model.result import RunResult, Timings
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Ticks, check_max_gap, check_tick_gap
-from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.interfaces import PreparedLog
 from factorgraph_loc.sensors.registry import functions, moving
 from factorgraph_loc.text import listed
@@ -138,7 +140,7 @@ def run(
         lambda share: report(before + (1.0 - before) * share),
         watch,
     )
-    with guard.quiet():
+    with guard.quiet(), only_new_searched():
         loop.run()
     started = perf_counter()
     in_space = None
@@ -168,10 +170,10 @@ def run(
     return RunResult(
         log=log.name,
         config=effective,
-        t=np.array([e.t for e in loop.estimates]),
-        poses=np.array([e.pose for e in loop.estimates]).reshape(-1, 3),
-        covariances=np.array([e.covariance for e in loop.estimates]).reshape(-1, 3, 3),
-        status=tuple(e.status for e in loop.estimates),
+        t=np.array(loop.told.t),
+        poses=np.array(loop.told.poses).reshape(-1, 3),
+        covariances=np.array(loop.told.covariances).reshape(-1, 3, 3),
+        status=tuple(loop.told.status),
         final=final,
         diagnostics=diagnostics,
         learnt=learnt,
@@ -184,11 +186,11 @@ def run(
             *prepared.warnings,
             *(line for _, doubts in functions("doubts") for line in doubts(use, estimator.diagnostics, learnt)),
             *(line for one in reliability.values() for line in one.doubts),
-            *never_localized(log, sensors, loop.estimates, final),
+            *never_localized(log, sensors, loop.told.status, final),
             *partly_scored(log, final, config.max_gap),
             *with_pauses(log, ticks.skipped, config.tick_gap),
         ),
-        causal_space=_in_space(loop.estimates),
+        causal_space=loop.told.in_space(),
         final_space=in_space,
         reliability=reliability,
     )
@@ -226,7 +228,7 @@ class _CausalRun:
     progress: Callable[[float], None] = lambda _: None
     watch: Callable[[float, Estimator], None] | None = None
     end: float = math.inf
-    estimates: list[PoseEstimate] = field(default_factory=list)
+    told: Told = field(default_factory=Told)
 
     def __post_init__(self) -> None:
         first, self._last = _span(self.log, self.sensors)
@@ -289,54 +291,40 @@ class _CausalRun:
             self._reach(m.t)
             self.guard.process(self.estimator, m)
             return
-        first, count = 0, m.count
-        while first < count:
-            self._reach(float(m.times[first]))
-            last = max(first + 1, int(m.times.searchsorted(self.ticks.due, "right")))
-            part = m.part(first, last)
-            self.ticks.before(part.t)  # none, but it has come that far
-            self.guard.process(self.estimator, part)
+        times, first = m.times.tolist(), 0
+        while first < len(times):
+            self._reach(times[first])
+            last = max(first + 1, bisect.bisect_right(times, self.ticks.due))
+            self.ticks.before(times[last - 1])  # none, but it has come that far
+            self.guard.process(self.estimator, m.part(first, last))
             first = last
 
     def _initialize(self) -> None:
         assert self.prior is not None
         self._initialized = True
-        with self.guard.telling(f"the start at {self.prior.t:.3f} s"):
+        with self.guard.telling("the start", self.prior.t):
             self.estimator.initialize(self.prior)
 
     def _update(self, t: float, measurements: Iterator[Measurement]) -> None:
         started = perf_counter()
         for m in measurements:
             self.guard.process(self.estimator, m)
-        with self.guard.telling(f"the estimate at {t:.3f} s"):
+        with self.guard.telling("the estimate", t):
             sound(self.estimator.estimate())
         self._update_s.append(perf_counter() - started)
         self._update_t.append(t)
 
     def _tick(self, t: float) -> None:
-        with self.guard.telling(f"the estimate at {t:.3f} s"):
+        with self.guard.telling("the estimate", t):
             e = sound(self.estimator.estimate(t))
         self.guard.process(self.estimator, Tick(t))
-        # copies with the tick's time: an estimator may reuse its arrays, and an unlocalized estimate has no time
-        self.estimates.append(
-            PoseEstimate(t, np.array(e.pose, dtype=float), np.array(e.covariance, dtype=float), e.status, e.space)
-        )
+        self.told.add(t, e)
         if self.watch is not None:
             self.watch(t, self.estimator)
         share = (t - self._start) / max(self._last - self._start, 1e-9)
         if share >= self._reported:
             self.progress(share)
             self._reported = share + 0.01
-
-
-def _in_space(estimates: Sequence[PoseEstimate]) -> Trajectory3 | None:
-    """The poses in space of localized estimates; None if there are none."""
-    rows = [(e.t, e.space) for e in estimates if e.space is not None and e.status == "localized"]
-    if not rows:
-        return None
-    t, poses = zip(*rows, strict=True)
-    parts = (np.array([getattr(p, name) for p in poses]) for name in ("position", "rotation", "covariance"))
-    return Trajectory3(np.array(t), *parts)
 
 
 def _begin(log: Log, sensors: tuple[str, ...], prior: PosePrior | None) -> float:

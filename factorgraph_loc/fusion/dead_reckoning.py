@@ -11,7 +11,7 @@ from factorgraph_loc.model.belief import PoseEstimate, PosePrior
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.trajectory import Trajectory
 from factors import se2
-from factors.motion import Increment, propagate
+from factors.motion import propagate
 from factors.se2 import Array
 
 
@@ -51,8 +51,8 @@ class DeadReckoning(Filter):
     def _start(self, prior: PosePrior) -> _PoseState:
         return _PoseState(np.array(prior.pose, dtype=float), se2.world_to_body(prior.pose, prior.covariance))
 
-    def _predict(self, increment: Increment) -> None:
-        s = self._state
+    def _predict(self, t: float) -> None:
+        s, increment = self._state, self._travelled(t)
         self._state = _PoseState(se2.compose(s.pose, increment.delta), propagate(s.covariance, increment))
 
     def _see(self, m: Measurement) -> None:

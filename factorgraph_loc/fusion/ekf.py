@@ -27,7 +27,6 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable
 from factorgraph_loc.sensors.binding import bound_sensors
 from factors import positive, rts_kernels, se2, se2_kernels
-from factors.motion import Increment
 from factors.se2 import Array
 
 NOWHERE = slice(POSE, POSE)  # the columns of a block that there is not
@@ -231,12 +230,14 @@ class Ekf(Filter):
         layout = Layout.of((name, len(constants.names)) for name, constants in self._blocks)
         return _State(np.array(prior.pose, dtype=float), np.zeros(len(sigmas)), covariance, layout)
 
-    def _predict(self, increment: Increment) -> None:
+    def _predict(self, t: float) -> None:
         s = self._state
         part = s.layout.columns.get(MOTION, NOWHERE)
         constants = s.rest[part.start - POSE : part.stop - POSE]
-        pose, transition, covariance = self._motion.predicted(increment, s.pose, s.covariance, constants, part.start)
-        self._step = _Step(pose, transition, increment.covariance)
+        self._odometry, pose, transition, noise, covariance = self._motion.predicted(
+            self._odometry, t, s.pose, s.covariance, constants, part.start
+        )
+        self._step = _Step(pose, transition, noise)
         self._state = _State(pose, s.rest, covariance, s.layout)
 
     def _see(self, m: Measurement) -> None:
@@ -306,7 +307,10 @@ class Ekf(Filter):
         self._step = _Step(self._state.pose, np.zeros((3, len(covariance))), body)
 
     def _estimate(self) -> PoseEstimate:
-        status: Status = "ambiguous" if any(sensor.silent for sensor in self._sensors.values()) else "localized"
+        status: Status = "localized"
+        for sensor in self._sensors.values():
+            if sensor.silent:
+                status = "ambiguous"
         return world_estimate(self._t, self._state.pose, self._state.covariance, status)
 
     def _record(self) -> _Record:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
+import numba
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
@@ -42,7 +43,8 @@ class Guard:
     def __init__(self, who: str) -> None:
         self._who = who
         self._last: Measurement | None = None  # what was taken
-        self._telling = ""
+        self._telling = ""  # what it is asked for
+        self._of: float | None = None  # and of which time
         self._silence = np.errstate(all="ignore")
         self._is_quiet = False
 
@@ -58,7 +60,7 @@ class Guard:
 
     def process(self, estimator: Estimator, measurement: Measurement) -> None:
         """Give a measurement to the estimator."""
-        self._last, self._telling = measurement, ""
+        self._last, self._telling, self._of = measurement, "", None
         if not self._is_quiet:
             with self:
                 estimator.process(measurement)
@@ -69,9 +71,9 @@ class Guard:
             self._pass_on(error)
             raise
 
-    def telling(self, what: str) -> Self:
-        """A context in which it is asked for something, such as ``the estimate at 1.000 s``."""
-        self._telling = what
+    def telling(self, what: str, t: float | None = None) -> Self:
+        """A context in which it is asked for something, such as ``the estimate``, of a time [s] or not."""
+        self._telling, self._of = what, t
         return self
 
     def __enter__(self) -> Self:
@@ -92,7 +94,8 @@ class Guard:
             raise self._failure(_reason(error)) from error
 
     def _failure(self, why: str) -> RunFailedError:
-        what = self._telling or (_named(self._last) if self._last is not None else "its start")
+        asked = self._telling if self._of is None else f"{self._telling} at {self._of:.3f} s"
+        what = asked or (_named(self._last) if self._last is not None else "its start")
         after = f" (after {_named(self._last)})" if self._telling and self._last is not None else ""
         return RunFailedError(f"{self._who}: {what}{after}: {why}")
 
@@ -103,14 +106,17 @@ def sound(estimate: PoseEstimate) -> PoseEstimate:
     nothing."""
     if estimate.status == "unlocalized":
         return estimate
-    if not all(map(math.isfinite, estimate.pose.tolist())):
+    if estimate.pose.shape != (3,) or estimate.covariance.shape != (3, 3):
+        raise ValueError("the estimate is no pose (3,) with a covariance (3, 3)")
+    is_finite, is_clear = _judged(estimate.pose, estimate.covariance)
+    if not is_finite:
         raise ValueError("the pose is not finite")
     if (space := estimate.space) is not None:
         if not (np.all(np.isfinite(space.position)) and np.all(np.isfinite(space.rotation))):
             raise ValueError("the pose in space is not finite")
         _positive(space.covariance)
         return estimate
-    if _clearly_positive_3(estimate.covariance):
+    if is_clear:
         return estimate
     covariance = _positive(estimate.covariance)
     return estimate if covariance is estimate.covariance else replace(estimate, covariance=covariance)
@@ -190,20 +196,19 @@ def nearest_positive(covariance: Array) -> Array | None:
     return found if np.all(np.isfinite(found)) else None
 
 
-def _clearly_positive_3(covariance: Array) -> bool:
-    """What :func:`clearly_positive` says of one covariance (3, 3), by what the rows before leave unexplained of each variance; in
-    plain numbers, as each estimate of a run is asked."""
-    (a, b, c), (d, e, f), (g, h, i) = covariance.tolist()
-    if not (0.0 < a < math.inf and 0.0 < e < math.inf and 0.0 < i < math.inf):
-        return False
-    x, y, z = math.sqrt(a), math.sqrt(e), math.sqrt(i)
-    xy, xz, yz = b / x / y, c / x / z, f / y / z
-    skew = max(abs(xy - d / x / y), abs(xz - g / x / z), abs(yz - h / y / z))
-    second = 1.0 - xy * xy
-    if not (skew <= SKEW and second > CLEAR):
-        return False
-    across = yz - xy * xz
-    return bool(1.0 - xz * xz - across * across / second > CLEAR)
+@numba.njit(cache=True, error_model="numpy")
+def _judged(pose: Array, covariance: Array) -> tuple[bool, bool]:
+    """Whether a pose (3,) is finite; and what :func:`clearly_positive` says of one covariance (3, 3), by what the rows before leave
+    unexplained of each variance. Compiled, as each estimate of a run is asked."""
+    finite = math.isfinite(pose[0]) and math.isfinite(pose[1]) and math.isfinite(pose[2])
+    c = covariance
+    x, y, z = math.sqrt(c[0, 0]), math.sqrt(c[1, 1]), math.sqrt(c[2, 2])
+    xy, xz, yz = c[0, 1] / x / y, c[0, 2] / x / z, c[1, 2] / y / z
+    second, across = 1.0 - xy * xy, yz - xy * xz
+    clear = 0.0 < c[0, 0] < math.inf and 0.0 < c[1, 1] < math.inf and 0.0 < c[2, 2] < math.inf
+    clear = clear and abs(xy - c[1, 0] / x / y) <= SKEW and abs(xz - c[2, 0] / x / z) <= SKEW
+    clear = clear and abs(yz - c[2, 1] / y / z) <= SKEW and second > CLEAR
+    return finite, clear and 1.0 - xz * xz - across * across / second > CLEAR
 
 
 def _named(measurement: Measurement) -> str:

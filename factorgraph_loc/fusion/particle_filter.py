@@ -232,7 +232,8 @@ class ParticleFilter(Filter):
         constants = self._rng.standard_normal((count, len(sigmas))) * sigmas
         return Cloud(poses, constants, np.full(count, -np.log(count)), parts=self._parts)
 
-    def _predict(self, increment: Increment) -> None:
+    def _predict(self, t: float) -> None:
+        increment = self._travelled(t)
         noise = self._rng.standard_normal((len(self._state.poses), 3)) @ positive.root(increment.covariance).T
         poses, _ = self._moved(self._state, increment, noise)
         self._state = replace(self._state, poses=poses)

@@ -92,13 +92,16 @@ class Filter(ABC):
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
+        if measurement.is_motion:
+            self._ahead = None
+            self._motion.add(measurement)
+            return
         if not isinstance(measurement, Tick):
             self._ahead = None
-        if measurement.is_motion:
-            self._motion.add(measurement)
-        elif not (isinstance(measurement, Tick) or self._uses(measurement.modality)):
-            self.diagnostics.ignore(measurement.modality, measurement.count)
-        elif self._state is None:
+            if not self._uses(measurement.modality):
+                self.diagnostics.ignore(measurement.modality, measurement.count)
+                return
+        if self._state is None:
             self._begin(measurement)
         elif measurement.t >= self._t:
             self._take(measurement)
@@ -145,8 +148,8 @@ class Filter(ABC):
         """The state that stands for the prior."""
 
     @abstractmethod
-    def _predict(self, increment: Increment) -> None:
-        """Move the state along."""
+    def _predict(self, t: float) -> None:
+        """Move the state along to ``t``, and the odometry."""
 
     @abstractmethod
     def _see(self, m: Any) -> None:
@@ -194,9 +197,13 @@ class Filter(ABC):
         if known is not None and known[0] is self._state and known[1]._t == t:
             self._catch_up(known[1])
             return
-        odometry, increment = self._motion.travelled(self._odometry, t)
-        self._predict(increment)
-        self._t, self._odometry = t, odometry
+        self._predict(t)
+        self._t = t
+
+    def _travelled(self, t: float) -> Increment:
+        """The motion to ``t``, to which the odometry goes on."""
+        self._odometry, increment = self._motion.travelled(self._odometry, t)
+        return increment
 
     def _catch_up(self, ahead: Filter) -> None:
         """Take over what the one that is ahead has predicted; the generator stays, as others draw by it too."""

@@ -108,7 +108,7 @@ class Localizer:
         if start is not None and not start.has_heading and not finds_heading(new):
             raise InputError(f"{self._name} cannot find an unknown heading with this rig and map, expected a heading")
         if start is not None and not math.isnan(start.t):
-            with guard.telling(f"the start at {start.t:.3f} s"):
+            with guard.telling("the start", start.t):
                 new.initialize(start)
         with self._lock:
             self._begin_anew(new, start, guard)
@@ -170,7 +170,7 @@ class Localizer:
             self._require_whole()
             if self._estimator is None or not self._is_under_way(self._newest):
                 return Belief(())
-            with self._guard.telling(f"the belief at {self._newest:.3f} s"):
+            with self._guard.telling("the belief", self._newest):
                 return copy.deepcopy(sound_belief(self._estimator.belief(self._newest)))
 
     def trajectory(self) -> Trajectory:
@@ -245,7 +245,7 @@ class Localizer:
             self._ticks = Ticks(m.t)
             if self._prior is not None:
                 self._prior = replace(self._prior, t=m.t)
-                with self._guard.telling(f"the start at {m.t:.3f} s"):
+                with self._guard.telling("the start", m.t):
                     estimator.initialize(self._prior)
         # as in a run of a log: a tick follows all measurements up to its time
         for t in self._ticks.before(m.t):
@@ -279,7 +279,7 @@ class Localizer:
             raise InputError(
                 f"t is {at:.3f} s, {at - self._newest:.0f} s ahead of all measurements, expected the same clock"
             )
-        with self._guard.telling(f"the estimate at {at:.3f} s"):
+        with self._guard.telling("the estimate", at):
             found = sound(self._estimator.estimate(at))
         # copied, because the estimator may reuse its arrays
         self._last = copy.deepcopy(replace(found, t=at))

@@ -110,7 +110,7 @@ class Log:
 
 def _pieces(rows: Rows, late: Integers, first: int, last: int) -> Iterator[Rows]:
     """The rows from ``first`` to before ``last``, cut before and after those that are ``late`` (L,)."""
-    for i in late[late.searchsorted(first) : late.searchsorted(last)].tolist():
+    for i in late[late.searchsorted(first) : late.searchsorted(last)].tolist() if len(late) else ():
         if first < i:
             yield rows.part(first, i)
         yield rows.part(i, i + 1)

@@ -202,11 +202,11 @@ class Motion(Protocol):
         """Corrected ``delta`` (3,) of an increment for ``constants`` (P,), and its Jacobian (3, P) in the tangent space."""
 
     def predicted(
-        self, increment: Increment, pose: Array, covariance: Array, constants: Array, first: int
-    ) -> tuple[Array, Array, Array]:
-        """Predict a Gaussian by an increment: the pose (3,), the first rows (3, S) of the transition (the other rows are those of
-        the identity), and the covariance (S, S) of the error state, in which the columns of ``constants`` (P,) begin at
-        ``first``."""
+        self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array, first: int
+    ) -> tuple[ChainState, Array, Array, Array, Array]:
+        """Predict a Gaussian from ``start`` to ``t``: the state there, the pose (3,), the first rows (3, S) of the transition (the
+        other rows are those of the identity), the covariance (3, 3) that the motion adds to the first three components, and the
+        covariance (S, S) of the error state, in which the columns of ``constants`` (P,) begin at ``first``."""
 
     def recalibrated(self, increment: Increment, constants: Array) -> Increment:
         """An increment corrected for ``constants`` (P,)."""

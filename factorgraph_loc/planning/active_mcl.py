@@ -36,7 +36,6 @@ from factorgraph_loc.planning.robot import ProximitySensor
 from factorgraph_loc.sensors.base import Link, NewVariable
 from factorgraph_loc.sensors.binding import bound_sensors
 from factors import se2
-from factors.motion import Increment
 from factors.se2 import Array
 
 RESAMPLE_BELOW, ENOUGH = (
@@ -110,7 +109,8 @@ class ActiveMcl(Filter):
         shares = (np.arange(count) * 0.5 * (math.sqrt(5.0) - 1.0)) % 1.0
         return _cloud(np.column_stack((places, math.pi * (2.0 * shares - 1.0))))
 
-    def _predict(self, increment: Increment) -> None:
+    def _predict(self, t: float) -> None:
+        increment = self._travelled(t)
         noise = self._rng.standard_normal(self._state.poses.shape) @ np.linalg.cholesky(increment.covariance).T
         poses = se2.compose(se2.compose(self._state.poses, increment.delta), se2.exp(noise))
         outside = np.where(self._space.cells(poses[:, :2]) >= 0, 0.0, OUTSIDE)

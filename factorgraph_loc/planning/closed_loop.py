@@ -204,7 +204,7 @@ class _ClosedLoop:
                 self._looked_at = self._robot.metres
                 # filters move at scans and ticks only
                 self._feed(Tick(self._robot.t))
-                with self._guard.telling(f"the walls at {self._robot.t:.3f} s"):
+                with self._guard.telling("the walls", self._robot.t):
                     self._estimator.see(self._robot.proximity, self._robot.look())
             if report.sensor in self._robot.decisive and self._is_sure():
                 position, heading = self.errors()
@@ -218,7 +218,7 @@ class _ClosedLoop:
         self._guard.process(self._estimator, measurement)
 
     def _estimate(self) -> PoseEstimate:
-        with self._guard.telling(f"the estimate at {self._robot.t:.3f} s"):
+        with self._guard.telling("the estimate", self._robot.t):
             return sound(self._estimator.estimate())
 
     def _is_sure(self) -> bool:
@@ -232,7 +232,7 @@ class _ClosedLoop:
     def _choose(self) -> Choice:
         self._feed(Tick(self._robot.t))
         started = perf_counter()
-        with self._guard.telling(f"the belief at {self._robot.t:.3f} s"):
+        with self._guard.telling("the belief", self._robot.t):
             belief = self._estimator.belief()
         particles, weights = _sampled(belief, self._space, self._rng)
         modes = _places(belief)

@@ -52,7 +52,6 @@ from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import FLOATS, TILTS
 from factors import se2
 from factors.camera.model import carrier
-from factors.motion import Increment
 from factors.robust import huber_weight
 from factors.se2 import Array
 
@@ -192,7 +191,8 @@ class Monoslam(Filter):
         """Whether no motion is measured, so that the motion is predicted from the velocity."""
         return self._twists is None and not (self._planar and self._wheels)
 
-    def _predict(self, increment: Increment) -> None:
+    def _predict(self, t: float) -> None:
+        increment = self._travelled(t)
         s, robot, dt = self._settings, self._state.robot, increment.duration
         if self._twists is not None:
             step = measured(robot, self._twists.between(self._t, self._t + dt), dt)

@@ -92,12 +92,15 @@ def predicted(
     constants: Array,
     indices: Integers,
     first: int,
-) -> tuple[Array, Array, Array]:
-    """The pose (3,), the first rows (3, S) of the transition, of which the others are those of the identity, and the covariance
-    (S, S) after a motion by ``delta`` (3,) with covariance ``noise`` (3, 3) and time ``moving``, under changed ``constants`` (P,),
-    whose places are ``indices`` (P,) and whose columns in the error state begin at ``first``."""
+    at: Array,
+    transition: Array,
+    after: Array,
+) -> None:
+    """Fill in the pose ``at`` (3,), the first rows ``transition`` (3, S), of which the others are those of the identity, and the
+    covariance ``after`` (S, S) a motion by ``delta`` (3,) with covariance ``noise`` (3, 3) and time ``moving``, under changed
+    ``constants`` (P,), whose places are ``indices`` (P,) and whose columns in the error state begin at ``first``."""
     size, count = len(covariance), len(constants)
-    transition, after = np.zeros((3, size)), covariance.copy()
+    transition[:], after[:] = 0.0, covariance
     columns = np.arange(3 + count)  # where the transition is not zero
     columns[3:] += first - 3
     x, y, turned = delta[0], delta[1], delta[2]
@@ -122,7 +125,7 @@ def predicted(
             for k in columns:
                 after[i, j] += moved[i, k] * transition[j, k]
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    return np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrapped(pose[2] + turned))), transition, after
+    at[0], at[1], at[2] = pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrapped(pose[2] + turned)
 
 
 @numba.njit(cache=True, inline="always")

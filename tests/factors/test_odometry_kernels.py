@@ -86,8 +86,9 @@ def test_a_gaussian_is_predicted_by_its_jacobians(rng, places):
     expected = whole @ before @ whole.T
     expected[:3, :3] += noise
     indices = np.array(places, dtype=np.int64)
-    found = odometry_kernels.predicted(
-        increment.delta, noise, increment.moving, pose, before, constants, indices, first
+    found = np.empty(3), np.empty((3, 8 + count)), np.empty((8 + count, 8 + count))
+    odometry_kernels.predicted(
+        increment.delta, noise, increment.moving, pose, before, constants, indices, first, *found
     )
     for one, other in zip(found, (se2.compose(pose, delta), transition, expected), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)

@@ -135,12 +135,9 @@ class OdometryMotion:
         return delta, jacobian
 
     def predicted(
-        self, increment: Increment, pose: Array, covariance: Array, constants: Array, first: int
-    ) -> tuple[Array, Array, Array]:
-        """Predict a Gaussian by an increment; see :meth:`factorgraph_loc.model.measurement.Motion.predicted`."""
-        motion = increment.delta, increment.covariance, increment.moving
-        pose, transition, after = kernels.predicted(*motion, pose, covariance, constants, self._indices, first)
-        return pose, transition, after
+        self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array, first: int
+    ) -> tuple[ChainState, Array, Array, Array, Array]:
+        return self._chain.predicted(start, t, pose, covariance, constants, self._indices, first)
 
     def recalibrated(self, increment: Increment, constants: Array) -> Increment:
         """An increment corrected for ``constants`` (P,)."""

@@ -1,0 +1,286 @@
+"""Compiled integration of odometry: rows, the knots of a chain that they become, and states between knots."""
+
+import math
+
+import numba
+import numpy as np
+
+from factors import se2
+from factors.odometry.kernels import State, carried, predicted, recalibrated, relative
+from factors.se2 import Array, Integers
+from factors.se2_kernels import body_to_world
+from factors.se2_kernels import composed as one_composed
+
+# columns of a row: time of its effect, its kind, and its values
+ROW = 5
+VELOCITY, INCREMENT, GYRO = 0.0, 1.0, 2.0  # v, w, -; twist of the whole increment; w, -, -
+# columns of a knot: state at the time of a row, the velocity in the robot frame, the velocity that it converges to, whether the
+# wheels are at rest, and the time of the last row of a gyro
+T, _X, _Y, _HEADING, _PATH, _TURN, _UNKNOWN, _STILL, _VX, _VY, _W, _UX, _UY, _UW, _STANDS, _GYRO_T = range(16)
+KNOT, STATE = 16, 8
+
+# m/s and rad/s, relative to the biases: wheels below are at rest; a gyro below agrees that the robot does not turn
+_REST, _GYRO_REST = 1e-3, 0.02
+
+# indices in the array of the model's constants: an array, because a tuple is slower to pass to compiled code
+_COS, _SIN, _LAG, _HOLD, _GYRO_BIAS, _USES_GYRO = range(6, 12)  # behind scales and biases
+
+_arc_coefficients = numba.njit(cache=True)(se2.arc_coefficients)
+
+
+@numba.njit(cache=True)
+def without_old(rows: Array, knots: Array, count: int, horizon: float) -> int:
+    """Forget old rows; returns the new count. Rarely, and many rows at once, because the remaining ones are moved to the front."""
+    newest = knots[count - 1, T]
+    if newest - knots[0, T] <= 2.0 * horizon:
+        return count
+    keep = np.searchsorted(knots[:count, T], newest - horizon, side="right") - 1
+    for i in range(count - keep):
+        rows[i], knots[i] = rows[keep + i], knots[keep + i]
+    return int(count - keep)
+
+
+@numba.njit(cache=True)
+def append(
+    rows: Array,
+    knots: Array,
+    count: int,
+    t: Array,
+    v: Array,
+    w: Array,
+    delay: float,
+    constants: Array,
+    horizon: float,
+) -> int:
+    """Append rows of velocities and their knots to the ``count`` existing ones, and forget old ones; returns the new count, -1
+    if the first row is older than the last existing one."""
+    if count and t[0] + delay < knots[count - 1, T]:
+        return -1
+    for i in range(len(t)):
+        row = rows[count + i]
+        row[0], row[1], row[2], row[3], row[4] = t[i] + delay, VELOCITY, v[i], w[i], 0.0
+    integrate(rows, knots, count, count + len(t), constants)
+    return without_old(rows, knots, count + len(t), horizon)
+
+
+@numba.njit(cache=True)
+def insert(
+    rows: Array,
+    knots: Array,
+    count: int,
+    t: float,
+    kind: float,
+    a: float,
+    b: float,
+    c: float,
+    constants: Array,
+    horizon: float,
+) -> int:
+    """Insert a row at its place in time among the ``count`` existing ones, after those of its time; forget old ones if it is the
+    newest. Returns the new count."""
+    i = count
+    if count and t < knots[count - 1, T]:
+        i = int(np.searchsorted(knots[:count, T], t, side="right"))
+        for k in range(count, i, -1):
+            rows[k] = rows[k - 1]
+    rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4] = t, kind, a, b, c
+    integrate(rows, knots, i, count + 1, constants)
+    return without_old(rows, knots, count + 1, horizon) if i == count else count + 1
+
+
+@numba.njit(cache=True)
+def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array) -> None:
+    """Compute the knots of the rows from ``begin`` to ``end``, each from the knot before it."""
+    scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
+    heading_rate_bias, heading_drift, turn_slowdown = constants[3], constants[4], constants[5]
+    c, s, lag, hold = constants[_COS], constants[_SIN], constants[_LAG], constants[_HOLD]
+    gyro_bias, use_gyro = constants[_GYRO_BIAS], constants[_USES_GYRO] > 0.0
+    for i in range(begin, end):
+        t, kind, a, b, phi = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4]
+        knot = knots[i]
+        if i == 0:
+            knot[:] = 0.0
+            knot[T], knot[_GYRO_T] = t, -math.inf
+        elif kind == INCREMENT and use_gyro:
+            _turn_by_gyro(rows, knots, i, constants)
+        elif kind == INCREMENT:
+            previous = knots[i - 1]
+            duration = t - previous[T]
+            if duration > 0.0:  # otherwise there is no time for motion
+                forward, sideways, turn = a / duration - speed_bias, b / duration, phi / duration - heading_rate_bias
+                stands = abs(forward) <= _REST and abs(sideways) <= _REST and abs(turn) <= _REST
+                if stands:
+                    forward = sideways = turn = 0.0
+                previous[_STANDS] = stands
+                previous[_UX] = scale_distance * (c * forward - s * sideways)
+                previous[_UY] = scale_distance * (s * forward + c * sideways)
+                speed = math.hypot(previous[_UX], previous[_UY])
+                previous[_UW] = scale_rotation * turn + heading_drift * speed
+            _move(previous, duration, 0.0, duration, knot)
+            knot[_UNKNOWN] += max(0.0, duration - hold)
+        else:
+            previous = knots[i - 1]
+            _move(previous, t - previous[T], lag, hold, knot)
+        if kind == VELOCITY:
+            stands = abs(a - speed_bias) <= _REST and abs(b - heading_rate_bias) <= _REST
+            knot[_STANDS] = stands
+            speed = 0.0 if stands else scale_distance * (a - speed_bias)
+            turn = 0.0 if stands else scale_rotation * (b - heading_rate_bias)
+            speed = math.copysign(max(0.0, abs(speed) - turn_slowdown * abs(turn)), speed)
+            knot[_UX], knot[_UY] = speed * c, speed * s
+            if not use_gyro or t - knot[_GYRO_T] > hold:
+                knot[_UW] = turn + heading_drift * abs(speed)
+            elif stands and abs(knot[_UW]) <= _GYRO_REST:
+                knot[_UW] = knot[_W] = 0.0
+        elif kind == GYRO:
+            _take_gyro(knot, t, a - gyro_bias)
+
+
+@numba.njit(cache=True)
+def _take_gyro(knot: Array, t: float, turn: float) -> None:
+    knot[_GYRO_T] = t
+    knot[_UW] = knot[_W] = 0.0 if knot[_STANDS] and abs(turn) <= _GYRO_REST else turn
+
+
+@numba.njit(cache=True)
+def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
+    """Compute the knot of an increment in row ``i``, and again those of the gyro since the previous increment: the robot moves by
+    the increment and rotates by the gyro."""
+    scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
+    heading_rate_bias, heading_drift = constants[3], constants[4]
+    c, s, hold, gyro_bias = constants[_COS], constants[_SIN], constants[_HOLD], constants[_GYRO_BIAS]
+    t, a, b, phi = rows[i, 0], rows[i, 2], rows[i, 3], rows[i, 4]
+    first = i - 1
+    while first >= 0 and rows[first, 1] != INCREMENT:
+        first -= 1
+    told = first >= 0 and t > knots[first, T]  # otherwise the start of the motion is unknown
+    first = max(first, 0)
+    duration = t - knots[first, T]
+    forward, sideways, turn, stands = 0.0, 0.0, 0.0, False
+    if told:
+        forward, sideways, turn = a / duration - speed_bias, b / duration, phi / duration - heading_rate_bias
+        stands = abs(forward) <= _REST and abs(sideways) <= _REST and abs(turn) <= _REST
+        if stands:
+            forward = sideways = turn = 0.0
+    ahead, aside = scale_distance * (c * forward - s * sideways), scale_distance * (s * forward + c * sideways)
+    for k in range(first, i):
+        knot, following = knots[k], knots[k + 1]
+        if told:
+            knot[_STANDS], knot[_UX], knot[_UY] = stands, ahead, aside
+            if t - knot[_GYRO_T] > duration + hold:
+                knot[_UW] = scale_rotation * turn + heading_drift * math.hypot(ahead, aside)
+            elif stands and abs(knot[_UW]) <= _GYRO_REST:
+                knot[_UW] = 0.0
+        step = rows[k + 1, 0] - knot[T]
+        _move(knot, step, 0.0, step, following)
+        if rows[k + 1, 1] == GYRO:
+            _take_gyro(following, rows[k + 1, 0], rows[k + 1, 2] - gyro_bias)
+    knots[i, _UNKNOWN] += max(0.0, duration - hold)
+
+
+@numba.njit(cache=True)
+def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> None:
+    """The knot after ``duration`` seconds: the motion continues for at most ``hold`` seconds, then it is unknown."""
+    ux, uy, uw = knot[_UX], knot[_UY], knot[_UW]
+    moving = min(duration, hold)
+    rests = knot[_STANDS] and uw == 0.0
+    if lag > 0.0:
+        rests = rests and max(abs(knot[_VX]), abs(knot[_VY]), abs(knot[_W])) <= _REST
+        decay = math.exp(-moving / lag)
+        settling = lag * (1.0 - decay)
+        behind_x, behind_y, behind_w = knot[_VX] - ux, knot[_VY] - uy, knot[_W] - uw
+        dx, dy = ux * moving + behind_x * settling, uy * moving + behind_y * settling
+        dtheta = uw * moving + behind_w * settling
+        out[_VX], out[_VY], out[_W] = ux + behind_x * decay, uy + behind_y * decay, uw + behind_w * decay
+    else:
+        dx, dy, dtheta = ux * moving, uy * moving, uw * moving
+        out[_VX], out[_VY], out[_W] = ux, uy, uw
+    if duration > hold:
+        out[_VX] = out[_VY] = out[_W] = 0.0
+    out[_UX], out[_UY], out[_UW], out[_STANDS], out[_GYRO_T] = ux, uy, uw, knot[_STANDS], knot[_GYRO_T]
+    a, b = _arc_coefficients(dtheta)
+    c, s = math.cos(knot[_HEADING]), math.sin(knot[_HEADING])
+    chord_x, chord_y = a * dx - b * dy, b * dx + a * dy
+    out[T] = knot[T] + duration
+    out[_X] = knot[_X] + c * chord_x - s * chord_y
+    out[_Y] = knot[_Y] + s * chord_x + c * chord_y
+    out[_HEADING] = knot[_HEADING] + dtheta
+    out[_PATH] = knot[_PATH] + math.hypot(dx, dy)
+    out[_TURN] = knot[_TURN] + abs(dtheta)
+    out[_UNKNOWN] = knot[_UNKNOWN] + duration - moving
+    out[_STILL] = knot[_STILL] + (moving if rests else 0.0)
+
+
+@numba.njit(cache=True)
+def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
+    """t, x, y, heading, path, turn, unknown and still at ``t``, from the last knot before it."""
+    if count == 0:
+        return t, 0.0, 0.0, 0.0, 0.0, 0.0, t, 0.0
+    i = np.searchsorted(knots[:count, T], t, side="right") - 1
+    if i < 0:
+        k = knots[0]
+        return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN] - (k[T] - t), k[_STILL]
+    k = np.empty(KNOT)
+    _move(knots[i], t - knots[i, T], constants[_LAG], constants[_HOLD], k)
+    return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN], k[_STILL]
+
+
+@numba.njit(cache=True)
+def travelled(
+    knots: Array, count: int, constants: Array, noise: Array, start: State, t: float
+) -> tuple[State, Array, Array, float, float]:
+    end = state_at(knots, count, t, constants)
+    delta, covariance, duration, still = relative(noise, start, end)
+    return end, delta, covariance, duration, still
+
+
+@numba.njit(cache=True)
+def predicted_at(
+    knots: Array,
+    count: int,
+    chain: Array,
+    noise: Array,
+    start: State,
+    t: float,
+    pose: Array,
+    covariance: Array,
+    constants: Array,
+    indices: Integers,
+    first: int,
+    at: Array,
+    transition: Array,
+    added: Array,
+    after: Array,
+) -> State:
+    end = state_at(knots, count, t, chain)
+    delta, spread, duration, still = relative(noise, start, end)
+    added[:] = spread
+    predicted(delta, spread, duration - still, pose, covariance, constants, indices, first, at, transition, after)
+    return end
+
+
+@numba.njit(cache=True)
+def moved_to(
+    knots: Array,
+    count: int,
+    chain: Array,
+    noise: Array,
+    start: State,
+    t: float,
+    pose: Array,
+    covariance: Array,
+    constants: Array,
+    indices: Integers,
+) -> tuple[Array, Array, Array]:
+    delta, spread, duration, still = relative(noise, start, state_at(knots, count, t, chain))
+    if len(indices):
+        delta = recalibrated(delta, duration - still, constants, indices)
+    at = np.array(one_composed(pose[0], pose[1], pose[2], delta[0], delta[1], delta[2]))
+    body = carried(covariance, delta, spread)
+    return at, body, body_to_world(at, body)
+
+
+@numba.njit(cache=True)
+def states_at(knots: Array, count: int, times: Array, constants: Array, out: Array) -> None:
+    for j in range(len(times)):
+        out[j, :] = state_at(knots, count, times[j], constants)
