@@ -61,7 +61,7 @@ class Guard:
     def process(self, estimator: Estimator, measurement: Measurement) -> None:
         """Give a measurement to the estimator."""
         self._last, self._telling, self._of = measurement, "", None
-        if not self._is_quiet:
+        if not (self._is_quiet or measurement.is_motion):  # odometry is but kept, which makes no warnings
             with self:
                 estimator.process(measurement)
             return

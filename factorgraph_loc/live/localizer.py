@@ -229,7 +229,8 @@ class Localizer:
         if offset:
             m = _moved(m, offset)
         self._check_stamp(m)
-        self._newest, self._last = max(self._newest, m.t), None
+        self._newest = max(self._newest, m.t)
+        self._last = None
         try:
             self._feed(estimator, m)
         except BaseException as error:  # an interrupt also leaves the estimator in an undefined state
@@ -238,7 +239,8 @@ class Localizer:
             else:
                 self._failure = RunFailedError(f"{self._name}: lost by {type(error).__name__}; call initialize() again")
             raise
-        self._tidy(estimator)
+        if self._newest >= self._tidied + TIDY_INTERVAL:
+            self._tidy(estimator)
 
     def _feed(self, estimator: Estimator, m: Measurement) -> None:
         if self._ticks is None:
@@ -272,7 +274,7 @@ class Localizer:
         self._require_whole()
         at = self._newest if t is None else max(self._newest, seconds_of("estimate()", t))
         if self._last is not None and self._last.t == at:
-            return copy.deepcopy(self._last)
+            return _copied(self._last, at)
         if self._estimator is None or not math.isfinite(self._newest) or not self._is_under_way(at):
             return PoseEstimate(math.nan, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
         if at > self._newest + AHEAD:
@@ -282,17 +284,20 @@ class Localizer:
         with self._guard.telling("the estimate", at):
             found = sound(self._estimator.estimate(at))
         # copied, because the estimator may reuse its arrays
-        self._last = copy.deepcopy(replace(found, t=at))
-        return copy.deepcopy(self._last)
+        self._last = _copied(found, at)
+        return _copied(found, at)
 
     def _tidy(self, estimator: Estimator) -> None:
-        """Forget the old past, every few seconds."""
-        if self._newest < self._tidied + TIDY_INTERVAL:
-            return
+        """Forget the old past."""
         self._tidied = self._newest
         if isinstance(estimator, ForgettingEstimator) and self._ticks is not None and self._ticks.count:
             estimator.forget(self._newest - self._history)
         estimator.diagnostics.keep_last(ROWS_KEPT)
+
+
+def _copied(e: PoseEstimate, t: float) -> PoseEstimate:
+    """The estimate with the time ``t``, and arrays of its own."""
+    return PoseEstimate(t, np.array(e.pose), np.array(e.covariance), e.status, copy.deepcopy(e.space))
 
 
 def _moved(m: Measurement, offset: float) -> Measurement:

@@ -28,18 +28,17 @@ def kinds() -> Mapping[type[Any], Channel]:
     return found
 
 
-def channel_of(m: object) -> Channel:
-    """The channel of a measurement's class; InputError if it is not a measurement."""
-    if type(m) not in kinds():
-        known = ", ".join(kind.__name__ for kind in kinds())
-        raise InputError(f"{type(m).__name__} is not a measurement, expected one of {known}")
-    return kinds()[type(m)]
+def channel_of(kind: type[Any]) -> Channel:
+    """The channel of a measurement's class; InputError if it is not one."""
+    if kind not in kinds():
+        known = ", ".join(one.__name__ for one in kinds())
+        raise InputError(f"{kind.__name__} is not a measurement, expected one of {known}")
+    return kinds()[kind]
 
 
 def checked(m: M) -> M:
     """A validated copy of a measurement, or itself if it consists of valid floats, which nobody can change; InputError names the
     first invalid field, its value and the expected values."""
-    channel = channel_of(m)
     if (floats := _floats_of(type(m))) is not None:
         for name, low, high in floats:
             value = getattr(m, name)
@@ -47,6 +46,7 @@ def checked(m: M) -> M:
                 break
         else:
             return m
+    channel = channel_of(type(m))
     t = seconds_of(type(m).__name__, m.t)
     where = f"{type(m).__name__} at {t:.3f} s"
     found = load(channel.check)(m, where) if channel.check else dict(_described(m, where, channel))
@@ -56,8 +56,9 @@ def checked(m: M) -> M:
 
 @cache
 def _floats_of(kind: type[Measurement]) -> tuple[tuple[str, float, float], ...] | None:
-    """Name and inclusive bounds of each field of a class with numbers only, as rows of odometry have; None for others."""
-    channel = kinds()[kind]
+    """Name and inclusive bounds of each field of a class with numbers only, as rows of odometry have; None for others.
+    InputError if it is no class of measurements."""
+    channel = channel_of(kind)
     if channel.check:
         return None
     table = _table_of(kind, channel)
