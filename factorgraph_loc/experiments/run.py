@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.experiments.causal_estimates import CausalEstimates
 from factorgraph_loc.experiments.doubts import findable, never_localized, partly_scored, with_pauses
 from factorgraph_loc.experiments.garbage import only_new_searched
 from factorgraph_loc.experiments.preparation import (
@@ -29,7 +30,6 @@ from factorgraph_loc.experiments.preparation import (
     use_of,
     used_sensors,
 )
-from factorgraph_loc.experiments.told import Told
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, SpaceEstimator, finds_heading
@@ -228,7 +228,7 @@ class _CausalRun:
     progress: Callable[[float], None] = lambda _: None
     watch: Callable[[float, Estimator], None] | None = None
     end: float = math.inf
-    told: Told = field(default_factory=Told)
+    told: CausalEstimates = field(default_factory=CausalEstimates)
 
     def __post_init__(self) -> None:
         first, self._last = _span(self.log, self.sensors)

@@ -12,7 +12,7 @@ from factors.se2 import Array
 
 
 @dataclass
-class Told:
+class CausalEstimates:
     """The estimates at the ticks, as columns: a few objects less for each tick."""
 
     t: list[float] = field(default_factory=list)
