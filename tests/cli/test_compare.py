@@ -1,0 +1,83 @@
+"""`fgloc compare`, from the arguments to the files."""
+
+import json
+import shutil
+
+import polars as pl
+
+
+def test_compare(fgloc, short_log, tmp_path):
+    out = tmp_path / "out"
+    result = fgloc("compare", short_log, "-e", "dead_reckoning,ekf", "-o", out, "--seeds", "0:2", "--jobs", 2)
+    assert result.exit_code == 0, result.output
+    assert "dead_reckoning" in result.stdout
+    assert str(out) in result.stdout
+    table = pl.read_csv(out / "results.csv")
+    assert set(table["estimator"]) == {"dead_reckoning", "ekf"}
+    assert (out / "results.parquet").is_file()
+    assert list(out.rglob("*.png"))
+    again = fgloc("compare", short_log, "-e", "ekf", "-o", out)
+    assert again.exit_code == 2
+    assert "--overwrite" in again.stderr
+
+
+def test_compare_says_why_there_are_no_errors(fgloc, short_log, tmp_path):
+    bare = tmp_path / "bare"
+    shutil.copytree(short_log, bare)
+    (bare / "reference.tum").unlink()
+    result = fgloc("compare", bare, "-e", "dead_reckoning", "-o", tmp_path / "out", "--prior", "0,0,0", "--jobs", 1)
+    assert result.exit_code == 0, result.output
+    assert "short: there is no reference to score against, so there are no errors" in result.stdout
+
+
+def test_compare_prints_one_table_with_seeds_pooled_and_the_best_in_words(fgloc, short_log, tmp_path):
+    out = tmp_path / "out"
+    result = fgloc(
+        "compare",
+        short_log,
+        "-e",
+        "dead_reckoning,particle_filter",
+        "-o",
+        out,
+        "--seeds",
+        "0:2",
+        "--set",
+        "particle_filter.particles=500",
+    )
+    assert result.exit_code == 0, result.output
+    lines = [line.split() for line in result.stdout.splitlines()]
+    assert [line[-1] for line in lines if line[:1] == ["short"]] == ["1/1", "2/2"]
+    assert "least causal position error: particle_filter, " in result.stdout
+    assert "(dead_reckoning: " in result.stdout
+    for name in ("results.parquet", "results.csv", "table.md", "differences.csv", "plots", "runs"):
+        assert name in result.stdout
+        assert (out / name).exists()
+
+
+def test_compare_reports_a_failed_run_and_goes_on(fgloc, short_log, tmp_path):
+    nowhere = tmp_path / "nowhere"
+    shutil.copytree(short_log, nowhere)
+    (nowhere / "reference.tum").unlink()
+    run_file = nowhere / "run.toml"
+    run_file.write_text(run_file.read_text().replace('name = "short"', 'name = "nowhere"'))
+    result = fgloc("compare", short_log, nowhere, "-e", "dead_reckoning", "-o", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "failed: nowhere, dead_reckoning, seed 0: dead_reckoning cannot start" in result.stderr
+    assert "least final position error" not in result.stdout
+    table = pl.read_csv(tmp_path / "out/results.csv")
+    assert table["status"].to_list() == ["ok", "failed"]
+    assert table["final.position_rmse"].null_count() == 1
+
+
+def test_a_folder_with_results_is_refused_before_anything_is_read(fgloc, tmp_path):
+    (tmp_path / "metrics.json").write_text("{}")
+    for command in ("run", "compare"):
+        result = fgloc(command, "no-such-log", "-e", "ekf", "-o", tmp_path)
+        assert result.exit_code == 2
+        assert "metrics.json" in result.stderr
+
+
+def test_compare_prints_json_alone(fgloc, short_log, tmp_path):
+    result = fgloc("compare", short_log, "-e", "ekf", "-o", tmp_path / "out", "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)

@@ -1,0 +1,135 @@
+"""`fgloc run`, from the arguments to the files."""
+
+import json
+import shutil
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+
+from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc.experiments.run import run
+from factorgraph_loc.model.belief import Learnt, LearntPoint
+from factorgraph_loc.model.trajectory import read_tum
+
+RUN_FILES = {
+    "final.tum",
+    "causal.tum",
+    "estimates.parquet",
+    "learnt.json",
+    "events.csv",
+    "metrics.json",
+    "config.toml",
+}
+
+
+@pytest.mark.in_full
+def test_run_writes_its_files_and_says_where(fgloc, short_log, tmp_path):
+    out = tmp_path / "out"
+    result = fgloc("run", short_log, "-e", "ekf", "-o", out, "--seed", 3)
+    assert result.exit_code == 0, result.output
+    assert {path.name for path in out.iterdir()} == RUN_FILES | {"plots"}
+    plots = {f"short-{name}.png" for name in ("trajectories", "errors-ekf", "consistency-ekf")}
+    assert {path.name for path in (out / "plots").iterdir()} == plots
+    assert str(out) in result.stdout
+    assert "causal" in result.stdout
+    assert "final" in result.stdout
+    assert tomllib.loads((out / "config.toml").read_text())["seed"] == 3
+    assert len(read_tum(out / "final.tum")) > 500
+    assert set(pl.read_parquet(out / "estimates.parquet")["kind"]) == {"causal", "final"}
+
+
+def test_run_prints_json_alone(fgloc, short_log, tmp_path):
+    result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out", "--json")
+    content = json.loads(result.stdout)
+    assert content["causal.position_rmse"] == pytest.approx(
+        json.loads((tmp_path / "out/metrics.json").read_text())["causal.position_rmse"]
+    )
+
+
+def test_run_takes_settings_sensors_and_a_start(fgloc, short_log, tmp_path):
+    options = ["--set", "ekf.max_delay=0.25", "--sensors", "odometry", "--prior", "0,0,0.5"]
+    result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out", *options)
+    assert result.exit_code == 0, result.output
+    config = tomllib.loads((tmp_path / "out/config.toml").read_text())
+    assert config["settings"]["max_delay"] == 0.25
+    assert config["sensors"] == ["odometry"]
+
+
+def test_run_refuses_to_overwrite_unless_told(fgloc, short_log, tmp_path):
+    first = fgloc("run", short_log, "-e", "dead_reckoning", "-o", tmp_path / "out")
+    again = fgloc("run", short_log, "-e", "dead_reckoning", "-o", tmp_path / "out")
+    (tmp_path / "out/plots/mine.png").write_text("mine")
+    (tmp_path / "out/plots/old-errors-ekf.png").write_text("of an earlier run")
+    told = fgloc("run", short_log, "-e", "dead_reckoning", "-o", tmp_path / "out", "--overwrite")
+    assert (first.exit_code, again.exit_code, told.exit_code) == (0, 2, 0)
+    assert "--overwrite" in again.stderr
+    assert (tmp_path / "out/plots/mine.png").is_file()
+    assert not (tmp_path / "out/plots/old-errors-ekf.png").exists()
+
+
+def test_run_says_how_consistent_it_was_and_what_it_learnt(fgloc, short_log, tmp_path, monkeypatch):
+    def eventful(log, config, progress):
+        result = run(log, config, progress)
+        result.diagnostics.events.extend((10.0 * i, f"event number {i}") for i in range(7))
+        values = {f"constant_{i}": (1.0 + i, 0.01) for i in range(12)}
+        status = ("unlocalized",) * 30 + result.status[30:]
+        return replace(result, learnt=Learnt(values), status=status)
+
+    monkeypatch.setattr("factorgraph_loc.experiments.run.run", eventful)
+    result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert sum(line.startswith("bearing_range: normalised innovation squared ") for line in lines) == 1
+    assert "localized after 3.0 s" in lines
+    learnt = [line for line in lines if line.startswith("learnt: ")]
+    assert learnt[:2] == ["learnt: constant_0 1 ± 0.01", "learnt: constant_1 2 ± 0.01"]
+    assert learnt[10:] == ["learnt: 2 more in learnt.json"]
+    i = next(i for i, line in enumerate(lines) if line.startswith("events: 7"))
+    assert lines[i + 1 : i + 6] == [f"  at {10.0 * k:.1f} s: event number {k}" for k in range(5)]
+    assert "event number 5" not in result.stdout
+    assert len(pl.read_csv(tmp_path / "out/events.csv")) == 7
+
+
+def test_run_aligns_where_the_map_was_free(fgloc, short_log, tmp_path, monkeypatch):
+    def mapping(log, config, progress):
+        result = run(log, config, progress)
+        landmarks = {n: LearntPoint(log.world.position(n), np.eye(2)) for n in log.world.landmarks}
+        config = {**result.config, "settings": {"landmarks": "unknown"}}
+        return replace(result, config=config, learnt=Learnt(landmarks=landmarks))
+
+    monkeypatch.setattr("factorgraph_loc.experiments.run.run", mapping)
+    result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out")
+    assert "final, aligned because the map was free: position RMSE 0." in result.stdout
+    assert "learnt landmarks: 4, aligned RMSE 0." in result.stdout
+
+
+def test_a_log_without_reference_has_innovations(fgloc, short_log, tmp_path):
+    shutil.copytree(short_log, tmp_path / "log")
+    (tmp_path / "log/reference.tum").unlink()
+    result = fgloc("run", tmp_path / "log", "-e", "ekf", "-o", tmp_path / "out", "--prior", "0,0,0")
+    assert result.exit_code == 0, result.output
+    assert "there is no reference to score against" in result.stdout
+    assert "bearing_range: normalised innovation squared " in result.stdout
+    names = {"short-trajectories.png", "short-consistency-ekf.png"}
+    assert {path.name for path in (tmp_path / "out/plots").iterdir()} == names
+
+
+def test_a_run_that_fails_has_exit_code_1(fgloc, short_log, tmp_path, monkeypatch):
+    def fail(*_):
+        raise RunFailedError("short: the estimate at 3.000 s is not finite")
+
+    monkeypatch.setattr("factorgraph_loc.experiments.run.run", fail)
+    result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out")
+    assert result.exit_code == 1
+    assert result.stderr == "error: short: the estimate at 3.000 s is not finite\n"
+    assert not (tmp_path / "out").exists()
+
+
+def test_batch_is_not_timed_by_update(fgloc, short_log, tmp_path):
+    result = fgloc("run", short_log, "-e", "batch", "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "for the final trajectory" in result.stdout
+    assert "per update" not in result.stdout
