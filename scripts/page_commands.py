@@ -5,7 +5,9 @@ and the files that it tells to write, blocks of TOML whose first line is a comme
 import re
 from dataclasses import dataclass
 
+MORE = "..."
 _BLOCK = re.compile(r"^```(console|python|toml)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _NAMED = re.compile(r"# ([\w.-]+\.toml)\b")
 # data of the reader's own or of others, installations, windows
 _ELSEWHERE = re.compile(
@@ -16,16 +18,18 @@ _ELSEWHERE = re.compile(
 
 @dataclass(frozen=True)
 class Step:
-    """A ``command``; or else the ``content`` of the ``file`` to write, or without a name of the Python to execute."""
+    """A ``command``, with what the page shows of its output; or else the ``content`` of the ``file`` to write, or without a name
+    of the Python to execute."""
 
     command: str | None = None
+    shown: str = ""
     file: str | None = None
     content: str = ""
 
 
 def commands(text: str) -> list[str]:
     """All commands of a page, without comments."""
-    return [command for kind, block in _BLOCK.findall(text) if kind == "console" for command in _lines(block)]
+    return [command for kind, block in _BLOCK.findall(text) if kind == "console" for command, _ in _typed(block)]
 
 
 def runnable(text: str) -> list[str]:
@@ -33,14 +37,17 @@ def runnable(text: str) -> list[str]:
     return [command for command in commands(text) if not _ELSEWHERE.search(command)]
 
 
-def steps(text: str) -> list[Step]:
-    """The runnable commands, the files and the Python of a page, in their order."""
+def steps(text: str, *, shown: bool = False) -> list[Step]:
+    """The runnable commands, the files and the Python of a page, in their order; ``shown``: of the commands those in blocks with
+    an output, and no Python."""
     found = []
     for kind, block in _BLOCK.findall(text):
         if kind == "console":
-            found += [Step(command) for command in _lines(block) if not _ELSEWHERE.search(command)]
+            typed = [Step(line, output) for line, output in _typed(block)]
+            wanted = not shown or any(step.shown for step in typed)
+            found += [step for step in typed if wanted and not _ELSEWHERE.search(step.command or "")]
         elif kind == "python":
-            found.append(Step(content=block))
+            found += [] if shown else [Step(content=block)]
         elif named := _NAMED.match(block):
             found.append(Step(file=named[1], content=block))
     return found
@@ -51,5 +58,50 @@ def tables(text: str) -> list[str]:
     return [block for kind, block in _BLOCK.findall(text) if kind == "toml"]
 
 
-def _lines(block: str) -> list[str]:
-    return [re.sub(r" +# .*", "", line.removeprefix("$ ")) for line in block.splitlines() if line.startswith("$ ")]
+def not_as_shown(shown: str, printed: str) -> str | None:
+    """The first line of an output on a page that is not in what a command prints; None without one.
+
+    A line ``...`` stands for any lines, a word ``...`` at the end of one for any words. Numbers may differ by 5 % or by one in
+    their last decimal, and those that tell how long something took, by anything.
+    """
+    left = [line.split() for line in printed.splitlines() if line.strip()]
+    skips = False
+    for line in (line for line in shown.splitlines() if line.strip()):
+        if line.strip() == MORE:
+            skips = True
+            continue
+        at = next((i for i, words in enumerate(left if skips else left[:1]) if _alike(line.split(), words)), None)
+        if at is None:
+            return line
+        left, skips = left[at + 1 :], False
+    return None if skips or not left else f"{' '.join(left[0])} (is printed, but not shown)"
+
+
+def _alike(shown: list[str], printed: list[str]) -> bool:
+    if shown[-1] == MORE:
+        shown, printed = shown[:-1], printed[: len(shown) - 1]
+    timed = set(range(len(shown))) if shown[:1] == ["time:"] else set()
+    if re.fullmatch(r"\d+/\d+", shown[-1]):  # a row of a comparison: time per update, and ratio to real time
+        timed = {len(shown) - 4, len(shown) - 3}
+    return len(shown) == len(printed) and all(
+        _is_near(a, b, timed=i in timed) for i, (a, b) in enumerate(zip(shown, printed, strict=True))
+    )
+
+
+def _is_near(shown: str, printed: str, *, timed: bool) -> bool:
+    """Whether two words are the same, but for their numbers, which are near each other."""
+    if set(shown) | set(printed) == {"─"}:  # below the head of a table
+        return True
+    numbers = list(zip(_NUMBER.findall(shown), _NUMBER.findall(printed), strict=False))
+    last = [10.0 ** -len(a.partition(".")[2]) if "." in a else 0.0 for a, _ in numbers]
+    near = (
+        abs(float(a) - float(b)) <= max(0.05 * abs(float(a)), 1.01 * d) for (a, b), d in zip(numbers, last, strict=True)
+    )
+    return _NUMBER.sub("0", shown) == _NUMBER.sub("0", printed) and (timed or all(near))
+
+
+def _typed(block: str) -> list[tuple[str, str]]:
+    """The commands of a console block without comments, each with the lines below it."""
+    parts = re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]
+    typed = (part.partition("\n") for part in parts)
+    return [(re.sub(r" +# .*", "", command), shown) for command, _, shown in typed]

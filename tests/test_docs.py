@@ -19,7 +19,7 @@ from factorgraph_loc.cli.app import app
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "scripts"))
 
-from page_commands import commands, runnable, tables  # noqa: E402
+from page_commands import commands, not_as_shown, runnable, tables  # noqa: E402
 
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -100,6 +100,45 @@ def test_a_tutorial_is_done_with_its_files_and_its_python(tmp_path):
     subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert (tmp_path / "inside/again").read_text() == "# cart.rig.toml\nname = 'cart'\n"
     assert sorted(path.name for path in (tmp_path / "inside").iterdir()) == ["again", "cart.rig.toml", "copy"]
+
+
+PRINTED = """\
+log   plaza2
+span  409.5 s
+
+rows  rate [Hz]
+4091       10.0
+
+  plaza2   ekf     0.293     0.05    280     3888    1/1
+time: 0.53 ms per update (median)
+"""
+
+
+@pytest.mark.parametrize(
+    ("shown", "told"),
+    [
+        (PRINTED, None),
+        ("log   plaza2\n...\nrows  ...\n4091 9.9\n...\n", None),  # within 5 %
+        ("...\n plaza2 ekf 0.292 0.99 999 3888 1/1\ntime: 9.99 ms per update (median)\n", None),  # how long it takes
+        ("...\n plaza2 ekf 0.333 0.05 280 3888 1/1\n...\n", " plaza2 ekf 0.333 0.05 280 3888 1/1"),
+        ("log   plaza2\nrows  rate [Hz]\n...\n", "rows  rate [Hz]"),
+        ("log   plaza1\n...\n", "log   plaza1"),
+        ("log   plaza2\nspan  409.5 s\n", "rows rate [Hz] (is printed, but not shown)"),
+    ],
+)
+def test_what_a_page_shows_of_an_output_is_compared_with_it(shown, told):
+    assert not_as_shown(shown, PRINTED) == told
+
+
+def test_an_output_that_has_changed_is_told_and_renewed(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("```console\n$ touch quiet\n```\n```console\n$ echo new  # a remark\nold\n$ echo more\n...\n```\n")
+    command = [sys.executable, str(ROOT / "scripts/run_tutorial"), str(page), "--shown"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "new\npage.md: echo new prints above, but not as shown: old\n")
+    subprocess.run([*command, "--renew"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "$ echo new  # a remark\nnew\n$ echo more\n...\n" in page.read_text()
+    assert not (tmp_path / "quiet").exists()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

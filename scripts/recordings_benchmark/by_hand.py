@@ -68,7 +68,7 @@ def section(options: Options) -> Report:
         typed = "<br>".join(f"`{command.replace('|', '')}`" for command in job.commands)
         written = ", ".join(job.files) or "-"
         row = (job.recording.name, written, typed or "-", str(len(job.commands)))
-        rows.append((*row, f"{done.seconds / 60.0:.1f}" if job.commands else "-", done.result or reason))
+        rows.append((*row, f"{done.seconds / 60.0:.2f}" if job.commands else "-", done.result or reason))
     report.table(("log", "files to write", "commands", "number", "processor [min]", "position RMSE [m]"), rows)
     return report
 

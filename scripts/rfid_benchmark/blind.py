@@ -1,0 +1,130 @@
+"""Calibration without a reference: what is learnt on some offices, and how the smoother does with it in others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from benchmarking.ensemble import RunErrors, run_errors
+from benchmarking.report import Options, Report, ratio_cells
+
+from factorgraph_loc.api.learning import calibrate
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.simulation import preset, simulate
+
+LEARNT_ON, TRIED_ON = range(1, 6), range(6, 16)  # seeds
+DURATION = 300.0  # s
+
+
+@dataclass(frozen=True)
+class Case:
+    """A key of the antennas' beam: its value in the simulation, and in the rig at hand."""
+
+    what: str
+    key: str
+    true: float
+    given: float
+
+
+CASES = (
+    Case("range 20 % too long", "r_max", 4.5, 5.4),
+    Case("range 20 % too short", "r_max", 4.5, 3.6),
+    Case("more reads than there are", "p0", 0.5, 0.9),
+)
+
+
+@dataclass(frozen=True)
+class Learning:
+    case: Case
+    out: Path
+
+
+@dataclass(frozen=True)
+class Learnt:
+    rig: Rig
+    value: float
+    error: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """``rig``: None for that of the simulation."""
+
+    case: Case
+    seed: int
+    rig: Rig | None
+
+
+def section(options: Options) -> Report:
+    report = Report("blind", options)
+    cases = [Learning(case, options.out / "blind") for case in CASES]
+    found: Mapping[int, Learnt] = report.collect(learnt, cases, [case.what for case in CASES])
+    seeds = TRIED_ON[: options.count(len(TRIED_ON))]
+    trials = [
+        Trial(CASES[i], seed, rig) for i, one in sorted(found.items()) for rig in (one.rig, None) for seed in seeds
+    ]
+    runs = report.collect(tried, trials, [f"{trial.case.what}, {trial.seed}" for trial in trials])
+    rows = []
+    for i, one in sorted(found.items()):
+        case = CASES[i]
+        mine, theirs = (
+            [
+                runs[j].causal
+                for j, trial in enumerate(trials)
+                if trial.case == case and (trial.rig is None) == true and j in runs
+            ]
+            for true in (False, True)
+        )
+        anees = [f"{np.mean([np.nanmean(run.nees) for run in group]):.2f}" for group in (mine, theirs)]
+        values = (f"`{case.key}` {case.given:g}", f"{case.true:g}", f"{one.value:.3f} ± {one.error:.3f}")
+        rows.append((case.what, *values, *ratio_cells(mine, theirs), *anees))
+    report.say(
+        f"`office`, {DURATION:.0f} s, learnt on seeds {LEARNT_ON[0]} to {LEARNT_ON[-1]}, tried on {seeds[0]} to {seeds[-1]}. "
+        "*Ratio*: of the smoother's causal error with the learnt rig to that with the rig of the simulation, with its 95 % "
+        "interval over worlds, and the largest of a single world"
+    )
+    heads = (
+        "rig at hand",
+        "given",
+        "in the simulation",
+        "learnt",
+        "ratio",
+        "worst",
+        "ANEES",
+        "ANEES, rig of the simulation",
+    )
+    report.table(heads, rows)
+    return report
+
+
+def office(case: Case, seed: int) -> Log:
+    beam = {case.key: case.true}
+    changes = {"drive": {"duration": DURATION}, "rig": {"rfid": {"models": {"default": beam}}}}
+    return simulate(preset("office", changes), seed)
+
+
+def with_beam(rig: Rig, **changes: float) -> Rig:
+    """The rig with other values of the antennas' beam."""
+    assert rig.rfid is not None
+    models = {"default": rig.rfid.models["default"].model_copy(update=changes)}
+    return rig.model_copy(update={"rfid": rig.rfid.model_copy(update={"models": models})})
+
+
+def learnt(job: Learning) -> Learnt:
+    """What the logs without their references teach."""
+    case = job.case
+    logs = [replace(office(case, seed), reference=None) for seed in LEARNT_ON]
+    job.out.mkdir(parents=True, exist_ok=True)
+    rig = with_beam(logs[0].rig, **{case.key: case.given})
+    found = calibrate(logs, job.out / f"{case.key}-{case.given:g}.rig.toml", rig=rig, overwrite=True)
+    constant = next(c for c in found.knowledge.constants if c.sensor == "rfid" and c.name.endswith(case.key))
+    return Learnt(found.rig, constant.fitted, constant.error)
+
+
+def tried(trial: Trial) -> RunErrors:
+    log = office(trial.case, trial.seed)
+    return run_errors(run(replace(log, rig=trial.rig or log.rig), RunConfig("smoother")), log)

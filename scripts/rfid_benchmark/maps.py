@@ -1,0 +1,50 @@
+"""Maps of the tags of the aisle's recordings, with and without the phases of their reads, against the survey."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from benchmarking.report import Options, Report
+
+from factorgraph_loc.experiments.maps import MapOptions, make_map
+from factorgraph_loc.io.readers import load
+from factorgraph_loc.mapping.tag_mapping import MadeTags
+from rfid_benchmark.aisle import RUNS
+
+NEAR = 0.05  # m
+
+
+@dataclass(frozen=True)
+class Job:
+    run: int
+    phases: bool
+    options: Options
+
+
+def section(options: Options) -> Report:
+    report = Report("maps", options)
+    jobs = [Job(run, phases, options) for run in RUNS for phases in (True, False)]
+    found = report.collect(made, jobs, [f"run {job.run}{'' if job.phases else ' without phases'}" for job in jobs])
+    report.say("Distances of the tags mapped along the reference from their survey [m]")
+    rows = []
+    for i, (distances, count) in sorted(found.items()):
+        job = jobs[i]
+        near = f"{np.mean(distances <= NEAR):.0%}"
+        figures = (np.sqrt(np.mean(distances**2)), np.median(distances), distances.max())
+        cells = [f"{len(distances)} of {count}", *(f"{figure:.3f}" for figure in figures), near]
+        rows.append((f"run {job.run}", "yes" if job.phases else "no", *cells))
+    report.table(("log", "phases", "tags", "root mean square", "median", "largest", f"within {NEAR} m"), rows)
+    return report
+
+
+def made(job: Job) -> tuple[np.ndarray, int]:
+    """The distances of the located tags, and the number of those in the survey."""
+    (log,) = load(f"rfid-aisle-run{job.run}", data_root=job.options.data_root)
+    if not job.phases:
+        assert log.rig.rfid is not None
+        log = replace(log, rig=log.rig.model_copy(update={"rfid": log.rig.rfid.model_copy(update={"phase": None})}))
+    found = make_map(log, MapOptions(of="tags")).details
+    assert isinstance(found, MadeTags)
+    distances = [entry.distance for entry in found.made.entries if entry.distance is not None]
+    return np.array(distances), len(log.world.tags)
