@@ -50,10 +50,11 @@ WIDE = 3.0  # m: standard deviation of all particles, of which a share of 1 - CL
 NARROW, CLEAR_FOR, CLEAR_FOR_WIDE = 0.4, 2.0, 10.0
 
 
-# Work: of one tag or landmark that one particle looks at it is 1, some nanoseconds.
+# Work: of one tag that one particle looks at it is 1, some nanoseconds.
 CHUNK = 1_000_000  # of what is done at once
-PARTICLE = 50  # of a particle that is weighed, besides what it looks at
-RESAMPLED = 100  # of a particle in each half of a resampling
+PARTICLE = 25  # of a particle that is weighed, besides what it looks at
+RESAMPLED = 60  # of a particle in each half of a resampling
+BEGUN = 80  # of a particle at first, with what the sensors make for the search
 
 
 class _Waiting(NamedTuple):
@@ -156,6 +157,7 @@ class Population:
             area = float(np.prod(self._bounds[1] - self._bounds[0]))
             count = int(np.clip(DENSITY * area * 2.0 * math.pi, FEWEST_AT_FIRST, MOST))
             cloud = _cloud(self._anywhere(count, odometry), np.full(count, -math.log(count)))
+            yield float(BEGUN * count)
         else:
             cloud = self._cloud
             if odometry.t > self._odometry.t:

@@ -31,7 +31,7 @@ DURATION = 60.0  # s of observations that are kept
 REFUTING = 8.0  # log of the odds that a track must lose by: kidnappings are rare
 BEFORE = 2.0  # s before a suspicion, or before what speaks for a change, in which it may lie
 UNSURE = 5.0  # a change may be at a time for which the log of its likelihood is so much below the highest
-SLICE = 4_000_000  # of work (:mod:`.population`) that is done at a measurement or a tick
+SLICE = 5_000_000  # of work (:mod:`.population`) that is done at a measurement or a tick
 APART = 16.0  # squared Mahalanobis distance to the track, beyond which it is another place
 
 

@@ -60,9 +60,9 @@ class Listed(NamedTuple):
     far: Array
 
 
-def place_tables(model: RfidModel, packed: Packed, tables: Tables) -> PlaceTables | None:
+def place_tables(model: RfidModel, packed: Packed, tables: Tables, logs: NDArray[np.float32]) -> PlaceTables | None:
     """The tables of places, from those of the antennas; None where facings matter, for models that have none, and where they would
-    be too large."""
+    be too large. ``packed``: the model as it is adjusted; ``logs`` (M, Z, 2): those of ``tables`` for each detection model."""
     used = [packed.kinds[a.model] for a in model.antennas]
     if not tables.level.size or LOGISTIC in used or tables.facings.max() > 1:
         return None
@@ -73,7 +73,7 @@ def place_tables(model: RfidModel, packed: Packed, tables: Tables) -> PlaceTable
     if math.prod(shape) > MOST:
         return None
     gain, missed = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-    _fill(packed, tables, columns, half, gain, missed)
+    _fill(packed, tables, logs, columns, half, gain, missed)
     return PlaceTables(gain, missed, level.reshape(-1).astype(np.int64), reach, tables.logs[0].copy())
 
 
@@ -136,7 +136,7 @@ def log_likelihood(
                 own = np.float64(silent.untold[h, i, j])
                 for r in range(listed.first[w], listed.first[w + 1]):
                     own += listed.hits[r] * tables.gain[listed.antennas[r], h, i, j]
-                total += _mixed(tempering * own, listed.odds[w], listed.elsewhere[w]) - listed.far[w]
+                total += mixed(tempering * own, listed.odds[w], listed.elsewhere[w]) - listed.far[w]
         out[n] += total
 
 
@@ -147,12 +147,12 @@ def far_from(
     reads = np.add.reduceat(np.append(hits, 0), first[:-1]) * (np.diff(first) > 0) if len(first) > 1 else np.zeros(0)
     out = np.empty(len(reads))
     for w, own in enumerate((tempering * reads * (tables.none[0] - tables.none[1])).tolist()):
-        out[w] = _mixed(own, states[0][w], states[1][w])
+        out[w] = mixed(own, states[0][w], states[1][w])
     return out
 
 
 @numba.njit(cache=True)
-def _mixed(own: float, odds: float, elsewhere: float) -> float:
+def mixed(own: float, odds: float, elsewhere: float) -> float:
     """Log-likelihood of a tag that may not be where the map has it, ``own`` being that if it is."""
     if odds == -np.inf or elsewhere == -np.inf:
         return own
@@ -167,6 +167,7 @@ def _mixed(own: float, odds: float, elsewhere: float) -> float:
 def _fill(
     packed: Packed,
     tables: Tables,
+    logs: NDArray[np.float32],
     columns: Integers,
     half: int,
     gain: NDArray[np.float32],
@@ -174,7 +175,8 @@ def _fill(
 ) -> None:
     none_hit, none_missed = tables.logs[0, 0], tables.logs[0, 1]
     for a in range(len(gain)):
-        at = packed.antennas[a]
+        at, m = packed.antennas[a], packed.which[a]
+        unit = 1.0 / packed.scale[m]
         for h in range(gain.shape[1]):
             table = columns[h, a]
             to_edge = tables.half[table]
@@ -182,11 +184,11 @@ def _fill(
             for i in range(2 * half + 1):
                 for j in range(2 * half + 1):
                     ex, ey = (i - half) * CELL - at[0], (j - half) * CELL - at[1]
-                    along = math.floor((at[3] * ex + at[4] * ey) / CELL + 0.5) + to_edge
-                    across = math.floor((at[3] * ey - at[4] * ex) / CELL + 0.5) + to_edge
+                    along = math.floor(unit * (at[3] * ex + at[4] * ey) / CELL + 0.5) + to_edge
+                    across = math.floor(unit * (at[3] * ey - at[4] * ex) / CELL + 0.5) + to_edge
                     log_q, log_p = none_hit, none_missed
                     if 0 <= along < size and 0 <= across < size:
                         row = tables.logits[tables.start[table] + along * size + across]
-                        log_q, log_p = tables.logs[row, 0], tables.logs[row, 1]
+                        log_q, log_p = logs[m, row, 0], logs[m, row, 1]
                     gain[a, h, i, j] = log_q - log_p
                     missed[a, h, i, j] = log_p - none_missed

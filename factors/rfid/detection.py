@@ -38,6 +38,8 @@ from factors.rfid.tables import (
 )
 from factors.se2 import Array, Integers
 
+ROUNDING = 0.02, 0.05  # of the parameters of a detection model, in tables of places
+KEPT = 3  # such tables, those of the rig among them
 SPARE = 0.5  # m: tags are looked up in a box on a grid of this size, which neighbouring poses share
 
 
@@ -99,6 +101,7 @@ class RfidLikelihood:
     parameters: Array = field(init=False, repr=False)
     _unadjusted: RfidLikelihood = field(init=False, repr=False)
     _last: list[_Last] = field(init=False, repr=False, default_factory=list)
+    _of_parameters: dict[tuple[float, ...], Places] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "packed", self.model.packed())
@@ -193,10 +196,8 @@ class RfidLikelihood:
         ``parameters`` (N, 2 M): of the detection models at each pose, by default its own.
         """
         poses = np.ascontiguousarray(poses, dtype=float)
-        if parameters is None and not self.parameters.any() and not looks.offsets.any():
-            places = self._unadjusted._places
-            if places is not None and places.is_wide(poses):
-                return places.log_likelihood(poses, looks)
+        if parameters is None and not looks.offsets.any() and self._places.is_wide(poses):
+            return self._places.log_likelihood(poses, looks)
         if parameters is None:
             parameters = self._of_poses(len(poses))
         largest = 1.0 if parameters is None else float(np.exp(parameters[:, 0::2].max(initial=0.0)))
@@ -275,10 +276,7 @@ class RfidLikelihood:
 
     def work(self, looks: TagReadCounts) -> int:
         """How many tags are looked at, by all antennas, to tell the likelihood of one pose among poses that are far apart."""
-        places = self._unadjusted._places
-        if places is None:
-            return 4 * len(looks.antennas) * len(self.tags.points)
-        return places.work(looks)
+        return self._unadjusted._places.work(looks)
 
     @cached_property
     def reached(self) -> float:
@@ -287,9 +285,22 @@ class RfidLikelihood:
         reach = np.max(packed.reach[packed.which] + np.hypot(*packed.antennas[:, :2].T), initial=0.0)
         return in_reach(self.tags.points[:, :2], float(reach))
 
-    @cached_property
-    def _places(self) -> Places | None:
-        return Places.of(self.model, self.packed, self._unadjusted._tables, self.tags.points)
+    @property
+    def _places(self) -> Places:
+        """Those of the parameters, which are rounded."""
+        steps = np.tile(ROUNDING, len(self.model.models))
+        rounded = np.rint(self.parameters / steps)
+        kept, key = self._unadjusted._of_parameters, tuple(rounded.tolist())
+        if key not in kept:
+            if len(kept) >= KEPT:
+                del kept[next(k for k in kept if any(k))]
+            parameters = steps * rounded
+            packed, shifts = adjustment.adjusted(self._unadjusted.packed, parameters), levels(parameters[1::2])
+            logs = np.array([logs[k] for logs, k in zip(self._unadjusted._adjusted_logs, shifts, strict=True)])
+            kept[key] = Places.of(
+                self.model, packed, self._unadjusted._tables, logs, self.tags.points, self.tags.normals
+            )
+        return kept[key]
 
     def by_tag(self, pose: Array, looks: TagReadCounts) -> tuple[Array, Array, Array]:
         """The contribution of each tag, all of the map being listed, at one pose (3,): tempered negative log-likelihood (T,),

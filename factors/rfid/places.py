@@ -6,16 +6,20 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factors.rfid import anywhere
+from factors.rfid import anywhere, scattered
 from factors.rfid.anywhere import Listed, PlaceTables, TagSilence
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.index import TagIndex, tag_index
 from factors.rfid.model import Packed, RfidModel
+from factors.rfid.scattered import Antennas, Looked
 from factors.rfid.tables import Tables
 from factors.se2 import Array, Integers
 
 WIDE = 2.0  # times the square that an antenna reaches: poses that touch more are looked at one by one
+PLACED = 25  # work of a pose, besides what it looks at
+BY_ANTENNA = 7  # work of a tag that is looked at by one antenna alone, where there are no tables of places
 
 
 def in_reach(points: Array, reach: float) -> float:
@@ -28,63 +32,92 @@ def in_reach(points: Array, reach: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """A map's tags by place, with the tables of a model whose parameters are as in the rig. ``points`` (T, 2) and ``levels`` (T,)
-    are in the order of the ``index``."""
+    """A map's tags by place, with the tables of a model. ``points`` (T, 3), ``normals`` (T, 2) and ``levels`` (A, T) are in the
+    order of the ``index``. ``tables``: of places, None for models that have none."""
 
-    tables: PlaceTables
+    antennas: Antennas
+    tables: PlaceTables | None
     tempering: float
     index: TagIndex
     points: Array
+    normals: Array
     levels: Integers
     _last: dict[tuple[object, ...], TagSilence] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, model: RfidModel, packed: Packed, antennas: Tables, points: Array) -> Places | None:
-        """For tags at ``points`` (T, 3), from the tables of ``antennas``; None where there are none of places."""
-        tables = anywhere.place_tables(model, packed, antennas)
-        if tables is None:
-            return None
-        found = tag_index(points)
-        ordered = np.ascontiguousarray(points[found.order, :2])
-        return cls(tables, model.tempering, found, ordered, tables.level[found.order])
+    def of(
+        cls, model: RfidModel, packed: Packed, tables: Tables, logs: NDArray[np.float32], points: Array, normals: Array
+    ) -> Places:
+        """For tags at ``points`` (T, 3) with ``normals`` (T, 2), from the ``tables`` of the antennas. ``packed``: the model as it
+        is adjusted; ``logs`` (M, Z, 2): those of the tables for each of its detection models."""
+        index = tag_index(points)
+        reach = np.max(packed.reach[packed.which] + np.hypot(packed.antennas[:, 0], packed.antennas[:, 1]), initial=0.0)
+        order = index.order
+        of_tags = np.ascontiguousarray(points[order]), np.ascontiguousarray(normals[order])
+        found = anywhere.place_tables(model, packed, tables, logs)
+        antennas = Antennas(packed, tables, logs, float(reach))
+        return cls(antennas, found, model.tempering, index, *of_tags, np.ascontiguousarray(tables.level[:, order]))
+
+    @property
+    def reach(self) -> float:
+        """How far [m] an antenna reaches from the robot's middle."""
+        return self.antennas.reach
 
     def is_wide(self, poses: Array) -> bool:
         """Whether poses (N, 3) are so far apart that most tags are in reach of few of them."""
-        reached = np.ptp(poses[:, :2], axis=0) + 2.0 * self.tables.reach
-        return bool(np.prod(reached) > WIDE * (2.0 * self.tables.reach) ** 2)
+        reached = np.ptp(poses[:, :2], axis=0) + 2.0 * self.reach
+        return bool(np.prod(reached) > WIDE * (2.0 * self.reach) ** 2)
 
     def work(self, looks: TagReadCounts) -> int:
         """How many tags are looked at for one pose, on average; one that was read counts as four."""
-        return round(in_reach(self.points, self.tables.reach)) + 4 * int(np.count_nonzero(looks.hits.any(axis=0)))
+        near = in_reach(self.points[:, :2], self.reach)
+        if self.tables is None:
+            return PLACED + round(BY_ANTENNA * len(looks.antennas) * near)
+        return PLACED + round(near) + 4 * int(np.count_nonzero(looks.hits.any(axis=0)))
 
     def log_likelihood(self, poses: Array, looks: TagReadCounts) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3)."""
-        silent = self._silence(looks)
-        listed = self._listed(looks, silent.odds)
-        none = self.tempering * len(self.points) * float(looks.rounds.sum()) * self.tables.none[1]
-        out = np.full(len(poses), none)
-        of_map = self.index, self.points, self.levels
-        anywhere.log_likelihood(poses, *of_map, self.tables, silent, listed, self.tempering, out)
+        odds = looks.others if looks.tags is not None else float(np.sort(looks.odds)[len(looks.odds) // 2])
+        number, rows = self._numbered(looks, odds)
+        of_map = self.index, self.points
+        if self.tables is None:
+            missed = np.sum(looks.rounds * self.antennas.logs[self.antennas.packed.which[looks.antennas], 0, 1])
+            states = number, looks.odds[rows], looks.elsewhere[rows], odds
+            looked = Looked(looks.antennas, looks.rounds, np.ascontiguousarray(looks.hits[:, rows]), *states)
+            out = np.full(len(poses), self.tempering * len(self.points) * float(missed))
+            scattered.log_likelihood(
+                poses, *of_map, self.normals, self.levels, self.antennas, looked, self.tempering, out
+            )
+            return out
+        silent = self._silence(self.tables, looks, odds)
+        listed = self._listed(self.tables, looks, number, rows)
+        out = np.full(len(poses), self.tempering * len(self.points) * float(looks.rounds.sum()) * self.tables.none[1])
+        levels = self.tables.level[self.index.order]
+        anywhere.log_likelihood(poses, *of_map, levels, self.tables, silent, listed, self.tempering, out)
         return out
 
-    def _silence(self, looks: TagReadCounts) -> TagSilence:
+    def _silence(self, tables: PlaceTables, looks: TagReadCounts, odds: float) -> TagSilence:
         """What a silence tells, for the odds that most tags have; that of the last looks is kept."""
-        odds = looks.others if looks.tags is not None else float(np.sort(looks.odds)[len(looks.odds) // 2])
         key = (looks.antennas.tobytes(), looks.rounds.tobytes(), odds)
         if key not in self._last:
             self._last.clear()
-            self._last[key] = anywhere.silence(self.tables, looks.antennas, looks.rounds, odds, self.tempering)
+            self._last[key] = anywhere.silence(tables, looks.antennas, looks.rounds, odds, self.tempering)
         return self._last[key]
 
-    def _listed(self, looks: TagReadCounts, odds: float) -> Listed:
+    def _numbered(self, looks: TagReadCounts, odds: float) -> tuple[NDArray[np.int32], Integers]:
+        """The tags that are not as most are: their number (T,) for each tag of the index, -1 for others, and their rows (W,) in the
+        looks."""
         rows = np.arange(len(looks.odds))
         if looks.tags is None:
             rows = np.flatnonzero(looks.hits.any(axis=0) | (looks.odds != odds) | (looks.elsewhere != 0.0))
         number = np.full(len(self.points), -1, dtype=np.int32)
         number[looks.listed[rows]] = np.arange(len(rows))
+        return number[self.index.order], rows
+
+    def _listed(self, tables: PlaceTables, looks: TagReadCounts, number: NDArray[np.int32], rows: Integers) -> Listed:
         which, antennas = np.nonzero(looks.hits[:, rows].T)
         first = np.searchsorted(which, np.arange(len(rows) + 1)).astype(np.int64)
         hits = looks.hits[:, rows].T[which, antennas]
         states = looks.odds[rows], looks.elsewhere[rows]
-        far = anywhere.far_from(self.tables, first, hits, states, self.tempering)
-        return Listed(number[self.index.order], *states, first, looks.antennas[antennas], hits, far)
+        far = anywhere.far_from(tables, first, hits, states, self.tempering)
+        return Listed(number, *states, first, looks.antennas[antennas], hits, far)

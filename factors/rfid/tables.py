@@ -150,7 +150,7 @@ def add_mixed(each: Floats, odds: Array, elsewhere: Array, tempering: float, out
 
 
 @numba.njit(cache=True)
-def _index(z: float) -> int:
+def logit_row(z: float) -> int:
     """Index of a logit in the tables of logarithms."""
     return int((min(max(z, NEGLIGIBLE_LOGIT), -NEGLIGIBLE_LOGIT) - NEGLIGIBLE_LOGIT) / STEP + 0.5)
 
@@ -163,7 +163,7 @@ def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray
         for i in range(2 * half + 1):
             for j in range(2 * half + 1):
                 z = seen(packed, antenna, (i - half) * CELL, (j - half) * CELL, height, c)[0]
-                table[f, i, j] = _index(z)
+                table[f, i, j] = logit_row(z)
 
 
 @numba.njit(cache=True)
@@ -391,7 +391,7 @@ def _add_direct(
             r = math.sqrt(u * u + across * across + NEAR * NEAR)
             c = -(normals[t, 0] * ex + normals[t, 1] * ey) / math.sqrt(distance2 + 1e-9)
             w = 1.0 - u / r
-            row = _index(logistic_value(b, r, w, z, c))
+            row = logit_row(logistic_value(b, r, w, z, c))
             if apart[t] >= 0:
                 each[apart[t], n] += np.float32(_read(row, hits[t], rounds, logs, changes, n) - rounds * none_missed)
                 total += rounds * none_missed

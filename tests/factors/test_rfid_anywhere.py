@@ -6,19 +6,21 @@ import pytest
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.index import tag_index, within
-from factors.rfid.model import Antenna, BeamModel, RfidModel
+from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel, bake
 
+BEAM = BeamModel()
 ANTENNAS = tuple(Antenna(0.2, 0.1 * k, 1.2, 1.5 * k) for k in range(4))
 WIDTH, DEPTH = 60.0, 40.0
 
 
-def scene(heights, tempering=1.0):
+def scene(heights, tempering=1.0, detection=BEAM):
     """A likelihood, looks from a pose in a hall with tags of all states, and poses near it and anywhere."""
     rng = np.random.default_rng(1)
     count = 300
     points = np.column_stack((rng.uniform(0.0, (WIDTH, DEPTH), (count, 2)), rng.choice(heights, count)))
-    model = RfidModel(ANTENNAS, (BeamModel(),), tempering=tempering)
-    likelihood = RfidLikelihood(model, TagArray(points, np.full(count, np.nan)))
+    model = RfidModel(ANTENNAS, (detection,), tempering=tempering)
+    facing = rng.uniform(-3.0, 3.0, count) if detection.uses_facing else np.full(count, np.nan)
+    likelihood = RfidLikelihood(model, TagArray(points, facing))
     pose = np.array((30.0, 20.0, 0.4))
     chance = np.stack([likelihood.probabilities(pose[None], k)[0] for k in range(len(ANTENNAS))])
     hits = rng.binomial(2, chance)
@@ -44,6 +46,43 @@ def test_poses_anywhere_are_as_likely_as_when_looked_at_alone(heights):
     assert np.std(together - exact) < 0.25
 
 
+LOGISTIC = LogisticModel((5.0, -0.6, -0.1, -3.0, 0.2, -0.1, -0.5, 1.5, 0.3, 0.1, -0.2))
+FACING = bake(LOGISTIC, 6.0, 0.3, (-0.8, 0.0, 0.8), 5)
+
+
+@pytest.mark.parametrize(
+    ("detection", "parameters"),
+    [
+        (BeamModel(), (0.1, -0.6)),
+        (BeamModel(), (-0.2, 0.5)),
+        (LOGISTIC, (0.0, 0.0)),
+        (LOGISTIC, (0.1, -0.6)),
+        (FACING, (0.0, 0.0)),
+        (FACING, (-0.1, 0.4)),
+    ],
+)
+def test_models_that_are_adjusted_or_use_facings_are_looked_at_anywhere_as_well(detection, parameters):
+    plain, looks, near, anywhere = scene((0.4, 1.2, 2.0), 0.7, detection)
+    likelihood = plain.adjusted(np.array(parameters))
+    poses = np.concatenate((near, anywhere))
+    together = likelihood.log_likelihood(poses, looks)
+    exact = -likelihood.score(poses, looks).nll
+    assert np.ptp(exact) > 50.0
+    assert np.mean(together - exact) == pytest.approx(0.0, abs=0.1)
+    assert np.std(together - exact) < 0.4
+
+
+def test_tables_of_adjusted_models_are_few():
+    plain, looks, _, anywhere = scene((1.2,))
+    first = plain.log_likelihood(anywhere, looks)
+    for shift in np.linspace(-1.0, 1.0, 9):
+        plain.adjusted(np.array((0.0, shift))).log_likelihood(anywhere, looks)
+    assert len(plain._of_parameters) == 3
+    tables = plain._places
+    np.testing.assert_array_equal(plain.log_likelihood(anywhere, looks), first)
+    assert plain._places is tables
+
+
 def test_what_is_out_of_reach_tells_what_silence_and_false_reads_tell():
     likelihood, looks, near, _ = scene((1.2,))
     away = np.concatenate((near, near + np.array((500.0, 0.0, 0.0))))
@@ -54,7 +93,6 @@ def test_what_is_out_of_reach_tells_what_silence_and_false_reads_tell():
 def test_only_tags_in_reach_are_counted_as_work():
     likelihood, looks, near, anywhere = scene((1.2,))
     assert likelihood.work(looks) < len(likelihood.tags.points)
-    assert likelihood._places is not None
     assert likelihood._places.is_wide(anywhere)
     assert not likelihood._places.is_wide(near)
 

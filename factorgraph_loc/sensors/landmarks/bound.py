@@ -29,6 +29,7 @@ from factors.update import Correction, landmark_update
 
 GOING_BACK = 5.0  # s that an estimator may go back in time
 SURVEYED_ITERATIONS = 4
+WORK = 8  # of a landmark, for one of many poses that are weighed by a compiled call
 SMALL = 40  # size of error states whose matrices are inverted by compiled code
 SEARCH_INTERVAL = 1.0  # s between searches while the track is suspicious
 
@@ -39,6 +40,10 @@ class LandmarkObservation(ResidualObservation):
     survey prior, which requires several linearisations if the first sighting is from afar."""
 
     surveyed: bool = False
+
+    @property
+    def work(self) -> int:
+        return WORK * self.found
 
     @property
     def iterations(self) -> int | None:  # type: ignore[override]

@@ -15,7 +15,7 @@ from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags, TagEvidence
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.monitor import ScanMonitor, SilenceMonitor
+from factorgraph_loc.sensors.rfid.monitor import ScanMonitor, SettledParameters, SilenceMonitor
 from factorgraph_loc.sensors.rfid.signals import TagSignals
 from factorgraph_loc.sensors.rfid.tag_map import extent
 from factors import positive, se2
@@ -43,6 +43,9 @@ class TagObservation:
     rounds: int = 0  # antenna rounds, for reads and misses
     blocks: tuple[str, ...] = ()
     told: TagEvidence | None = None  # of the states of tags
+    settled: RfidLikelihood | None = (
+        None  # with the detection models for a search, where these are not as in the factor
+    )
     iterations: ClassVar[int] = rfid_update.ITERATIONS
 
     @property
@@ -62,7 +65,10 @@ class TagObservation:
 
     def at_its_time(self) -> Self | None:
         """The reads and misses at their own time; None for strength and phase, whose likelihoods are multimodal."""
-        return None if self.here is None else replace(self, factor=replace(self.factor, seen=self.here))
+        if self.here is None:
+            return None
+        likelihood = self.factor.likelihood if self.settled is None else self.settled
+        return replace(self, factor=replace(self.factor, likelihood=likelihood, seen=self.here))
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -126,6 +132,8 @@ class TagSensor(Sensor):
         self._diagnostics = diagnostics
         self._signals = TagSignals(setup, self.tags)
         self._monitor, self._silence = ScanMonitor(), SilenceMonitor()
+        self._settled = SettledParameters()
+        self._for_search = self.tags.likelihood
         self._heard = -math.inf  # last scan that was checked for silence
 
     def observe(self, m: RfidScan, view: View) -> Iterator[TagObservation]:
@@ -135,9 +143,12 @@ class TagSensor(Sensor):
         here = looks if view.offset is None else looks.moved(view.offset.delta)
         told = None
         if view.localized:
-            told = self.tags.told(here, view.pose, view.covariance, self._estimated(likelihood, view))
+            estimated = self._estimated(likelihood, view)
+            if view.newest and self.suspicious_since is None and self._settled.add(m.t, estimated.parameters):
+                self._for_search = likelihood.adjusted(self._settled.values)
+            told = self.tags.told(here, view.pose, view.covariance, estimated)
             looks, here = self.tags.with_states(looks, told), self.tags.with_states(here, told)
-        yield replace(self._detection(m, here, looks), told=told)
+        yield replace(self._detection(m, here, looks), told=told, settled=self._for_search)
         if self._silence.lasts and view.newest:
             return
         strengths = self._signals.strengths(m)
@@ -220,8 +231,10 @@ class TagSensor(Sensor):
 
     def rewind(self, t: float) -> None:
         self.tags.forget(math.nextafter(t, math.inf))
+        self._settled.forget(math.nextafter(t, math.inf))
 
     def restart(self, t: float) -> None:
+        self._settled.forget(t)
         self._monitor.clear()
         self._signals.clear()
         self.tags.forget(t)

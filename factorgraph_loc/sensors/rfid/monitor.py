@@ -1,15 +1,18 @@
-"""Detection of a lost track, and of a failed reader, from reads and misses."""
+"""Detection of a lost track, and of a failed reader, from reads and misses; and what the detection models were before."""
 
 import itertools
 import math
 from collections import deque
 
+import numpy as np
+
+from factors.se2 import Array
+
 DURATION = 5.0  # s of scans that are tested jointly
 KEPT = 60.0  # s
 SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations; thresholds at which a suspicion begins and ends
 SCANS = 4  # minimum number
-
-
+CHANGED = 0.05  # of a parameter of a detection model
 SILENT = 8.0  # log odds above which silence is attributed to a failure instead of the pose
 
 
@@ -96,3 +99,28 @@ class ScanMonitor:
             if total > most:
                 most, begin = total, t
         return begin
+
+
+class SettledParameters:
+    """The parameters (P,) of detection models as they were estimated some seconds ago: a track that is wrong spoils them before it
+    is found out. They are held until they have changed clearly, as each value needs tables of its own in a search."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[tuple[float, Array]] = deque()
+        self.values: Array = np.zeros(1)  # as in the rig
+
+    def add(self, t: float, estimated: Array) -> bool:
+        """Add an estimate of the time ``t`` [s], later ones are discarded; whether the parameters changed."""
+        self.forget(t)
+        self._waiting.append((t, estimated))
+        changed = False
+        while self._waiting[0][0] < t - DURATION:
+            _, settled = self._waiting.popleft()
+            if np.max(np.abs(settled - self.values), initial=0.0) > CHANGED:
+                self.values, changed = settled, True
+        return changed
+
+    def forget(self, since: float) -> None:
+        """Forget the estimates from the time ``since`` on."""
+        while self._waiting and self._waiting[-1][0] >= since:
+            self._waiting.pop()
