@@ -152,14 +152,14 @@ class Window:
             return np.asarray(self._smoother.marginalCovariance(key))
 
     def covariances(self, poses: Sequence[int]) -> dict[int, Array]:
-        """Marginal covariances of poses by key, from one elimination of the window; none where that fails."""
-        order, known = gtsam.Ordering(), self.linear()[0]
+        """Marginal covariances of poses by key, from one elimination of the window; none where that fails, or has lost one."""
+        order = gtsam.Ordering()
         for key in poses:
             order.push_back(key)
         try:
-            root = known.marginalMultifrontalBayesNet(order, function=gtsam.EliminateQR).matrix()[0]
+            root = self.linear()[0].marginalMultifrontalBayesNet(order, function=gtsam.EliminateQR).matrix()[0]
             rows = np.linalg.inv(root).reshape(len(poses), 3, -1)
-        except (RuntimeError, ValueError, np.linalg.LinAlgError):
+        except (RuntimeError, IndexError, ValueError, np.linalg.LinAlgError):
             return {}
         return dict(zip(poses, rows @ rows.transpose(0, 2, 1), strict=True))
 

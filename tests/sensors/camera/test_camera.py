@@ -184,7 +184,10 @@ def test_a_robot_that_is_carried_elsewhere_goes_on_there(name, kind, log):
     assert 5.0 < lost[0] < 7.0
     assert position_errors(result, made)[result.t > lost[0] + 0.2].max() < 0.15
     final = errors(result.final, made.reference)
-    assert final.position[final.t < 4.9].max() < 0.1
+    before = final.position[final.t < 4.9]
+    # when it was carried is known to some tenths of a second, of which no pose is told
+    assert np.isfinite(before[final.t[final.t < 4.9] < 4.5]).all()
+    assert np.nanmax(before) < 0.1
 
 
 @pytest.mark.parametrize("name", CONFIGS)
