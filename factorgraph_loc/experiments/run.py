@@ -47,7 +47,7 @@ from factorgraph_loc.text import listed
 from factorgraph_loc.version import __version__
 from factors.se2 import Array
 
-_REHEARSAL = 2.0  # s of a log
+_REHEARSAL = 2.0  # s from the first observation
 _REHEARSED: set[tuple[str, tuple[str, ...]]] = set()  # estimators with their sensors, in this process
 
 
@@ -199,18 +199,23 @@ def run(
 def _rehearse(
     config: RunConfig, setup: model_setup.Setup, settings: FileModel, log: Log, prior: PosePrior | None
 ) -> None:
-    """Let an estimator that is thrown away work on the first seconds, so that compiled functions are loaded, or compiled, before
-    times are taken. Once in a process for each estimator and its sensors; an error comes again in the run itself."""
+    """Let an estimator that is thrown away work on the first seconds with observations, so that compiled functions are loaded, or
+    compiled, before times are taken. Once in a process for each estimator and its sensors; an error comes again in the run itself.
+    """
     kind = config.estimator, setup.sensors
     if kind in _REHEARSED:
         return
     _REHEARSED.add(kind)
     begin = _begin(log, setup.sensors, prior)
+    moves = moving(log.streams, "floor", "space", "turn")
+    observes = [s for s in log.streams if s in setup.sensors and s not in moves]
+    seen = [log.streams[s].t + log.rig.time_offset(s) for s in observes]
+    first = min((float(t[t >= begin].min(initial=math.inf)) for t in seen), default=begin)
     guard = Guard(config.estimator)
     with suppress(FglocError), guard, guard.quiet():
         estimator = registry.create(config.estimator, replace(setup, rng=np.random.default_rng(config.seed)), settings)
         ticks = Ticks(begin, config.tick_gap)
-        _CausalRun(guard, estimator, log, setup.sensors, prior, ticks, end=begin + _REHEARSAL).run()
+        _CausalRun(guard, estimator, log, setup.sensors, prior, ticks, end=first + _REHEARSAL).run()
         with guard.telling("the final trajectory"):
             estimator.trajectory()
 

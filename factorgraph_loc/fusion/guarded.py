@@ -61,7 +61,7 @@ class Guard:
     def process(self, estimator: Estimator, measurement: Measurement) -> None:
         """Give a measurement to the estimator."""
         self._last, self._telling, self._of = measurement, "", None
-        if not (self._is_quiet or measurement.is_motion):  # odometry is but kept, which makes no warnings
+        if not (self._is_quiet or measurement.is_motion):  # odometry is only stored, without warnings of NumPy
             with self:
                 estimator.process(measurement)
             return
@@ -107,7 +107,7 @@ def sound(estimate: PoseEstimate) -> PoseEstimate:
     if estimate.status == "unlocalized":
         return estimate
     if estimate.pose.shape != (3,) or estimate.covariance.shape != (3, 3):
-        raise ValueError("the estimate is no pose (3,) with a covariance (3, 3)")
+        raise ValueError("the estimate is not a pose (3,) with a covariance (3, 3)")
     is_finite, is_clear = _judged(estimate.pose, estimate.covariance)
     if not is_finite:
         raise ValueError("the pose is not finite")

@@ -230,8 +230,7 @@ class Incremental:
         return value
 
     def _marginal(self, key: int, spread: Array | None = None, graph: Graph | None = None) -> tuple[Array, Array]:
-        """Estimate and covariance of a variable; ``spread``: its covariance, if that is known; ``graph``: where to report, of a
-        copy."""
+        """Estimate and covariance of a variable; ``spread``: that covariance, if known; ``graph``: where to report, of a copy."""
         value = self._value(key)
         try:
             covariance = self._solver.covariance(key) if spread is None else spread
@@ -259,10 +258,9 @@ class Incremental:
         while self._graph.keyframes[end].t < now - lag:
             end += 1
         leaving = self._graph.keyframes[count:end]
-        keys = [k.key for k in leaving]
         try:
             # of a start of the whole problem the covariance is not asked; a window with points takes long to eliminate
-            spreads = {} if self._is_whole or self._maps else self._solver.covariances(keys)
+            spreads = {} if self._is_whole or self._maps else self._solver.covariances([k.key for k in leaving])
             for k in leaving:
                 spread = self._filtered[k.index][1] if self._is_whole else spreads.get(k.key)
                 self._left.append(self._marginal(k.key, spread))

@@ -70,6 +70,22 @@ def test_a_first_run_is_rehearsed_and_no_result_depends_on_it(log, name, monkeyp
     assert np.array_equal(first.covariances, second.covariances)
 
 
+def test_a_rehearsal_reaches_the_first_observations_of_a_robot_that_drives_blind_at_first(log, monkeypatch):
+    seen = log.streams["bearing_range"]
+    log = replace(log, streams={**log.streams, "bearing_range": replace(seen, t=np.linspace(1.2, 1.9, len(seen.t)))})
+    estimator = estimator_type("ekf")
+    process = estimator.process
+    taken = {}
+    monkeypatch.setattr(
+        estimator, "process", lambda self, m: (taken.setdefault(id(self), []).append(m.sensor), process(self, m))
+    )
+    monkeypatch.setattr("factorgraph_loc.experiments.run._REHEARSED", set())
+    monkeypatch.setattr("factorgraph_loc.experiments.run._REHEARSAL", 0.3)
+    run(log, RunConfig("ekf"))
+    rehearsal, itself = taken.values()
+    assert 0 < rehearsal.count("bearing_range") < itself.count("bearing_range")
+
+
 @pytest.mark.parametrize("start", [None, 0.72])
 @pytest.mark.parametrize("name", ["dead_reckoning", "ekf", "smoother"])
 def test_rows_of_odometry_may_come_at_once(log, name, start, monkeypatch):

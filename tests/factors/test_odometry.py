@@ -152,24 +152,6 @@ def test_a_way_in_one_call_is_state_and_motion():
     assert (motion.duration, motion.still) == (expected.duration, expected.still)
 
 
-def test_a_gaussian_in_one_call_is_predicted_along_the_motion():
-    chain = velocities(OdometryModel(along=Growth(0.1, 0.2, 0.3)), [(0.0, 0.5, 0.1), (0.3, 0.4, -0.2), (1.0, 0.3, 0.3)])
-    start, pose = chain.state(0.2), np.array((1.0, 2.0, 3.0))
-    root = np.random.default_rng(3).standard_normal((6, 6))
-    constants, indices = np.array((0.02, -0.01)), np.array((0, 2))
-    end, at, transition, noise, after = chain.predicted(start, 1.7, pose, root @ root.T, constants, indices, 4)
-    expected, motion = chain.travelled(start, 1.7)
-    delta, by_changes = recalibrated(motion, np.array((0.02, 0.0, -0.01, 0.0)))
-    whole = np.eye(6)
-    whole[:3, :3], whole[:3, 4:] = se2.adjoint(se2.inverse(delta)), by_changes[:, indices]
-    before = whole @ root @ root.T @ whole.T
-    before[:3, :3] += motion.covariance
-    assert end == expected
-    np.testing.assert_array_equal(noise, motion.covariance)
-    for one, other in ((at, se2.compose(pose, delta)), (transition, whole[:3]), (after, before)):
-        np.testing.assert_allclose(one, other, atol=1e-12)
-
-
 def test_old_rows_are_forgotten_and_recent_ones_kept():
     chain = velocities(OdometryModel(), [(0.01 * i, 1.0, 0.0) for i in range(5000)], horizon=5.0)
     assert not chain.add_velocity(30.0, 1.0, 0.0)

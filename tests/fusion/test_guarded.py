@@ -105,8 +105,8 @@ def test_a_sound_estimate_is_the_same():
         (estimate(((1.0, 1.1, 0.0), (1.1, 1.0, 0.0), (0.0, 0.0, 1.0))), "the covariance is not positive definite"),
         (estimate(((1.0, 0.1, 0.0), (0.2, 1.0, 0.0), (0.0, 0.0, 1.0))), "the covariance is not positive definite"),
         (estimate(((1.0, 0.1, 0.0), (0.1, 1.0, 0.0), (math.nan, 0.0, 1.0))), "the covariance is not finite"),
-        (estimate(np.eye(2)), "the estimate is no pose (3,) with a covariance (3, 3)"),
-        (estimate(pose=(0.0, 0.0)), "the estimate is no pose (3,) with a covariance (3, 3)"),
+        (estimate(np.eye(2)), "the estimate is not a pose (3,) with a covariance (3, 3)"),
+        (estimate(pose=(0.0, 0.0)), "the estimate is not a pose (3,) with a covariance (3, 3)"),
     ],
 )
 def test_what_cannot_be_is_a_failure(given, why):
