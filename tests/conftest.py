@@ -11,6 +11,10 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from factorgraph_loc.threads import use_one_thread
+
+# before numpy is imported, as commands do: two threads spend most of their time waiting for each other, ten times the work itself
+use_one_thread()
 # the same examples on each run; no deadline, as the first call of a compiled function takes seconds
 settings.register_profile("seeded", derandomize=True, deadline=None)
 settings.load_profile("seeded")

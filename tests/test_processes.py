@@ -42,7 +42,8 @@ if __name__ == "__main__":
 """
 
 
-def test_a_job_that_fails_or_dies_takes_nothing_with_it():
+def test_a_job_that_fails_or_dies_takes_nothing_with_it(monkeypatch):
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS")
     jobs = ["6 * 7", "1 / 0", "__import__('os')._exit(3)", "__import__('os').environ['OPENBLAS_NUM_THREADS']"]
     outcomes = dict(run_each(eval, jobs, workers=2))
     assert outcomes[0] == 42
