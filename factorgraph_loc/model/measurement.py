@@ -181,7 +181,7 @@ class Motion(Protocol):
         """Keep the rows of the last ``horizon`` seconds."""
 
     def state(self, t: float) -> ChainState:
-        """The state of the integrated odometry at ``t``."""
+        """The state of the integrated odometry at ``t``. Raises RunFailedError if the rows of then are no longer kept."""
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:
         """The relative motion between two states, with its covariance."""

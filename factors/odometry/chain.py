@@ -50,7 +50,7 @@ class OdometryChain:
         self._rows = np.zeros((256, ROW))
         self._knots = np.zeros((256, KNOT))
         self._count = 0
-        self._forgotten = False
+        self.begin = -math.inf  # s, from when on it is known: rows of before were forgotten
         m = model
         scales = (
             m.scale_distance,
@@ -93,8 +93,7 @@ class OdometryChain:
         count = append(self._rows, self._knots, n, t, v, w, self.model.delay, self._constants, self.horizon)
         if count < 0:
             return sum(map(self.add_velocity, t.tolist(), v.tolist(), w.tolist()))
-        self._forgotten = self._forgotten or count < n + len(t)
-        self._count = count
+        self._now_has(count, forgets=count < n + len(t))
         return len(t)
 
     def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array) -> None:
@@ -103,7 +102,8 @@ class OdometryChain:
         self._extend(t[last], INCREMENT, se2.log(moves))
 
     def state(self, t: float) -> ChainState:
-        """The state of the chain at ``t``; before the first knot the motion is unknown and the pose constant."""
+        """The state of the chain at ``t``, which must not be before ``begin``; before the first knot the motion is unknown and
+        the pose constant."""
         return ChainState(*state_at(self._knots, self._count, t, self._constants))
 
     def states(self, t: Array) -> Array:
@@ -172,12 +172,11 @@ class OdometryChain:
         return deltas, covariances
 
     def _insert(self, t: float, kind: float, a: float, b: float, c: float) -> bool:
-        if self._forgotten and t < self._knots[0, T]:
+        if t < self.begin:
             return False
         self._reserve(1)
         count = insert(self._rows, self._knots, self._count, t, kind, a, b, c, self._constants, self.horizon)
-        self._forgotten = self._forgotten or count <= self._count
-        self._count = count
+        self._now_has(count, forgets=count <= self._count)
         return True
 
     def _extend(self, t: Array, kind: float, values: Array) -> None:
@@ -198,5 +197,9 @@ class OdometryChain:
 
     def _forget(self) -> None:
         count = without_old(self._rows, self._knots, self._count, self.horizon)
-        self._forgotten = self._forgotten or count < self._count
+        self._now_has(count, forgets=count < self._count)
+
+    def _now_has(self, count: int, *, forgets: bool) -> None:
         self._count = count
+        if forgets:
+            self.begin = float(self._knots[0, T])

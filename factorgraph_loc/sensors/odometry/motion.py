@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
+from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Measurement, Rows
@@ -113,6 +114,10 @@ class OdometryMotion:
             self._diagnostics.drop_late("odometry", m.count - kept)
 
     def state(self, t: float) -> ChainState:
+        if t < self._chain.begin:
+            raise RunFailedError(
+                f"odometry: the motion at {t:.3f} s was asked for, but only that from {self._chain.begin:.3f} s on is kept"
+            )
         return self._chain.state(t)
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:

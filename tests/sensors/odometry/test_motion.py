@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
@@ -56,3 +57,13 @@ def test_a_covariance_can_be_inverted_however_far_the_robot_seems_to_go(sigma):
         for found in (increment.covariance, covariance):
             np.linalg.cholesky(found)
             assert np.all(np.linalg.eigvalsh(np.linalg.inv(found)) > 0.0)
+
+
+def test_motion_of_before_what_is_kept_is_refused():
+    motion = OdometryMotion(RIG, ("odometry",), Diagnostics())
+    for i in range(300):
+        motion.add(VelocityOdometry(0.1 * i, 1.0, 0.0))
+    moved = motion.relative(motion.state(29.0 - motion.horizon), motion.state(29.0))
+    assert moved.delta[0] == pytest.approx(motion.horizon)
+    with pytest.raises(RunFailedError, match=r"the motion at 10\.000 s was asked for, but only that from"):
+        motion.state(10.0)
