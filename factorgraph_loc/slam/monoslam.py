@@ -25,7 +25,8 @@ from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3, planar_estimate, planar_trajectory
-from factorgraph_loc.sensors.camera.sensor import Pixels
+from factorgraph_loc.sensors.camera.sensor import CAMERAS, Pixels
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.sensors.twist.measurement import in_space, twist_settings
 from factorgraph_loc.slam.monoslam_invariance import carried
@@ -36,6 +37,8 @@ from factorgraph_loc.slam.monoslam_state import Eye, Innovation, MapPoint, SlamS
 from factorgraph_loc.slam.space_motion import (
     PLANAR,
     ROBOT,
+    SHIFT,
+    TURN,
     UPRIGHT,
     Origin,
     RobotState,
@@ -43,6 +46,7 @@ from factorgraph_loc.slam.space_motion import (
     TwistChain,
     about_z,
     constant_velocity,
+    cross,
     measured,
     on_the_floor,
     planar,
@@ -105,8 +109,10 @@ class Monoslam(Filter):
         self._twists = None if twist is None else TwistChain(twist, HORIZON)
         self._planar = settings.planar is not False
         self._wheels = bool(moving(setup.sensors, "floor"))
+        camera = setup.rig.find(CameraSettings) if any(name in setup.sensors for name in CAMERAS) else None
         constants = self._motion.constants.names
         self._scale = constants.index(SCALE) if SCALE in constants else None
+        self._mounting = np.zeros((6, 6)) if camera is None else _of_mounting(camera)
         self._step: Step | None = None
         self._predicted, self._anew = np.empty((0, 0)), False
         # without a map the start is unobservable: its uncertainty is kept out of the state, where it would shrink as the
@@ -323,9 +329,8 @@ class Monoslam(Filter):
         return planar_estimate(self._t, SpacePose(robot.position, robot.rotation, spread))
 
     def _spread(self, robot: RobotState, covariance: Array) -> Array:
-        """The covariance (6, 6) of a pose, including that of the start."""
-        own = covariance[:6, :6]
-        return own if self._origin is None else own + self._origin.of_pose(robot)
+        """The covariance (6, 6) of a pose, including that of the start without a map, or of the camera's mounting in one."""
+        return covariance[:6, :6] + (self._mounting if self._origin is None else self._origin.of_pose(robot))
 
     def _record(self) -> UpdateRecord:
         s = self._state
@@ -339,6 +344,13 @@ class Monoslam(Filter):
     def _kept(self, s: SlamState) -> Array:
         """The covariance (12 + P, 12 + P) of a state without its points."""
         return s.covariance[: s.base, : s.base].copy()
+
+
+def _of_mounting(camera: CameraSettings) -> Array:
+    """The covariance (6, 6) of a pose if images tell that of the camera alone, of what is not known of the mounting."""
+    u, lever = camera.uncertainty, np.eye(6)
+    lever[SHIFT, TURN] = cross(camera.model().position)
+    return (lever * np.square((u.roll, u.pitch, u.yaw, u.x, u.y, u.z))) @ lever.T
 
 
 def _starting(sigmas: Array) -> Array:

@@ -141,7 +141,7 @@ class SpaceBatch(Monoslam):
             ticks,
             np.array([pose.translation() for pose in poses]).reshape(-1, 3),
             np.array([pose.rotation().matrix() for pose in poses]).reshape(-1, 3, 3),
-            np.array([spreads[i] for i in rows]).reshape(-1, 6, 6),
+            np.array([spreads[i] + self._mounting for i in rows]).reshape(-1, 6, 6),
         )
 
     def _matched(self, m: Pixels, match: Match, eye: Eye) -> None:

@@ -42,3 +42,12 @@ def spread_of(residuals: Array) -> dict[str, float]:
         figures[f"{axis}_mad"] = float(np.median(np.abs(residuals[:, i])))
         figures[f"{axis}_rms"] = float(np.sqrt(np.mean(residuals[:, i] ** 2)))
     return figures
+
+
+def common_to_images(residuals: Array, t: Array) -> Array:
+    """Correlation (2,) of the residuals (K, 2) of different points in one image, by coordinate; ``t`` (K,): of the images."""
+    _, which = np.unique(t, return_inverse=True)
+    sums = np.array([np.bincount(which, axis) for axis in residuals.T])
+    pairs = np.sum(np.bincount(which).astype(float) ** 2) - len(t)
+    square = np.sum(residuals**2, axis=0)
+    return np.asarray((np.sum(sums**2, axis=1) - square) / pairs / (square / len(t)))

@@ -13,7 +13,7 @@ from benchmarking.report import Report
 from matplotlib import pyplot as plt
 
 from camera_benchmark.options import CameraOptions
-from camera_benchmark.reprojection import reprojection_residuals, spread_of
+from camera_benchmark.reprojection import common_to_images, reprojection_residuals, spread_of
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.readers import load
@@ -60,13 +60,16 @@ def section(options: CameraOptions) -> Report:
     report.say(
         f"{log.span()[1]:.0f} s, {len(log.streams[TWIST].t)} stamps, {len(t)} times a point is seen, on average "
         f"{len(t) / len(log.streams[TWIST].t):.1f} in an image; pixel noise of {log.rig.camera.pixel_sigma:.1f} px, as the data "
-        "set states. What is seen less what should be from the poses of the motion capture:"
+        "set states. What is seen less what should be from the poses of the motion capture, and how much of it (its variance) "
+        "the points of an image have in common:"
     )
     rows = []
     for eye, sensor in (("left", LEFT), ("right", RIGHT)):
-        found = spread_of(reprojection_residuals(log.reference3, log, sensor))
-        rows.append((eye, *(f"{found[f'{axis}_{how}']:.1f}" for axis in "uv" for how in ("mad", "rms"))))
-    report.table(("eye", "u: median size [px]", "rms", "v: median size [px]", "rms"), rows)
+        residuals = reprojection_residuals(log.reference3, log, sensor)
+        found, common = spread_of(residuals), common_to_images(residuals, t)
+        sizes = [[f"{found[f'{axis}_{how}']:.1f}" for how in ("mad", "rms")] for axis in "uv"]
+        rows.append((eye, *sizes[0], f"{common[0]:.2f}", *sizes[1], f"{common[1]:.2f}"))
+    report.table(("eye", "u: median size [px]", "rms", "common", "v: median size [px]", "rms", "common"), rows)
     outcomes = report.collect(attempt, [Job(log, config) for config in CONFIGS.values()], list(CONFIGS), workers=1)
     results = {label: outcomes[i] for i, label in enumerate(CONFIGS) if i in outcomes}
     report.say(

@@ -8,6 +8,7 @@ it. ``y_k_j`` (4, N, 20) [px] are u and v in the left and in the right image, -1
 ``w_vk_vk_i`` (3, N) are velocity and turn rate in the vehicle frame.
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -113,7 +114,8 @@ def _check_pixels(path: Path, pixels: Array, numbers: Integers) -> None:
 
 def _rig(path: Path, fields: dict[str, Array], t: Array) -> Rig:
     """Both cameras and the noise of the file. Variances of velocities are per row, which gives a random walk. One standard
-    deviation is used for u and v."""
+    deviation is used for u and v. As pixels of one image are off by nearly the same from the poses of the motion capture, it is
+    that of the camera's orientation too."""
     fu, fv, cu, cv, b = (float(fields[name][0, 0]) for name in ("fu", "fv", "cu", "cv", "b"))
     if min(fu, fv, b) <= 0.0:
         raise InputError(f"{path}: fu, fv, b are {fu:g}, {fv:g}, {b:g}, expected more than 0")
@@ -133,7 +135,9 @@ def _rig(path: Path, fields: dict[str, Array], t: Array) -> Rig:
         sigma = float(np.sqrt(fields["y_var"].mean()))
         lens = {"width": SIZE[0], "height": SIZE[1], "fx": fu, "fy": fv, "cx": cu, "cy": cv}
         place = {"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}
-        return parse_model(CameraSettings, {**lens, **place, "pixel_sigma": sigma, "robust": ROBUST}, path)
+        wobble = dict.fromkeys(("roll", "pitch", "yaw"), sigma / math.sqrt(fu * fv))
+        settings = {**lens, **place, "pixel_sigma": sigma, "robust": ROBUST, "uncertainty": wobble}
+        return parse_model(CameraSettings, settings, path)
 
     return Rig(
         name="starry_night",
