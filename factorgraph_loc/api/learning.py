@@ -63,6 +63,7 @@ def build_map(
     prior: str | None = None,
     drop_dead: bool = False,
     points: Settings | None = None,
+    colmap: str | Path | None = None,
     rig: RigLike | None = None,
     world: WorldLike | None = None,
     overwrite: bool = False,
@@ -72,7 +73,10 @@ def build_map(
     For the arguments see :class:`~factorgraph_loc.experiments.maps.MapOptions`.
     """
     maps.picture_beside(Path(out), overwrite=overwrite)
-    options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead, points or {})
+    model = None if colmap is None else Path(colmap)
+    options = maps.MapOptions(
+        of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead, points or {}, model
+    )
     made = maps.make_map(one(log, rig, world), options)
     made.write(Path(out), overwrite=overwrite)
     return made

@@ -110,6 +110,10 @@ def map_(
         bool,
         typer.Option("--drop-dead", help="Only write the log's map without the tags that are believed dead."),
     ] = False,
+    colmap: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Take the points of this model of COLMAP (text) of the log's images."),
+    ] = None,
     prior: Prior = None,
     set_: Settings = None,
     *,
@@ -124,7 +128,7 @@ def map_(
     loaded = source.load_one(log)
     settings = parse_settings(set_ or (), [estimator], [maps.POINTS])
     options = maps.MapOptions(
-        of, estimator, settings[estimator], extend, poses, tag_height, prior, drop_dead, settings[maps.POINTS]
+        of, estimator, settings[estimator], extend, poses, tag_height, prior, drop_dead, settings[maps.POINTS], colmap
     )
     made = maps.make_map(loaded, options, partial(show.progress, counted=False))
     made.write(out, overwrite=overwrite)

@@ -83,7 +83,8 @@ def export(
             "--out",
             "-o",
             metavar="FILE",
-            help="The file to write; its suffix selects the format: .mcap (Foxglove), .tum, .kitti, .g2o or .ply (map).",
+            help="The file to write; its suffix selects the format: .mcap (Foxglove), .tum, .kitti, .g2o, .ply or .colmap (maps; a "
+            "folder).",
         ),
     ],
     *,

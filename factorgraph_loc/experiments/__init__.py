@@ -3,6 +3,7 @@
 __all__ = [
     "active",
     "cluster",
+    "colmap",
     "compare",
     "experiment",
     "experiment_file",

@@ -123,26 +123,19 @@ def map_points(
         )
     except RuntimeError as error:  # raised by GTSAM for an underdetermined system
         raise RunFailedError(f"points and cameras cannot be adjusted: {told(error)}") from error
-    kept, points, covariances, angles = _kept(adjusted, settings)
-    errors = reproject(adjusted.model, adjusted.cameras, points, kept)[0]
-    shift, turn = _moved(posed.cameras, adjusted.cameras)
-    report = PointReport(
-        keyframes=len(posed.frames),
-        pairs=len(pairs),
-        tracks=total,
-        triangulated=int(np.count_nonzero(good)),
-        points=len(points),
-        observations=len(kept),
-        rms=float(np.sqrt(np.mean(errors**2))),
-        mad=float(np.median(np.abs(errors))),
-        parallax=float(np.median(angles)),
-        sigma=float(np.median(_worst(covariances))),
-        shifted=float(np.median(shift)),
-        turned=float(np.median(turn)),
-        focal=adjusted.model.fx,
-    )
-    made = point_map(posed, adjusted.cameras, kept, points, covariances, settings.views)
-    return MadePoints(made, adjusted.cameras, adjusted.model, report)
+    return _made(posed, adjusted, settings, len(pairs), total, int(np.count_nonzero(good)))
+
+
+def points_of_others(
+    model: CameraModel, posed: PosedFrames, tracks: Tracks, points: Array, settings: PointSettings
+) -> MadePoints:
+    """A map of ``points`` (T, 3), as another program has them, seen in ``posed`` frames as ``tracks`` say."""
+    information = np.asarray(np.linalg.inv(posed.covariances), dtype=float)
+    of_cameras, of_points = bundle.marginals(model, posed.cameras, information, tracks, points)
+    errors = reproject(model, posed.cameras, points, tracks)[0]
+    count = len(points)
+    found = Bundle(model, posed.cameras, tracks, points, np.arange(count), errors, of_cameras, of_points)
+    return _made(posed, found, settings, 0, count, count)
 
 
 def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
@@ -179,6 +172,32 @@ def point_map(
         seen_from=cameras.positions[tracks.frame[shown]],
         sizes=np.array([posed.frames[i].sizes[k] for i, k in seen], dtype=float),
     )
+
+
+def _made(
+    posed: PosedFrames, adjusted: Bundle, settings: PointSettings, pairs: int, total: int, triangulated: int
+) -> MadePoints:
+    """The map of the points that fulfil the settings, and the report."""
+    kept, points, covariances, angles = _kept(adjusted, settings)
+    errors = reproject(adjusted.model, adjusted.cameras, points, kept)[0]
+    shift, turn = _moved(posed.cameras, adjusted.cameras)
+    report = PointReport(
+        keyframes=len(posed.frames),
+        pairs=pairs,
+        tracks=total,
+        triangulated=triangulated,
+        points=len(points),
+        observations=len(kept),
+        rms=float(np.sqrt(np.mean(errors**2))),
+        mad=float(np.median(np.abs(errors))),
+        parallax=float(np.median(angles)),
+        sigma=float(np.median(_worst(covariances))),
+        shifted=float(np.median(shift)),
+        turned=float(np.median(turn)),
+        focal=adjusted.model.fx,
+    )
+    made = point_map(posed, adjusted.cameras, kept, points, covariances, settings.views)
+    return MadePoints(made, adjusted.cameras, adjusted.model, report)
 
 
 def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Array, Array]:

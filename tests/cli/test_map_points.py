@@ -6,7 +6,9 @@ import numpy as np
 import polars as pl
 import pytest
 from PIL import Image
+from scipy.spatial import cKDTree
 
+from factorgraph_loc.io.colmap import read_colmap
 from factorgraph_loc.io.native.world_file import read_world
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
@@ -118,6 +120,35 @@ def test_a_map_is_thinned_extended_and_exported(fgloc, gallery_on_disk, tmp_path
     rows = np.array([line.split() for line in body.splitlines()], dtype=float)
     np.testing.assert_allclose(rows[:, :3], read_world(both).points.positions, atol=1e-6)
     assert (rows[:, 4] >= 1).all()
+
+
+def test_a_map_goes_to_colmap_and_comes_back(fgloc, gallery_on_disk, tmp_path):
+    log, out, back, model = (
+        gallery_on_disk(),
+        tmp_path / "a.world.toml",
+        tmp_path / "b.world.toml",
+        tmp_path / "a.colmap",
+    )
+    assert fgloc("map", log, "-o", out).exit_code == 0
+    result = fgloc("export", log, "--world", out, "-o", model)
+    assert result.exit_code == 0, result.output
+    result = fgloc("map", log, "--colmap", model, "-o", back, "--json")
+    assert result.exit_code == 0, result.output
+    given, found = read_world(out).points, read_world(back).points
+    assert json.loads(result.stdout)["points"] == len(found) > 0.7 * len(given)
+    apart, nearest = cKDTree(given.positions).query(found.positions)
+    assert apart.max() < 1e-6
+    # cameras are exact here, and those of the first map were not
+    assert (
+        np.trace(found.covariances, axis1=1, axis2=2).mean()
+        < np.trace(given.covariances[nearest], axis1=1, axis2=2).mean()
+    )
+    again = tmp_path / "b.colmap"
+    assert fgloc("export", log, "--world", back, "-o", again).exit_code == 0
+    assert len(read_colmap(again).points) == len(found)
+    result = fgloc("export", log, "-o", again)
+    assert result.exit_code == 2
+    assert "no points with descriptors" in result.stderr
 
 
 def test_settings_of_points(fgloc, gallery_on_disk, tmp_path):
