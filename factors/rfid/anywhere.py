@@ -73,8 +73,10 @@ def place_tables(model: RfidModel, packed: Packed, tables: Tables, logs: NDArray
     if math.prod(shape) > MOST:
         return None
     gain, missed = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-    _fill(packed, tables, logs, columns, half, gain, missed)
-    return PlaceTables(gain, missed, level.reshape(-1).astype(np.int64), reach, tables.logs[0].copy())
+    q = packed.false_read + packed.span * tables.sigmoids[0]
+    none = np.log(np.array((q, 1.0 - q)))
+    _fill(packed, tables, logs, columns, half, none, gain, missed)
+    return PlaceTables(gain, missed, level.reshape(-1).astype(np.int64), reach, none)
 
 
 def silence(tables: PlaceTables, antennas: Integers, rounds: Integers, odds: float, tempering: float) -> TagSilence:
@@ -170,10 +172,10 @@ def _fill(
     logs: NDArray[np.float32],
     columns: Integers,
     half: int,
+    none: Array,
     gain: NDArray[np.float32],
     missed: NDArray[np.float32],
 ) -> None:
-    none_hit, none_missed = tables.logs[0, 0], tables.logs[0, 1]
     for a in range(len(gain)):
         at, m = packed.antennas[a], packed.which[a]
         unit = 1.0 / packed.scale[m]
@@ -186,9 +188,9 @@ def _fill(
                     ex, ey = (i - half) * CELL - at[0], (j - half) * CELL - at[1]
                     along = math.floor(unit * (at[3] * ex + at[4] * ey) / CELL + 0.5) + to_edge
                     across = math.floor(unit * (at[3] * ey - at[4] * ex) / CELL + 0.5) + to_edge
-                    log_q, log_p = none_hit, none_missed
+                    log_q, log_p = none
                     if 0 <= along < size and 0 <= across < size:
-                        row = tables.logits[tables.start[table] + along * size + across]
+                        row = tables.rows[tables.start[table] + along * size + across]
                         log_q, log_p = logs[m, row, 0], logs[m, row, 1]
                     gain[a, h, i, j] = log_q - log_p
-                    missed[a, h, i, j] = log_p - none_missed
+                    missed[a, h, i, j] = log_p - none[1]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import reduce
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,12 +63,12 @@ class TagReadCounts:
         """The same with ``tags`` listed, ascending, which are among them all that are listed now."""
         if self.tags is None or len(tags) == len(self.tags):
             return self
-        at = np.searchsorted(tags, self.tags)
-        hits = np.zeros((len(self.hits), len(tags)), dtype=np.int64)
-        hits[:, at] = self.hits
-        odds, elsewhere = np.full(len(tags), self.others), np.zeros(len(tags))
-        odds[at], elsewhere[at] = self.odds, self.elsewhere
+        hits, odds, elsewhere = _listing(self.tags, self.hits, self.odds, self.elsewhere, self.others, tags)
         return replace(self, hits=hits, odds=odds, elsewhere=elsewhere, tags=tags)
+
+    def hits_of(self, tags: Integers) -> Integers:
+        """The number of rounds (K, U) that read each of ``tags`` (U,), ascending."""
+        return _listing(self.listed, self.hits, self.odds, self.elsewhere, self.others, tags)[0]
 
     def with_odds(self, odds: Array) -> TagReadCounts:
         """The same with log-odds ``odds`` (T,) of all tags of the map."""
@@ -80,7 +82,7 @@ def together(parts: list[TagReadCounts]) -> TagReadCounts:
         return parts[0]
     tags = parts[0].tags
     if tags is not None:
-        tags = np.unique(np.concatenate([p.listed for p in parts]))
+        tags = reduce(union, [p.listed for p in parts])
         odds = np.full(len(tags), parts[0].others)
         for p in reversed(parts):
             odds[np.searchsorted(tags, p.listed)] = p.odds
@@ -97,3 +99,38 @@ def together(parts: list[TagReadCounts]) -> TagReadCounts:
         tags,
         parts[0].others,
     )
+
+
+@numba.njit(cache=True)
+def union(some: Integers, others: Integers) -> Integers:
+    """All numbers of either, which are ascending both."""
+    out = np.empty(len(some) + len(others), np.int64)
+    i = j = count = 0
+    while i < len(some) or j < len(others):
+        if j == len(others) or (i < len(some) and some[i] <= others[j]):
+            out[count] = some[i]
+            j += j < len(others) and some[i] == others[j]
+            i += 1
+        else:
+            out[count] = others[j]
+            j += 1
+        count += 1
+    return out[:count]
+
+
+@numba.njit(cache=True)
+def _listing(
+    listed: Integers, hits: Integers, odds: Array, elsewhere: Array, others: float, tags: Integers
+) -> tuple[Integers, Array, Array]:
+    """Hits, odds and elsewhere of ``tags``, of which not all are listed, nor all that are listed among them."""
+    new_hits = np.zeros((len(hits), len(tags)), np.int64)
+    new_odds, new_elsewhere = np.full(len(tags), others), np.zeros(len(tags))
+    i = 0
+    for u in range(len(tags)):
+        while i < len(listed) and listed[i] < tags[u]:
+            i += 1
+        if i < len(listed) and listed[i] == tags[u]:
+            for k in range(len(hits)):
+                new_hits[k, u] = hits[k, i]
+            new_odds[u], new_elsewhere[u] = odds[i], elsewhere[i]
+    return new_hits, new_odds, new_elsewhere

@@ -10,32 +10,23 @@ lost by the unknown state (Louis, JRSS B 44(2), 1982, eq. 3.2').
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field, replace
+import math
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import se2
-from factors.rfid import adjustment
+from factors.rfid import adjustment, weighing
 from factors.rfid import kernels as rfid_kernels
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.index import TagIndex, tag_index, within
+from factors.rfid.counts import TagReadCounts, union
+from factors.rfid.index import Corner, TagIndex, near, tag_index, within
 from factors.rfid.kernels import terms
 from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed, RfidModel
 from factors.rfid.places import Places, in_reach
-from factors.rfid.tables import (
-    Array32,
-    Changes,
-    Floats,
-    Tables,
-    add_log_likelihood,
-    add_mixed,
-    adjusted_logs,
-    levels,
-    make_tables,
-)
+from factors.rfid.tables import Tables, make_tables
 from factors.se2 import Array, Integers
 
 ROUNDING = 0.02, 0.05  # of the parameters of a detection model, in tables of places
@@ -80,11 +71,10 @@ class NearTags(NamedTuple):
 
 
 class _Last(NamedTuple):
-    """The tags that mattered last, in a box from ``low`` to ``high`` (2,)."""
+    """The tags that mattered last, in a box."""
 
     looks: TagReadCounts
-    low: Array
-    high: Array
+    box: tuple[Corner, Corner]
     near: NearTags
 
 
@@ -117,7 +107,7 @@ class RfidLikelihood:
 
     def prepare(self) -> None:
         """Make the tables now, which is done once, and not when they are first needed."""
-        for name in ("_tables", "_adjusted_logs", "_places"):
+        for name in ("_tables", "_places"):
             getattr(self._unadjusted, name)
 
     def joint_score(self, pose: Array, parameters: Array, looks: TagReadCounts) -> Score:
@@ -145,52 +135,32 @@ class RfidLikelihood:
         """The tags that are in reach of poses (N, 3), or of others within a ``margin`` [m] of these, and those that are listed."""
         if looks.tags is None:
             return NearTags(looks, (self.tags.points, self.tags.normals, *looks.arrays), (0.0, 0.0, 0.0))
-        reach = margin + _reach(packed, looks)
         # on a grid, so that the same tags count whatever was looked at before: to the last bit, sums depend on them
-        low = SPARE * np.floor((poses[:, :2].min(axis=0) - reach) / SPARE)
-        high = SPARE * np.ceil((poses[:, :2].max(axis=0) + reach) / SPARE)
+        box = _box(poses, margin + _reach(packed, looks.offsets, looks.antennas))
         last = self._unadjusted._last
-        if last and last[0].looks is looks and np.all(last[0].low == low) and np.all(last[0].high == high):
+        if last and last[0].looks is looks and last[0].box == box:
             return last[0].near
-        tags = np.union1d(within(self._unadjusted._index, low, high), looks.tags)
+        tags = union(within(self._unadjusted._index, *box), looks.tags)
         listed = looks.listing(tags)
         of_tags = self.tags.points[tags], self.tags.normals[tags]
         count = self.model.tempering * (len(self.tags.points) - len(tags))
         nll, _, _, mean, spread = terms(packed, NEGLIGIBLE_LOGIT, 1.0, 0, int(looks.rounds.sum()))
         found = NearTags(listed, (*of_tags, *listed.arrays), (count * nll, count * mean, count * spread))
-        last[:] = [_Last(looks, low, high, found)]
+        last[:] = [_Last(looks, box, found)]
         return found
 
     def displaced(self, poses: Array, looks: TagReadCounts, tags: NDArray[np.int64], shifts: Array) -> Array:
         """Tempered log-likelihood (U, K) of what was seen of U ``tags`` if each were ``shifts`` (K, 2) from where the map has it,
         relative to a silence out of reach: the mean of the likelihood over poses (N, 3)."""
-        count = len(tags) * len(shifts)
-        points = np.repeat(self.tags.points[tags], len(shifts), axis=0)
-        points[:, :2] += np.tile(shifts, (len(tags), 1))
-        array = TagArray(points, np.repeat(self.tags.facing[tags], len(shifts)))
-        listed = looks.listing(np.union1d(looks.listed, tags))
-        hits = np.repeat(listed.hits[:, np.searchsorted(listed.listed, tags)], len(shifts), axis=1)
-        level = np.repeat(self._unadjusted._tables.level[:, tags], len(shifts), axis=1)
-        # in double precision, as the last bit of a single decides in which cell of a table a tag is
-        each = np.zeros((count, len(poses)))
-        tables = self._unadjusted._tables._replace(level=level)
-        self._add(
-            poses,
-            replace(looks, hits=hits),
-            array,
-            tables,
-            np.arange(count),
-            np.zeros(len(poses)),
-            each,
-            self._of_poses(len(poses)),
+        found = np.empty((len(tags), len(shifts)))
+        of_tags = self._of_tags(tags, looks.hits_of(tags))
+        weighing.displaced(
+            *self._tabled, poses, looks.arrays[:3], of_tags, shifts, self.model.tempering, self.parameters[None], found
         )
-        found = self.model.tempering * each
-        most = found.max(axis=1)
-        mean = most + np.log(np.mean(np.exp(found - most[:, None]), axis=1))
-        return np.asarray(mean.reshape(len(tags), len(shifts)))
+        return found
 
     def log_likelihood(self, poses: Array, looks: TagReadCounts, parameters: Array | None = None) -> Array:
-        """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.tables`, :mod:`factors.rfid.anywhere`):
+        """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.weighing`, :mod:`factors.rfid.anywhere`):
         for particles.
 
         ``parameters`` (N, 2 M): of the detection models at each pose, by default its own.
@@ -198,73 +168,37 @@ class RfidLikelihood:
         poses = np.ascontiguousarray(poses, dtype=float)
         if parameters is None and not looks.offsets.any() and self._places.is_wide(poses):
             return self._places.log_likelihood(poses, looks)
-        if parameters is None:
-            parameters = self._of_poses(len(poses))
-        largest = 1.0 if parameters is None else float(np.exp(parameters[:, 0::2].max(initial=0.0)))
+        parameters = self.parameters[None] if parameters is None else np.ascontiguousarray(parameters)
         packed = self._unadjusted.packed
-        tables = self._unadjusted._tables
+        largest = float(np.exp(parameters[:, 0::2].max(initial=0.0)))
         around = self.around(poses, looks, packed._replace(reach=largest * packed.reach))
-        looks, tags = around.looks, self.tags
-        if looks.tags is not None:
-            tags = TagArray(around.arrays[0], self.tags.facing[looks.tags])
-            tables = tables._replace(level=tables.level[:, looks.tags])
-        reach = _reach(packed._replace(reach=largest * packed.reach), looks)
-        near = _in_box(tags.points, poses, reach) | looks.hits.any(axis=0)
-        which = np.flatnonzero((looks.odds > -np.inf) & (looks.elsewhere > -np.inf) & near)
-        apart = np.full(len(looks.odds), -1, dtype=np.int64)
-        apart[which] = np.arange(len(which))
-        out = np.zeros(len(poses))
-        each = np.zeros((len(which), len(poses)), dtype=np.float32)
-        self._add(poses, looks, tags, tables, apart, out, each, parameters)
-        out *= self.model.tempering
-        out -= around.unlisted[0]
-        if len(which):
-            add_mixed(each, looks.odds[which], looks.elsewhere[which], self.model.tempering, out)
+        near = around.looks
+        silence = terms(packed, NEGLIGIBLE_LOGIT, 1.0, 0, int(looks.rounds.sum()))[0]
+        out = np.full(len(poses), -self.model.tempering * len(self.tags.points) * silence)
+        of_tags = self._of_tags(near.listed, near.hits)
+        states = near.odds, near.elsewhere
+        weighing.add_log_likelihood(
+            *self._tabled, poses, near.arrays[:3], of_tags, states, self.model.tempering, parameters, out
+        )
         return out
 
-    def _add(
-        self,
-        poses: Array,
-        looks: TagReadCounts,
-        tags: TagArray,
-        tables: Tables,
-        apart: NDArray[np.int64],
-        out: Array,
-        each: Floats,
-        parameters: Array | None,
-    ) -> None:
-        """Add all looks at ``tags``, see :func:`~factors.rfid.tables.add_log_likelihood`."""
-        packed = self._unadjusted.packed
-        for i in range(len(looks.antennas)):
-            at = poses if not looks.offsets[i].any() else se2.compose(poses, looks.offsets[i])
-            seen = (tags.points, tags.normals, looks.hits[i], int(looks.rounds[i]))
-            antenna = int(looks.antennas[i])
-            changes = None if parameters is None else self._changes(parameters, antenna)
-            add_log_likelihood(packed, tables, antenna, at, *seen, apart, out, each, changes)
+    @property
+    def _tabled(self) -> tuple[Packed, Tables]:
+        return self._unadjusted.packed, self._unadjusted._tables
 
-    def _of_poses(self, count: int) -> Array | None:
-        """The parameters (N, 2 M), the same at ``count`` poses; None where they change nothing."""
-        return np.broadcast_to(self.parameters, (count, len(self.parameters))) if self.parameters.any() else None
-
-    def _changes(self, parameters: Array, antenna: int) -> Changes:
-        """What ``parameters`` (N, 2 M) make of the tables of an antenna."""
-        packed = self._unadjusted.packed
-        m = int(packed.which[antenna])
-        logs = self._unadjusted._adjusted_logs[m]
-        return Changes(np.exp(-parameters[:, 2 * m]), levels(parameters[:, 2 * m + 1]), logs)
-
-    @cached_property
-    def _adjusted_logs(self) -> list[Array32]:
-        return [adjusted_logs(self.packed, peak) for peak in self.packed.peak]
+    def _of_tags(self, tags: Integers, hits: Integers) -> tuple[Array, Array, Integers, Integers]:
+        """Points, normals, tables and ``hits`` (K, U) of U ``tags``."""
+        return (
+            self.tags.points[tags],
+            self.tags.normals[tags],
+            np.take(self._unadjusted._tables.level, tags, axis=1),
+            hits,
+        )
 
     def reachable(self, poses: Array, looks: TagReadCounts, margin: float) -> NDArray[np.int64]:
         """Places in the map, ascending, of the tags within a ``margin`` [m] of the reach of an antenna from any of the poses."""
-        reach = margin + _reach(self.packed, looks)
-        low, high = poses[:, :2].min(axis=0), poses[:, :2].max(axis=0)
-        tags = within(self._unadjusted._index, low - reach, high + reach)
-        points = self.tags.points[tags, :2]
-        beyond = np.maximum(np.maximum(low - points, points - high), 0.0)
-        return np.asarray(tags[np.hypot(*beyond.T) < reach])
+        reach = margin + _reach(self.packed, looks.offsets, looks.antennas)
+        return near(self._unadjusted._index, self.tags.points, poses, reach)
 
     @cached_property
     def _index(self) -> TagIndex:
@@ -294,12 +228,8 @@ class RfidLikelihood:
         if key not in kept:
             if len(kept) >= KEPT:
                 del kept[next(k for k in kept if any(k))]
-            parameters = steps * rounded
-            packed, shifts = adjustment.adjusted(self._unadjusted.packed, parameters), levels(parameters[1::2])
-            logs = np.array([logs[k] for logs, k in zip(self._unadjusted._adjusted_logs, shifts, strict=True)])
-            kept[key] = Places.of(
-                self.model, packed, self._unadjusted._tables, logs, self.tags.points, self.tags.normals
-            )
+            packed = adjustment.adjusted(self._unadjusted.packed, steps * rounded)
+            kept[key] = Places.of(self.model, packed, self._unadjusted._tables, self.tags.points, self.tags.normals)
         return kept[key]
 
     def by_tag(self, pose: Array, looks: TagReadCounts) -> tuple[Array, Array, Array]:
@@ -321,13 +251,22 @@ class RfidLikelihood:
         return out
 
 
-def _reach(packed: Packed, looks: TagReadCounts) -> float:
-    """How far [m] the antennas reach at most from the pose that looks are relative to."""
-    way = float(np.max(np.hypot(looks.offsets[:, 0], looks.offsets[:, 1]), initial=0.0))
-    return way + float(np.max(packed.reach[packed.which] + np.hypot(*packed.antennas[:, :2].T)))
+@numba.njit(cache=True)
+def _reach(packed: Packed, offsets: Array, antennas: Integers) -> float:
+    """How far [m] the antennas reach at most from the pose that looks (K,) are relative to."""
+    way = farthest = 0.0
+    for k in range(len(antennas)):
+        way = max(way, math.hypot(offsets[k, 0], offsets[k, 1]))
+    for a in range(len(packed.which)):
+        lever = math.hypot(packed.antennas[a, 0], packed.antennas[a, 1])
+        farthest = max(farthest, packed.reach[packed.which[a]] + lever)
+    return way + farthest
 
 
-def _in_box(points: Array, poses: Array, reach: float) -> NDArray[np.bool_]:
-    """Which points (T, 3) are within ``reach`` [m] of the box that holds poses (N, 3)."""
-    low, high = poses[:, :2].min(axis=0), poses[:, :2].max(axis=0)
-    return np.asarray(np.all((points[:, :2] > low - reach) & (points[:, :2] < high + reach), axis=1))
+@numba.njit(cache=True)
+def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
+    """The corners of the box that holds what is within ``reach`` [m] of poses (N, 3), on the grid."""
+    low_x, low_y = poses[:, 0].min() - reach, poses[:, 1].min() - reach
+    high_x, high_y = poses[:, 0].max() + reach, poses[:, 1].max() + reach
+    low = SPARE * math.floor(low_x / SPARE), SPARE * math.floor(low_y / SPARE)
+    return low, (SPARE * math.ceil(high_x / SPARE), SPARE * math.ceil(high_y / SPARE))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numba
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from factors.se2 import Array, Integers
 
 CELL = 2.0  # m
+Corner = tuple[float, float]
 MOST_CELLS = 1 << 20  # a map that is wider has larger cells
 
 
@@ -39,11 +41,6 @@ def tag_index(points: Array) -> TagIndex:
     return TagIndex(low, cell, columns, start, np.argsort(number, kind="stable"))
 
 
-def within(index: TagIndex, low: Array, high: Array) -> NDArray[np.int64]:
-    """Places, ascending, of the tags in the cells that a box from ``low`` to ``high`` (2,) [m] touches."""
-    return np.sort(_within(index, low[0], low[1], high[0], high[1]))
-
-
 @numba.njit(cache=True, inline="always")
 def cells(index: TagIndex, low: float, high: float, axis: int, count: int) -> tuple[int, int]:
     """First and last of ``count`` cells along an axis that an interval touches; the last is before the first if none is."""
@@ -55,10 +52,11 @@ def cells(index: TagIndex, low: float, high: float, axis: int, count: int) -> tu
 
 
 @numba.njit(cache=True)
-def _within(index: TagIndex, low_x: float, low_y: float, high_x: float, high_y: float) -> NDArray[np.int64]:
+def within(index: TagIndex, low: Array | Corner, high: Array | Corner) -> NDArray[np.int64]:
+    """Places, ascending, of the tags in the cells that a box from ``low`` to ``high`` (2,) [m] touches."""
     rows = (len(index.start) - 1) // index.columns
-    first_x, last_x = cells(index, low_x, high_x, 0, index.columns)
-    first_y, last_y = cells(index, low_y, high_y, 1, rows)
+    first_x, last_x = cells(index, low[0], high[0], 0, index.columns)
+    first_y, last_y = cells(index, low[1], high[1], 1, rows)
     count = 0
     for y in range(first_y, last_y + 1):
         if last_x >= first_x:
@@ -70,4 +68,20 @@ def _within(index: TagIndex, low_x: float, low_y: float, high_x: float, high_y: 
             for k in range(index.start[y * index.columns + first_x], index.start[y * index.columns + last_x + 1]):
                 out[count] = index.order[k]
                 count += 1
+    out.sort()
     return out
+
+
+@numba.njit(cache=True)
+def near(index: TagIndex, points: Array, poses: Array, reach: float) -> NDArray[np.int64]:
+    """Places, ascending, of the tags at ``points`` (T, 3) within ``reach`` [m] of the box that holds poses (N, 3)."""
+    low_x, high_x, low_y, high_y = poses[:, 0].min(), poses[:, 0].max(), poses[:, 1].min(), poses[:, 1].max()
+    tags = within(index, (low_x - reach, low_y - reach), (high_x + reach, high_y + reach))
+    count = 0
+    for t in tags:
+        x, y = points[t, 0], points[t, 1]
+        dx, dy = max(low_x - x, 0.0, x - high_x), max(low_y - y, 0.0, y - high_y)
+        if math.sqrt(dx * dx + dy * dy) < reach:
+            tags[count] = t
+            count += 1
+    return tags[:count]

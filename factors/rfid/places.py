@@ -14,7 +14,7 @@ from factors.rfid.counts import TagReadCounts
 from factors.rfid.index import TagIndex, tag_index
 from factors.rfid.model import Packed, RfidModel
 from factors.rfid.scattered import Antennas, Looked
-from factors.rfid.tables import Tables
+from factors.rfid.tables import Tables, logs_of
 from factors.se2 import Array, Integers
 
 WIDE = 2.0  # times the square that an antenna reaches: poses that touch more are looked at one by one
@@ -45,11 +45,10 @@ class Places:
     _last: dict[tuple[object, ...], TagSilence] = field(default_factory=dict)
 
     @classmethod
-    def of(
-        cls, model: RfidModel, packed: Packed, tables: Tables, logs: NDArray[np.float32], points: Array, normals: Array
-    ) -> Places:
+    def of(cls, model: RfidModel, packed: Packed, tables: Tables, points: Array, normals: Array) -> Places:
         """For tags at ``points`` (T, 3) with ``normals`` (T, 2), from the ``tables`` of the antennas. ``packed``: the model as it
-        is adjusted; ``logs`` (M, Z, 2): those of the tables for each of its detection models."""
+        is adjusted."""
+        logs = logs_of(packed)
         index = tag_index(points)
         reach = np.max(packed.reach[packed.which] + np.hypot(packed.antennas[:, 0], packed.antennas[:, 1]), initial=0.0)
         order = index.order

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from factors.rfid.anywhere import mixed
 from factors.rfid.index import TagIndex, cells
 from factors.rfid.kernels import FAST
-from factors.rfid.model import LOGISTIC, NEAR, Packed, logistic_value
-from factors.rfid.tables import CELL, Tables, logit_row
+from factors.rfid.model import Packed
+from factors.rfid.tables import Tables, row_of
 from factors.se2 import Array, Integers
 
 
@@ -113,27 +113,8 @@ def log_likelihood(
 @numba.njit(cache=True, inline="always")
 def _row(model: Antennas, antenna: int, along: float, across: float, height: float, facing: float, level: int) -> int:
     """The row of the tables of logarithms for a tag, placed along and across the antenna's heading, with its height and facing."""
-    packed, tables = model.packed, model.tables
-    m = packed.which[antenna]
-    if along * along + across * across >= packed.reach[m] ** 2:
+    m = model.packed.which[antenna]
+    if along * along + across * across >= model.packed.reach[m] ** 2:
         return 0
-    unit = 1.0 / packed.scale[m]
-    along, across = unit * along, unit * across
-    if packed.kinds[m] == LOGISTIC:
-        above = height - packed.antennas[antenna, 2]
-        cp, sp = packed.antennas[antenna, 5], packed.antennas[antenna, 6]
-        u, z = cp * along + sp * above, cp * above - sp * along
-        r = math.sqrt(u * u + across * across + NEAR * NEAR)
-        return logit_row(logistic_value(packed.parameters[m], r, 1.0 - u / r, z, facing))
-    half, layers = tables.half[level], tables.facings[level]
-    size = 2 * half + 1
-    i = min(max(int(along / CELL + half + 0.5), 0), size - 1)
-    j = min(max(int(across / CELL + half + 0.5), 0), size - 1)
-    place = tables.start[level] + i * size + j
-    if layers == 1:
-        return int(tables.logits[place])
-    f = (facing + 1.0) * 0.5 * (layers - 1)
-    below = min(int(f), layers - 2)
-    low = np.float64(tables.logits[place + below * size * size])
-    high = np.float64(tables.logits[place + (below + 1) * size * size])
-    return int(low + (f - below) * (high - low) + 0.5)
+    unit = 1.0 / model.packed.scale[m]
+    return row_of(model.packed, model.tables, antenna, level, unit * along, unit * across, height, facing)

@@ -17,15 +17,17 @@ scan is used twice.
 import math
 from collections import deque
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.se2 import Array
+from factors import se2_kernels
+from factors.se2 import Array, Integers
 
 KEPT = 200.0  # s of evidence that can be taken back
 BELIEVED = 0.5  # probability above which a tag is believed to be dead, or moved
 PITCH, FARTHEST = 0.5, 1.5  # m: of the grid of displacements, and the largest of them
-DEAD, MOVED = 1, 2  # columns of the weights: as surveyed, dead, and moved to each place
+DEAD = 1  # column of the weights: as surveyed, dead, and moved to each place
 
 
 def displacements() -> Array:
@@ -40,14 +42,6 @@ def _log(probability: float) -> float:
     return math.log(probability) if probability > 0.0 else -math.inf
 
 
-def _log_sum(rows: Array) -> Array:
-    """Logarithms (N,) of the sums of what ``rows`` (N, K) are the logarithms of."""
-    most = rows.max(axis=1)
-    safe = np.where(most > -np.inf, most, 0.0)
-    with np.errstate(divide="ignore"):
-        return np.asarray(safe + np.log(np.sum(np.exp(rows - safe[:, None]), axis=1)))
-
-
 class TagStates:
     """The states of T tags. ``dead`` and ``moved``: prior probabilities, together below 1, that a tag is so; ``prior``: the
     log-odds of both."""
@@ -60,7 +54,7 @@ class TagStates:
         self.prior = float(_log(dead + moved) - prior[0])
         self._odds = np.full(count, self.prior)
         # time, tags, and what they told of each state
-        self._told: deque[tuple[float, NDArray[np.int64], NDArray[np.float32]]] = deque()
+        self._told: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
         self._heard = -math.inf
 
     @property
@@ -68,7 +62,7 @@ class TagStates:
         """Log-odds (T,) of dead or moved against as surveyed."""
         return self._odds.copy()
 
-    def odds_of(self, tags: NDArray[np.int64]) -> Array:
+    def odds_of(self, tags: Integers) -> Array:
         """Those (U,) of U ``tags``."""
         return np.asarray(self._odds[tags])
 
@@ -78,60 +72,105 @@ class TagStates:
         return self._heard
 
     @property
-    def doubtful(self) -> NDArray[np.int64]:
-        """The tags that are more likely dead or moved than not."""
-        return np.flatnonzero(self._odds > 0.0)
+    def doubtful(self) -> Integers:
+        """The tags that are dead or moved with a probability above :data:`BELIEVED`."""
+        return np.flatnonzero(self._odds > math.log(BELIEVED / (1.0 - BELIEVED)))
 
     @property
     def suspects(self) -> dict[int, float]:
-        """The tags that are dead or moved with a probability above :data:`BELIEVED`, which is told."""
-        tags = np.flatnonzero(self._odds > math.log(BELIEVED / (1.0 - BELIEVED)))
+        """The probability of each of these, which is told."""
+        tags = self.doubtful
         return dict(zip(tags.tolist(), (1.0 / (1.0 + np.exp(-self._odds[tags]))).tolist(), strict=True))
 
     def was_read(self, tag: int) -> bool:
         """Whether a tag was read, which is not dead then."""
         return bool(self._weights[tag, DEAD] == -np.inf)
 
-    def hear(self, t: float, tags: NDArray[np.int64]) -> None:
+    def hear(self, t: float, tags: Integers) -> None:
         """Tags (R,) were read at ``t``: they are not dead."""
         if len(tags):
-            dying = tags[self._weights[tags, DEAD] > -np.inf]
-            self._weights[dying, DEAD] = -np.inf
-            self._weigh(dying)
+            _hear(self._weights, self._odds, tags)
             self._heard = max(self._heard, t)
 
-    def expect(self, tags: NDArray[np.int64], told: Array) -> Array:
+    def expect(self, tags: Integers, told: Array) -> Array:
         """The log-likelihood (U,) of what was seen of U ``tags``, of those that are dead or moved. ``told`` (U, 1 + K): the
         log-likelihoods if they are as surveyed, and at each place, relative to a silence out of range."""
-        weights = self._weights[tags, DEAD:]
-        after = weights.copy()
-        after[:, 1:] += told[:, 1:]
-        with np.errstate(invalid="ignore"):
-            return np.nan_to_num(_log_sum(after) - _log_sum(weights), nan=-np.inf, neginf=-np.inf)
+        return _expected(self._weights, tags, told)
 
-    def learn(self, t: float, tags: NDArray[np.int64], told: Array) -> None:
+    def learn(self, t: float, tags: Integers, told: Array) -> None:
         """Take what was ``told`` (U, 1 + K) of U ``tags`` at ``t``, see :meth:`expect`."""
         if len(tags):
             self._told.append((t, tags, told.astype(np.float32)))
-            self._add(tags, self._told[-1][2])
+            _learn(self._weights, self._odds, tags, self._told[-1][2], 1.0)
         while self._told and self._told[0][0] < t - KEPT:
             self._told.popleft()
 
     def forget(self, since: float) -> None:
         """Take back what was learnt since ``since``, at most :data:`KEPT` seconds: the robot was elsewhere, or it will be processed
         again. That a tag was read is kept."""
-        kept: deque[tuple[float, NDArray[np.int64], NDArray[np.float32]]] = deque()
+        kept: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
         for row in self._told:
             if row[0] < since:
                 kept.append(row)
             else:
-                self._add(row[1], -row[2])
+                _learn(self._weights, self._odds, row[1], row[2], -1.0)
         self._told = kept
 
-    def _add(self, tags: NDArray[np.int64], told: NDArray[np.float32]) -> None:
-        self._weights[tags, 0] += told[:, 0]
-        self._weights[tags, MOVED:] += told[:, 1:]
-        self._weigh(tags)
 
-    def _weigh(self, tags: NDArray[np.int64]) -> None:
-        self._odds[tags] = _log_sum(self._weights[tags, DEAD:]) - self._weights[tags, 0]
+@numba.njit(cache=True)
+def sigma_poses(pose: Array, root: Array) -> Array:
+    """The poses (6, 3) that lie a column of ``root`` (3, 3) before and behind ``pose`` (3,)."""
+    out = np.empty((6, 3))
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(6):
+        sign = 1.0 if i < 3 else -1.0
+        x, y, turned = se2_kernels.exp(sign * root[0, i % 3], sign * root[1, i % 3], sign * root[2, i % 3])
+        out[i] = pose[0] + c * x - s * y, pose[1] + s * x + c * y, se2_kernels.wrapped(pose[2] + turned)
+    return out
+
+
+@numba.njit(cache=True)
+def _log_sum(weights: Array, told: Array) -> float:
+    """The logarithm of the sum of all that ``weights`` and what is ``told``, which is added to all but the first, stand for."""
+    most = weights[0]
+    for k in range(1, len(weights)):
+        most = max(most, weights[k] + told[k])
+    if most == -np.inf:
+        return -math.inf
+    total = math.exp(weights[0] - most)
+    for k in range(1, len(weights)):
+        total += math.exp(weights[k] + told[k] - most)
+    return float(most + math.log(total))
+
+
+@numba.njit(cache=True)
+def _expected(weights: Array, tags: Integers, told: Array) -> Array:
+    out, nothing = np.empty(len(tags)), np.zeros(told.shape[1])
+    for u in range(len(tags)):
+        before = _log_sum(weights[tags[u], DEAD:], nothing)
+        out[u] = -np.inf if before == -np.inf else _log_sum(weights[tags[u], DEAD:], told[u]) - before
+    return out
+
+
+@numba.njit(cache=True)
+def _hear(weights: Array, odds: Array, tags: Integers) -> None:
+    """That ``tags`` are not dead."""
+    for t in tags:
+        if weights[t, DEAD] > -np.inf:
+            weights[t, DEAD] = -np.inf
+            odds[t] = _odds(weights[t])
+
+
+@numba.njit(cache=True)
+def _learn(weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32], sign: float) -> None:
+    for u in range(len(tags)):
+        of_tag = weights[tags[u]]
+        of_tag[0] += sign * told[u, 0]
+        for k in range(1, told.shape[1]):
+            of_tag[DEAD + k] += sign * told[u, k]
+        odds[tags[u]] = _odds(of_tag)
+
+
+@numba.njit(cache=True)
+def _odds(weights: Array) -> float:
+    return float(_log_sum(weights[DEAD:], np.zeros(len(weights) - DEAD)) - weights[0])

@@ -89,6 +89,25 @@ def test_tables_are_near_the_likelihood(name: str) -> None:
     assert np.abs(found - exact).mean() < 0.05 * np.abs(exact).mean()
 
 
+@pytest.mark.parametrize("name", MODELS)
+def test_many_looks_at_many_tags_add_up(name: str) -> None:
+    """Tables multiply the likelihoods of looks and of tags before they take logarithms: of 600 poses, 100 rounds and 1,500 tags."""
+    likelihood, looks = scene(MODELS[name])
+    poses = POSE + np.random.default_rng(1).normal(size=(600, 3)) * 0.3
+    often = replace(looks, rounds=50 * looks.rounds, hits=50 * looks.hits)
+    expected = likelihood.log_likelihood(poses, looks)
+    assert likelihood.log_likelihood(poses, often) == pytest.approx(50.0 * expected, rel=1e-8)
+    tags = likelihood.tags
+    copied = TagArray(np.tile(tags.points, (100, 1)), np.tile(tags.facing, 100))
+    mixed = replace(looks, odds=np.linspace(-3.0, 3.0, 15), elsewhere=np.linspace(-5.0, 0.0, 15))
+    expected = likelihood.log_likelihood(poses, mixed)
+    mixed = replace(
+        mixed, hits=np.tile(mixed.hits, 100), odds=np.tile(mixed.odds, 100), elsewhere=np.tile(mixed.elsewhere, 100)
+    )
+    found = RfidLikelihood(likelihood.model, copied).log_likelihood(poses, mixed)
+    assert found == pytest.approx(100.0 * expected, rel=1e-8)
+
+
 def test_one_read_and_one_silence_by_hand() -> None:
     tags = TagArray(np.array(((2.0, 0.5, 1.0), (3.0, -1.0, 1.0))), np.full(2, np.nan))
     likelihood = RfidLikelihood(RfidModel((Antenna(z=1.0),), (BeamModel(),), 0.01, 0.02, 0.5), tags)

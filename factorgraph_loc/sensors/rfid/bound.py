@@ -147,7 +147,8 @@ class TagSensor(Sensor):
             if view.newest and self.suspicious_since is None and self._settled.add(m.t, estimated.parameters):
                 self._for_search = likelihood.adjusted(self._settled.values)
             told = self.tags.told(here, view.pose, view.covariance, estimated)
-            looks, here = self.tags.with_states(looks, told), self.tags.with_states(here, told)
+            looks = self.tags.with_states(looks, told)
+            here = looks if view.offset is None else looks.moved(view.offset.delta)
         yield replace(self._detection(m, here, looks), told=told, settled=self._for_search)
         if self._silence.lasts and view.newest:
             return

@@ -11,10 +11,10 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.tag_map import TagMap, tag_map
-from factors import positive, se2
-from factors.rfid.counts import TagReadCounts
+from factors import positive
+from factors.rfid.counts import TagReadCounts, union
 from factors.rfid.detection import RfidLikelihood
-from factors.rfid.tag_states import FARTHEST, TagStates
+from factors.rfid.tag_states import FARTHEST, TagStates, sigma_poses
 from factors.se2 import Array, Integers
 
 CONFIRMED = (
@@ -88,12 +88,13 @@ class KnownTags:
                 reads.append((rows[number], place))
         if unknown:
             diagnostics.ignore("tag not in the map", unknown)
-        row, read = np.array(reads, dtype=np.int64).reshape(-1, 2).T
-        self.states.hear(m.t, np.unique(read))
+        self.states.hear(m.t, np.array(sorted({place for _, place in reads}), dtype=np.int64))
         self._tell()
-        tags = np.union1d(read, self.states.doubtful)
+        tags = np.array(sorted({*(place for _, place in reads), *self.states.doubtful.tolist()}), dtype=np.int64)
+        number = {place: i for i, place in enumerate(tags.tolist())}
         hits = np.zeros((len(used), len(tags)), dtype=np.int64)
-        np.add.at(hits, (row, np.searchsorted(tags, read)), 1)
+        for row, place in reads:
+            hits[row, number[place]] += 1
         odds = self.states.odds_of(tags)
         # what is read of a tag that is believed to have moved tells nothing of an unknown pose
         elsewhere = np.where(hits.any(axis=0) & (odds <= 0.0), -np.inf, 0.0)
@@ -103,16 +104,16 @@ class KnownTags:
     def told(self, looks: TagReadCounts, pose: Array, covariance: Array, likelihood: RfidLikelihood) -> TagEvidence:
         """What looks tell of the tags in reach at a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3); ``likelihood``:
         with the detection models as they are estimated to be."""
-        root = WIDENED * math.sqrt(3.0) * positive.root(covariance)
-        poses = se2.compose(pose, se2.exp(np.concatenate((root.T, -root.T))))
-        tags = np.union1d(likelihood.reachable(poses, looks, FARTHEST), looks.heard)
+        poses = sigma_poses(pose, WIDENED * math.sqrt(3.0) * positive.root(covariance))
+        tags = union(likelihood.reachable(poses, looks, FARTHEST), looks.heard)
         tags = tags[self.states.odds_of(tags) > -np.inf]
         shifts = np.concatenate((np.zeros((1, 2)), self.states.shifts))
-        return TagEvidence(tags, likelihood.displaced(poses, looks, tags, shifts), np.isin(tags, looks.heard))
+        heard = np.asarray(looks.hits_of(tags).any(axis=0))
+        return TagEvidence(tags, likelihood.displaced(poses, looks, tags, shifts), heard)
 
     def with_states(self, looks: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
         """The looks at tags that may be dead or moved, of which they tell ``evidence``."""
-        looks = looks.listing(np.union1d(looks.listed, evidence.tags))
+        looks = looks.listing(union(looks.listed, evidence.tags))
         at = np.searchsorted(looks.listed, evidence.tags)
         odds, elsewhere = looks.odds.copy(), looks.elsewhere.copy()
         odds[at] = self.states.odds_of(evidence.tags)

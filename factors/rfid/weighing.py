@@ -1,0 +1,279 @@
+"""Likelihoods of reads and misses for many poses that are near each other, as particles, from tables.
+
+The looks of all antennas at a tag are the factors of one product, of which only the whole has a logarithm. The inner loops run over
+poses, which access nearby cells of a table for one tag, and use vector registers: also for logarithms and exponentials, which the
+library computes one by one.
+"""
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.rfid.adjustment import MOST_CERTAIN
+from factors.rfid.kernels import FAST
+from factors.rfid.model import LOGISTIC, NEGLIGIBLE_LOGIT, Packed
+from factors.rfid.tables import CELL, Tables, row_of
+from factors.se2 import Array, Integers
+
+BLOCK = 512  # poses at a time, so that what is needed of them stays in the cache
+FARTHEST = 20.0  # log of the ratio of two likelihoods of which the smaller one does not count
+LEAST = 1e-12  # probability of a read, and of a miss
+PRODUCT = 20  # factors of at least LEAST, of which a product is no underflow
+SHIFT = 0.05  # of the logit of a model's peak, to which it is rounded, as in tables of places
+MIXED = 500  # factors up to two, of which a product is no overflow
+
+_Looks = tuple[Array, Integers, Integers]  # offsets, antennas and rounds of read counts
+_Tags = tuple[Array, Array, Integers, Integers]  # points, normals, tables (A, T) and hits (K, T)
+_MANTISSA, _HALF = 0x000FFFFFFFFFFFFF, 0x3FE0000000000000  # bits of a number, and of 0.5
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def add_log_likelihood(
+    packed: Packed,
+    tables: Tables,
+    poses: Array,
+    looks: _Looks,
+    tags: _Tags,
+    states: tuple[Array, Array],
+    tempering: float,
+    parameters: Array,
+    out: Array,
+) -> None:
+    """Add to ``out`` (N,) the tempered log-likelihood of read counts of T tags, above that of a silence out of reach, for poses
+    (N, 3). ``states``: ``odds`` and ``elsewhere`` (T,), see :mod:`factors.rfid.tag_states`; ``parameters`` (N or 1, 2 M): of the
+    detection models at each pose."""
+    odds, elsewhere = states
+    seen = np.empty(len(odds), np.bool_)
+    _near(packed, poses, looks, tags, parameters, seen)
+    size = min(BLOCK, len(poses))
+    at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
+    own, product, room, mixed = np.empty(size), np.empty(size), np.empty(size), np.ones(size)
+    for first in range(0, len(poses), size):
+        count = min(size, len(poses) - first)
+        found = out[first : first + count]
+        _place(packed, poses[first : first + count], looks, parameters, first, at, models)
+        factors = 0
+        for t in range(len(odds)):
+            if not seen[t]:
+                continue
+            _of_tag(packed, tables, at, models, count, looks, tags, t, own, product, room)
+            if odds[t] == -np.inf or elsewhere[t] == -np.inf:
+                for n in range(count):
+                    found[n] += tempering * own[n]
+                continue
+            other = odds[t] + elsewhere[t]
+            both = max(odds[t], 0.0) + math.log1p(math.exp(-abs(odds[t])))
+            for n in range(count):
+                surveyed = tempering * own[n]
+                found[n] += max(surveyed, other) - both
+                mixed[n] *= 1.0 + _exp(-min(abs(surveyed - other), FARTHEST))
+            factors += 1
+            if factors == MIXED:
+                _add_logs(mixed, count, found)
+                factors = 0
+        _add_logs(mixed, count, found)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def displaced(
+    packed: Packed,
+    tables: Tables,
+    poses: Array,
+    looks: _Looks,
+    tags: _Tags,
+    shifts: Array,
+    tempering: float,
+    parameters: Array,
+    out: Array,
+) -> None:
+    """Fill ``out`` (T, S) with the tempered log-likelihoods, above that of a silence out of reach, of what was seen of T tags, each
+    moved by ``shifts`` (S, 2): the logarithm of the mean over poses (N, 3)."""
+    each = len(poses)
+    size = len(shifts) * each
+    # what is seen of a tag that was moved is what is seen of the map's from poses that were moved the other way
+    moved = np.empty((size, 3))
+    for i in range(size):
+        shift, pose = shifts[i // each], poses[i % each]
+        moved[i, 0], moved[i, 1], moved[i, 2] = pose[0] - shift[0], pose[1] - shift[1], pose[2]
+    at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
+    own, product, room = np.empty(size), np.empty(size), np.empty(size)
+    _place(packed, moved, looks, parameters, 0, at, models)
+    for t in range(len(out)):
+        _of_tag(packed, tables, at, models, size, looks, tags, t, own, product, room)
+        for i in range(len(shifts)):
+            most = mean = 0.0
+            for n in range(i * each, (i + 1) * each):
+                most = own[n] if n == i * each else max(most, own[n])
+            for n in range(i * each, (i + 1) * each):
+                mean += math.exp(tempering * (own[n] - most)) / each
+            out[t, i] = tempering * most + math.log(mean)
+
+
+@numba.njit(cache=True)
+def _near(packed: Packed, poses: Array, looks: _Looks, tags: _Tags, parameters: Array, seen: NDArray[np.bool_]) -> None:
+    """Which tags (T,) are read, or in reach of any of the poses."""
+    offsets, antennas, _ = looks
+    points, hits = tags[0], tags[3]
+    reach = 0.0
+    for k in range(len(antennas)):
+        a, m = packed.antennas[antennas[k]], packed.which[antennas[k]]
+        way = math.sqrt(offsets[k, 0] ** 2 + offsets[k, 1] ** 2) + math.sqrt(a[0] ** 2 + a[1] ** 2)
+        reach = max(reach, way + packed.reach[m] * math.exp(np.max(parameters[:, 2 * m])))
+    low_x = high_x = poses[0, 0]
+    low_y = high_y = poses[0, 1]
+    for n in range(1, len(poses)):
+        low_x, high_x = min(low_x, poses[n, 0]), max(high_x, poses[n, 0])
+        low_y, high_y = min(low_y, poses[n, 1]), max(high_y, poses[n, 1])
+    for t in range(len(points)):
+        x, y = points[t, 0], points[t, 1]
+        dx, dy = max(low_x - x, 0.0, x - high_x), max(low_y - y, 0.0, y - high_y)
+        seen[t] = dx * dx + dy * dy < reach * reach
+        for k in range(len(antennas)):
+            seen[t] |= hits[k, t] > 0
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def _place(
+    packed: Packed, poses: Array, looks: _Looks, parameters: Array, first: int, at: Array, models: Array
+) -> None:
+    """For each look ``at`` (K, 4, N): place of the antenna, cosine and sine of its heading; and for each of ``models`` (M, 2, N):
+    one over the scale of the range, and rate of the probabilities, at poses (N, 3) whose parameters begin at row ``first``."""
+    offsets, antennas, _ = looks
+    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    for n in range(len(poses)):
+        row = first + n if len(parameters) > 1 else 0
+        for m in range(len(models)):
+            certain = min(packed.peak[m], MOST_CERTAIN)
+            shift = SHIFT * np.rint(parameters[row, 2 * m + 1] / SHIFT)
+            models[m, 0, n] = math.exp(-parameters[row, 2 * m])
+            models[m, 1, n] = packed.span / (certain + (1.0 - certain) * math.exp(-shift))
+    for k in range(len(antennas)):
+        a, (dx, dy, turn) = packed.antennas[antennas[k]], offsets[k]
+        c1, s1 = math.cos(turn), math.sin(turn)
+        dx, dy = dx + c1 * a[0] - s1 * a[1], dy + s1 * a[0] + c1 * a[1]
+        c1, s1 = c1 * a[3] - s1 * a[4], s1 * a[3] + c1 * a[4]
+        x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
+        for n in range(len(poses)):
+            x[n], y[n] = poses[n, 0] + cosine[n] * dx - sine[n] * dy, poses[n, 1] + sine[n] * dx + cosine[n] * dy
+            c[n], s[n] = cosine[n] * c1 - sine[n] * s1, sine[n] * c1 + cosine[n] * s1
+
+
+@numba.njit(cache=True)
+def _silence(packed: Packed, rounds: Integers) -> float:
+    """Log-likelihood of one tag out of reach that is not read."""
+    return float(np.sum(rounds) * math.log1p(-packed.false_read - packed.span / (1.0 + math.exp(-NEGLIGIBLE_LOGIT))))
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def _of_tag(
+    packed: Packed,
+    tables: Tables,
+    at: Array,
+    models: Array,
+    count: int,
+    looks: _Looks,
+    tags: _Tags,
+    t: int,
+    own: Array,
+    product: Array,
+    room: Array,
+) -> None:
+    """The log-likelihood ``own`` (N,) of one tag above that of a silence out of reach."""
+    points, normals, levels, hits = tags
+    _, antennas, rounds = looks
+    own[:count], product[:count] = -_silence(packed, rounds), 1.0
+    factors = 0
+    for k in range(len(antennas)):
+        level = levels[antennas[k], t]
+        model = models[packed.which[antennas[k]]]
+        unit, rate = model[0], model[1]
+        _chances(packed, tables, at[k], unit, count, antennas[k], level, points[t], normals[t], room)
+        for i in range(rounds[k]):
+            if i < hits[k, t]:
+                for n in range(count):
+                    product[n] *= _floored(packed, rate[n], room[n])
+            else:
+                for n in range(count):
+                    product[n] *= 1.0 - _floored(packed, rate[n], room[n])
+            factors += 1
+            if factors % PRODUCT == 0:
+                _add_logs(product, count, own)
+    _add_logs(product, count, own)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def _chances(
+    packed: Packed,
+    tables: Tables,
+    at: Array,
+    unit: Array,
+    count: int,
+    antenna: int,
+    level: int,
+    point: Array,
+    normal: Array,
+    chance: Array,
+) -> None:
+    """The sigmoids (N,) of the model's logits of one tag from one antenna."""
+    x, y, c, s = at[0], at[1], at[2], at[3]
+    tx, ty, height, nx, ny = point[0], point[1], point[2], normal[0], normal[1]
+    if packed.kinds[packed.which[antenna]] == LOGISTIC or tables.facings[level] > 1:
+        reach, sigmoids = packed.reach[packed.which[antenna]], tables.sigmoids
+        for n in range(count):
+            ex, ey = unit[n] * (tx - x[n]), unit[n] * (ty - y[n])
+            along, across, squared, row = c[n] * ex + s[n] * ey, c[n] * ey - s[n] * ex, ex * ex + ey * ey, 0
+            if squared < reach * reach:
+                facing = -(nx * ex + ny * ey) / math.sqrt(squared + 1e-9)
+                row = row_of(packed, tables, antenna, level, along, across, height, facing)
+            chance[n] = sigmoids[row]
+        return
+    half = tables.half[level]
+    width, ends, middle = np.int32(2 * half + 1), np.int32(2 * half), half + 0.5
+    table = tables.chances[tables.start[level] : tables.start[level] + (2 * half + 1) ** 2]
+    cells = np.empty(count, np.int32)  # a loop of its own, in registers, which looking up is not
+    for n in range(count):
+        scale = unit[n] * (1.0 / CELL)
+        ex, ey = scale * (tx - x[n]), scale * (ty - y[n])
+        # constant beyond the edge of the table
+        i = min(max(np.int32(c[n] * ex + s[n] * ey + middle), np.int32(0)), ends)
+        j = min(max(np.int32(c[n] * ey - s[n] * ex + middle), np.int32(0)), ends)
+        cells[n] = i * width + j
+    for n in range(count):
+        chance[n] = table[np.uint32(cells[n])]
+
+
+@numba.njit(cache=True, inline="always")
+def _floored(packed: Packed, rate: float, chance: float) -> float:
+    """Probability of a read."""
+    return float(min(max(packed.false_read + rate * chance, LEAST), 1.0 - LEAST))
+
+
+@numba.njit(cache=True, fastmath=True)
+def _add_logs(values: Array, count: int, out: Array) -> None:
+    """Add the logarithms of positive numbers (N,) to ``out``, to 1e-10; the numbers become one."""
+    room = np.empty(count)
+    bits, mantissas = values.view(np.int64), room.view(np.int64)
+    for n in range(count):
+        mantissas[n] = (bits[n] & _MANTISSA) | _HALF
+    root = math.sqrt(0.5)
+    for n in range(count):
+        exponent = np.int32(bits[n] >> 52) - 1022
+        s = (room[n] - root) / (room[n] + root)
+        z = s * s
+        series = 1.0 + z * (1 / 3 + z * (1 / 5 + z * (1 / 7 + z * (1 / 9 + z * (1 / 11)))))
+        out[n] += 2.0 * s * series + (exponent - 0.5) * math.log(2.0)
+    for n in range(count):
+        values[n] = 1.0
+
+
+@numba.njit(cache=True, inline="always")
+def _exp(x: float) -> float:
+    """The exponential of x from -20 to 0, to 1e-8."""
+    y = x / 64.0
+    e = 1.0 + y * (
+        1.0 + y / 2 * (1.0 + y / 3 * (1.0 + y / 4 * (1.0 + y / 5 * (1.0 + y / 6 * (1.0 + y / 7 * (1.0 + y / 8))))))
+    )
+    e = e * e * e * e * e * e * e * e
+    return float(e * e * e * e * e * e * e * e)
