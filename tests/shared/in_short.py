@@ -10,6 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
+from factorgraph_loc.drawing import figures
 from factorgraph_loc.experiments.execute import run_planned
 
 
@@ -50,8 +51,13 @@ def _sent(what):
 def blank_pictures(monkeypatch):
     """Figures are made, but neither laid out nor drawn: a picture is one blank line, as wide as it would be."""
 
-    def savefig(figure, out, *, format, dpi):
-        Image.new("L", (round(figure.get_figwidth() * dpi), 1), 255).save(out, format=format)
+    def drawn(figure, dpi):
+        with figures.drawing(figure):
+            return Image.new("RGB", (round(figure.get_figwidth() * dpi), 1), "white")
 
-    monkeypatch.setattr(Figure, "savefig", savefig)
+    def draw(*_):
+        pytest.fail("a figure is drawn after all: blank_pictures has to replace what does it")
+
+    monkeypatch.setattr(figures, "_drawn", drawn)
     monkeypatch.setattr(Figure, "draw_without_rendering", lambda _: None)
+    monkeypatch.setattr(Figure, "draw", draw)
