@@ -41,14 +41,11 @@ NOISE = 2.0
 
 NEGLIGIBLE, WIDENED = 1e-4, np.diag((0.1, 0.1, 0.05)) ** 2  # weight of a place that is denied; m, m, rad
 
-# the weight of a clear place, within so many standard deviations of it, and how large those may be at most: m, rad
-CLEAR_WEIGHT, REACH = 0.99, 5.0
-WIDEST_POSITION, WIDEST_HEADING = 0.45, 0.3
+# A place is clear once the robot has been within so much of it, m and rad, with one of these probabilities for its time, s.
+NEAR_POSITION, NEAR_HEADING = 0.5, math.radians(15.0)
+CLEAR = ((0.98, 1.0), (0.9, 4.0))
 CLEAR_OBSERVATIONS, CLEAR_THINGS = 3, 2  # of something, and of different things
-WIDE = 3.0  # m: standard deviation of all particles, of which a share of 1 - CLEAR_WEIGHT may be anywhere
-# s that a place must have been clear, where its standard deviations are at most this share of the largest, and where not
-NARROW, CLEAR_FOR, CLEAR_FOR_WIDE = 0.4, 2.0, 10.0
-
+REACH = 5.0  # standard deviations, within which weight counts for a place that is denied
 
 # Work: of one tag that one particle looks at it is 1, some nanoseconds.
 CHUNK = 1_000_000  # of what is done at once
@@ -84,7 +81,7 @@ class Population:
         self._log_evidence = 0.0
         self._telling = 0  # observations of things that were there
         self._things: set[Hashable] = set()
-        self._clear_since = math.inf
+        self._since = [math.inf for _ in CLEAR]  # when the place had these probabilities first
         self._waiting: deque[_Waiting] = deque()
         self._running: Generator[float, None, None] | None = None
         self._rival = 0.0
@@ -113,14 +110,12 @@ class Population:
 
     @property
     def best(self) -> PosePrior | None:
-        """The pose at the last observation if one hypothesis has been clear for a while, else None."""
-        if self._odometry is None or not math.isfinite(self._clear_since):
+        """The pose at the last observation if one hypothesis is clear, else None."""
+        at = self._odometry
+        if at is None or all(at.t < since + lasts for since, (_, lasts) in zip(self._since, CLEAR, strict=True)):
             return None
         mode = self.hypotheses[0]
-        needed = CLEAR_FOR if self._width(mode) <= NARROW else CLEAR_FOR_WIDE
-        if self._odometry.t < self._clear_since + needed:
-            return None
-        return PosePrior(self._odometry.t, mode.pose, mode.covariance)
+        return PosePrior(at.t, mode.pose, mode.covariance)
 
     @property
     def log_evidence(self) -> float:
@@ -169,7 +164,11 @@ class Population:
         self._hypotheses = None
         self._telling += observation.found > 0
         self._things.update(observation.things)
-        self._clear_since = min(self._clear_since, odometry.t) if self._is_clear() else math.inf
+        near = self._weight_of_best()
+        self._since = [
+            min(since, odometry.t) if near >= enough else math.inf
+            for since, (enough, _) in zip(self._since, CLEAR, strict=True)
+        ]
 
     @property
     def particles(self) -> tuple[Array, Array]:
@@ -183,14 +182,13 @@ class Population:
         rows = systematic(self._cloud.weights, rng, count)
         return kld.jittered(self._cloud.poses, rows, rng)
 
-    def _is_clear(self) -> bool:
+    def _weight_of_best(self) -> float:
+        """The probability that the robot is near the likeliest hypothesis; 0 while too little was seen."""
         if self._telling < CLEAR_OBSERVATIONS or len(self._things) < CLEAR_THINGS or self._cloud is None:
-            return False
-        # what is spread widely as a whole is not one place, and needs no search for modes
-        if np.linalg.eigvalsh(self._cloud.moments[1][:2, :2])[-1] > WIDE**2:
-            return False
-        mode = self.hypotheses[0]
-        return self._weight_near(mode.pose, mode.covariance) >= CLEAR_WEIGHT and self._width(mode) <= 1.0
+            return 0.0
+        error = self._cloud.poses - self.hypotheses[0].pose
+        near = (np.hypot(error[:, 0], error[:, 1]) < NEAR_POSITION) & (np.abs(se2.wrap(error[:, 2])) < NEAR_HEADING)
+        return float(self._cloud.weights[near].sum())
 
     def denies(self, place: PosePrior) -> bool:
         """Whether enough was seen to say that the robot is not at a place, at the time of the last observation."""
@@ -204,12 +202,6 @@ class Population:
         error[:, 2] = se2.wrap(error[:, 2])
         near = np.sum(error * positive.solve(covariance, error.T).T, axis=1) < REACH**2
         return float(self._cloud.weights[near].sum())
-
-    @staticmethod
-    def _width(mode: Mode) -> float:
-        """The standard deviations of a place, as a share of the largest that it may have."""
-        position = math.sqrt(np.linalg.eigvalsh(mode.covariance[:2, :2])[-1])
-        return float(max(position / WIDEST_POSITION, math.sqrt(mode.covariance[2, 2]) / WIDEST_HEADING))
 
     def _predicted(self, cloud: Cloud, start: ChainState, end: ChainState) -> Cloud:
         increment = self._motion.relative(start, end)

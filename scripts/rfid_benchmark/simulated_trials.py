@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 from benchmarking.statistics import first_held
-from benchmarking.trials import BEFORE, HOLD, JUMP, is_right
+from benchmarking.trials import BEFORE, HOLD, JUMP, POSITION, is_right
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.base import Estimator
@@ -18,6 +18,7 @@ from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import SimulationSettings
+from factors.se2 import Array
 
 AWAY = 3.0  # m, least displacement of a kidnapping
 APART = 60.0  # s between the parts of a log that a kidnapping joins
@@ -30,12 +31,14 @@ class SimulatedTrial:
     """One trial. ``seconds``: from the first scan (at the new place) until the estimate is correct and stays so for 10 s,
     whatever its status; ``claimed``: until it first is ``localized`` (correct and localized again, after a kidnapping); NaN if
     never. ``false``: the first claim is wrong; after a kidnapping: it is localized at the deadline without being correct.
+    ``doubt``: the probability by its covariance, at the first claim, that its position is farther off than is right.
     ``busy_ms``: processor time of each tenth of a second of the log, which holds at most one scan of the presets."""
 
     seed: int
     seconds: float
     claimed: float
     false: bool
+    doubt: float = math.nan
     busy_ms: tuple[float, ...] = ()
 
 
@@ -81,8 +84,9 @@ def start_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     claims = np.flatnonzero(np.array(result.status) == "localized")
     claimed = float(result.t[claims[0]]) - first if len(claims) else math.nan
     false = bool(len(claims)) and not bool(good[claims[0]])
+    doubt = beyond(result.covariances[claims[0]], POSITION) if len(claims) else math.nan
     # without the first, which begins before the run
-    return SimulatedTrial(seed, held(result, good, first), claimed, false, tuple(clock.busy_ms[1:]))
+    return SimulatedTrial(seed, held(result, good, first), claimed, false, doubt, tuple(clock.busy_ms[1:]))
 
 
 def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
@@ -107,6 +111,15 @@ def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     late = not seconds <= job.deadline
     false = late and bool(localized[at_deadline]) and not bool(good[at_deadline])
     return SimulatedTrial(seed, seconds, held(result, good & localized, first), false)
+
+
+def beyond(covariance: Array, distance: float) -> float:
+    """The probability that a Gaussian of this ``covariance`` (3, 3) is farther from its mean position than ``distance`` [m]."""
+    angle = math.pi * np.arange(180) / 180.0
+    direction = np.column_stack((np.cos(angle), np.sin(angle)))
+    curvature = np.einsum("ni,ij,nj->n", direction, np.linalg.inv(covariance[:2, :2]), direction)
+    shares = np.exp(-0.5 * distance**2 * curvature) / curvature
+    return float(shares.mean() / np.mean(1.0 / curvature))
 
 
 def held(result: RunResult, good: np.typing.NDArray[np.bool_], first: float) -> float:

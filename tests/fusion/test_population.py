@@ -123,6 +123,35 @@ def test_symmetric_places_stay_ambiguous():
         assert min(np.linalg.norm(m.pose - expected) for m in modes) < 0.6
 
 
+@pytest.mark.parametrize(("spread", "claimed"), [(0.15, 2.0), (0.21, 5.0), (0.3, None)])
+def test_a_place_is_claimed_when_it_is_likely_enough(spread, claimed):
+    """0.996, 0.94 and 0.75 of a Gaussian are within half a metre: from the third observation on, a second or four are enough."""
+
+    class Seen:
+        found, work = 1, 1
+
+        def __init__(self, number, at):
+            self.things, self.at = {number}, at
+
+        def log_likelihood(self, poses, values):
+            if self.at is None:
+                return np.zeros(len(poses))
+            error = se2.log(se2.between(self.at, poses))
+            return -0.5 * np.sum((error / (spread, spread, 0.05)) ** 2, axis=1)
+
+    world = World(scattered(0), 0)
+    seeker = world.seeker()
+    first = None
+    for i in range(12):
+        if i:
+            world.motion.add(VelocityOdometry(i * STEP, 0.0, 0.0))
+        seeker.add(world.motion.state(i * STEP), Seen(i, None if i else START))
+        seeker.advance()
+        if first is None and seeker.best is not None:
+            first = seeker.best.t
+    assert first == claimed
+
+
 def test_no_reads_claim_nothing():
     world = World(scattered(0), 0)
     world.silent = True
