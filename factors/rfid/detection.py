@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -19,6 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import se2
 from factors.rfid import adjustment, weighing
 from factors.rfid import kernels as rfid_kernels
 from factors.rfid.counts import TagReadCounts, union
@@ -63,7 +64,7 @@ class Score(NamedTuple):
 
 class NearTags(NamedTuple):
     """Tags that matter to some poses: the ``looks`` at them, and as ``arrays`` points, normals, and those of the looks;
-    ``unlisted``: negative log-likelihood, its mean and variance, tempered, of all others together."""
+    ``unlisted``: negative log-likelihood, its mean and variance, not tempered, of all others together."""
 
     looks: TagReadCounts
     arrays: tuple[Array, Array, Array, Integers, Integers, Integers, Array, Array]
@@ -105,6 +106,12 @@ class RfidLikelihood:
         object.__setattr__(out, "parameters", np.asarray(parameters, dtype=float))
         return out
 
+    def tempered(self, tempering: float) -> RfidLikelihood:
+        """The same with another exponent, for reads that are more or less correlated."""
+        out = copy.copy(self)
+        object.__setattr__(out, "model", replace(self.model, tempering=tempering))
+        return out
+
     def prepare(self) -> None:
         """Make the tables now, which is done once, and not when they are first needed."""
         for name in ("_tables", "_places"):
@@ -118,7 +125,8 @@ class RfidLikelihood:
         packed, pose = adjustment.adjusted(self._unadjusted.packed, parameters), np.asarray(pose, dtype=float)
         near = self.around(pose[None], looks, packed)
         told = adjustment.score(packed, pose, *near.arrays, self.model.tempering, gradient, information)
-        nll, expected, variance = (np.array([a + b]) for a, b in zip(told, near.unlisted, strict=True))
+        others = self.model.tempering * np.array(near.unlisted)
+        nll, expected, variance = (np.array([a + b]) for a, b in zip(told, others, strict=True))
         return Score(nll, gradient[None], information[None], expected, variance)
 
     def score(self, poses: Array, looks: TagReadCounts) -> Score:
@@ -128,7 +136,7 @@ class RfidLikelihood:
         out = Score(np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n), np.empty(n))
         near = self.around(poses, looks, self.packed)
         rfid_kernels.score(self.packed, poses, *near.arrays, self.model.tempering, *out)
-        nll, expected, variance = near.unlisted
+        nll, expected, variance = self.model.tempering * np.array(near.unlisted)
         return out._replace(nll=out.nll + nll, expected=out.expected + expected, variance=out.variance + variance)
 
     def around(self, poses: Array, looks: TagReadCounts, packed: Packed, margin: float = 0.0) -> NearTags:
@@ -143,7 +151,7 @@ class RfidLikelihood:
         tags = union(within(self._unadjusted._index, *box), looks.tags)
         listed = looks.listing(tags)
         of_tags = self.tags.points[tags], self.tags.normals[tags]
-        count = self.model.tempering * (len(self.tags.points) - len(tags))
+        count = len(self.tags.points) - len(tags)
         nll, _, _, mean, spread = terms(packed, NEGLIGIBLE_LOGIT, 1.0, 0, int(looks.rounds.sum()))
         found = NearTags(listed, (*of_tags, *listed.arrays), (count * nll, count * mean, count * spread))
         last[:] = [_Last(looks, box, found)]
@@ -167,7 +175,7 @@ class RfidLikelihood:
         """
         poses = np.ascontiguousarray(poses, dtype=float)
         if parameters is None and not looks.offsets.any() and self._places.is_wide(poses):
-            return self._places.log_likelihood(poses, looks)
+            return self._places.log_likelihood(poses, looks, self.model.tempering)
         parameters = self.parameters[None] if parameters is None else np.ascontiguousarray(parameters)
         packed = self._unadjusted.packed
         largest = float(np.exp(parameters[:, 0::2].max(initial=0.0)))
@@ -242,6 +250,15 @@ class RfidLikelihood:
         rfid_kernels.by_tag(self.packed, pose, self.tags.points, self.tags.normals, *arrays, nll, gradient, information)
         alpha = self.model.tempering
         return alpha * nll, alpha * gradient, alpha * information
+
+    def expected(self, pose: Array, looks: TagReadCounts) -> tuple[TagReadCounts, Array]:
+        """The looks at the tags that are in reach of a pose (3,) or listed, and the probability (K, C) of a read in each."""
+        near = self.around(pose[None], looks, self.packed)
+        out = np.empty(near.looks.hits.shape)
+        for k, antenna in enumerate(looks.antennas.tolist()):
+            at = se2.compose(pose, looks.offsets[k])[None]
+            rfid_kernels.probabilities(self.packed, antenna, at, *near.arrays[:2], out[k : k + 1])
+        return near.looks, out
 
     def probabilities(self, poses: Array, antenna: int) -> Array:
         """Probability (N, T), floor included, that a round of an antenna reads each tag from poses (N, 3)."""

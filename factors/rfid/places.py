@@ -37,7 +37,6 @@ class Places:
 
     antennas: Antennas
     tables: PlaceTables | None
-    tempering: float
     index: TagIndex
     points: Array
     normals: Array
@@ -55,7 +54,7 @@ class Places:
         of_tags = np.ascontiguousarray(points[order]), np.ascontiguousarray(normals[order])
         found = anywhere.place_tables(model, packed, tables, logs)
         antennas = Antennas(packed, tables, logs, float(reach))
-        return cls(antennas, found, model.tempering, index, *of_tags, np.ascontiguousarray(tables.level[:, order]))
+        return cls(antennas, found, index, *of_tags, np.ascontiguousarray(tables.level[:, order]))
 
     @property
     def reach(self) -> float:
@@ -74,7 +73,7 @@ class Places:
             return PLACED + round(BY_ANTENNA * len(looks.antennas) * near)
         return PLACED + round(near) + 4 * int(np.count_nonzero(looks.hits.any(axis=0)))
 
-    def log_likelihood(self, poses: Array, looks: TagReadCounts) -> Array:
+    def log_likelihood(self, poses: Array, looks: TagReadCounts, tempering: float) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3)."""
         odds = looks.others if looks.tags is not None else float(np.sort(looks.odds)[len(looks.odds) // 2])
         number, rows = self._numbered(looks, odds)
@@ -83,24 +82,22 @@ class Places:
             missed = np.sum(looks.rounds * self.antennas.logs[self.antennas.packed.which[looks.antennas], 0, 1])
             states = number, looks.odds[rows], looks.elsewhere[rows], odds
             looked = Looked(looks.antennas, looks.rounds, np.ascontiguousarray(looks.hits[:, rows]), *states)
-            out = np.full(len(poses), self.tempering * len(self.points) * float(missed))
-            scattered.log_likelihood(
-                poses, *of_map, self.normals, self.levels, self.antennas, looked, self.tempering, out
-            )
+            out = np.full(len(poses), tempering * len(self.points) * float(missed))
+            scattered.log_likelihood(poses, *of_map, self.normals, self.levels, self.antennas, looked, tempering, out)
             return out
-        silent = self._silence(self.tables, looks, odds)
-        listed = self._listed(self.tables, looks, number, rows)
-        out = np.full(len(poses), self.tempering * len(self.points) * float(looks.rounds.sum()) * self.tables.none[1])
+        silent = self._silence(self.tables, looks, odds, tempering)
+        listed = self._listed(self.tables, looks, number, rows, tempering)
+        out = np.full(len(poses), tempering * len(self.points) * float(looks.rounds.sum()) * self.tables.none[1])
         levels = self.tables.level[self.index.order]
-        anywhere.log_likelihood(poses, *of_map, levels, self.tables, silent, listed, self.tempering, out)
+        anywhere.log_likelihood(poses, *of_map, levels, self.tables, silent, listed, tempering, out)
         return out
 
-    def _silence(self, tables: PlaceTables, looks: TagReadCounts, odds: float) -> TagSilence:
+    def _silence(self, tables: PlaceTables, looks: TagReadCounts, odds: float, tempering: float) -> TagSilence:
         """What a silence tells, for the odds that most tags have; that of the last looks is kept."""
-        key = (looks.antennas.tobytes(), looks.rounds.tobytes(), odds)
+        key = (looks.antennas.tobytes(), looks.rounds.tobytes(), odds, tempering)
         if key not in self._last:
             self._last.clear()
-            self._last[key] = anywhere.silence(tables, looks.antennas, looks.rounds, odds, self.tempering)
+            self._last[key] = anywhere.silence(tables, looks.antennas, looks.rounds, odds, tempering)
         return self._last[key]
 
     def _numbered(self, looks: TagReadCounts, odds: float) -> tuple[NDArray[np.int32], Integers]:
@@ -113,10 +110,12 @@ class Places:
         number[looks.listed[rows]] = np.arange(len(rows))
         return number[self.index.order], rows
 
-    def _listed(self, tables: PlaceTables, looks: TagReadCounts, number: NDArray[np.int32], rows: Integers) -> Listed:
+    def _listed(
+        self, tables: PlaceTables, looks: TagReadCounts, number: NDArray[np.int32], rows: Integers, tempering: float
+    ) -> Listed:
         which, antennas = np.nonzero(looks.hits[:, rows].T)
         first = np.searchsorted(which, np.arange(len(rows) + 1)).astype(np.int64)
         hits = looks.hits[:, rows].T[which, antennas]
         states = looks.odds[rows], looks.elsewhere[rows]
-        far = anywhere.far_from(tables, first, hits, states, self.tempering)
+        far = anywhere.far_from(tables, first, hits, states, tempering)
         return Listed(number, *states, first, looks.antennas[antennas], hits, far)

@@ -75,7 +75,7 @@ def updated(
     except np.linalg.LinAlgError:  # rounding made it singular
         found = _updated(*arguments, pose, positive.nearest(covariance), iterations)
     at, posterior, nis, dof, excess, variance, evidence = found
-    nll, expected, spread = near.unlisted
+    nll, expected, spread = likelihood.model.tempering * np.array(near.unlisted)
     return TagUpdate(at, posterior, nis, dof, excess + nll - expected, variance + spread, evidence - nll, values)
 
 

@@ -15,7 +15,7 @@ from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags, TagEvidence
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.monitor import ScanMonitor, SettledParameters, SilenceMonitor
+from factorgraph_loc.sensors.rfid.monitor import BurstMonitor, ScanMonitor, SettledParameters, SilenceMonitor
 from factorgraph_loc.sensors.rfid.signals import TagSignals
 from factorgraph_loc.sensors.rfid.tag_map import extent
 from factors import positive, se2
@@ -132,6 +132,7 @@ class TagSensor(Sensor):
         self._diagnostics = diagnostics
         self._signals = TagSignals(setup, self.tags)
         self._monitor, self._silence = ScanMonitor(), SilenceMonitor()
+        self._bursts = BurstMonitor(self.tags.antennas, len(self.tags.map.names))
         self._settled = SettledParameters()
         self._for_search = self.tags.likelihood
         self._heard = -math.inf  # last scan that was checked for silence
@@ -180,7 +181,18 @@ class TagSensor(Sensor):
             self._monitor.add(t, correction.excess_nll, correction.variance)
         if observation.told is not None and self.suspicious_since is None:
             self.tags.learn(t, observation.told)
+            if view.newest:
+                self._count(observation, view)
         return True
+
+    def _count(self, observation: TagObservation, view: View) -> None:
+        """Count reads and misses against what is expected of them, and temper by how they go together."""
+        assert self.tags.likelihood is not None
+        assert isinstance(observation.factor.seen, TagReadCounts)
+        looks, expected = self._estimated(self.tags.likelihood, view).expected(view.pose, observation.factor.seen)
+        self._bursts.add(observation.t, looks, expected, self.tags.states.odds_of(looks.listed) <= 0.0)
+        if self.tags.temper(1.0 / self._bursts.together):
+            self._for_search = self.tags.likelihood.adjusted(self._settled.values)
 
     def _estimated(self, likelihood: RfidLikelihood, view: View) -> RfidLikelihood:
         """The likelihood with the detection models as they are estimated to be."""
@@ -237,6 +249,7 @@ class TagSensor(Sensor):
     def restart(self, t: float) -> None:
         self._settled.forget(t)
         self._monitor.clear()
+        self._bursts.clear()
         self._signals.clear()
         self.tags.forget(t)
 

@@ -60,10 +60,25 @@ class KnownTags:
         self.likelihood, self.trust = None, 1.0
         if settings is not None:
             model, self.trust = settings.model(), trust(self.map.sigmas, settings.pass_sigma)
+            self._tempering = model.tempering
             self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
         dead, moved = (0.0, 0.0) if settings is None else (settings.dead_tags, settings.moved_tags)
         self.states = TagStates(len(self.map.names), dead, moved)
         self._waiting: deque[tuple[float, Integers, Array]] = deque()  # what reads told since `CONFIRMED` ago
+
+    @property
+    def antennas(self) -> int:
+        """How many antennas the rig has."""
+        return len(self._antennas)
+
+    def temper(self, tempering: float) -> bool:
+        """Use this exponent of the likelihood where it is less than that of the rig; whether it is another one."""
+        assert self.likelihood is not None
+        new = min(self._tempering, tempering) * self.trust
+        if new == self.likelihood.model.tempering:
+            return False
+        self.likelihood = self.likelihood.tempered(new)
+        return True
 
     def looks(self, m: RfidScan, *, count: bool = True) -> TagReadCounts | None:
         """Reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time. Without ``count``,

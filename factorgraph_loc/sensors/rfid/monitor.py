@@ -5,7 +5,9 @@ import math
 from collections import deque
 
 import numpy as np
+from numpy.typing import NDArray
 
+from factors.rfid.counts import TagReadCounts
 from factors.se2 import Array
 
 DURATION = 5.0  # s of scans that are tested jointly
@@ -13,6 +15,10 @@ KEPT = 60.0  # s
 SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations; thresholds at which a suspicion begins and ends
 SCANS = 4  # minimum number
 CHANGED = 0.05  # of a parameter of a detection model
+BLOCK, POSSIBLE = 10.0, 0.01  # s in which reads are counted; least probability of one that is
+INDEPENDENT = 1.5  # ratio of variances up to which reads are taken to be independent
+PRIOR = 50.0  # variance of independent reads that is believed beforehand
+REMEMBERED = 0.95  # share of what was counted that still counts a block later
 SILENT = 8.0  # log odds above which silence is attributed to a failure instead of the pose
 
 
@@ -99,6 +105,44 @@ class ScanMonitor:
             if total > most:
                 most, begin = total, t
         return begin
+
+
+class BurstMonitor:
+    """How many rounds tell as much as one. Reads and misses that go together, behind a person or a shelf, scatter more in blocks of
+    time than independent ones; the ratio of the variances is their worth (McCullagh and Nelder, "Generalized linear models", 1989,
+    section 4.5). Counted for each of A antennas and T tags."""
+
+    def __init__(self, antennas: int, tags: int) -> None:
+        # reads less expected ones, and their variance, in this block
+        self._cells = np.zeros((2, antennas, tags))
+        self._sums = np.full(2, PRIOR)  # of the squares, and of the variances, of all blocks
+        self._begun = -math.inf
+        self._last = -math.inf
+
+    @property
+    def together(self) -> float:
+        """The ratio, 1 where a right model may have it by chance."""
+        found = float(self._sums[0] / self._sums[1])
+        return found if found > INDEPENDENT else 1.0
+
+    def add(self, t: float, looks: TagReadCounts, expected: Array, counts: NDArray[np.bool_]) -> None:
+        """Add looks with the probabilities (K, C) of a read, once; ``counts`` (C,): which of the tags are counted."""
+        if t <= self._last:
+            return
+        self._last = t
+        if t >= self._begun + BLOCK:
+            self._sums = REMEMBERED * self._sums + (np.sum(self._cells[0] ** 2), np.sum(self._cells[1]))
+            self._cells[:] = 0.0
+            self._begun = t
+        told = np.where(counts & (expected > POSSIBLE), looks.rounds[:, None], 0)
+        at = np.ix_(looks.antennas, looks.listed)
+        self._cells[0][at] += np.where(told, looks.hits - told * expected, 0.0)
+        self._cells[1][at] += told * expected * (1.0 - expected)
+
+    def clear(self) -> None:
+        """Forget this block: the track was wrong."""
+        self._cells[:] = 0.0
+        self._begun = -math.inf
 
 
 class SettledParameters:

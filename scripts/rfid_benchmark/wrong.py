@@ -1,0 +1,95 @@
+"""Rigs and maps that are wrong, of which nobody tells: causal errors against those of an estimator that knows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from benchmarking.ensemble import EnsembleJob, run_ensemble
+from benchmarking.report import Options, Report, ratio_cells
+
+from factorgraph_loc.experiments.run import RunConfig
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.simulation.settings import preset
+from rfid_benchmark.blind import with_beam
+
+SEEDS = 10
+FIRST = 4000  # first seed, not used by other sections
+DURATION = 300.0  # s
+CONFIGS = {"particle filter": RunConfig("particle_filter"), "smoother": RunConfig("smoother")}
+BURSTS = {"duration": 5.0, "share": 0.4}
+TOGETHER = 4.5  # rounds that such bursts make worth one
+
+
+@dataclass(frozen=True)
+class Case:
+    """``true``: keys of the antennas' beam in the simulation; ``given``: in the rig at hand. ``misplaced``: share of the tags that
+    are 1 m off; ``bursts``: whether reads and misses come in bursts."""
+
+    what: str
+    given: Mapping[str, float] = field(default_factory=dict)
+    true: Mapping[str, float] = field(default_factory=dict)
+    misplaced: float = 0.0
+    bursts: bool = False
+
+
+CASES = (
+    Case("none"),
+    Case("range 20 % too long", {"r_max": 5.4}),
+    Case("range 20 % too short", {"r_max": 3.6}),
+    Case("read probability 0.9 for 0.5", {"p0": 0.9}, {"p0": 0.5}),
+    Case("a tenth of the tags 1 m off", misplaced=0.1),
+    Case("a quarter of the tags 1 m off", misplaced=0.25),
+    Case("bursts of 5 s, 0.4 of the time", bursts=True),
+    Case(
+        "range 20 % too long, 0.9 for 0.7, a tenth 1 m off, bursts", {"r_max": 5.4, "p0": 0.9}, {"p0": 0.7}, 0.1, True
+    ),
+)
+
+
+def section(options: Options) -> Report:
+    report = Report("wrong", options)
+    seeds = range(FIRST, FIRST + options.count(SEEDS))
+    jobs = {
+        (case.what, knows, seed): job(case, knows, seed) for case in CASES for knows in (False, True) for seed in seeds
+    }
+    labels = [f"{what}, {'known' if knows else 'not known'}, {seed}" for what, knows, seed in jobs]
+    found = report.collect(run_ensemble, list(jobs.values()), labels)
+    outcomes = {key: found[i] for i, key in enumerate(jobs) if i in found}
+    rows = []
+    for name in CONFIGS:
+        for case in CASES:
+            both = [s for s in seeds if (case.what, False, s) in outcomes and (case.what, True, s) in outcomes]
+            mine, theirs = ([outcomes[case.what, knows, s][name] for s in both] for knows in (False, True))
+            if both:
+                causal = ratio_cells([run.causal for run in mine], [run.causal for run in theirs])
+                anees = [f"{np.mean([np.nanmean(run.causal.nees) for run in runs]):.2f}" for runs in (mine, theirs)]
+                unsure = np.mean([1.0 - run.share("localized") for run in mine])
+                rows.append((case.what, name, *causal, *anees, f"{100 * unsure:.0f} %"))
+    report.say(
+        f"`office`, {len(seeds)} worlds of {DURATION:.0f} s. *Ratio*: of the causal error to that of an estimator that knows "
+        "range, read probability, the true places of the tags, and for bursts a tempering, with its 95 % interval over worlds, "
+        "and the largest of a single world"
+    )
+    heads = ("wrong", "estimator", "ratio", "worst", "ANEES", "ANEES, knowing", "not localized")
+    report.table(heads, rows)
+    return report
+
+
+def job(case: Case, knows: bool, seed: int) -> EnsembleJob:
+    faults: dict[str, Any] = {"fading": BURSTS} if case.bursts else {}
+    if not knows:
+        faults["misplaced"] = case.misplaced
+    beam: dict[str, Any] = {"models": {"default": {"kind": "beam", **case.true}}}
+    if case.bursts and knows:
+        beam["tempering"] = 1.0 / TOGETHER
+    changes = {"drive": {"duration": DURATION}, "faults": faults, "rig": {"rfid": beam}}
+    return EnsembleJob(preset("office", changes), seed, CONFIGS, None if knows else partial(told, given=case.given))
+
+
+def told(log: Log, _: int, given: Mapping[str, float]) -> Log:
+    """The log with the rig at hand."""
+    return replace(log, rig=with_beam(log.rig, **given))
