@@ -1,6 +1,7 @@
 """Maps made from logs: landmarks, tags, and 3-D points from images."""
 
 __all__ = [
+    "bends",
     "camera_poses",
     "image_localization",
     "map_figure",

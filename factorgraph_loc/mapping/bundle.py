@@ -110,9 +110,8 @@ def adjust(
         tracks, left = tracks.kept(right)
         points, old, known = points[left], old[left], known.kept(left)
     errors = reproject(model, cameras, points, tracks)[0]
-    of_cameras, of_points = marginals(
-        model, cameras, np.asarray(np.linalg.inv(covariances), dtype=float), tracks, points
-    )
+    information = np.asarray(np.linalg.inv(covariances), dtype=float)
+    of_cameras, of_points = marginals(model, cameras, information, tracks, points, known)
     return Bundle(model, cameras, tracks, points, old, errors, of_cameras, of_points)
 
 
