@@ -8,6 +8,7 @@ import numpy as np
 from factors.se2 import Array
 
 SMALL = 1e-4  # rad; smaller angles use series, against cancellation
+SHORT = 0.5  # rad; of many poses smaller angles use longer series, in less time
 
 
 @numba.njit(cache=True)
@@ -21,6 +22,22 @@ def arc(angle: float) -> tuple[float, float]:
     if abs(angle) < SMALL:
         return 1.0 - angle * angle / 6.0, angle / 2.0
     return math.sin(angle) / angle, 2.0 * math.sin(angle / 2.0) ** 2 / angle
+
+
+@numba.njit(cache=True, inline="always")
+def _arc_of_many(angle: float) -> tuple[float, float]:
+    """:func:`arc` to 1e-12."""
+    if abs(angle) > SHORT:
+        return math.sin(angle) / angle, 2.0 * math.sin(angle / 2.0) ** 2 / angle
+    z = angle * angle
+    p = 1.0 - z / 6 * (1.0 - z / 20 * (1.0 - z / 42 * (1.0 - z / 72 * (1.0 - z / 110))))
+    q = angle / 2 * (1.0 - z / 12 * (1.0 - z / 30 * (1.0 - z / 56 * (1.0 - z / 90 * (1.0 - z / 132)))))
+    return p, q
+
+
+@numba.njit(cache=True, inline="always")
+def _wrapped_of_many(angle: float) -> float:
+    return angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
 
 
 @numba.njit(cache=True)
@@ -72,3 +89,50 @@ def body_to_world(pose: Array, covariance: Array) -> Array:
     out[0, 2] = out[2, 0] = c * covariance[0, 2] - s * covariance[1, 2]
     out[1, 2] = out[2, 1] = s * covariance[0, 2] + c * covariance[1, 2]
     return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def all_moved(poses: Array, delta: Array, twists: Array) -> Array:
+    """Poses (N, 3) composed with ``delta`` (3,), and each then moved by a twist (N, 3) in its own frame."""
+    out, cd, sd = np.empty_like(poses), math.cos(delta[2]), math.sin(delta[2])
+    for n in range(len(poses)):
+        c, s = math.cos(poses[n, 2]), math.sin(poses[n, 2])
+        p, q = _arc_of_many(twists[n, 2])
+        x, y = p * twists[n, 0] - q * twists[n, 1], q * twists[n, 0] + p * twists[n, 1]
+        dx, dy = delta[0] + cd * x - sd * y, delta[1] + sd * x + cd * y
+        out[n, 0], out[n, 1] = poses[n, 0] + c * dx - s * dy, poses[n, 1] + s * dx + c * dy
+        out[n, 2] = _wrapped_of_many(poses[n, 2] + delta[2] + twists[n, 2])
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def twists_to(pose: Array, others: Array) -> Array:
+    """The twists (N, 3) in the frame of a pose (3,) that lead from it to others (N, 3)."""
+    out, c, s = np.empty_like(others), math.cos(pose[2]), math.sin(pose[2])
+    for n in range(len(others)):
+        dx, dy = others[n, 0] - pose[0], others[n, 1] - pose[1]
+        angle = _wrapped_of_many(others[n, 2] - pose[2])
+        p, q = _arc_of_many(angle)
+        x, y, scale = c * dx + s * dy, c * dy - s * dx, 1.0 / (p * p + q * q)
+        out[n, 0], out[n, 1], out[n, 2] = scale * (p * x + q * y), scale * (p * y - q * x), angle
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
+    """Weighted mean (3,), circular in heading, and covariance (3, 3) of poses (N, 3) in the world's frame."""
+    x = y = cosine = sine = 0.0
+    for n in range(len(poses)):
+        x, y = x + weights[n] * poses[n, 0], y + weights[n] * poses[n, 1]
+        cosine, sine = cosine + weights[n] * math.cos(poses[n, 2]), sine + weights[n] * math.sin(poses[n, 2])
+    heading, covariance = math.atan2(sine, cosine), np.zeros((3, 3))
+    xx = xy = xh = yy = yh = hh = 0.0
+    for n in range(len(poses)):
+        dx, dy, dh = poses[n, 0] - x, poses[n, 1] - y, _wrapped_of_many(poses[n, 2] - heading)
+        wx, wy, wh = weights[n] * dx, weights[n] * dy, weights[n] * dh
+        xx, xy, xh = xx + wx * dx, xy + wx * dy, xh + wx * dh
+        yy, yh, hh = yy + wy * dy, yh + wy * dh, hh + wh * dh
+    covariance[0] = xx, xy, xh
+    covariance[1] = xy, yy, yh
+    covariance[2] = xh, yh, hh
+    return np.array((x, y, heading)), covariance

@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.model.belief import Mode
-from factors import positive, se2
+from factors import positive, se2, se2_kernels
+from factors.motion import ChainState
 from factors.se2 import Array
 
 # of a cloud that has collapsed to one point: its covariance must still be one
 MINIMUM_VARIANCE = 1e-10
 LEAST_VARIANCE = 1e-30  # of constants, in their units: particles that all descend from one must not make them exact
+NOWHERE = np.zeros(3)
+NO_ODOMETRY = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 MODES = 5  # at most
 REACH = np.array((1.0, 1.0, 0.6))  # m, m, rad: from the middle of a mode to its ends
 BISECTIONS, SMALLEST = 8, 0.01  # of what is left of a likelihood: to find the share that is taken, and the least of it
@@ -28,7 +31,8 @@ CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad, in which the heaviest place is lo
 class Cloud:
     """``poses`` (N, 3), ``constants`` (N, P) of odometry and sensor, and normalised ``log_weights`` (N,).
 
-    ``parts``: the columns of each block in them. ``localized``: the place is known.
+    ``parts``: the columns of each block in them. ``localized``: the place is known. ``odometry``: that of when the particles were
+    there.
     """
 
     poses: Array
@@ -36,6 +40,7 @@ class Cloud:
     log_weights: Array
     localized: bool = True
     parts: Mapping[str, slice] = field(default_factory=dict)
+    odometry: ChainState = NO_ODOMETRY
 
     @property
     def weights(self) -> Array:
@@ -45,6 +50,17 @@ class Cloud:
     def moments(self) -> tuple[Array, Array]:
         """Mean (3,) and covariance (3, 3) in the world's frame."""
         return pose_moments(self.poses, self.weights)
+
+    @cached_property
+    def joint(self) -> tuple[Array, Array]:
+        """Mean (P,) of the constants, and covariance (3+P, 3+P) of the pose's body-frame perturbation and of them."""
+        _, mean, covariance = self._errors()
+        return mean[3:], covariance
+
+    def _errors(self) -> tuple[Array, Array, Array]:
+        """Of each particle the pose's body-frame perturbation from the mean pose, and the constants: (N, 3+P), with moments."""
+        errors = np.concatenate((se2_kernels.twists_to(self.moments[0], self.poses), self.constants), axis=1)
+        return errors, *vector_moments(errors, self.weights)
 
     def with_block(self, name: str, mean: Array, covariance: Array, rng: np.random.Generator) -> Cloud:
         """With one more block, drawn from a Gaussian with ``mean`` (d,) and ``covariance`` (d, d)."""
@@ -64,8 +80,7 @@ class Cloud:
         """
         weights = self.weights
         middle, _ = self.moments
-        errors = np.concatenate((se2.log(se2.between(middle, self.poses)), self.constants), axis=1)
-        mean, covariance = vector_moments(errors, weights)
+        errors, mean, covariance = self._errors()
         # The covariance of a weighted sample is by sum(w^2) too small, and by more where many descend from few, of which only what
         # the kernels drew is independent. It is little, but the constants would lose it with each resampling.
         lost = float(weights @ weights)
@@ -81,7 +96,11 @@ class Cloud:
         by_pose = positive.solve(covariance[:3, :3], covariance[:3])
         explained = covariance[:, :3] @ by_pose
         shrunk = mean + np.sqrt(1.0 - renewed) * (errors[:, :3] - mean[:3]) @ by_pose
-        cloud = replace(self, poses=se2.compose(middle, se2.exp(shrunk[:, :3])), constants=shrunk[:, 3:])
+        cloud = replace(
+            self,
+            poses=se2_kernels.all_moved(np.tile(middle, (len(shrunk), 1)), NOWHERE, shrunk),
+            constants=shrunk[:, 3:],
+        )
         kernel = _inflated(explained, lost / renewed) - (1.0 - renewed) * explained
         return cloud, kernel + _inflated(covariance - explained, lost)
 
@@ -90,7 +109,7 @@ class Cloud:
         noise = positive.draws(kernel, len(rows), rng)
         return replace(
             self,
-            poses=se2.compose(self.poses[rows], se2.exp(noise[:, :3])),
+            poses=se2_kernels.all_moved(self.poses[rows], NOWHERE, noise),
             constants=self.constants[rows] + noise[:, 3:],
             log_weights=np.full(len(rows), -np.log(len(rows))),
         )
@@ -183,11 +202,7 @@ def silverman(count: int, size: int) -> float:
 
 def pose_moments(poses: Array, weights: Array) -> tuple[Array, Array]:
     """Weighted mean (3,), circular in heading, and covariance (3, 3) of poses (N, 3) in the world's frame."""
-    heading = np.arctan2(weights @ np.sin(poses[:, 2]), weights @ np.cos(poses[:, 2]))
-    mean = np.array((weights @ poses[:, 0], weights @ poses[:, 1], heading))
-    error = poses - mean
-    error[:, 2] = se2.wrap(error[:, 2])
-    covariance = (weights[:, None] * error).T @ error
+    mean, covariance = se2_kernels.moments(poses, weights)
     return mean, covariance + np.diag(np.full(3, MINIMUM_VARIANCE))
 
 

@@ -6,18 +6,20 @@ Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, chapte
 adds next to no noise. Constants of odometry and sensor that are estimated travel with each particle. Their stated spread is a
 little too small where landmarks tell next to nothing of them: resampling moves their mean at random.
 
+Particles move when something is seen, and at least as often as clouds are kept for smoothing, along all of the odometry since. In
+between the estimate is their Gaussian, with the constants, predicted as the EKF predicts its own.
+
 Where the place is not known, at an unknown start or once it is refuted, particles are drawn from what the search among all that is
 seen tells of it (:mod:`~factorgraph_loc.fusion.search`). A start with an unknown heading is such a place.
 """
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -29,7 +31,7 @@ from factorgraph_loc.fusion.cloud import Cloud, largest_share, normalised, syste
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.search import Search
-from factorgraph_loc.fusion.timeline import Filter, FilterSettings, Taken
+from factorgraph_loc.fusion.timeline import Filter, FilterSettings, Taken, twin
 from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -38,7 +40,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation
 from factorgraph_loc.sensors.binding import bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
-from factors import positive, se2
+from factors import positive, se2, se2_kernels
 from factors.motion import Increment
 from factors.se2 import Array
 
@@ -70,7 +72,8 @@ class CloudView:
     newest = True
 
     def __init__(self, owner: Filter) -> None:
-        self._filter, self.t = owner, owner._t
+        self._filter: Any = owner
+        self.t = owner._t
 
     @property
     def localized(self) -> bool:
@@ -78,11 +81,11 @@ class CloudView:
 
     @property
     def pose(self) -> Array:
-        return np.asarray(self._filter._state.moments[0])
+        return np.asarray(self._filter._moments()[0], dtype=float)
 
     @property
     def covariance(self) -> Array:
-        return se2.world_to_body(*self._filter._state.moments)
+        return se2.world_to_body(*self._filter._moments())
 
     def value(self, name: str) -> Array | None:
         cloud, part = self._filter._state, self._filter._state.parts.get(name)
@@ -98,7 +101,8 @@ class CloudView:
     def poses_at(self, times: Array) -> Array:
         constants = self.value(MOTION)
         owner = self._filter
-        return owner._motion.poses_at(owner._odometry, times, np.zeros(0) if constants is None else constants)
+        values = np.zeros(0) if constants is None else constants
+        return np.asarray(owner._motion.poses_at(owner._odometry, times, values))
 
     def earlier(self, t: float) -> EarlierPose | None:
         return None
@@ -114,12 +118,11 @@ class ParticleFilter(Filter):
     deterministic = False
     supports_unknown_start = True
     _state: Cloud
-    _rng: np.random.Generator
 
     def __init__(self, setup: Setup, settings: ParticleFilterSettings, diagnostics: Diagnostics | None = None) -> None:
         super().__init__(setup, settings, diagnostics)
         self._settings = settings
-        self._rng = setup.rng
+        self._drawn_by = setup.rng
         # trajectories are drawn by a generator of their own, whose state is kept: the same ones each time
         (self._smoothing_rng,) = setup.rng.spawn(1)
         calibration: Calibration = "particles" if settings.self_calibration else "none"
@@ -137,8 +140,9 @@ class ParticleFilter(Filter):
         """The particles with their weights, and the Gaussians of their modes; of all, once the place is known."""
         if self._state is None:
             return Belief(())
-        cloud = self._at(t)._state
-        modes = (Mode(1.0, *cloud.moments),) if cloud.localized else cloud.modes()
+        there = self._at(t)
+        cloud = there._moved_on(twin(self._drawn_by))
+        modes = (Mode(1.0, *there._moments()),) if cloud.localized else cloud.modes()
         return Belief(modes, cloud.poses, cloud.weights)
 
     def learnt(self) -> Learnt:
@@ -167,11 +171,11 @@ class ParticleFilter(Filter):
             kept = [r for r in self._records if r.cloud is not None]
             records = [r for r in records if r.t >= kept[0].t]
             if kept[-1] is not self._records[-1]:
-                kept.append(replace(self._records[-1], cloud=self._state))
+                kept.append(replace(self._records[-1], cloud=self._moved_on(twin(self._smoothing_rng))))
             changes = [change for _, change in self._changes]
             known = is_known(np.array([r.t for r in records]), changes)
             records = [r for r, told in zip(records, known.tolist(), strict=True) if told]
-            rng = copy.deepcopy(self._smoothing_rng)
+            rng = twin(self._smoothing_rng)
             simulation = BackwardSimulation(
                 kept, self._increment, self._moved, rng, self._settings.smoothing_trajectories, changes
             )
@@ -187,10 +191,12 @@ class ParticleFilter(Filter):
     def _start(self, prior: PosePrior) -> Cloud:
         if prior.has_heading:
             self._search.begin_track(found=False)
-            return self._cloud(self._rng.multivariate_normal(prior.pose, prior.covariance, self._settings.particles))
+            return self._cloud(
+                self._drawn_by.multivariate_normal(prior.pose, prior.covariance, self._settings.particles)
+            )
         start = KnownPosition(prior, self._motion)
         self._search.begin(start)
-        poses = start.drawn(self._rng, self._settings.particles, self._odometry)
+        poses = start.drawn(self._drawn_by, self._settings.particles, self._odometry)
         return replace(self._cloud(poses), localized=False)
 
     def _take(self, m: Measurement) -> None:
@@ -213,7 +219,7 @@ class ParticleFilter(Filter):
     def _found(self, since: float) -> Cloud | None:
         """Particles drawn from what the search tells, None where it tells nothing; once that is one place a track begins, with what
         was seen ``since`` then."""
-        poses = self._search.sample(self._rng, self._settings.particles, self._odometry)
+        poses = self._search.sample(self._drawn_by, self._settings.particles, self._odometry)
         if not len(poses):
             return None
         if self._search.best is None:
@@ -229,14 +235,38 @@ class ParticleFilter(Filter):
         count = len(poses)
         poses[:, 2] = se2.wrap(poses[:, 2])
         sigmas = np.concatenate([constants.sigmas for _, constants in self._blocks])
-        constants = self._rng.standard_normal((count, len(sigmas))) * sigmas
-        return Cloud(poses, constants, np.full(count, -np.log(count)), parts=self._parts)
+        constants = self._drawn_by.standard_normal((count, len(sigmas))) * sigmas
+        return Cloud(poses, constants, np.full(count, -np.log(count)), parts=self._parts, odometry=self._odometry)
+
+    def _anchor(self) -> None:
+        super()._anchor()
+        if self._state.odometry.t == self._t:
+            self._state = replace(self._state, odometry=self._odometry)
 
     def _predict(self, t: float) -> None:
-        increment = self._travelled(t)
-        noise = self._rng.standard_normal((len(self._state.poses), 3)) @ positive.root(increment.covariance).T
-        poses, _ = self._moved(self._state, increment, noise)
-        self._state = replace(self._state, poses=poses)
+        self._travelled(t)
+
+    def _moved_on(self, rng: np.random.Generator) -> Cloud:
+        """The particles where the robot is now."""
+        cloud = self._state
+        if cloud.odometry.t == self._t:
+            return cloud
+        increment = self._motion.relative(cloud.odometry, self._odometry)
+        noise = rng.standard_normal((len(cloud.poses), 3)) @ positive.root(increment.covariance).T
+        poses, _ = self._moved(cloud, increment, noise)
+        return replace(cloud, poses=poses, odometry=self._odometry)
+
+    def _moments(self) -> tuple[Array, Array]:
+        """Mean (3,) and covariance (3, 3) in the world's frame of where the robot is now."""
+        cloud = self._state
+        if cloud.odometry.t == self._t:
+            return cloud.moments
+        mean, covariance = cloud.joint
+        part = cloud.parts.get(MOTION, slice(0, 0))
+        _, pose, _, _, spread = self._motion.predicted(
+            cloud.odometry, self._t, cloud.moments[0], covariance, mean[part], POSE + part.start
+        )
+        return pose, se2_kernels.body_to_world(pose, spread)
 
     def _moved(self, cloud: Cloud, increment: Increment, noise: Array | None = None) -> tuple[Array, Array]:
         """Poses (N, 3) after the increment, each under its own constants, and with body-frame ``noise`` (N, 3), if any.
@@ -253,12 +283,11 @@ class ParticleFilter(Filter):
             delta, by_constants[:, part] = self._motion.changed(increment, mean)
             changed = (values - mean) @ by_constants[:, part].T
             noise = changed if noise is None else noise + changed
-        poses = se2.compose(cloud.poses, delta)
-        if noise is not None:
-            poses = se2.compose(poses, se2.exp(noise))
+        poses = se2.compose(cloud.poses, delta) if noise is None else se2_kernels.all_moved(cloud.poses, delta, noise)
         return poses, np.concatenate((se2.adjoint(se2.inverse(delta)), by_constants), axis=1)
 
     def _see(self, m: Measurement) -> None:
+        self._state = self._moved_on(self._drawn_by)
         if not self._state.localized:
             if self._search.look(m, self._odometry):
                 self._state = self._found(self._t) or self._state
@@ -269,7 +298,7 @@ class ParticleFilter(Filter):
                 continue
             if isinstance(seen, NewVariable):
                 if not seen.sightings:
-                    self._state = self._state.with_block(seen.name, seen.mean, seen.noise, self._rng)
+                    self._state = self._state.with_block(seen.name, seen.mean, seen.noise, self._drawn_by)
                 continue
             here = seen
             if seen.is_judged:
@@ -285,8 +314,12 @@ class ParticleFilter(Filter):
 
     def _pass(self, tick: Tick) -> None:
         if self._state.localized:
+            if self._t >= self._state.odometry.t + self._settings.smoothing_interval - 1e-9:
+                self._state = self._moved_on(self._drawn_by)
             self._doubt(tick)
-        elif self._search.advance():
+            return
+        self._state = self._moved_on(self._drawn_by)
+        if self._search.advance():
             self._state = self._found(self._t) or self._state
 
     def _doubt(self, m: Measurement) -> None:
@@ -330,22 +363,24 @@ class ParticleFilter(Filter):
             self._resample()
 
     def _resample(self) -> None:
-        chosen = systematic(self._state.weights, self._rng, self._settings.particles)
+        chosen = systematic(self._state.weights, self._drawn_by, self._settings.particles)
         if self._settings.kld:
-            chosen = chosen[kld.prefix(self._state.poses[chosen], self._rng, self._settings.min_particles)]
+            chosen = chosen[kld.prefix(self._state.poses[chosen], self._drawn_by, self._settings.min_particles)]
         cloud, kernel = self._state.density()
-        self._state = cloud.drawn(chosen, kernel, self._rng)
+        self._state = cloud.drawn(chosen, kernel, self._drawn_by)
 
     def _estimate(self) -> PoseEstimate:
         if self._state.localized:
             status: Status = "ambiguous" if self._search.doubts else "localized"
-            return PoseEstimate(self._t, *self._state.moments, status)
-        mode = self._state.modes()[0]
+            return PoseEstimate(self._t, *self._moments(), status)
+        mode = self._moved_on(twin(self._drawn_by)).modes()[0]
         return PoseEstimate(self._t, mode.pose, mode.covariance, "ambiguous")
 
     def _record(self) -> Record:
         estimate = self._estimate()
         keep = self._smooth and self._is_due()
+        if keep:
+            self._state = self._moved_on(self._drawn_by)
         return Record(self._t, self._odometry, estimate.pose, estimate.covariance, self._state if keep else None)
 
     def _is_due(self) -> bool:

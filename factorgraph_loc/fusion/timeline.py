@@ -67,7 +67,7 @@ class Filter(ABC):
         calibrates = getattr(settings, "self_calibration", False)
         self._motion = bound_motion(setup, self.diagnostics, self_calibration=calibrates)
         self._sensors: dict[str, Sensor] = {}  # by the modality of their measurements
-        self._rng: np.random.Generator | None = None  # of a filter that draws
+        self._rng: np.random.Generator | None = None  # of a filter whose predictions draw
         self._state: Any = None
         # the last one that was ahead of this one, and the state that it began with: the next tick need not go there once more
         self._ahead: tuple[Any, Filter] | None = None
@@ -178,7 +178,7 @@ class Filter(ABC):
         self._ahead = None
         ahead = object.__new__(type(self))  # as copy.copy does, in a third of the time
         vars(ahead).update(vars(self))
-        ahead._rng = None if self._rng is None else _twin(self._rng)
+        ahead._rng = None if self._rng is None else twin(self._rng)
         ahead._anchor()
         ahead._move(t)
         self._ahead = self._state, ahead
@@ -276,7 +276,7 @@ def world_estimate(t: float, pose: Array, covariance: Array, status: Status = "l
     return PoseEstimate(t, pose, se2_kernels.body_to_world(pose, covariance), status)
 
 
-def _twin(rng: np.random.Generator) -> np.random.Generator:
+def twin(rng: np.random.Generator) -> np.random.Generator:
     """A generator that will draw the same numbers; a deep copy takes four times as long."""
     bits = type(rng.bit_generator)(0)
     bits.state = rng.bit_generator.state

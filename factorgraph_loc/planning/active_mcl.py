@@ -157,7 +157,11 @@ class ActiveMcl(Filter):
 
     def _estimate(self) -> PoseEstimate:
         status: Status = "localized" if _is_one_place(self._state) else "ambiguous"
-        return PoseEstimate(self._t, *self._state.moments, status)
+        return PoseEstimate(self._t, *self._moments(), status)
+
+    def _moments(self) -> tuple[Array, Array]:
+        moments: tuple[Array, Array] = self._state.moments
+        return moments
 
     def _record(self) -> PoseEstimate:
         return self._estimate()

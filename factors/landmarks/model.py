@@ -255,10 +255,10 @@ def _seen(
     distance; the gradient direction of the range; and the inverse standard deviation of the range."""
     range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma = model
     range_error, bearing_error, weight = 0.0, 0.0, 0.0
-    distance = max(math.hypot(sx, sy), 1e-6)
+    distance = max(math.sqrt(sx * sx + sy * sy), 1e-6)
     vx, vy = (ahead_x, ahead_y) if depth else (sx / distance, sy / distance)
     if not math.isnan(measured_range):
-        weight = 1.0 / math.hypot(range_sigma, range_sigma_relative * measured_range)
+        weight = 1.0 / math.sqrt(range_sigma**2 + (range_sigma_relative * measured_range) ** 2)
         range_error = (range_scale * (vx * sx + vy * sy) - measured_range) * weight
     if not math.isnan(measured_bearing):
         angle = math.atan2(sy, sx) - turn + bearing_bias - measured_bearing
@@ -314,10 +314,13 @@ def _squared(
     the determinants' roots.
     """
     range_sigma, range_sigma_relative, bearing_sigma = noise
+    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     for i in range(len(poses)):
-        c, s = math.cos(poses[i, 2]), math.sin(poses[i, 2])
+        c, s = cosine[i], sine[i]
         x, y, bearing_bias, range_scale, depth_axis = constants[i]
-        ahead_x, ahead_y = math.cos(turn + depth_axis), math.sin(turn + depth_axis)
+        ahead_x = ahead_y = 0.0
+        if depth:
+            ahead_x, ahead_y = math.cos(turn + depth_axis), math.sin(turn + depth_axis)
         model = (range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma)
         for k in range(len(points)):
             dx, dy = points[k, 0] - poses[i, 0], points[k, 1] - poses[i, 1]

@@ -10,11 +10,12 @@ from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.cloud import Cloud, largest_share, systematic
+from factorgraph_loc.fusion.cloud import Cloud, largest_share, pose_moments, systematic
 from factorgraph_loc.fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeUncertainty
@@ -236,3 +237,28 @@ def test_what_no_particle_explains_is_taken_in_few_shares():
         left -= largest_share(np.full(50, -np.log(50.0)), -1e9 * np.arange(50.0), left, 25.0)
         count += 1
     assert count < 500
+
+
+def test_ticks_move_no_particle(log):
+    """Until something is seen the particles wait, however many ticks there are; the estimate has the moments that they have once
+    they are moved: of 4,000 the mean to 5 standard errors, the covariance to 7, which fails in fewer than one of 10,000 runs."""
+    setup = Setup(log.rig, log.world, ("odometry", "bearing_range"), np.random.default_rng(1))
+    found = []
+    for ticks in (np.arange(0.0, 0.85, 0.05), [0.0, 0.8]):
+        setup = replace(setup, rng=np.random.default_rng(1))
+        estimator = ParticleFilter(setup, ParticleFilterSettings(particles=4000, self_calibration=False))
+        estimator.initialize(PosePrior(0.0, log.reference.poses[0], np.diag((0.1, 0.1, 0.05)) ** 2))
+        for m in log.measurements(("odometry",)):
+            if m.t < 0.9:
+                estimator.process(m)
+        for t in ticks:
+            estimator.process(Tick(t))
+        found.append((estimator.estimate(0.8), estimator.belief(0.8)))
+    (one, cloud), (other, same) = found
+    assert one.pose[0] != log.reference.poses[0, 0]
+    np.testing.assert_array_equal(cloud.particles, same.particles)
+    np.testing.assert_array_equal(one.pose, other.pose)
+    mean, covariance = pose_moments(cloud.particles, cloud.weights)
+    sigmas = np.sqrt(np.diag(one.covariance))
+    assert np.all(np.abs(mean - one.pose) < 5.0 * sigmas / np.sqrt(4000))
+    assert np.all(np.abs(covariance - one.covariance) < 7.0 * np.outer(sigmas, sigmas) / np.sqrt(2000))
