@@ -12,6 +12,7 @@ __all__ = [
     "detection",
     "factor",
     "kernels",
+    "knots",
     "model",
     "phase",
     "strength",

@@ -11,8 +11,17 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.rfid import knots
 from factors.rfid.kernels import seen
-from factors.rfid.model import LOGISTIC, NEAR, NEGLIGIBLE_LOGIT, Packed, RfidModel, logistic_value
+from factors.rfid.model import (
+    GRID,
+    LOGISTIC,
+    NEAR,
+    NEGLIGIBLE_LOGIT,
+    Packed,
+    RfidModel,
+    logistic_value,
+)
 from factors.se2 import Array
 
 Array32 = NDArray[np.float32]
@@ -52,6 +61,7 @@ def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
     level = np.zeros((len(model.antennas), len(heights)), dtype=np.int64)
     tables: list[NDArray[np.uint16]] = []
     halves: list[int] = []
+    planes: dict[int, Array] = {}
     for i, antenna in enumerate(model.antennas):
         detection = model.models[antenna.model]
         if packed.kinds[antenna.model] == LOGISTIC:
@@ -64,7 +74,12 @@ def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
                 numbers[key] = len(tables)
                 half = math.ceil(detection.reach / CELL)
                 table = np.empty((FACINGS if detection.uses_facing else 1, 2 * half + 1, 2 * half + 1), np.uint16)
-                _fill(packed, i, key[2] * LEVEL, half, table)
+                if packed.kinds[antenna.model] == GRID and antenna.pitch == 0.0:
+                    if antenna.model not in planes:
+                        planes[antenna.model] = _planes(packed, antenna.model, table.shape)
+                    _fill_level(planes[antenna.model], packed, antenna.model, step * LEVEL, table)
+                else:
+                    _fill(packed, i, step * LEVEL, half, table)
                 tables.append(table)
                 halves.append(half)
             found[j] = numbers[key]
@@ -86,6 +101,25 @@ def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
 def logit_row(z: float) -> int:
     """Place of a logit in the sigmoids."""
     return int((min(max(z, NEGLIGIBLE_LOGIT), -NEGLIGIBLE_LOGIT) - NEGLIGIBLE_LOGIT) / STEP + 0.5)
+
+
+def _planes(packed: Packed, model: int, shape: tuple[int, ...]) -> Array:
+    """The logits (H, F, NX, NX) of a grid at the heights of its knots, with the facings and in the cells of tables (F, NX, NX)."""
+    heights, facings, nx, ny, first = packed.shapes[model].tolist()
+    x0, y0, cell = packed.parameters[model, :3]
+    grid = packed.knots[first : first + heights * facings * nx * ny].reshape(heights, facings, nx, ny)
+    at = (np.arange(shape[1]) - shape[1] // 2) * CELL
+    by_x, by_y = (knots.matrix(knots.cubic((at - a) / cell, n), n) for a, n in ((x0, nx), (y0, ny)))
+    by_facing = knots.matrix(knots.cubic(np.linspace(0.0, facings - 1.0, shape[0]), facings), facings)
+    return np.asarray(np.einsum("fk,hkxy->hfxy", by_facing, by_x @ grid @ by_y.T))
+
+
+def _fill_level(planes: Array, packed: Packed, model: int, height: float, table: NDArray[np.uint16]) -> None:
+    """As :func:`_fill`, from the planes of a grid, for an antenna without pitch: cells lie in these at all heights."""
+    z0, step = packed.parameters[model, 3:5]
+    levels, weights = knots.linear(np.array(((height - z0) / step,)), len(planes))
+    z = np.einsum("k,kfxy->fxy", weights[0], planes[levels[0]])
+    table[:] = (np.clip(z, NEGLIGIBLE_LOGIT, -NEGLIGIBLE_LOGIT) - NEGLIGIBLE_LOGIT) / STEP + 0.5
 
 
 @numba.njit(cache=True)

@@ -14,6 +14,7 @@ from scipy import sparse
 
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor, fit_linear
 from factorgraph_loc.sensors.rfid.calibration.pairs import TagPairs
+from factors.rfid import knots
 from factors.rfid.model import DetectionModel, GridModel, bake, logits
 from factors.se2 import Array
 
@@ -63,45 +64,21 @@ def design_of(grid: GridModel, points: Array, facing: Array) -> sparse.csr_array
     """The matrix (M, knots) from the grid's knots to logits at ``points`` (M, 3) with ``facing`` (M,)."""
     shape = grid.logits.shape
     axes = [
-        _linear((points[:, 2] - grid.heights[0]) / _step(grid.heights), shape[0]),
-        _cubic(0.5 * (facing + 1.0) * (shape[1] - 1), shape[1]),
-        _cubic((points[:, 0] - grid.x0) / grid.cell, shape[2]),
-        _cubic((points[:, 1] - grid.y0) / grid.cell, shape[3]),
+        knots.linear((points[:, 2] - grid.heights[0]) / _step(grid.heights), shape[0]),
+        knots.cubic(0.5 * (facing + 1.0) * (shape[1] - 1), shape[1]),
+        knots.cubic((points[:, 0] - grid.x0) / grid.cell, shape[2]),
+        knots.cubic((points[:, 1] - grid.y0) / grid.cell, shape[3]),
     ]
-    knots, weights = np.zeros((len(points), 1), dtype=np.int64), np.ones((len(points), 1))
+    columns, weights = np.zeros((len(points), 1), dtype=np.int64), np.ones((len(points), 1))
     for size, (places, shares) in zip(shape, axes, strict=True):
-        knots = (knots[:, :, None] * size + places[:, None, :]).reshape(len(points), -1)
+        columns = (columns[:, :, None] * size + places[:, None, :]).reshape(len(points), -1)
         weights = (weights[:, :, None] * shares[:, None, :]).reshape(len(points), -1)
-    ends = knots.shape[1] * np.arange(len(points) + 1)
-    return sparse.csr_array((weights.ravel(), knots.ravel(), ends), shape=(len(points), grid.logits.size))
+    ends = columns.shape[1] * np.arange(len(points) + 1)
+    return sparse.csr_array((weights.ravel(), columns.ravel(), ends), shape=(len(points), grid.logits.size))
 
 
 def _step(heights: Array) -> float:
     return float(heights[1] - heights[0]) if len(heights) > 1 else 1.0
-
-
-def _linear(place: Array, count: int) -> tuple[Array, Array]:
-    """Knots (M, 2) and weights of linear interpolation; a single knot if there is only one."""
-    if count == 1:
-        return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))
-    below = np.clip(np.floor(place).astype(np.int64), 0, count - 2)
-    share = np.clip(place - below, 0.0, 1.0)
-    return np.column_stack((below, below + 1)), np.column_stack((1.0 - share, share))
-
-
-def _cubic(place: Array, count: int) -> tuple[Array, Array]:
-    """Knots (M, 4) and weights of cubic convolution (Keys, IEEE TASSP 29(6), 1981, eq. 4 and 6)."""
-    if count == 1:
-        return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))
-    below = np.clip(np.floor(place).astype(np.int64), 0, count - 2)
-    f = np.clip(place - below, 0.0, 1.0)
-    weights = (
-        ((-0.5 * f + 1.0) * f - 0.5) * f,
-        (1.5 * f - 2.5) * f * f + 1.0,
-        ((-1.5 * f + 2.0) * f + 0.5) * f,
-        (0.5 * f - 0.5) * f * f,
-    )
-    return np.clip(below[:, None] + np.arange(-1, 3), 0, count - 1), np.column_stack(weights)
 
 
 def _roughness(shape: Sequence[int]) -> sparse.csc_array:
