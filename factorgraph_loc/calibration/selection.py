@@ -112,7 +112,7 @@ class Bench:
         self, folds: Sequence[Fold], learners: Sequence[Learner], evaluate: Callable[[Log], Mapping[str, Any]]
     ) -> None:
         self._folds, self.learners, self._evaluate = folds, learners, evaluate
-        self._known: dict[State, StretchErrors] = {}
+        self._known: dict[tuple[int, str], Mapping[str, Any] | None] = {}
         self.judgements: dict[Unit, Judgement] = {}
 
     def forget(self) -> None:
@@ -121,15 +121,13 @@ class Bench:
 
     def outcome(self, state: State) -> StretchErrors:
         """The outcome with the parameters of ``state``."""
-        if state not in self._known:
-            tests = [
-                replace(test, rig=_usable(learner.rig(state), state))
-                for fold, learner in zip(self._folds, self.learners, strict=True)
-                for test in fold.tests
-            ]
-            dof = 3 if all(has_heading(test) for test in tests) else 2
-            self._known[state] = StretchErrors.of([self._scores(test) for test in tests], dof)
-        return self._known[state]
+        tests = [
+            replace(test, rig=_usable(learner.rig(state), state))
+            for fold, learner in zip(self._folds, self.learners, strict=True)
+            for test in fold.tests
+        ]
+        dof = 3 if all(has_heading(test) for test in tests) else 2
+        return StretchErrors.of([self._scores(i, test) for i, test in enumerate(tests)], dof)
 
     def better(self, state: State, others: State) -> bool:
         """Whether the estimator is better with ``state`` than with ``others``."""
@@ -154,11 +152,14 @@ class Bench:
                 state = more
         return state
 
-    def _scores(self, log: Log) -> Mapping[str, Any] | None:
-        try:
-            return self._evaluate(log)
-        except (InputError, RunFailedError):
-            return None
+    def _scores(self, number: int, log: Log) -> Mapping[str, Any] | None:
+        """Those of a stretch, which is run once with each rig: many states give a fold the same one."""
+        key = number, log.rig.model_dump_json()
+        if key not in self._known:
+            self._known[key] = None
+            with suppress(InputError, RunFailedError):
+                self._known[key] = self._evaluate(log)
+        return self._known[key]
 
 
 def _usable(rig: Rig, state: State) -> Rig:

@@ -1,6 +1,7 @@
 """Calibrations that would make an estimator worse, and what is left of them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,10 @@ import pytest
 from factorgraph_loc.api import learning
 from factorgraph_loc.calibration import report
 from factorgraph_loc.calibration.calibrate import calibrate
+from factorgraph_loc.calibration.held_out import Fold
+from factorgraph_loc.calibration.selection import Bench
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.calibrating import Unit
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factorgraph_loc.sensors.rfid.settings import BeamSettings, SurveySettings
 
@@ -90,6 +94,21 @@ def test_if_nothing_pays_the_rig_is_that_of_the_input(simulate):
         n for one in found.judgements for n in one.names
     }
     assert not any(c.kept for c in found.knowledge.constants)
+
+
+def test_a_stretch_is_run_once_with_each_rig(simulate):
+    """Whatever parameters that rig comes from, until something else is learnt."""
+    log, runs = simulate(seconds=30.0), []
+    same, rigs = Unit("odometry", ("delay",)), {0: log.rig, 1: log.rig.model_copy(update={"name": "other"})}
+    learner = SimpleNamespace(rig=lambda state: rigs[sum(unit != same for unit in state)])
+    bench = Bench([Fold(0, (), (log,))], [learner], lambda one: runs.append(one.rig.name) or scores(0.1))
+    for unit in (same, Unit("odometry", ("scale_distance",))):
+        bench.outcome(frozenset())
+        bench.outcome(frozenset({unit}))
+    assert runs == ["unknown", "other"]
+    bench.forget()
+    bench.outcome(frozenset())
+    assert runs == ["unknown", "other", "unknown"]
 
 
 def test_a_survey_that_the_estimator_does_not_like_is_not_shifted(read_tags, tmp_path):
