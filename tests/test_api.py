@@ -76,7 +76,7 @@ def test_simulated_logs_are_those_of_the_same_seed(office, tmp_path):
     assert np.array_equal(read.streams["odometry"].dx, office.streams["odometry"].dx)
     with pytest.raises(fgloc.InputError, match="images need out"):
         fgloc.simulate("office", images=True)
-    changes = {"drive": {"duration": 2.0}, "images": {"rate": 2.0}}
+    changes = {"drive": {"duration": 2.0}, "images": {"rate": 2.0}, "world": {"width": 9.0, "depth": 8.0}}
     seen = fgloc.simulate("office", changes=changes, images=True, out=tmp_path / "seen")
     assert all(path.is_file() for path in seen.streams["camera"].file)
 

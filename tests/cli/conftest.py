@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from in_short import blank_pictures, in_short, runs_here  # noqa: F401 - fixtures
+from in_short import blank_pictures, in_short, leave_blank, runs_here  # noqa: F401 - fixtures
 from typer.testing import CliRunner, Result
 
 from factorgraph_loc.cli.app import app
@@ -57,6 +57,18 @@ def fgloc() -> Fgloc:
 
     def call(*args: object) -> Result:
         return CliRunner().invoke(app, [str(arg) for arg in args])
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def fgloc_once() -> Fgloc:
+    """The same for fixtures that several tests share, without pictures."""
+
+    def call(*args: object) -> Result:
+        with pytest.MonkeyPatch.context() as patch:
+            leave_blank(patch)
+            return CliRunner().invoke(app, [str(arg) for arg in args])
 
     return call
 

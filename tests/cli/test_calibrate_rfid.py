@@ -51,19 +51,13 @@ def a_log(seconds=70.0):
 
 
 @pytest.fixture(scope="module")
-def calibrated(tmp_path_factory):
-    from typer.testing import CliRunner  # noqa: PLC0415
-
-    from factorgraph_loc.cli.app import app  # noqa: PLC0415
-
+def calibrated(fgloc_once, tmp_path_factory):
     folder = tmp_path_factory.mktemp("rfid")
     write_native(a_log(), folder / "circles")
     rig = folder / "places.rig.toml"
     rig.write_text("[rfid.antennas]\nleft = { yaw = 1.5708 }\nright = { yaw = -1.5708 }\n")
     out = folder / "cart.rig.toml"
-    result = CliRunner().invoke(
-        app, ["calibrate", str(folder / "circles"), "--rig", str(rig), "-o", str(out), "--json"]
-    )
+    result = fgloc_once("calibrate", folder / "circles", "--rig", rig, "-o", out, "--json")
     assert result.exit_code == 0, result.output
     return folder / "circles", out, json.loads(result.stdout)
 
@@ -87,6 +81,15 @@ def test_the_report_tells_what_was_chosen(calibrated):
     page = out.with_name("cart.report.html").read_text()
     assert page.count("data:image/png;base64,") == 3
     assert "model of detection" in page
+
+
+def test_json_is_one_document(calibrated):
+    _, out, found = calibrated
+    assert found["files"] == {"rig": str(out), "report": str(out.with_name("cart.report.html"))}
+    assert {c["name"] for c in found["constants"]} >= {"scale_distance", "scale_rotation", "heading_rate_bias"}
+    assert found["after"]["circles"]["causal.position_rmse"] > 0.0
+    assert {name for one in found["judged"] for name in one["parameters"]} >= {"odometry.noise", "rfid.models"}
+    assert all({"accepted", "new", "old", "gain", "gain_error"} <= set(one) for one in found["judged"])
 
 
 def test_without_places_of_antennas_nothing_is_learnt(fgloc, calibrated, tmp_path):

@@ -50,6 +50,11 @@ def _sent(what):
 @pytest.fixture
 def blank_pictures(monkeypatch):
     """Figures are made, but neither laid out nor drawn: a picture is one blank line, as wide as it would be."""
+    leave_blank(monkeypatch)
+
+
+def leave_blank(patch):
+    """What ``blank_pictures`` does, for fixtures that last longer than a test."""
 
     def drawn(figure, dpi):
         with figures.drawing(figure):
@@ -58,6 +63,6 @@ def blank_pictures(monkeypatch):
     def draw(*_):
         pytest.fail("a figure is drawn after all: blank_pictures has to replace what does it")
 
-    monkeypatch.setattr(figures, "_drawn", drawn)
-    monkeypatch.setattr(Figure, "draw_without_rendering", lambda _: None)
-    monkeypatch.setattr(Figure, "draw", draw)
+    patch.setattr(figures, "_drawn", drawn)
+    patch.setattr(Figure, "draw_without_rendering", lambda _: None)
+    patch.setattr(Figure, "draw", draw)

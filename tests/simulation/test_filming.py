@@ -8,7 +8,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.simulation import film, preset, simulate, with_images
 from factors.camera import model as reprojection
 
-SETTINGS = {"drive": {"duration": 8.0}, "world": {"tags": 20}, "images": {"rate": 2.5}}
+SETTINGS = {"drive": {"duration": 8.0}, "world": {"tags": 12, "width": 9.0, "depth": 8.0}, "images": {"rate": 2.5}}
 
 
 @pytest.fixture(scope="module")
