@@ -63,7 +63,7 @@ class WorldSettings(FileModel):
 class DriveSettings(FileModel):
     """A drive between random places."""
 
-    duration: Annotated[float, Field(ge=1.0, le=14_400.0), InUnit("s")] = 600.0
+    duration: Annotated[float, Field(ge=1.0, le=36_000.0), InUnit("s")] = 600.0
     """duration of the log"""
     speed: Annotated[float, Field(ge=0.01, le=3.0), InUnit("m/s")] = 0.5
     """highest speed"""

@@ -1,0 +1,67 @@
+"""What a map of points costs, over the keyframes that it is made from."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from benchmarking.report import Options, Report
+
+from factorgraph_loc import simulate
+from factorgraph_loc.experiments.maps import make_map
+
+SIZES = (100, 400, 1600)  # images
+RATE = 2.0  # images per second
+SEED = 7
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Keyframes and observations of a map, processor time [s] of its features and of its points, and peak memory [MB]."""
+
+    keyframes: int
+    observations: int
+    features: float
+    points: float
+    megabytes: float
+
+
+def cost_of(images: int) -> Cost:
+    """What the map of one drive costs."""
+    changes = {"world": {"tags": 1}, "drive": {"duration": images / RATE}, "images": {"rate": RATE}}
+    seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stages(name: str) -> Iterator[Callable[[float, float], None]]:
+        started = time.process_time()
+        yield lambda _done, _total: None
+        seconds[name] = time.process_time() - started
+
+    with TemporaryDirectory() as folder:
+        log = simulate("office", SEED, changes=changes, images=True, out=Path(folder) / "drive")
+        made = make_map(log, stages=stages)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000.0
+    return Cost(made.details.keyframes, made.details.observations, seconds["features"], seconds["points"], peak)
+
+
+def section(options: Options) -> Report:
+    report = Report("keyframes", options)
+    costs = report.collect(cost_of, SIZES, [f"{size} images" for size in SIZES])
+    report.say("A map of points from one drive through an office. Processor time [s] a keyframe, and peak memory [MB]")
+    rows = [
+        (
+            f"{cost.keyframes:,}",
+            f"{cost.observations:,}",
+            f"{cost.features / cost.keyframes:.3f}",
+            f"{cost.points / cost.keyframes:.3f}",
+            f"{cost.megabytes:.0f}",
+        )
+        for cost in costs.values()
+    ]
+    report.table(("keyframes", "observations", "features", "points", "memory"), rows)
+    return report
