@@ -32,9 +32,10 @@ prepare() {
     # what is installed is named by a hash of what asks for it; a test environment serves the demo too
     wanted="$(cat pyproject.toml constraints.txt | sha256sum | cut -d' ' -f1)"
     stamp=.venv/installed
+    unset PYTHONDONTWRITEBYTECODE # each of many processes would compile all modules anew, which are compiled when first imported
     if ! grep -qx "$wanted$extra" "$stamp" 2>/dev/null && ! grep -qxF "$wanted[test]" "$stamp" 2>/dev/null; then
         echo "Installing the project and its dependencies into .venv (a few minutes the first time) ..."
-        .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".$extra" || return 1
+        .venv/bin/python -m pip install -qq --no-compile --disable-pip-version-check -c constraints.txt -e ".$extra" || return 1
         echo "$wanted$extra" >"$stamp"
     fi
     export PATH="$PWD/.venv/bin:$PATH"

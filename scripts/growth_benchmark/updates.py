@@ -36,7 +36,8 @@ RUNS: Mapping[str, RunConfig] = {
 WINDOWS = tuple(RUNS)[:3]
 BASE: Mapping[str, float] = {"minutes": 2.0, "rate": 5.0, "landmarks": 30}
 AXES: Mapping[str, tuple[tuple[int, ...], tuple[str, ...]]] = {
-    "minutes": ((10, 60, 600), WINDOWS),
+    "minutes": ((10, 60, 600), WINDOWS[:2]),
+    "minutes, particles": ((10, 60), WINDOWS[2:]),
     "minutes, full history": ((10, 30, 60), ("smoother, full history",)),
     "rate": ((1, 5, 25), WINDOWS),
     "landmarks": ((30, 1000, 10_000), WINDOWS),
@@ -46,6 +47,7 @@ AXES: Mapping[str, tuple[tuple[int, ...], tuple[str, ...]]] = {
 }
 WHAT = {
     "minutes": "length of the log [min]",
+    "minutes, particles": "length of the log [min]",
     "minutes, full history": "length of the log [min]",
     "rate": "looks at landmarks [1/s]",
     "landmarks": "landmarks in the map",
