@@ -61,7 +61,7 @@ def section(options: Options) -> Report:
             f"{cost.points / cost.keyframes:.3f}",
             f"{cost.megabytes:.0f}",
         )
-        for cost in costs.values()
+        for _, cost in sorted(costs.items())
     ]
     report.table(("keyframes", "observations", "features", "points", "memory"), rows)
     return report

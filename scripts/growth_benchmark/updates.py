@@ -128,7 +128,8 @@ def section(options: Options) -> Report:
     report = Report("updates", options)
     cases = [Case(axis, size, name) for axis, (sizes, names) in AXES.items() for name in names for size in sizes]
     labels = [f"{c.axis}, {c.size}, {c.name}" for c in cases]
-    costs = {cases[i]: cost for i, cost in report.collect(cost_of, cases, labels).items()}
+    found = report.collect(cost_of, cases, labels)
+    costs = {cases[i]: found[i] for i in sorted(found)}
     report.say(
         "Processor time of an update [ms]: median, 99 %, and the median of the last quarter over that of the first; memory that "
         f"the run took [MB]. Where a row does not say otherwise: {BASE['minutes']:.0f} minutes, {BASE['rate']:.0f} looks a second, "
