@@ -9,7 +9,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.colmap import model_of
 from factorgraph_loc.experiments.particles import particles_of
 from factorgraph_loc.exports import foxglove, rerun_scene
-from factorgraph_loc.exports.points import write_ply
+from factorgraph_loc.exports.points import write_bundle, write_ply
 from factorgraph_loc.exports.runs import Particles, StoredRun, find_runs, is_results, read_runs
 from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write_g2o
 from factorgraph_loc.files.shipped import manifests
@@ -122,6 +122,8 @@ def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
         write_ply(log.world.points, out)
     elif out.suffix == ".colmap":
         write_colmap(model_of(log), log.rig.of(CameraSettings).model(), out)
+    elif out.suffix == ".g2o" and not runs and log.world.points is not None:
+        write_bundle(model_of(log), log.rig.of(CameraSettings).model(), out)
     elif out.suffix == ".g2o":
         run = _only(runs, out)
         sensors = run.folder.config.sensors or log.rig.sensors

@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 from PIL import Image
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.io.colmap import read_colmap
 from factorgraph_loc.io.native.world_file import read_world
@@ -149,6 +150,26 @@ def test_a_map_goes_to_colmap_and_comes_back(fgloc, gallery_on_disk, tmp_path):
     result = fgloc("export", log, "-o", again)
     assert result.exit_code == 2
     assert "no points with descriptors" in result.stderr
+
+
+def test_a_map_goes_to_g2o(fgloc, gallery_on_disk, tmp_path):
+    log, world, out = gallery_on_disk(), tmp_path / "a.world.toml", tmp_path / "a.g2o"
+    assert fgloc("map", log, "-o", world).exit_code == 0
+    result = fgloc("export", log, "--world", world, "-o", out)
+    assert result.exit_code == 0, result.output
+    rows = [line.split() for line in out.read_text().splitlines()]
+    values = {row[1]: np.array(row[2:], dtype=float) for row in rows if row[0].startswith("VERTEX")}
+    focal = float(next(row[2] for row in rows if row[0] == "PARAMS_CAMERAPARAMETERS"))
+    edges = [row for row in rows if row[0] == "EDGE_PROJECT_XYZ2UV"]
+    apart = []
+    for _, point, image, _, *pixel in edges:
+        pose = values[image]
+        seen = Rotation.from_quat(pose[3:]).inv().apply(values[point] - pose[:3])
+        apart.append(np.array(pixel[:2], dtype=float) - focal * seen[:2] / seen[2])
+    assert sum(row[0] == "VERTEX_XYZ" for row in rows) == len(read_world(world).points)
+    assert len(edges) > 300
+    assert np.median(np.linalg.norm(apart, axis=1)) < 2.0
+    assert rows[-1] == ["FIX", "0"]
 
 
 def test_settings_of_points(fgloc, gallery_on_disk, tmp_path):
