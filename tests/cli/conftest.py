@@ -2,12 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from in_short import blank_pictures, in_short, leave_blank, runs_here  # noqa: F401 - fixtures
+from typer import testing
 from typer.testing import CliRunner, Result
 
 from factorgraph_loc.cli.app import app
@@ -25,6 +27,7 @@ from factorgraph_loc.vision.settings import FrontendSettings
 from factors import se2
 from factors.camera.model import camera_pose
 
+testing._get_command = cache(testing._get_command)  # made once, not for each call, most of which take no longer
 Fgloc = Callable[..., Result]
 SECONDS = 60.0
 WALL = 3.0  # m: the picture hangs on the plane x = 3, 4 m wide and 2.4 m high, 100 px a metre
