@@ -93,7 +93,7 @@ def test_images_are_located_in_a_map_of_others(fgloc, gallery_on_disk, tmp_path)
     ],
 )
 def test_ranges_that_are_none(fgloc, gallery_on_disk, tmp_path, options, message):
-    result = fgloc("images", gallery_on_disk(), *options, "--count", 300, "-o", tmp_path / "out")
+    result = fgloc("images", gallery_on_disk(), "--count", 300, "--feature", "sift", *options, "-o", tmp_path / "out")
     assert result.exit_code == 2
     assert message in result.stderr
 

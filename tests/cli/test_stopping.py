@@ -39,9 +39,18 @@ def temporary(folder):
     return [path for path in folder.rglob(".*") if ".fgloc-" in path.name]
 
 
+def hang_up_ignored():
+    """As ``nohup`` starts a command."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+
 @pytest.mark.parametrize(("how", "whole"), [(signal.SIGTERM, False), (signal.SIGHUP, True)])
 def test_a_signal_ends_a_comparison_with_its_processes(how, whole, processes, short_log, tmp_path):
-    running = compare(processes, tmp_path / "out", short_log, stderr=subprocess.PIPE)
+    """A signal that is ignored from the start stays so."""
+    options = {} if how == signal.SIGHUP else {"preexec_fn": hang_up_ignored}
+    running = compare(processes, tmp_path / "out", short_log, stderr=subprocess.PIPE, **options)
+    if how != signal.SIGHUP:
+        os.kill(running.pid, signal.SIGHUP)
     (os.killpg if whole else os.kill)(running.pid, how)
     said = running.communicate(timeout=processes.PATIENCE)[1]
     assert (running.returncode, said) == (128 + how, LINES[how])
@@ -57,16 +66,6 @@ def test_a_killed_comparison_leaves_no_process_and_can_be_made_again(processes, 
     other = fgloc("compare", short_log, "-e", "dead_reckoning", "-o", tmp_path / "out")
     assert other.exit_code == 2
     assert "holds results already" in other.stderr
-
-
-def test_a_signal_that_is_ignored_from_the_start_stays_so(processes, short_log, tmp_path):
-    def nohup():
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)
-
-    running = compare(processes, tmp_path / "out", short_log, preexec_fn=nohup, stderr=subprocess.PIPE)
-    os.kill(running.pid, signal.SIGHUP)
-    os.kill(running.pid, signal.SIGTERM)
-    assert running.communicate(timeout=processes.PATIENCE)[1] == "terminated\n"
 
 
 def test_a_signal_is_not_lost_in_a_destructor():

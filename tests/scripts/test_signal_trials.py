@@ -21,7 +21,7 @@ def convert(bench):
 def test_signals_to_a_conversion_leave_nothing(bench, convert):
     assert len(convert.expected) > 3
     assert convert.timed == set()
-    for command, how, after in drawn([convert], 3, seed=3):
+    for command, how, after in drawn([convert], 2, seed=3):
         assert bench.try_signal(command, how, after).faults == ()
 
 
