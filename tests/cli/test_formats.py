@@ -2,12 +2,11 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scripts_here import run_script
 
 from factorgraph_loc.io.native.world_file import read_world
 from factorgraph_loc.io.readers import load
@@ -20,7 +19,7 @@ PAGE = (ROOT / "docs" / "formats.md").read_text()
 def hall(tmp_path_factory):
     """The files of three programs, with the manifest and the map that the page shows."""
     folder = tmp_path_factory.mktemp("example") / "hall"
-    subprocess.run([sys.executable, ROOT / "scripts" / "example_folder", folder], check=True, capture_output=True)
+    run_script("example_folder", folder)
     manifest, world = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)[:2]
     (folder / "monday.toml").write_text(manifest)
     (folder / "hall.world.toml").write_text(world)

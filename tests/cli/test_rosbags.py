@@ -1,25 +1,22 @@
 """From a bag of a robot that nobody knows to a comparison, as docs/rosbags.md tells, and logs as bags."""
 
 import json
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tomli_w
+from scripts_here import run_script
 
 from factorgraph_loc.io.readers import load
-
-EXAMPLE = Path(__file__).parents[2] / "scripts" / "example_bag"
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """A bag with reads in a message type of its own, a rig and a map beside it."""
     bag = tmp_path_factory.mktemp("recorded") / "drive.bag"
-    subprocess.run([sys.executable, EXAMPLE, bag, "--seconds", "15"], check=True, capture_output=True)
+    run_script("example_bag", bag, "--seconds", 15)
     return bag
 
 

@@ -1,10 +1,7 @@
 """Every estimator on every sensor gives the results that are stored; ``scripts/golden renew`` stores them anew."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +12,7 @@ from regression.differences import differences, size_of
 from regression.records import Record, read_records, record_run, write_records
 from regression.scenarios import SCENARIOS
 from regression.tolerances import TOLERANCE, beyond_processors
+from scripts_here import run_script
 
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings
@@ -147,15 +145,7 @@ def test_results_are_renewed_where_they_changed(tmp_path, monkeypatch):
     assert commands.renew([]) == []
 
 
-def test_the_command(tmp_path):
-    script = Path(__file__).parents[2] / "scripts/golden"
-    told = [
-        subprocess.run(
-            [sys.executable, script, action, tmp_path, "--long", "--only", "landmarks-bearings"],
-            check=True,
-            capture_output=True,
-            text=True,
-        ).stdout
-        for action in ("write", "compare")
-    ]
-    assert told == ["", "nothing differs\n"]
+def test_the_command(tmp_path, capsys):
+    for action, told in (("write", ""), ("compare", "nothing differs\n")):
+        assert run_script("golden", action, tmp_path, "--long", "--only", "landmarks-bearings") == 0
+        assert capsys.readouterr().out == told

@@ -1,13 +1,13 @@
 """The experiment files, and the example of how to script one."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
+from runpy import run_path
 
 import polars as pl
 import pytest
+from in_short import runs_here  # noqa: F401 - a fixture
+from scripts_here import run_script
 
 from factorgraph_loc.experiments.experiment_file import SIMULATION, nested, read_experiment
 from factorgraph_loc.files.shipped import manifests
@@ -48,25 +48,22 @@ def test_an_experiment_file_is_in_the_documentation(file):
     assert f"scripts/experiments/{file.name}" in (ROOT / "docs/scripting.md").read_text()
 
 
-def test_the_example_runs(tmp_path):
+@pytest.mark.usefixtures("runs_here")
+def test_the_example_runs(tmp_path, monkeypatch, capsys):
     """The example, of fewer and shorter drives."""
     text = (ROOT / "scripts/example_experiment").read_text()
     shorter = text.replace('seeds = "0:6"', 'seeds = "0:2"').replace("duration = 30.0", "duration = 5.0")
     assert shorter.count("0:2") == shorter.count("duration = 5.0") == 1
     script = tmp_path / "example.py"
     script.write_text(shorter)
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, str(script)],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"plaza2, ekf: off by 0\.\d\d m", done.stdout)
-    assert "8 runs, 0 of them failed" in done.stdout
+    monkeypatch.chdir(tmp_path)
+    run_path(str(script), run_name="imported")  # as the processes of an experiment do
+    assert capsys.readouterr().out == ""
+    assert not (tmp_path / "out").exists()
+    assert run_script(script) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"plaza2, ekf: off by 0\.\d\d m", told)
+    assert "8 runs, 0 of them failed" in told
     assert (tmp_path / "out/example-experiment/errors.png").is_file()
     assert (tmp_path / "out/example-experiment/report.html").is_file()
     assert len(pl.read_parquet(tmp_path / "out/example-experiment/results.parquet")) == 8

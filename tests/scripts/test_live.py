@@ -2,9 +2,7 @@
 
 import json
 import math
-import os
 import re
-import subprocess
 import sys
 from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader
@@ -13,11 +11,12 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from scripts_here import run_script
 
 import factorgraph_loc as fgloc
 
 ROOT = Path(__file__).parents[2]
-REPLAY, NODE = ROOT / "scripts/example_live", ROOT / "scripts/ros2_node_example"
+NODE = ROOT / "scripts/ros2_node_example"
 
 
 @pytest.fixture(scope="module")
@@ -41,30 +40,19 @@ def test_the_example_of_the_docs_runs(capsys):
     assert re.match(r"100\.3 \[2\.\d+ +1\.\d+ .* localized\n$", capsys.readouterr().out, re.DOTALL)
 
 
-def test_a_log_is_replayed(log, tmp_path):
+def test_a_log_is_replayed(log, tmp_path, capsys):
     fgloc.convert(log, tmp_path / "office")
-    command = [
-        sys.executable,
-        REPLAY,
-        tmp_path / "office",
-        "--speed",
-        "20",
-        "--every",
-        "5",
-        "--plot",
-        tmp_path / "way.png",
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | {"MPLBACKEND": "Agg"})
-    rows = [line.split() for line in done.stdout.splitlines() if re.match(r" +\d", line)]
+    options = ("--speed", 20, "--every", 5, "--plot", tmp_path / "way.png")
+    assert run_script("example_live", tmp_path / "office", *options) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if re.match(r" +\d", line)]
     assert len(rows) >= 2
     assert all(row[6] in ("localized", "ambiguous") and float(row[7]) < 0.5 for row in rows)
     assert (tmp_path / "way.png").stat().st_size > 1000
 
 
 def test_a_log_that_is_not_there_is_one_line():
-    done = subprocess.run([sys.executable, REPLAY, "nowhere"], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert re.fullmatch(r"error: .*nowhere.*\n", done.stderr)
+    with pytest.raises(SystemExit, match=r"^error: .*nowhere.*$"):
+        run_script("example_live", "nowhere")
 
 
 def test_without_ros_the_node_says_what_it_needs(monkeypatch):

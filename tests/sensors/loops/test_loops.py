@@ -20,7 +20,7 @@ from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNo
 from factorgraph_loc.sensors.pushed import checked
 from factors import se2
 
-SIDE, SPEED, STEP, ROUNDS = 12.0, 0.5, 0.5, 4  # m, m/s, s
+SIDE, SPEED, STEP, ROUNDS = 12.0, 0.5, 0.5, 3  # m, m/s, s
 NOISE = OdometryNoise(
     along=GrowthSettings(per_time=0.01), lateral=GrowthSettings(per_time=0.01), heading=GrowthSettings(per_time=0.01)
 )
