@@ -133,8 +133,12 @@ def _fill_level(planes: Array, packed: Packed, model: int, height: float, table:
     """As :func:`_fill`, from the planes of a grid, for an antenna without pitch: cells lie in these at all heights."""
     z0, step = packed.parameters[model, 3:5]
     levels, weights = knots.linear(np.array(((height - z0) / step,)), len(planes))
-    z = np.einsum("k,kfxy->fxy", weights[0], planes[levels[0]])
-    table[:] = (np.clip(z, NEGLIGIBLE_LOGIT, -NEGLIGIBLE_LOGIT) - NEGLIGIBLE_LOGIT) / STEP + 0.5
+    z = sum(weight * planes[level] for level, weight in zip(levels[0], weights[0], strict=True) if weight > 0.0)
+    np.clip(z, NEGLIGIBLE_LOGIT, -NEGLIGIBLE_LOGIT, out=z)
+    z -= NEGLIGIBLE_LOGIT
+    z /= STEP
+    z += 0.5
+    table[:] = z
 
 
 @numba.njit(cache=True)
