@@ -32,7 +32,8 @@ def scene(
     antennas = tuple(Antenna(0.3 * math.cos(a), 0.3 * math.sin(a), 1.0, a, pitch) for a in np.arange(4) * math.pi / 2.0)
     facing = rng.uniform(-math.pi, math.pi, 15)
     facing[:3] = np.nan
-    tags = TagArray(np.column_stack((rng.uniform(1.0, 7.0, (15, 2)), rng.uniform(0.8, 1.4, 15))), facing)
+    places, heights = rng.uniform(1.0, 7.0, (15, 2)), rng.uniform(0.8, 1.4, 15)
+    tags = TagArray(np.column_stack((places, 0.3 * np.rint(heights / 0.3))), facing)
     hits = rng.integers(0, 3, (4, 15))
     looks = TagReadCounts(rng.normal(size=(4, 3)) * 0.1, np.arange(4), np.full(4, 2), hits)
     return RfidLikelihood(RfidModel(antennas, (model,), 0.01, 0.02, tempering), tags), looks
