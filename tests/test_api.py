@@ -82,7 +82,7 @@ def test_simulated_logs_are_those_of_the_same_seed(office, tmp_path):
 
 
 def test_calibrate_writes_a_rig(tmp_path):
-    changes = {"drive": {"duration": 60.0}, "world": {"tags": 0, "landmarks": 20}}
+    changes = {"drive": {"duration": 45.0}, "world": {"tags": 0, "landmarks": 20}}
     log = fgloc.simulate("office", 1, changes=changes)
     streams = {name: log.streams[name] for name in ("odometry", "bearing_range")}
     log = replace(log, streams=streams, rig=log.rig.model_copy(update={"sensors": tuple(streams)}))

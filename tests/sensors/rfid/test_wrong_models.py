@@ -32,6 +32,12 @@ def told(log: Log, prior: PriorSettings | None = None, **changes: float) -> Log:
     return replace(log, rig=log.rig.model_copy(update={"rfid": rfid}))
 
 
+@cache
+def exact(estimator: str):
+    """The outcome with what made the reads, known exactly."""
+    return outcome(told(office(), EXACT), estimator)
+
+
 def outcome(log: Log, estimator: str):
     result = run(log, RunConfig(estimator, {"particles": 2000} if estimator == "particle_filter" else {}))
     return result, score(result, log)
@@ -42,7 +48,7 @@ def test_a_range_that_is_too_long_is_found(estimator):
     log = office()
     model = log.rig.of(RfidSettings).models["default"]
     assert isinstance(model, BeamSettings)
-    _, best = outcome(told(log, EXACT), estimator)
+    _, best = exact(estimator)
     result, found = outcome(told(log, r_max=1.2 * model.r_max), estimator)
     _, misled = outcome(told(log, EXACT, r_max=1.2 * model.r_max), estimator)
     assert found["causal.position_rmse"] < 1.25 * best["causal.position_rmse"]
@@ -65,7 +71,7 @@ def test_a_read_probability_that_is_too_low_is_found(estimator):
 
 
 def test_what_is_known_exactly_is_not_learnt():
-    result, _ = outcome(told(office(), EXACT), "smoother")
+    result, _ = exact("smoother")
     assert not [name for name in result.learnt.values if name.startswith("rfid")]
     result = run(office(), RunConfig("smoother", {"self_calibration": False}))
     assert not result.learnt.values
