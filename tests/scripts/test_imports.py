@@ -11,30 +11,43 @@ import tomllib
 from collections import defaultdict
 from graphlib import TopologicalSorter
 
+import pytest
 from package_tables import FACES, HEIGHT, MODULES, ROOT, imported, named, names_in, package_of, steps, tables
 
 EXCEPTIONS: set[tuple[str, str]] = set()
 
 # what estimators and sensors know of each other
 CONTRACT = {f"factorgraph_loc.sensors.{name}" for name in ("base", "binding", "known_position", "registry")}
-IMPORTS = {module: imported(module) for module in MODULES}
-# what is imported, by whom: by our modules, by the package of another that the docs show, by commands, and by readers of the docs
-NAMED = {(module, *found) for module in MODULES for found in named(module)}
-NAMED |= {("", *found) for path in sorted((ROOT / "tests/compass/package").rglob("*.py")) for found in names_in(path)}
-COMMANDS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"].values()
-NAMED |= {("", *command.split(":")) for command in COMMANDS}
-NAMED |= {("", shown, "") for shown in re.findall(r"automodule:: (\S+)", (ROOT / "docs/api.md").read_text())}
+
+
+@pytest.fixture(scope="module")
+def imports():
+    """What each module imports."""
+    return {module: imported(module) for module in MODULES}
+
+
+@pytest.fixture(scope="module")
+def in_use():
+    """What is imported, by whom: by our modules, by the package of another that the docs show, by commands, and by readers of the
+    docs."""
+    found = {(module, *found) for module in MODULES for found in named(module)}
+    found |= {
+        ("", *found) for path in sorted((ROOT / "tests/compass/package").rglob("*.py")) for found in names_in(path)
+    }
+    commands = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"].values()
+    found |= {("", *command.split(":")) for command in commands}
+    return found | {("", shown, "") for shown in re.findall(r"automodule:: (\S+)", (ROOT / "docs/api.md").read_text())}
 
 
 def test_every_package_has_a_layer():
     assert {package_of(module) for module in MODULES} == HEIGHT.keys()
 
 
-def test_no_import_goes_up():
+def test_no_import_goes_up(imports):
     # what users see of the package stands at the top, and names all that is below
     up = {
         (module, other)
-        for module, others in IMPORTS.items()
+        for module, others in imports.items()
         for other in others
         if HEIGHT[package_of(other)] > HEIGHT[package_of(module)]
     }
@@ -48,12 +61,12 @@ def test_nothing_waits_for_the_statistics_of_scipy():
     ]
 
 
-def test_no_estimator_imports_a_sensor():
+def test_no_estimator_imports_a_sensor(imports):
     of_sensors = ("factorgraph_loc.sensors", "factorgraph_loc.vision", "factors.odometry", "factors.landmarks")
     of_sensors += ("factors.rfid", "factors.camera")
     found = {
         (module, other)
-        for module, others in IMPORTS.items()
+        for module, others in imports.items()
         for other in others - CONTRACT
         if package_of(module) == "fusion" and other.startswith(of_sensors)
     }
@@ -65,38 +78,38 @@ def test_no_circle_of_modules():
     assert list(TopologicalSorter(graph).static_order())
 
 
-def test_no_circle_of_packages():
+def test_no_circle_of_packages(imports):
     graph: dict[str, set[str]] = defaultdict(set)
-    for module, others in IMPORTS.items():
+    for module, others in imports.items():
         for other in others:
             if (module, other) not in EXCEPTIONS and package_of(other) != package_of(module):
                 graph[package_of(module)].add(package_of(other))
     assert list(TopologicalSorter(graph).static_order())
 
 
-def test_no_import_of_the_inside_of_another_package():
+def test_no_import_of_the_inside_of_another_package(in_use):
     # whoever needs a module of another package lists it in the `__all__` of its `__init__.py`, if it is not better moved
     inside = {
         (user, f"{package}.{name}")
-        for user, *found in NAMED
+        for user, *found in in_use
         for package, name in steps(*found, user=user)
         if name not in FACES[package]
     }
     assert not inside
 
 
-def test_no_import_of_a_private_name():
+def test_no_import_of_a_private_name(in_use):
     private = {
         (user, place, name)
-        for user, place, name in NAMED
+        for user, place, name in in_use
         if any(part.startswith("_") and part != "__version__" for part in (*place.split("."), *name.split(".")))
         and user.rpartition(".")[0] != place.rpartition(".")[0]
     }
     assert not private
 
 
-def test_what_is_public_is_there_and_is_used():
-    used = {step for user, *found in NAMED for step in steps(*found, user=user)}
+def test_what_is_public_is_there_and_is_used(in_use):
+    used = {step for user, *found in in_use for step in steps(*found, user=user)}
     public = {(package, name) for package, face in FACES.items() for name in face}
     modules = {(package, name) for package, name in public if f"{package}.{name}" in MODULES}
     assert modules <= used, "no other package imports these: take them off the `__all__` of their package"

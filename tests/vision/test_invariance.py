@@ -6,6 +6,8 @@ neighbours, and at least RIGHT of these pairs are the right ones; their directio
 0.1 rad.
 """
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ REPEATED, MATCHED, RIGHT = 0.65, 0.6, 0.85
 COUNT = 400
 
 
+@cache
 def texture() -> np.ndarray:
     """A picture with structure of all sizes (480, 480, 3)."""
     rng = np.random.default_rng(9)
@@ -28,27 +31,26 @@ def texture() -> np.ndarray:
     return np.asarray(np.clip(128 + 40 * sum(layers), 0, 255).astype(np.uint8))
 
 
-PICTURE = texture()
 FEATURES = extractor("colour", COUNT)
 
 
 def warped(angle: float, zoom: float) -> tuple[np.ndarray, np.ndarray]:
     """The picture turned by ``angle`` [rad] and zoomed around its middle, and the affine map (2, 3) that does it."""
-    middle = (np.array(PICTURE.shape[1::-1]) - 1.0) / 2.0
+    middle = (np.array(texture().shape[1::-1]) - 1.0) / 2.0
     linear = zoom * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     affine = np.column_stack([linear, middle - linear @ middle])
     # what is made smaller is blurred first, as a lens does it
-    source = cv2.GaussianBlur(PICTURE, (0, 0), 0.5 * np.sqrt(zoom**-2 - 1.0)) if zoom < 0.99 else PICTURE
-    image = cv2.warpAffine(source, affine, PICTURE.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    source = cv2.GaussianBlur(texture(), (0, 0), 0.5 * np.sqrt(zoom**-2 - 1.0)) if zoom < 0.99 else texture()
+    image = cv2.warpAffine(source, affine, texture().shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     return image, affine
 
 
 def within(points: np.ndarray, margin: float) -> np.ndarray:
-    return np.all((points > margin) & (points < np.array(PICTURE.shape[1::-1]) - 1.0 - margin), axis=1)
+    return np.all((points > margin) & (points < np.array(texture().shape[1::-1]) - 1.0 - margin), axis=1)
 
 
 def check(image: np.ndarray, affine: np.ndarray) -> None:
-    before, first = FEATURES.detectAndCompute(PICTURE)
+    before, first = FEATURES.detectAndCompute(texture())
     after, second = FEATURES.detectAndCompute(image)
     linear, shift = affine[:, :2], affine[:, 2]
     zoom = np.sqrt(np.linalg.det(linear))
@@ -100,11 +102,11 @@ def test_rotation_and_zoom(angle: float, zoom: float) -> None:
 @settings(max_examples=15)
 @given(contrast=st.floats(0.3, 1.0), brightness=st.floats(0.0, 1.0))
 def test_brightness_and_contrast(contrast: float, brightness: float) -> None:
-    image = PICTURE * contrast + 255.0 * (1.0 - contrast) * brightness
+    image = texture() * contrast + 255.0 * (1.0 - contrast) * brightness
     check(np.rint(image).astype(np.uint8), np.eye(2, 3))
 
 
 def test_what_is_another_picture_fails_the_check() -> None:
-    other = np.ascontiguousarray(PICTURE[::-1, :, ::-1])
+    other = np.ascontiguousarray(texture()[::-1, :, ::-1])
     with pytest.raises(AssertionError):
         check(other, np.eye(2, 3))
