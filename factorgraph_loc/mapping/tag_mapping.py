@@ -191,4 +191,4 @@ def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, fl
         )
     # other parts of the log's map are valid in its frame only
     rest = log.world if in_given_frame else World()
-    return World(name=f"{log.name}-map", landmarks=rest.landmarks, tags=tags, walls=rest.walls)
+    return rest.model_copy(update={"name": f"{log.name}-map", "tags": tags, "points": None})

@@ -29,6 +29,7 @@ from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed, RfidModel
 from factors.rfid.places import Places, in_reach
 from factors.rfid.tables import Tables, make_tables
 from factors.se2 import Array, Integers
+from factors.walls import NO_WALLS, walls_around
 
 ROUNDING = 0.02, 0.05  # of the parameters of a detection model, in tables of places
 KEPT = 3  # such tables, those of the rig among them
@@ -37,10 +38,12 @@ SPARE = 0.5  # m: tags are looked up in a box on a grid of this size, which neig
 
 @dataclass(frozen=True, eq=False)
 class TagArray:
-    """T tags: ``points`` (T, 3) [m] in the world and ``facing`` (T,) [rad], NaN if unknown."""
+    """T tags: ``points`` (T, 3) [m] in the world and ``facing`` (T,) [rad], NaN if unknown. ``walls`` (W, 5): segments between
+    which they are, [m], with their attenuation [dB]."""
 
     points: Array
     facing: Array
+    walls: Array = field(default_factory=NO_WALLS.copy)
 
     @cached_property
     def normals(self) -> Array:
@@ -95,7 +98,9 @@ class RfidLikelihood:
     _of_parameters: dict[tuple[float, ...], Places] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "packed", self.model.packed())
+        packed = self.model.packed()
+        walls = walls_around(self.tags.walls, float(packed.reach.max(initial=0.0)))
+        object.__setattr__(self, "packed", packed._replace(walls=walls))
         object.__setattr__(self, "parameters", np.zeros(2 * len(self.model.models)))
         object.__setattr__(self, "_unadjusted", self)
 

@@ -19,6 +19,7 @@ from factors.rfid.kernels import FAST
 from factors.rfid.model import Packed
 from factors.rfid.tables import Tables, row_of
 from factors.se2 import Array, Integers
+from factors.walls import farther
 
 
 class Antennas(NamedTuple):
@@ -94,7 +95,8 @@ def log_likelihood(
                 for k in range(looks):
                     antenna = looked.antennas[k]
                     x, y = points[t, 0] - at[k, 0], points[t, 1] - at[k, 1]
-                    along, across = at[k, 2] * x + at[k, 3] * y, at[k, 2] * y - at[k, 3] * x
+                    factor = farther(packed.walls, at[k, 0], at[k, 1], points[t, 0], points[t, 1])
+                    along, across = factor * (at[k, 2] * x + at[k, 3] * y), factor * (at[k, 2] * y - at[k, 3] * x)
                     facing = -(normals[t, 0] * x + normals[t, 1] * y) / math.sqrt(x * x + y * y + 1e-9)
                     row = _row(model, antenna, along, across, points[t, 2], facing, levels[antenna, t])
                     if row == 0 and w < 0:

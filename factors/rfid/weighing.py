@@ -16,6 +16,7 @@ from factors.rfid.kernels import FAST
 from factors.rfid.model import LOGISTIC, NEGLIGIBLE_LOGIT, Packed
 from factors.rfid.tables import CELL, Tables, row_of
 from factors.se2 import Array, Integers
+from factors.walls import Walls, around, crosses
 
 BLOCK = 512  # poses at a time, so that what is needed of them stays in the cache
 FARTHEST = 20.0  # log of the ratio of two likelihoods of which the smaller one does not count
@@ -23,6 +24,7 @@ LEAST = 1e-12  # probability of a read, and of a miss
 PRODUCT = 20  # factors of at least LEAST, of which a product is no underflow
 SHIFT = 0.05  # of the logit of a model's peak, to which it is rounded, as in tables of places
 MIXED = 500  # factors up to two, of which a product is no overflow
+_WHERE_IT_IS = np.zeros((1, 2))
 
 _Looks = tuple[Array, Integers, Integers]  # offsets, antennas and rounds of read counts
 _Tags = tuple[Array, Array, Integers, Integers]  # points, normals, tables (A, T) and hits (K, T)
@@ -58,7 +60,7 @@ def add_log_likelihood(
         for t in range(len(odds)):
             if not seen[t]:
                 continue
-            _of_tag(packed, tables, at, models, count, looks, tags, t, own, product, room)
+            _of_tag(packed, tables, at, models, count, looks, tags, t, _WHERE_IT_IS, own, product, room)
             if odds[t] == -np.inf or elsewhere[t] == -np.inf:
                 for n in range(count):
                     found[n] += tempering * own[n]
@@ -101,7 +103,7 @@ def displaced(
     own, product, room = np.empty(size), np.empty(size), np.empty(size)
     _place(packed, moved, looks, parameters, 0, at, models)
     for t in range(len(out)):
-        _of_tag(packed, tables, at, models, size, looks, tags, t, own, product, room)
+        _of_tag(packed, tables, at, models, size, looks, tags, t, shifts, own, product, room)
         for i in range(len(shifts)):
             most = mean = 0.0
             for n in range(i * each, (i + 1) * each):
@@ -176,11 +178,13 @@ def _of_tag(
     looks: _Looks,
     tags: _Tags,
     t: int,
+    shifts: Array,
     own: Array,
     product: Array,
     room: Array,
 ) -> None:
-    """The log-likelihood ``own`` (N,) of one tag above that of a silence out of reach."""
+    """The log-likelihood ``own`` (N,) of one tag above that of a silence out of reach. ``shifts`` (S, 2): how much tag and antenna
+    have been moved to where the walls are, N / S poses each."""
     points, normals, levels, hits = tags
     _, antennas, rounds = looks
     own[:count], product[:count] = -_silence(packed, rounds), 1.0
@@ -189,6 +193,9 @@ def _of_tag(
         level = levels[antennas[k], t]
         model = models[packed.which[antennas[k]]]
         unit, rate = model[0], model[1]
+        if len(packed.walls.factor):
+            unit = unit[:count].copy()
+            _attenuate(packed.walls, at[k], points[t], shifts, unit)
         _chances(packed, tables, at[k], unit, count, antennas[k], level, points[t], normals[t], room)
         for i in range(rounds[k]):
             if i < hits[k, t]:
@@ -201,6 +208,29 @@ def _of_tag(
             if factors % PRODUCT == 0:
                 _add_logs(product, count, own)
     _add_logs(product, count, own)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def _attenuate(walls: Walls, at: Array, point: Array, shifts: Array, unit: Array) -> None:
+    """Multiply ``unit`` (N,) by the factors of the walls between one antenna and one tag, see :func:`factors.walls.farther`."""
+    each = len(unit) // len(shifts)
+    for i in range(len(shifts)):
+        dx, dy, poses = shifts[i, 0], shifts[i, 1], slice(i * each, (i + 1) * each)
+        tx, ty, x, y, out = point[0] + dx, point[1] + dy, at[0, poses], at[1, poses], unit[poses]
+        low_x, high_x, low_y, high_y = x.min() + dx, x.max() + dx, y.min() + dy, y.max() + dy
+        first, end = around(walls, tx, ty)
+        for k in range(first, end):
+            line, factor = walls.lines[walls.order[k]], walls.factor[walls.order[k]]
+            # whether the tag and all poses are on one side of it
+            ax, bx = (low_x, high_x) if line[3] < 0.0 else (high_x, low_x)
+            ay, by = (low_y, high_y) if line[2] > 0.0 else (high_y, low_y)
+            side = line[2] * (ty - line[1]) - line[3] * (tx - line[0])
+            least = line[2] * (ay - line[1]) - line[3] * (ax - line[0])
+            most = line[2] * (by - line[1]) - line[3] * (bx - line[0])
+            if side * least >= 0.0 and side * most >= 0.0:
+                continue
+            for n in range(each):
+                out[n] *= factor if crosses(line, x[n] + dx, y[n] + dy, tx, ty) else 1.0
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)

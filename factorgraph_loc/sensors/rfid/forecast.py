@@ -4,7 +4,7 @@ particles.
 All antennas of a robot measure from one pose, so a table holds the result of all antennas for each tag position in the robot
 frame, and a tag is looked up once. Only reads need the individual antennas, and they are few: log p(z | x) = sum of log(1 - q) over
 all tags in range + sum of logit(q) over the reads. Both are relative to the floor of false reads, so that tags out of range
-contribute nothing. False reads of tags out of range are not simulated.
+contribute nothing. False reads of tags out of range are not simulated, nor are walls.
 """
 
 import math
@@ -57,7 +57,7 @@ def make_tables(likelihood: RfidLikelihood) -> ScanTables:
     levels, level = np.unique(np.rint(tags.points[:, 2] / LEVEL).astype(np.int64), return_inverse=True)
     layers = FACINGS + 1 if any(m.uses_facing for m in model.models) else 1
     q: Array = np.empty((len(levels), layers, 2 * half + 1, 2 * half + 1, len(model.antennas)))
-    _fill(likelihood.packed, np.asarray(levels * LEVEL, dtype=float), half, q)
+    _fill(model.packed(), np.asarray(levels * LEVEL, dtype=float), half, q)
     floor = max(model.false_read, ALMOST_NEVER)
     q = np.clip(q, floor, 1.0 - ALMOST_NEVER)
     told = np.argwhere((q > floor + NOTHING).any(axis=(0, 1, 4)))
