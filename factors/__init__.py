@@ -20,4 +20,5 @@ __all__ = [
     "se2",
     "se2_kernels",
     "update",
+    "walls",
 ]
