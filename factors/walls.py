@@ -36,18 +36,21 @@ class Walls(NamedTuple):
     order: Integers
 
 
-def walls_around(segments: Array, reach: float) -> Walls:
-    """Walls x1, y1, x2, y2 [m] and attenuation [dB], (W, 5), for places that are at most ``reach`` [m] apart."""
+def walls_around(segments: Array, reach: float) -> Walls | None:
+    """Walls x1, y1, x2, y2 [m] and attenuation [dB], (W, 5), for places that are at most ``reach`` [m] apart; None if none
+    attenuates, for which compiled code has no branch."""
     segments = segments[segments[:, 4] > 0.0]
+    if not len(segments):
+        return None
     ends = segments[:, :4].reshape(-1, 2)
-    low, high = (ends.min(axis=0), ends.max(axis=0)) if len(ends) else (np.zeros(2), np.zeros(2))
+    low, high = ends.min(axis=0), ends.max(axis=0)
     size = high - low + 2.0 * reach
     cell = max(CELL, math.sqrt(float(np.prod(size)) / MOST_CELLS), float(size.max()) / MOST_CELLS)
-    columns, rows = (np.ceil(size / cell).astype(np.int64) if len(ends) else np.ones(2, np.int64)).tolist()
+    columns, rows = np.ceil(size / cell).astype(np.int64).tolist()
     x, y = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
     centres = low - reach + cell * np.column_stack((x.ravel(), y.ravel()))
     near = [np.flatnonzero(_distance(centres, wall) <= reach + cell * math.sqrt(0.5)) for wall in segments]
-    cells = np.concatenate((np.empty(0, np.int64), *near))
+    cells = np.concatenate(near)
     order = np.repeat(np.arange(len(segments)), [len(one) for one in near])[np.argsort(cells, kind="stable")]
     return Walls(
         np.column_stack((segments[:, :2], segments[:, 2:4] - segments[:, :2])),
@@ -74,7 +77,6 @@ def _distance(points: Array, wall: Array) -> Array:
 
 
 NO_WALLS = np.empty((0, 5))
-OPEN = walls_around(NO_WALLS, 0.0)
 
 
 @numba.njit(cache=True, inline="always")
@@ -99,11 +101,11 @@ def around(walls: Walls, x: float, y: float) -> tuple[int, int]:
 
 
 @numba.njit(cache=True)
-def farther(walls: Walls, ax: float, ay: float, bx: float, by: float) -> float:
+def farther(walls: Walls | None, ax: float, ay: float, bx: float, by: float) -> float:
     """The factor by which the walls between two places make the second one seem farther away."""
+    if walls is None:
+        return 1.0
     out = 1.0
-    if not len(walls.factor):
-        return out
     first, end = around(walls, bx, by)
     for k in range(first, end):
         w = walls.order[k]
@@ -113,10 +115,12 @@ def farther(walls: Walls, ax: float, ay: float, bx: float, by: float) -> float:
 
 
 @numba.njit(cache=True)
-def all_farther(walls: Walls, antennas: Array, tags: Array) -> Array:
+def all_farther(walls: Walls | None, antennas: Array, tags: Array) -> Array:
     """The factors (N, T) of :func:`farther` from ``antennas`` (N, 2) to ``tags`` (T, 2)."""
     out = np.ones((len(antennas), len(tags)))
-    for n in range(len(antennas) if len(walls.factor) else 0):
+    if walls is None:
+        return out
+    for n in range(len(antennas)):
         for t in range(len(tags)):
             out[n, t] = farther(walls, antennas[n, 0], antennas[n, 1], tags[t, 0], tags[t, 1])
     return out

@@ -35,7 +35,7 @@ class PlaceTables(NamedTuple):
     level: Integers
     reach: float
     none: Array
-    walls: Walls
+    walls: Walls | None
 
 
 class TagSilence(NamedTuple):

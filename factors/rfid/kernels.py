@@ -61,15 +61,13 @@ def of_tag(
     ex, ey = point[0] - x, point[1] - y
     m = packed.which[antenna]
     squared = ex * ex + ey * ey
-    if squared >= packed.reach[m] ** 2:
+    factor = farther(packed.walls, x, y, point[0], point[1])
+    if factor * factor * squared >= packed.reach[m] ** 2:
         return NEGLIGIBLE_LOGIT, 0.0, 0.0, 0.0, 0.0
     p, q = c * ex + s * ey, c * ey - s * ex
     nx, ny = c * normal[0] + s * normal[1], c * normal[1] - s * normal[0]
     distance = math.sqrt(squared + 1e-9)
     facing = -(nx * p + ny * q) / distance
-    factor = farther(packed.walls, x, y, point[0], point[1])
-    if factor * factor * squared >= packed.reach[m] ** 2:
-        return NEGLIGIBLE_LOGIT, 0.0, 0.0, 0.0, 0.0
     unit = factor / packed.scale[m]
     height = point[2] - packed.antennas[antenna, 2]
     value, by_p, by_q, _, by_c = seen(packed, antenna, unit * p, unit * q, height, facing)

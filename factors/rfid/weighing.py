@@ -192,10 +192,7 @@ def _of_tag(
     for k in range(len(antennas)):
         level = levels[antennas[k], t]
         model = models[packed.which[antennas[k]]]
-        unit, rate = model[0], model[1]
-        if len(packed.walls.factor):
-            unit = unit[:count].copy()
-            _attenuate(packed.walls, at[k], points[t], shifts, unit)
+        unit, rate = _attenuated(packed.walls, at[k], points[t], shifts, model[0], count), model[1]
         _chances(packed, tables, at[k], unit, count, antennas[k], level, points[t], normals[t], room)
         for i in range(rounds[k]):
             if i < hits[k, t]:
@@ -211,12 +208,14 @@ def _of_tag(
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
-def _attenuate(walls: Walls, at: Array, point: Array, shifts: Array, unit: Array) -> None:
-    """Multiply ``unit`` (N,) by the factors of the walls between one antenna and one tag, see :func:`factors.walls.farther`."""
-    each = len(unit) // len(shifts)
+def _attenuated(walls: Walls | None, at: Array, point: Array, shifts: Array, unit: Array, count: int) -> Array:
+    """``unit`` (N,) times the factors of the walls between one antenna and one tag, see :func:`factors.walls.farther`."""
+    if walls is None:
+        return unit
+    each, all_ = count // len(shifts), unit[:count].copy()
     for i in range(len(shifts)):
         dx, dy, poses = shifts[i, 0], shifts[i, 1], slice(i * each, (i + 1) * each)
-        tx, ty, x, y, out = point[0] + dx, point[1] + dy, at[0, poses], at[1, poses], unit[poses]
+        tx, ty, x, y, out = point[0] + dx, point[1] + dy, at[0, poses], at[1, poses], all_[poses]
         low_x, high_x, low_y, high_y = x.min() + dx, x.max() + dx, y.min() + dy, y.max() + dy
         first, end = around(walls, tx, ty)
         for k in range(first, end):
@@ -231,6 +230,7 @@ def _attenuate(walls: Walls, at: Array, point: Array, shifts: Array, unit: Array
                 continue
             for n in range(each):
                 out[n] *= factor if crosses(line, x[n] + dx, y[n] + dy, tx, ty) else 1.0
+    return all_
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)

@@ -51,7 +51,7 @@ class Rounds:
     silent: tuple[str, ...]
 
     @cached_property
-    def walls(self) -> Walls:
+    def walls(self) -> Walls | None:
         """The walls between antennas and tags, as surveyed."""
         return walls_around(self.tags.walls, FARTHEST)
 

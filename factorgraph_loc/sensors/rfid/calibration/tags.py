@@ -100,7 +100,7 @@ class _TagReads:
     walls: Array
 
     @cached_property
-    def _walls(self) -> Walls:
+    def _walls(self) -> Walls | None:
         return walls_around(self.walls, REACH + FARTHEST)
 
     def thinned(self, most: int) -> _TagReads:
