@@ -219,7 +219,7 @@ class RfidLikelihood:
 
     @cached_property
     def _tables(self) -> Tables:
-        return make_tables(self.model, self.packed, self.tags.points[:, 2])
+        return make_tables(self.model, self.packed._replace(walls=None), self.tags.points[:, 2])
 
     def work(self, looks: TagReadCounts) -> int:
         """How many tags are looked at, by all antennas, to tell the likelihood of one pose among poses that are far apart."""
