@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
@@ -30,6 +30,7 @@ def straight(length):
     return found
 
 
+@settings(max_examples=30)
 @given(st.floats(0.3, 20.0))
 def test_primitives_have_their_length_and_start_at_the_robot(length):
     paths = primitives(length)
@@ -142,17 +143,20 @@ def test_free_length_agrees_with_distances_to_walls(office):
     poses = np.column_stack((space.centres[rng.integers(len(space.centres), size=200)], rng.uniform(-3.1, 3.1, 200)))
     paths = primitives(6.0)
     steps = free_steps(space, poses, paths)
-    stopped = 0
+    free, before, after, beyond = [], [], [], []
     for path, last in zip(paths, steps, strict=True):
         np.testing.assert_array_equal(free_length(space, poses, path), path.way[last])
         for pose, end in zip(poses[:20], last[:20].tolist(), strict=True):
             at = se2.compose(pose, path.poses)[:, :2]
-            assert distance_to_walls(world, at[: end + 1]).min() > CLEARANCE - CELL * math.sqrt(0.5)
-            assert not crosses(world, at[:end], at[1 : end + 1]).any()
-            if end + 1 < len(at):
-                stopped += 1
-                assert distance_to_walls(world, at[end + 1 : end + 2])[0] < CLEARANCE + CELL * math.sqrt(0.5)
-    assert stopped > 100
+            free.append(at[: end + 1])
+            before.append(at[:end])
+            after.append(at[1 : end + 1])
+            beyond.append(at[end + 1 : end + 2])
+    free, before, after, beyond = (np.concatenate(points) for points in (free, before, after, beyond))
+    assert distance_to_walls(world, free).min() > CLEARANCE - CELL * math.sqrt(0.5)
+    assert not crosses(world, before, after).any()
+    assert distance_to_walls(world, beyond).max() < CLEARANCE + CELL * math.sqrt(0.5)
+    assert len(beyond) > 100
 
 
 def test_a_robot_at_a_wall_may_leave_it_but_not_go_through():
