@@ -113,9 +113,9 @@ for line in sys.stdin:
     if '"number": 0' in line:
         clock.on_start(None)
         clock.on_start(None)
-        work(1.0)
+        work(0.6)
         clock.on_end(None)
-        work(1.0)
+        work(0.6)
         clock.on_end(None)
     else:
         work(1000.0)
@@ -124,7 +124,7 @@ for line in sys.stdin:
 
 
 def test_the_time_of_compilation_does_not_count(tmp_path):
-    worker = Worker(tmp_path, command=("-c", COMPILING), seconds=0.5)
+    worker = Worker(tmp_path, command=("-c", COMPILING), seconds=0.3)
     compiled, hanging = (verdict for _, verdict in worker.try_cases("toml", 0, 0, 2))
     worker.close()
     assert compiled.outcome == "read"
