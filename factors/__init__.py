@@ -19,6 +19,7 @@ __all__ = [
     "rts_kernels",
     "se2",
     "se2_kernels",
+    "small_kernels",
     "update",
     "walls",
 ]

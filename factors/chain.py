@@ -9,7 +9,9 @@ depends on, by the next one, and by the parameters.
 import numba
 import numpy as np
 
+from factors import small_kernels
 from factors.se2 import Array, Integers
+from factors.small_kernels import inverse, product, product_by_transpose
 
 POSE = 3
 LEAST = 1e-11  # of a diagonal element: what elimination leaves below this share of it is a matter of rounding
@@ -112,7 +114,9 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
             return False, inverses, by_next, by_shared, steps, left, down
         _multiply(inverses[i], after[i], by_next[i])
         _multiply(inverses[i], side, by_shared[i])
-        steps[i] = inverses[i] @ carried
+        for a in range(POSE):
+            for b in range(POSE):
+                steps[i, a] += inverses[i, a, b] * carried[b]
         _subtract(side, by_shared[i], left)
         for a in range(POSE):
             for j in range(shared):
@@ -131,12 +135,17 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
 def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
     """The step of Gauss and Newton, with ``damping`` added to the diagonal: of the poses (N, 3) and of the parameters (P,). The
     first value tells whether the problem determines them; LinAlgError where it is the parameters that are not determined."""
-    found, _, by_next, by_shared, steps, left, down = _eliminated(system, damping)
-    poses, shared = -steps, -down
+    found, _, by_next, by_shared, poses, left, shared = _eliminated(system, damping)
     if found:
-        shared[:] = np.linalg.solve(left, shared)
+        right = np.empty((len(shared), 1))
+        for k in range(len(shared)):
+            right[k, 0] = -shared[k]
+        right, _ = small_kernels.solved(left, right)
+        for k in range(len(shared)):
+            shared[k] = right[k, 0]
         for i in range(len(poses) - 1, -1, -1):
             for a in range(POSE):
+                poses[i, a] = -poses[i, a]
                 for k in range(len(shared)):
                     poses[i, a] -= by_shared[i, a, k] * shared[k]
                 if i + 1 < len(poses):
@@ -152,17 +161,26 @@ def covariances(system: System) -> tuple[bool, Array, Array]:
     shared = len(left)
     if not found:
         return False, out, left
-    common = np.linalg.inv(left)
-    common = (common + common.T) / 2.0
-    crossed = np.zeros((POSE, shared))  # the covariance of the pose and the parameters
+    common = inverse(left)
+    for a in range(shared):
+        for b in range(a):
+            common[a, b] = common[b, a] = (common[a, b] + common[b, a]) / 2.0
+    crossed = np.zeros((POSE, shared))  # the covariance of the pose and the parameters, negative
     for i in range(len(out) - 1, -1, -1):
-        here = -by_shared[i] @ common
+        here = product(by_shared[i], common)
         # of what the next pose and the parameters make of this one
-        spread = by_shared[i] @ common @ by_shared[i].T
+        spread = product_by_transpose(here, by_shared[i])
         if i + 1 < len(out):
-            here -= by_next[i] @ crossed
-            both = by_next[i] @ crossed @ by_shared[i].T
-            spread += by_next[i] @ out[i + 1] @ by_next[i].T + both + both.T
-        out[i] += (spread + spread.T) / 2.0
+            beyond = product(by_next[i], crossed)
+            both = product_by_transpose(beyond, by_shared[i])
+            later = product_by_transpose(product(by_next[i], out[i + 1]), by_next[i])
+            for a in range(POSE):
+                for b in range(POSE):
+                    spread[a, b] += later[a, b] - both[a, b] - both[b, a]
+                for k in range(shared):
+                    here[a, k] -= beyond[a, k]
+        for a in range(POSE):
+            for b in range(POSE):
+                out[i, a, b] += (spread[a, b] + spread[b, a]) / 2.0
         crossed = here
     return True, out, common

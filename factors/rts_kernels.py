@@ -4,17 +4,20 @@ import numba
 import numpy as np
 
 from factors.se2 import Array
+from factors.small_kernels import product, product_by_transpose, solved
 
 
 @numba.njit(cache=True)
 def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
     """The predicted covariance (S, S). ``transition`` (3, S): its first rows, the others are those of the identity; ``noise`` (3,
     3): added to the first three components."""
-    moved = transition @ covariance
-    after = covariance.copy()
-    after[:3] = moved
-    after[:, :3] = moved.T
-    after[:3, :3] = moved @ transition.T + noise
+    moved, after = product(transition, covariance), covariance.copy()
+    own = product_by_transpose(moved, transition)
+    for i in range(3):
+        for j in range(3, len(after)):
+            after[i, j] = after[j, i] = moved[i, j]
+        for j in range(3):
+            after[i, j] = own[i, j] + noise[i, j]
     return after
 
 
@@ -26,11 +29,22 @@ def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, 
     smoothed state after that step differs by ``change`` (S,) from the predicted one, and has the covariance ``later`` (S, S).
     LinAlgError if the predicted covariance is singular.
     """
-    after = predicted(covariance, transition, noise)
+    size, after, moved = len(covariance), predicted(covariance, transition, noise), product(transition, covariance)
     carried = covariance.copy()  # transition times covariance
-    carried[:3] = transition @ covariance
-    gain = np.ascontiguousarray(np.linalg.solve(after, carried).T)
-    return gain @ change, covariance + gain @ (later - after) @ gain.T
+    for i in range(3):
+        for j in range(size):
+            carried[i, j] = moved[i, j]
+    gain, _ = solved(after, carried)  # its transpose
+    for i in range(size):
+        for j in range(size):
+            after[i, j] = later[i, j] - after[i, j]
+    correction, half, out = np.zeros(size), product(after, gain), covariance.copy()
+    for k in range(size):
+        for i in range(size):
+            correction[i] += gain[k, i] * change[k]
+            for j in range(size):
+                out[i, j] += gain[k, i] * half[k, j]
+    return correction, out
 
 
 @numba.njit(cache=True)

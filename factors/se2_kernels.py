@@ -132,7 +132,8 @@ def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
         wx, wy, wh = weights[n] * dx, weights[n] * dy, weights[n] * dh
         xx, xy, xh = xx + wx * dx, xy + wx * dy, xh + wx * dh
         yy, yh, hh = yy + wy * dy, yh + wy * dh, hh + wh * dh
-    covariance[0] = xx, xy, xh
-    covariance[1] = xy, yy, yh
-    covariance[2] = xh, yh, hh
+    covariance[0, 0], covariance[1, 1], covariance[2, 2] = xx, yy, hh
+    covariance[0, 1] = covariance[1, 0] = xy
+    covariance[0, 2] = covariance[2, 0] = xh
+    covariance[1, 2] = covariance[2, 1] = yh
     return np.array((x, y, heading)), covariance

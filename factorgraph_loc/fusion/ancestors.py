@@ -4,6 +4,8 @@ Godsill, Doucet, West, JASA 99(465), 2004, eq. 7: an ancestor is drawn with its 
 The kernel is compiled: in numpy it takes ten times as long, and most of the final result's time (``scripts/bench``).
 """
 
+import math
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +80,9 @@ def _draw(
     what is left of the pose's error."""
     count = len(predicted)
     size = whitened.shape[1] - 3
-    cosine, sine = np.cos(predicted[:, 2]), np.sin(predicted[:, 2])
+    cosine, sine = np.empty(count), np.empty(count)
+    for i in range(count):
+        cosine[i], sine[i] = math.cos(predicted[i, 2]), math.sin(predicted[i, 2])
     density = np.empty(count)
     rows = np.empty(len(after), np.int64)
     for j in range(len(after)):
@@ -100,8 +104,9 @@ def _draw(
             density[i] = log_weights[i] - 0.5 * squared
             highest = max(highest, density[i])
         if not highest > -np.inf:  # so far away that no density is left: by the weights alone
-            highest = np.max(log_weights)
-            density[:] = log_weights
+            for i in range(count):
+                density[i] = log_weights[i]
+                highest = max(highest, density[i])
         total = 0.0
         for i in range(count):
             # far below the highest nothing is drawn, and exp is what takes time

@@ -70,19 +70,28 @@ def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size:
         lows[m] = right - 1e-9
         highs[m] = left + 1e-9 + (BINS if left < right else 0.0)
         m += 1
-    order = np.argsort(table[:m, DISTANCE])
+    order = np.empty(m, dtype=np.int64)
+    for k in range(m):
+        free = k
+        while free > 0 and table[order[free - 1], DISTANCE] > table[k, DISTANCE]:
+            order[free] = order[free - 1]
+            free -= 1
+        order[free] = k
     starts = np.zeros(BINS + 1, dtype=np.int64)
     for j in order:
         for b in range(math.floor(lows[j]), math.floor(highs[j]) + 1):
             starts[b % BINS + 1] += 1
-    starts = np.cumsum(starts)
-    items, used = np.empty(starts[BINS], dtype=np.int64), starts[:-1].copy()
+    for b in range(BINS):
+        starts[b + 1] += starts[b]
+    items, used, ordered = np.empty(starts[BINS], dtype=np.int64), starts.copy(), np.empty((m, 13))
     for k in range(m):
         j = order[k]
+        for c in range(13):
+            ordered[k, c] = table[j, c]
         for b in range(math.floor(lows[j]), math.floor(highs[j]) + 1):
             items[used[b % BINS]] = k
             used[b % BINS] += 1
-    return Surroundings(origin, table[order], starts, items, size)
+    return Surroundings(origin, ordered, starts, items, size)
 
 
 @numba.njit(inline="always", error_model="numpy")
@@ -153,31 +162,29 @@ def expose(
     table, starts, items = around.table, around.starts, around.items
     origin, size = around.origin, around.size
     place = (origin[0], origin[1], origin[2], size[2], size[3], size[4])
-    for i in range(height):
-        for j in range(width):
-            x, y = directions[i, j, 0], directions[i, j, 1]
-            found[i, j], blue, green, red = _look(
-                table, starts, items, place, texels, layout, x, y, rotation, pixel_at_one
-            )
-            out[i, j, 0] += blue
-            out[i, j, 1] += green
-            out[i, j, 2] += red
-    for i in range(height):
-        for j in range(width):
-            here = found[i, j]
-            left, right, up, down = max(j - 1, 0), min(j + 1, width - 1), max(i - 1, 0), min(i + 1, height - 1)
-            if found[i, left] == here == found[i, right] and found[up, j] == here == found[down, j]:
-                continue
-            across = (directions[i, right, 0] - directions[i, left, 0]) / (right - left)
-            along = (directions[down, j, 1] - directions[up, j, 1]) / (down - up)
-            for k in range(5):  # remove the central ray and add four around it
-                a, b = (0.5 * (k % 2) - 0.25, 0.5 * (k // 2) - 0.25) if k < 4 else (0.0, 0.0)
-                weight = np.float32(0.25) if k < 4 else np.float32(-1.0)
-                x, y = directions[i, j, 0] + a * across, directions[i, j, 1] + b * along
-                _, blue, green, red = _look(table, starts, items, place, texels, layout, x, y, rotation, pixel_at_one)
-                out[i, j, 0] += weight * blue
-                out[i, j, 1] += weight * green
-                out[i, j, 2] += weight * red
+    for edges in range(2):  # one loop for both, as what is inlined takes seconds to compile
+        for i in range(height):
+            for j in range(width):
+                across, along, first = 0.0, 0.0, 4
+                if edges == 1:  # remove the central ray and add four around it
+                    here, first = found[i, j], 0
+                    left, right, up, down = max(j - 1, 0), min(j + 1, width - 1), max(i - 1, 0), min(i + 1, height - 1)
+                    if found[i, left] == here == found[i, right] and found[up, j] == here == found[down, j]:
+                        continue
+                    across = (directions[i, right, 0] - directions[i, left, 0]) / (right - left)
+                    along = (directions[down, j, 1] - directions[up, j, 1]) / (down - up)
+                for k in range(first, 5):
+                    a, b = (0.5 * (k % 2) - 0.25, 0.5 * (k // 2) - 0.25) if k < 4 else (0.0, 0.0)
+                    weight = np.float32(0.25 if k < 4 else 1.0 - 2.0 * edges)
+                    x, y = directions[i, j, 0] + a * across, directions[i, j, 1] + b * along
+                    hit, blue, green, red = _look(
+                        table, starts, items, place, texels, layout, x, y, rotation, pixel_at_one
+                    )
+                    if edges == 0:
+                        found[i, j] = hit
+                    out[i, j, 0] += weight * blue
+                    out[i, j, 1] += weight * green
+                    out[i, j, 2] += weight * red
 
 
 @numba.njit(inline="always", error_model="numpy")

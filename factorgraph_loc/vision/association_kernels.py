@@ -72,16 +72,22 @@ def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Arr
     ``predicted`` (C, 2); ``inverses`` (C, 2, 2): inverse gate matrices (1 on the border); ``reaches`` (C,): largest radii;
     ``features`` (K, 2). ``cell``: size of the cells for sorting features.
     """
-    low_x, low_y = features[:, 0].min(), features[:, 1].min()
-    columns = int((features[:, 0].max() - low_x) / cell) + 1
-    lines = int((features[:, 1].max() - low_y) / cell) + 1
+    low_x, low_y = high_x, high_y = features[0, 0], features[0, 1]
+    for i in range(1, len(features)):
+        low_x, low_y = min(low_x, features[i, 0]), min(low_y, features[i, 1])
+        high_x, high_y = max(high_x, features[i, 0]), max(high_y, features[i, 1])
+    columns, lines = int((high_x - low_x) / cell) + 1, int((high_y - low_y) / cell) + 1
     where = np.empty(len(features), np.int64)
-    counts = np.zeros(columns * lines + 1, np.int64)
+    begins, used = np.zeros(columns * lines + 1, np.int64), np.zeros(columns * lines, np.int64)
     for i in range(len(features)):
         where[i] = int((features[i, 1] - low_y) / cell) * columns + int((features[i, 0] - low_x) / cell)
-        counts[where[i] + 1] += 1
-    begins = np.cumsum(counts)
-    sorted_features = np.argsort(where, kind="mergesort")
+        begins[where[i] + 1] += 1
+    for i in range(columns * lines):
+        begins[i + 1] += begins[i]
+    sorted_features = np.empty(len(features), np.int64)
+    for i in range(len(features)):
+        sorted_features[begins[where[i]] + used[where[i]]] = i
+        used[where[i]] += 1
     pairs = np.empty((1024, 2), np.int64)
     n = 0
     for c in range(len(predicted)):
@@ -101,7 +107,8 @@ def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Arr
                     continue
                 if n == len(pairs):
                     longer = np.empty((2 * n, 2), np.int64)
-                    longer[:n] = pairs
+                    for k in range(n):
+                        longer[k, 0], longer[k, 1] = pairs[k, 0], pairs[k, 1]
                     pairs = longer
                 pairs[n, 0], pairs[n, 1] = c, f
                 n += 1

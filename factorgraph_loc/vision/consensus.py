@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from factors import positive
+from factors import positive, small_kernels
 from factors.camera import kernels as reprojection_kernels
 from factors.camera import model as reprojection
 from factors.camera.kernels import Lens
@@ -129,7 +129,7 @@ def _joint(
     """Normalised squared innovation of points (K, 3) seen at pixels (K, 2) with noise (K, 2, 2), by a camera with perturbation
     covariance (6, 6)."""
     predicted, jacobian, _ = reprojection_kernels.linearize_in_space(lens, position, rotation, points)
-    information, pull, total = np.zeros((6, 6)), np.zeros(6), 0.0
+    information, pull, total = np.zeros((6, 6)), np.zeros((6, 1)), 0.0
     for i in range(len(points)):
         a, b, c = spreads[i, 0, 0], spreads[i, 0, 1], spreads[i, 1, 1]
         determinant = a * c - b * b
@@ -138,12 +138,18 @@ def _joint(
         total += u * wu + v * wv
         for j in range(6):
             ju, jv = jacobian[i, 0, j], jacobian[i, 1, j]
-            pull[j] += ju * wu + jv * wv
+            pull[j, 0] += ju * wu + jv * wv
             xu, xv = (c * ju - b * jv) / determinant, (a * jv - b * ju) / determinant
             for m in range(6):
                 information[j, m] += xu * jacobian[i, 0, m] + xv * jacobian[i, 1, m]
     # by the matrix inversion lemma, in a form that allows a singular covariance
-    return float(total - pull @ (covariance @ np.linalg.solve(np.eye(6) + information @ covariance, pull)))
+    both = small_kernels.product(information, covariance)
+    for j in range(6):
+        both[j, j] += 1.0
+    drawn = small_kernels.product(covariance, small_kernels.solved(both, pull)[0])
+    for j in range(6):
+        total -= pull[j, 0] * drawn[j, 0]
+    return total
 
 
 def _root(camera: CameraPose) -> Array:

@@ -121,11 +121,10 @@ def spread(points: Float, scales: Float, reach: float, alike: float, count: int)
     Nearby: within ``reach`` times their own of the ``scales`` (N,), with a scale ratio of at most ``alike``. If there are too
     few, the strongest of the others are added."""
     total = len(points)
-    first = np.empty(min(count, total), dtype=np.int64)
-    crowded = np.empty(total, dtype=np.int64)
-    free = others = 0
+    wanted, chosen = min(count, total), 0
+    taken = np.zeros(total, np.bool_)
     for n in range(total):
-        if free == len(first):
+        if chosen == wanted:
             break
         radius = (reach * scales[n]) ** 2
         alone = True
@@ -137,14 +136,18 @@ def spread(points: Float, scales: Float, reach: float, alike: float, count: int)
                     alone = False
                     break
         if alone:
-            first[free] = n
-            free += 1
-        else:
-            crowded[others] = n
-            others += 1
-    missing = min(len(first) - free, others)
-    first[free : free + missing] = crowded[:missing]
-    return np.sort(first[: free + missing])
+            taken[n] = True
+            chosen += 1
+    out, free = np.empty(wanted, np.int64), wanted - chosen  # places for the others
+    chosen = 0
+    for n in range(total):
+        if not taken[n] and free > 0:
+            taken[n] = True
+            free -= 1
+        if taken[n]:
+            out[chosen] = n
+            chosen += 1
+    return out
 
 
 @numba.njit(cache=True, fastmath=FAST)

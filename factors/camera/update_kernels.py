@@ -14,6 +14,7 @@ from factors.camera.kernels import Lens, in_camera, mounting, pixel
 from factors.robust import huber_weight
 from factors.se2 import Array
 from factors.se2_kernels import exp
+from factors.small_kernels import inverse
 
 Row = tuple[float, float, float]
 
@@ -66,7 +67,7 @@ def updated(
     """See :func:`~factors.update.robust_update`: correction (S,) and covariance (S, S) afterwards; whitened residuals (K, 2) at the
     prediction, and their normalised square. ``gate``: of a single point."""
     n, size = len(seen.points), len(covariance)
-    prior = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    prior = inverse(covariance)
     first, jacobian = np.empty((n, 2)), np.empty((n, 2, 3))
     _whiten(seen, pose[0], pose[1], pose[2], first, jacobian)
     weights, before = np.ones(n), np.zeros(size)
@@ -245,7 +246,7 @@ def _solved(
     information[2, 0] += xa
     information[1, 2] += ya
     information[2, 1] += ya
-    after = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    after = inverse(information)
     delta = np.empty(len(prior))
     for i in range(len(prior)):
         delta[i] = after[i, 0] * px + after[i, 1] * py + after[i, 2] * pa

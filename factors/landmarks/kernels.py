@@ -60,15 +60,17 @@ def linearize(
                     by_pose[k, i, 0] * twist[0] + by_pose[k, i, 1] * twist[1] + by_pose[k, i, 2] * twist[2]
                 )
         if widened or len(spreads):
-            spread = np.eye(2)
+            uu, uv, vv = 1.0, 0.0, 1.0
             if len(spreads):
-                spread += by_point[k] @ np.ascontiguousarray(spreads[k]) @ by_point[k].T
+                a, b, d = _carried(by_point[k], spreads[k])
+                uu, uv, vv = uu + a, uv + b, vv + d
             if widened:
-                spread += count * (by_pose[k] @ covariance @ by_pose[k].T)
+                a, b, d = _carried(by_pose[k], covariance)
+                uu, uv, vv = uu + count * a, uv + count * b, vv + count * d
             # of the inverse of the lower root
-            p = 1.0 / math.sqrt(spread[0, 0])
-            low = spread[1, 0] * p
-            q = 1.0 / math.sqrt(max(spread[1, 1] - low * low, 1e-12 * spread[1, 1]))
+            p = 1.0 / math.sqrt(uu)
+            low = uv * p
+            q = 1.0 / math.sqrt(max(vv - low * low, 1e-12 * vv))
             r = -low * p * q
             error[k, 1] = r * error[k, 0] + q * error[k, 1]
             error[k, 0] *= p
@@ -86,13 +88,28 @@ def linearize(
 
 
 @numba.njit(cache=True)
+def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
+    """The elements (0, 0), (1, 0) and (1, 1) of what a Jacobian (2, D) makes of a covariance (D, D)."""
+    a = b = d = 0.0
+    for i in range(len(covariance)):
+        for j in range(len(covariance)):
+            a += jacobian[0, i] * covariance[i, j] * jacobian[0, j]
+            b += jacobian[1, i] * covariance[i, j] * jacobian[0, j]
+            d += jacobian[1, i] * covariance[i, j] * jacobian[1, j]
+    return a, b, d
+
+
+@numba.njit(cache=True)
 def weigh(error: Array, by_pose: Array, by_sensor: Array, robust: float) -> None:
     """Multiply what :func:`linearize` found by the roots of the robust weights."""
     for k in range(len(error)):
         root = math.sqrt(geman_mcclure_weight(error[k, 0] ** 2 + error[k, 1] ** 2, robust))
-        error[k] *= root
-        by_pose[k] *= root
-        by_sensor[k] *= root
+        for i in range(2):
+            error[k, i] *= root
+            for j in range(3):
+                by_pose[k, i, j] *= root
+            for j in range(TIME_OFFSET + 1):
+                by_sensor[k, i, j] *= root
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -19,6 +19,7 @@ from factors.motion import Increment
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array
 from factors.se2_kernels import arc, log, wrapped
+from factors.small_kernels import inverse, product
 
 _NOWHERE = np.zeros(3)
 
@@ -113,11 +114,16 @@ def _linearize(
     else:
         off = _between(measured, rel)
         residual = np.array(log(off[0], off[1], off[2]))
-        derivative[:] = np.linalg.inv(_right_jacobian(residual))
-    error[:] = whitener @ residual
-    whitened = whitener @ derivative
-    by_later[:] = whitened @ _adjoint(_between(offset, np.zeros(3)))
-    by_earlier[:] = -whitened @ _adjoint(_between(_compose(earlier_offset, rel), np.zeros(3)))
+        derivative = inverse(_right_jacobian(residual))
+    whitened = product(whitener, derivative)
+    to_later = product(whitened, _adjoint(_between(offset, np.zeros(3))))
+    to_earlier = product(whitened, _adjoint(_between(_compose(earlier_offset, rel), np.zeros(3))))
+    for i in range(len(error)):
+        error[i] = 0.0
+        for j in range(len(error)):
+            error[i] += whitener[i, j] * residual[j]
+        for j in range(3):
+            by_later[i, j], by_earlier[i, j] = to_later[i, j], -to_earlier[i, j]
 
 
 @numba.njit(cache=True)

@@ -29,6 +29,12 @@ _arc_coefficients = numba.njit(cache=True)(se2.arc_coefficients)
 
 
 @numba.njit(cache=True)
+def _copy(row: Array, to: Array) -> None:
+    for j in range(len(row)):
+        to[j] = row[j]
+
+
+@numba.njit(cache=True)
 def without_old(rows: Array, knots: Array, count: int, horizon: float) -> int:
     """Forget old rows; returns the new count. Rarely, and many rows at once, because the remaining ones are moved to the front."""
     newest = knots[count - 1, T]
@@ -36,7 +42,8 @@ def without_old(rows: Array, knots: Array, count: int, horizon: float) -> int:
         return count
     keep = np.searchsorted(knots[:count, T], newest - horizon, side="right") - 1
     for i in range(count - keep):
-        rows[i], knots[i] = rows[keep + i], knots[keep + i]
+        _copy(rows[keep + i], rows[i])
+        _copy(knots[keep + i], knots[i])
     return int(count - keep)
 
 
@@ -82,7 +89,7 @@ def insert(
     if count and t < knots[count - 1, T]:
         i = int(np.searchsorted(knots[:count, T], t, side="right"))
         for k in range(count, i, -1):
-            rows[k] = rows[k - 1]
+            _copy(rows[k - 1], rows[k])
     rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4] = t, kind, a, b, c
     integrate(rows, knots, i, count + 1, constants)
     return without_old(rows, knots, count + 1, horizon) if i == count else count + 1
@@ -254,7 +261,8 @@ def predicted_at(
 ) -> State:
     end = state_at(knots, count, t, chain)
     delta, spread, duration, still = relative(noise, start, end)
-    added[:] = spread
+    for i in range(3):
+        _copy(spread[i], added[i])
     predicted(delta, spread, duration - still, pose, covariance, constants, indices, first, at, transition, after)
     return end
 
@@ -283,4 +291,6 @@ def moved_to(
 @numba.njit(cache=True)
 def states_at(knots: Array, count: int, times: Array, constants: Array, out: Array) -> None:
     for j in range(len(times)):
-        out[j, :] = state_at(knots, count, times[j], constants)
+        s = state_at(knots, count, times[j], constants)
+        row = out[j]
+        row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7] = s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7]

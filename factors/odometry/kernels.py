@@ -7,6 +7,7 @@ import numpy as np
 
 from factors.se2 import Array, Integers
 from factors.se2_kernels import SMALL, arc, exp, log, wrapped
+from factors.small_kernels import product
 
 # Minimum variance of positions relative to the largest one. A pose known only to a hundred metres is not known better than to a
 # tenth of a millimetre in any direction; otherwise its covariance would be numerically singular.
@@ -58,7 +59,10 @@ def relatives(noise: Array, starts: Array, ends: Array, constants: Array, indice
         delta, covariance, duration, still = relative(noise, start, end)
         if len(indices):
             delta = recalibrated(delta, duration - still, constants, indices)
-        deltas[k], covariances[k] = delta, covariance
+        for i in range(3):
+            deltas[k, i] = delta[i]
+            for j in range(3):
+                covariances[k, i, j] = covariance[i, j]
     return deltas, covariances
 
 
@@ -100,14 +104,16 @@ def predicted(
     covariance ``after`` (S, S) a motion by ``delta`` (3,) with covariance ``noise`` (3, 3) and time ``moving``, under changed
     ``constants`` (P,), whose places are ``indices`` (P,) and whose columns in the error state begin at ``first``."""
     size, count = len(covariance), len(constants)
-    transition[:], after[:] = 0.0, covariance
     columns = np.arange(3 + count)  # where the transition is not zero
-    columns[3:] += first - 3
+    for j in range(3 * size):
+        transition[j // size, j % size] = 0.0
     x, y, turned = delta[0], delta[1], delta[2]
     if count:
         changed_delta, by_changes = recalibrate(np.array(log(x, y, turned)), moving, _full(constants, indices))
         x, y, turned = changed_delta[0], changed_delta[1], changed_delta[2]
-        transition[:, first : first + count] = by_changes[:, indices]
+        for i in range(3):
+            for j in range(count):
+                transition[i, first + j], columns[3 + j] = by_changes[i, indices[j]], first + j
     # the adjoint of the inverse of the motion
     c, s = math.cos(turned), math.sin(turned)
     transition[0, 0], transition[0, 1], transition[0, 2] = c, s, s * x - c * y
@@ -118,7 +124,9 @@ def predicted(
         for k in columns:
             for j in range(size):
                 moved[i, j] += transition[i, k] * covariance[k, j]
-    after[:3], after[:, :3] = moved, moved.T
+    for i in range(size):
+        for j in range(3, size):
+            after[i, j] = after[j, i] = moved[i, j] if i < 3 else covariance[i, j]
     for i in range(3):
         for j in range(3):
             after[i, j] = noise[i, j]
@@ -191,7 +199,11 @@ def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Arr
 def changed(twist: Array, moving: float, constants: Array, indices: Integers) -> tuple[Array, Array]:
     """:func:`recalibrate` for corrections ``constants`` (P,) with ``indices`` (P,) among all constants; the Jacobian is (3, P)."""
     delta, by_changes = recalibrate(twist, moving, _full(constants, indices))
-    return delta, np.ascontiguousarray(by_changes[:, indices])
+    out = np.empty((3, len(indices)))
+    for i in range(3):
+        for j in range(len(indices)):
+            out[i, j] = by_changes[i, indices[j]]
+    return delta, out
 
 
 @numba.njit(cache=True)
@@ -212,12 +224,18 @@ def linearize(
     relative = np.array((rx, ry, turned))
     ex, ey, angle = _between(delta, relative)
     x, y, angle = log(ex, ey, angle)
-    by_end = whitener @ _inverse(_right_jacobian(x, y, angle))
+    by_end = product(whitener, _inverse(_right_jacobian(x, y, angle)))
     c, s = math.cos(turned), math.sin(turned)
-    # the adjoint of the inverse of the relative pose
-    adjoint = np.array(((c, s, s * rx - c * ry), (-s, c, c * rx + s * ry), (0.0, 0.0, 1.0)))
-    by_delta = whitener @ _inverse(_right_jacobian(-x, -y, -angle))
-    return whitener @ np.array((x, y, angle)), -by_end @ adjoint, by_end, -by_delta @ by_changes
+    # the adjoint of the inverse of the relative pose, negative
+    adjoint = np.array(((-c, -s, c * ry - s * rx), (s, -c, -c * rx - s * ry), (0.0, 0.0, -1.0)))
+    by_delta = product(whitener, _inverse(_right_jacobian(-x, -y, -angle)))
+    for i in range(3):
+        for j in range(3):
+            by_delta[i, j] = -by_delta[i, j]
+    residual = np.empty(3)
+    for i in range(3):
+        residual[i] = whitener[i, 0] * x + whitener[i, 1] * y + whitener[i, 2] * angle
+    return residual, product(by_end, adjoint), by_end, product(by_delta, by_changes)
 
 
 @numba.njit(cache=True)
@@ -276,13 +294,18 @@ def linearize_all(
     """Residuals (3 K,) of K increments and their Jacobian (3 K, 6 + P), see :mod:`factors.chain`, between the poses ``first`` (K,)
     and those that follow; ``column``: of the constants."""
     for k in range(len(first)):
-        start, end, rows = poses[first[k]], poses[first[k] + 1], slice(3 * k, 3 * k + 3)
+        start, end, row = poses[first[k]], poses[first[k] + 1], 3 * k
         if len(indices):
             found = linearize_changed(start, end, twists[k], moving[k], constants, indices, whiteners[k])
-            jacobian[rows, column : column + len(indices)] = found[3]
+            for i in range(3):
+                for j in range(len(indices)):
+                    jacobian[row + i, column + j] = found[3][i, j]
         else:
             found = linearize(start, end, deltas[k], np.zeros((3, 0)), whiteners[k])
-        residual[rows], jacobian[rows, :3], jacobian[rows, 3:6] = found[0], found[1], found[2]
+        for i in range(3):
+            residual[row + i] = found[0][i]
+            for j in range(3):
+                jacobian[row + i, j], jacobian[row + i, 3 + j] = found[1][i, j], found[2][i, j]
 
 
 @numba.njit(cache=True)

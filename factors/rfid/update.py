@@ -16,6 +16,7 @@ from factors.rfid.detection import RfidLikelihood, Score
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Packed
 from factors.se2 import Array, Integers
+from factors.small_kernels import inverse, product, solved
 
 _Tags = tuple[Array, Array]  # points and normals
 _Seen = tuple[Array, Integers, Integers, Integers, Array, Array]  # offsets, antennas, rounds, hits, odds and elsewhere
@@ -119,12 +120,12 @@ def _updated(
 ) -> tuple[Array, Array, float, int, float, float, float]:
     """:func:`scored_update` by one factor of read counts."""
     here = _score(packed, tags, seen, tempering, pose)
-    prior_information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    prior_information = inverse(covariance)
     nis, dof = _innovation(here.gradient[0], here.information[0], covariance, tempering)
     surprise, variance, cost = here.nll[0] - here.expected[0], here.variance[0], here.nll[0]
-    best, moved = pose.copy(), np.zeros(3)
+    best, moved, largest = pose.copy(), np.zeros(3), LARGEST_STEP.copy()  # as a constant is another type
     for _ in range(iterations):
-        step = _scoring_step(prior_information, here.information[0], here.gradient[0], moved, LARGEST_STEP)
+        step = _scoring_step(prior_information, here.information[0], here.gradient[0], moved, largest)
         small = True
         for i in range(3):
             small = small and abs(step[i]) < CONVERGED * math.sqrt(covariance[i, i])
@@ -135,12 +136,16 @@ def _updated(
         for _ in range(4):
             tried = _stepped(best, step)
             there, error = _score(packed, tags, seen, tempering, tried), _apart(pose, tried)
-            tried_cost = there.nll[0] + 0.5 * np.dot(error, np.dot(prior_information, error))
+            tried_cost = there.nll[0]
+            for i in range(3):
+                for j in range(3):
+                    tried_cost += 0.5 * error[i] * prior_information[i, j] * error[j]
             lower = tried_cost <= cost
             if lower:
                 best, cost, moved, here = tried, tried_cost, error, there
                 break
-            step = step / 2.0
+            for i in range(3):
+                step[i] /= 2.0
         if not lower:
             break
     posterior, log_ratio = _posterior(prior_information, here.information[0])
@@ -193,27 +198,72 @@ def _apart(pose: Array, other: Array) -> Array:
 @numba.njit(cache=True)
 def _scoring_step(prior_information: Array, information: Array, gradient: Array, moved: Array, largest: Array) -> Array:
     """The step (D,) of Fisher scoring from where the state has ``moved`` (D,) to, shortened to the ``largest`` (D,) allowed."""
-    step = -np.linalg.solve(prior_information + information, gradient + prior_information @ moved)
-    step *= min(1.0, np.min(largest / np.maximum(np.abs(step), 1e-12)))
-    return np.asarray(step)
+    size, both, pull = len(gradient), prior_information.copy(), np.empty((len(gradient), 1))
+    for i in range(size):
+        pull[i, 0] = -gradient[i]
+        for j in range(size):
+            both[i, j] += information[i, j]
+            pull[i, 0] -= prior_information[i, j] * moved[j]
+    found, _ = solved(both, pull)
+    step, share = np.empty(size), 1.0
+    for i in range(size):
+        share = min(share, largest[i] / max(abs(found[i, 0]), 1e-12))
+    for i in range(size):
+        step[i] = share * found[i, 0]
+    return step
 
 
 @numba.njit(cache=True)
 def _posterior(prior_information: Array, information: Array) -> tuple[Array, float]:
     """Covariance (D, D) after an update, and the log of its determinant's ratio to that before."""
-    posterior = np.asarray(np.linalg.inv(prior_information + information))
-    return posterior, float(np.linalg.slogdet(posterior)[1] + np.linalg.slogdet(prior_information)[1])
+    size, both = len(information), prior_information.copy()
+    for i in range(size):
+        for j in range(size):
+            both[i, j] += information[i, j]
+    posterior, after = solved(both, np.eye(size))
+    return posterior, solved(prior_information, np.empty((size, 0)))[1] - after
 
 
 @numba.njit(cache=True)
 def _innovation(gradient: Array, information: Array, covariance: Array, tempering: float) -> tuple[float, int]:
     """Normalised square of a score, and its degrees of freedom."""
-    spread = tempering * information + information @ covariance @ information + NOTHING_TOLD * np.eye(len(gradient))
-    if (
-        covariance[0, 0] + covariance[1, 1] > FAR
-    ):  # of one direction so much more than of the others that these would be lost
-        units = np.sqrt(np.diag(spread))
-        gradient = gradient / units
-        spread = spread / units.reshape(len(units), 1) / units + ROUNDING * np.eye(len(units))
-    nis = float(gradient @ np.linalg.solve(spread, gradient))
-    return nis, int(np.sum(np.linalg.eigvalsh(information) > TELLING)) if nis > 0.0 else 0
+    size, spread, pull = (
+        len(gradient),
+        product(product(information, covariance), information),
+        np.empty((len(gradient), 1)),
+    )
+    for i in range(size):
+        pull[i, 0] = gradient[i]
+        spread[i, i] += NOTHING_TOLD
+        for j in range(size):
+            spread[i, j] += tempering * information[i, j]
+    if covariance[0, 0] + covariance[1, 1] > FAR:
+        # of one direction so much more than of the others that these would be lost
+        units = np.empty(size)
+        for i in range(size):
+            units[i] = math.sqrt(spread[i, i])
+        for i in range(size):
+            pull[i, 0] /= units[i]
+            for j in range(size):
+                spread[i, j] /= units[i] * units[j]
+            spread[i, i] += ROUNDING
+    found, nis = solved(spread, pull)[0], 0.0
+    for i in range(size):
+        nis += pull[i, 0] * found[i, 0]
+    return nis, _telling(information) if nis > 0.0 else 0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _telling(information: Array) -> int:
+    """The number of eigenvalues above :data:`TELLING`: that of positive pivots of the matrix less this times the identity
+    (Sylvester's law of inertia)."""
+    size, left, count = len(information), information.copy(), 0
+    for k in range(size):
+        left[k, k] -= TELLING
+    for k in range(size):
+        count += left[k, k] > 0.0
+        for i in range(k + 1, size):
+            share = left[i, k] / left[k, k]
+            for j in range(k + 1, size):
+                left[i, j] -= share * left[k, j]
+    return count
