@@ -6,6 +6,7 @@ __all__ = [
     "camera",
     "chain",
     "chi_squared",
+    "compiled",
     "compressed",
     "graph",
     "landmarks",

@@ -1,15 +1,15 @@
 """Poses between those of a row, along the odometry: compiled, as a run has ten of them a second."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
 from factors.odometry.kernels import carried
 from factors.se2 import Array, Integers
 from factors.se2_kernels import composed, exp, log, related
 
 
-@numba.njit(cache=True)
+@compiled
 def between(
     before: Integers,
     deltas: Array,

@@ -6,10 +6,10 @@ N poses, P parameters, M residuals. A row of a Jacobian (M, 6 + P) holds the der
 depends on, by the next one, and by the parameters.
 """
 
-import numba
 import numpy as np
 
 from factors import small_kernels
+from factors.compiled import compiled
 from factors.se2 import Array, Integers
 from factors.small_kernels import inverse, product, product_by_transpose
 
@@ -21,7 +21,7 @@ LEAST = 1e-11  # of a diagonal element: what elimination leaves below this share
 System = tuple[Array, Array, Array, Array, Array, Array]
 
 
-@numba.njit(cache=True)
+@compiled
 def normal(count: int, first: Integers, jacobian: Array, residual: Array) -> System:
     """The normal equations of ``count`` poses."""
     shared = jacobian.shape[1] - 2 * POSE
@@ -52,7 +52,7 @@ def normal(count: int, first: Integers, jacobian: Array, residual: Array) -> Sys
     return own, after, border, corner, gradient, common
 
 
-@numba.njit(cache=True)
+@compiled
 def _inverted(block: Array, out: Array) -> bool:
     """The inverse of a symmetric positive definite block (3, 3); False where rounding has left none."""
     a, b, c = block[0, 0], block[1, 0], block[2, 0]
@@ -77,7 +77,7 @@ def _inverted(block: Array, out: Array) -> bool:
     return True
 
 
-@numba.njit(cache=True)
+@compiled
 def _multiply(left: Array, right: Array, out: Array) -> None:
     """Add ``left`` (3, 3) times ``right`` (3, D) to ``out`` (3, D)."""
     for a in range(POSE):
@@ -86,7 +86,7 @@ def _multiply(left: Array, right: Array, out: Array) -> None:
                 out[a, k] += left[a, b] * right[b, k]
 
 
-@numba.njit(cache=True)
+@compiled
 def _subtract(left: Array, right: Array, out: Array) -> None:
     """Subtract the transpose of ``left`` (3, C) times ``right`` (3, D) from ``out`` (C, D)."""
     for a in range(POSE):
@@ -95,7 +95,7 @@ def _subtract(left: Array, right: Array, out: Array) -> None:
                 out[j, k] -= left[a, j] * right[a, k]
 
 
-@numba.njit(cache=True)
+@compiled
 def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Array, Array, Array, Array]:
     """Whether every pose can be eliminated in turn; the inverse block of each (N, 3, 3), that times its blocks by the next pose and
     by the parameters and times its gradient; and what is left of the parameters (P, P) and of their gradient (P,)."""
@@ -131,7 +131,7 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
     return True, inverses, by_next, by_shared, steps, left, down
 
 
-@numba.njit(cache=True)
+@compiled
 def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
     """The step of Gauss and Newton, with ``damping`` added to the diagonal: of the poses (N, 3) and of the parameters (P,). The
     first value tells whether the problem determines them; LinAlgError where it is the parameters that are not determined."""
@@ -154,7 +154,7 @@ def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
     return found, poses, shared
 
 
-@numba.njit(cache=True)
+@compiled
 def covariances(system: System) -> tuple[bool, Array, Array]:
     """Marginal covariances of the poses (N, 3, 3) and of the parameters (P, P), as :func:`solved`."""
     found, out, by_next, by_shared, _, left, _ = _eliminated(system, 0.0)

@@ -11,9 +11,9 @@ this is Gauss-Newton on the residual sqrt(2 nll).
 
 import math
 
-import numba
 import numpy as np
 
+from factors.compiled import compiled
 from factors.se2 import Array
 
 RELATIVE_RIDGE = 1e-9  # of the mean curvature, against division by zero
@@ -21,7 +21,7 @@ RIDGE = 1e-10
 LEAST = 1e-12  # a cost of zero has no gradient
 
 
-@numba.njit(cache=True)
+@compiled
 def _cholesky(matrix: Array, lower: Array) -> None:
     d = len(matrix)
     for i in range(d):
@@ -32,7 +32,7 @@ def _cholesky(matrix: Array, lower: Array) -> None:
             lower[i, j] = math.sqrt(max(total, RIDGE)) if i == j else total / lower[j, j]
 
 
-@numba.njit(cache=True)
+@compiled
 def _whitened(lower: Array, vector: Array, out: Array) -> float:
     """Compute L^-1 v into ``out`` and return its squared norm."""
     squared = 0.0
@@ -45,7 +45,7 @@ def _whitened(lower: Array, vector: Array, out: Array) -> float:
     return squared
 
 
-@numba.njit(cache=True)
+@compiled
 def _compress(nll: float, gradient: Array, information: Array, residual: Array, jacobian: Array) -> None:
     d = len(gradient)
     curvature = information.copy()

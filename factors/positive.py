@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from factors.compiled import compiled
 from factors.se2 import Array
 
 LEAST = 1e-12  # minimum eigenvalue of an invertible correlation matrix
@@ -37,7 +37,7 @@ def sound(covariance: Array) -> Array:
     return covariance if np.linalg.eigvalsh(shares)[0] > LEAST else nearest(covariance)
 
 
-@numba.njit(cache=True)
+@compiled
 def is_clear(covariance: Array) -> bool:
     """Whether a covariance (D, D) is finite and far from singular, so that it is its own :func:`sound` covariance."""
     size, left = len(covariance), np.empty(covariance.shape)

@@ -2,13 +2,13 @@
 
 import math
 
-import numba
 import numpy as np
 
+from factors.compiled import compiled
 from factors.se2 import Array
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def root(covariance: Array) -> tuple[Array, bool]:
     """The lower root of a covariance (D, D), of which the lower half is read, and whether there is one."""
     size = len(covariance)
@@ -27,7 +27,7 @@ def root(covariance: Array) -> tuple[Array, bool]:
     return out, True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def inverse(covariance: Array) -> tuple[Array, bool]:
     """The inverse of a covariance (D, D), of which the lower half is read, and whether there is one."""
     size = len(covariance)

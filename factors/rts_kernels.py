@@ -1,13 +1,13 @@
 """One backward step of the Rauch-Tung-Striebel smoother (1965), compiled."""
 
-import numba
 import numpy as np
 
+from factors.compiled import compiled
 from factors.se2 import Array
 from factors.small_kernels import product, product_by_transpose, solved
 
 
-@numba.njit(cache=True)
+@compiled
 def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
     """The predicted covariance (S, S). ``transition`` (3, S): its first rows, the others are those of the identity; ``noise`` (3,
     3): added to the first three components."""
@@ -21,7 +21,7 @@ def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
     return after
 
 
-@numba.njit(cache=True)
+@compiled
 def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, later: Array) -> tuple[Array, Array]:
     """The correction (S,) of a state, and its smoothed covariance (S, S).
 
@@ -47,7 +47,7 @@ def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, 
     return correction, out
 
 
-@numba.njit(cache=True)
+@compiled
 def is_skew(covariance: Array, share: float) -> bool:
     """Whether a covariance (S, S) is asymmetric by more than this share of two standard deviations."""
     for i in range(len(covariance)):

@@ -2,21 +2,21 @@
 
 import math
 
-import numba
 import numpy as np
 
+from factors.compiled import compiled
 from factors.se2 import Array
 
 SMALL = 1e-4  # rad; smaller angles use series, against cancellation
 SHORT = 0.5  # rad; of many poses smaller angles use longer series, in less time
 
 
-@numba.njit(cache=True)
+@compiled
 def wrapped(angle: float) -> float:
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
 
 
-@numba.njit(cache=True)
+@compiled
 def arc(angle: float) -> tuple[float, float]:
     """``sin(angle) / angle`` and ``(1 - cos(angle)) / angle``."""
     if abs(angle) < SMALL:
@@ -24,7 +24,7 @@ def arc(angle: float) -> tuple[float, float]:
     return math.sin(angle) / angle, 2.0 * math.sin(angle / 2.0) ** 2 / angle
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _arc_of_many(angle: float) -> tuple[float, float]:
     """:func:`arc` to 1e-12."""
     if abs(angle) > SHORT:
@@ -35,18 +35,18 @@ def _arc_of_many(angle: float) -> tuple[float, float]:
     return p, q
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _wrapped_of_many(angle: float) -> float:
     return angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
 
 
-@numba.njit(cache=True)
+@compiled
 def exp(x: float, y: float, angle: float) -> tuple[float, float, float]:
     p, q = arc(angle)
     return p * x - q * y, q * x + p * y, wrapped(angle)
 
 
-@numba.njit(cache=True)
+@compiled
 def log(x: float, y: float, heading: float) -> tuple[float, float, float]:
     angle = wrapped(heading)
     p, q = arc(angle)
@@ -54,21 +54,21 @@ def log(x: float, y: float, heading: float) -> tuple[float, float, float]:
     return scale * (p * x + q * y), scale * (p * y - q * x), angle
 
 
-@numba.njit(cache=True)
+@compiled
 def composed(x: float, y: float, heading: float, dx: float, dy: float, turned: float) -> tuple[float, float, float]:
     """The pose (dx, dy, turned) in the frame of another one."""
     c, s = math.cos(heading), math.sin(heading)
     return x + c * dx - s * dy, y + s * dx + c * dy, wrapped(heading + turned)
 
 
-@numba.njit(cache=True)
+@compiled
 def related(x: float, y: float, heading: float, to_x: float, to_y: float, to: float) -> tuple[float, float, float]:
     """The pose (to_x, to_y, to) as seen from another one."""
     c, s, dx, dy = math.cos(heading), math.sin(heading), to_x - x, to_y - y
     return c * dx + s * dy, c * dy - s * dx, wrapped(to - heading)
 
 
-@numba.njit(cache=True)
+@compiled
 def moved(pose: Array, twist: Array) -> Array:
     """The pose (3,) moved by a twist in its own frame, of which the first three components are read."""
     x, y, turned = exp(twist[0], twist[1], twist[2])
@@ -76,7 +76,7 @@ def moved(pose: Array, twist: Array) -> Array:
     return np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrapped(pose[2] + turned)))
 
 
-@numba.njit(cache=True)
+@compiled
 def body_to_world(pose: Array, covariance: Array) -> Array:
     """:func:`factors.se2.body_to_world` of one pose (3,), and of the first three components of a covariance (S, S), of which the
     upper triangle is read: the result is symmetric to the last bit."""
@@ -91,7 +91,7 @@ def body_to_world(pose: Array, covariance: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def all_moved(poses: Array, delta: Array, twists: Array) -> Array:
     """Poses (N, 3) composed with ``delta`` (3,), and each then moved by a twist (N, 3) in its own frame."""
     out, cd, sd = np.empty_like(poses), math.cos(delta[2]), math.sin(delta[2])
@@ -105,7 +105,7 @@ def all_moved(poses: Array, delta: Array, twists: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def twists_to(pose: Array, others: Array) -> Array:
     """The twists (N, 3) in the frame of a pose (3,) that lead from it to others (N, 3)."""
     out, c, s = np.empty_like(others), math.cos(pose[2]), math.sin(pose[2])
@@ -118,7 +118,7 @@ def twists_to(pose: Array, others: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@compiled(error_model="numpy", fastmath={"reassoc", "contract"})
 def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
     """Weighted mean (3,), circular in heading, and covariance (3, 3) of poses (N, 3) in the world's frame."""
     x = y = cosine = sine = 0.0

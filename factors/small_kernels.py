@@ -6,13 +6,13 @@ process that compiles.
 
 import math
 
-import numba
 import numpy as np
 
+from factors.compiled import compiled
 from factors.se2 import Array
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def product(left: Array, right: Array) -> Array:
     """The matrix product (M, N) of ``left`` (M, K) and ``right`` (K, N)."""
     out = np.zeros((left.shape[0], right.shape[1]))
@@ -23,7 +23,7 @@ def product(left: Array, right: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def product_by_transpose(left: Array, right: Array) -> Array:
     """The matrix product (M, N) of ``left`` (M, K) and the transpose of ``right`` (N, K)."""
     out = np.zeros((left.shape[0], right.shape[0]))
@@ -34,7 +34,7 @@ def product_by_transpose(left: Array, right: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def solved(matrix: Array, right: Array) -> tuple[Array, float]:
     """The solution (D, N) of ``matrix`` (D, D) times x = ``right`` (D, N), by elimination with pivots, and the logarithm of the
     absolute determinant. LinAlgError if the matrix is singular."""
@@ -66,7 +66,7 @@ def solved(matrix: Array, right: Array) -> tuple[Array, float]:
     return out, log_determinant
 
 
-@numba.njit(cache=True)
+@compiled
 def inverse(matrix: Array) -> Array:
     """The inverse of a matrix (D, D). LinAlgError if it is singular."""
     return solved(matrix, np.eye(len(matrix)))[0]

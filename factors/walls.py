@@ -12,9 +12,9 @@ The factor is constant except where a wall's end comes between the two. There it
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from factors.compiled import compiled
 from factors.se2 import Array, Integers, transform_from
 
 CELL = 1.0  # m
@@ -79,7 +79,7 @@ def _distance(points: Array, wall: Array) -> Array:
 NO_WALLS = np.empty((0, 5))
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def crosses(line: Array, ax: float, ay: float, bx: float, by: float) -> bool:
     """Whether a wall (4,) is between two places. One on the wall itself has it on no side."""
     x, y, dx, dy = line[0], line[1], line[2], line[3]
@@ -89,7 +89,7 @@ def crosses(line: Array, ax: float, ay: float, bx: float, by: float) -> bool:
     return bool((side_a * side_b < 0.0) & (first * (first + ex * dy - ey * dx) <= 0.0))
 
 
-@numba.njit(cache=True)
+@compiled
 def around(walls: Walls, x: float, y: float) -> tuple[int, int]:
     """The first of the walls in ``order`` that matter at a place, and the end of them."""
     i, j = (x - walls.corner[0]) / walls.cell, (y - walls.corner[1]) / walls.cell
@@ -100,7 +100,7 @@ def around(walls: Walls, x: float, y: float) -> tuple[int, int]:
     return walls.start[cell], walls.start[cell + 1]
 
 
-@numba.njit(cache=True)
+@compiled
 def farther(walls: Walls | None, ax: float, ay: float, bx: float, by: float) -> float:
     """The factor by which the walls between two places make the second one seem farther away."""
     if walls is None:
@@ -114,7 +114,7 @@ def farther(walls: Walls | None, ax: float, ay: float, bx: float, by: float) -> 
     return out
 
 
-@numba.njit(cache=True)
+@compiled
 def all_farther(walls: Walls | None, antennas: Array, tags: Array) -> Array:
     """The factors (N, T) of :func:`farther` from ``antennas`` (N, 2) to ``tags`` (T, 2)."""
     out = np.ones((len(antennas), len(tags)))

@@ -97,7 +97,8 @@ def first_use() -> None:
         return
     from factors.odometry.kernels import relative  # which every run needs
 
-    cache = relative.stats.cache_path
+    function: Any = relative  # as numba makes it
+    cache = function.stats.cache_path
     if cache is None or not any(Path(cache).glob("*.relative-*.nbi")):
         note("the first use compiles for up to a minute; later ones do not")
 

@@ -6,11 +6,11 @@ The kernel is compiled: in numpy it takes ten times as long, and most of the fin
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import positive
+from factors.compiled import compiled
 from factors.se2 import Array
 
 Indices = NDArray[np.int64]
@@ -66,7 +66,7 @@ def transition_log_density(
     return np.asarray(-0.5 * np.sum(error**2, axis=-1))
 
 
-@numba.njit(cache=True)
+@compiled
 def _draw(
     predicted: Array,
     whitened: Array,

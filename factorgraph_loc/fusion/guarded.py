@@ -13,7 +13,6 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
-import numba
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
@@ -23,6 +22,7 @@ from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.text import plain
+from factors.compiled import compiled
 from factors.se2 import Array
 
 # singular matrices, overflows, divisions by zero, values that no function takes; all that GTSAM throws
@@ -196,7 +196,7 @@ def nearest_positive(covariance: Array) -> Array | None:
     return found if np.all(np.isfinite(found)) else None
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _judged(pose: Array, covariance: Array) -> tuple[bool, bool]:
     """Whether a pose (3,) is finite; and what :func:`clearly_positive` says of one covariance (3, 3), by what the rows before leave
     unexplained of each variance. Compiled, as each estimate of a run is asked."""

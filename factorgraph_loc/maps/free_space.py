@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
 from factorgraph_loc.errors import InputError
+from factors.compiled import compiled
 from factors.se2 import Array
 
 CELL = 0.2  # m
@@ -163,7 +163,7 @@ def _graph(index: NDArray[np.int64]) -> sparse.csr_matrix:
     return sparse.csr_matrix(entries, shape=(count, count))
 
 
-@numba.njit(cache=True)
+@compiled
 def _clear(index: NDArray[np.int64], origin: Array, a: Array, b: Array) -> bool:
     dx, dy = b[0] - a[0], b[1] - a[1]
     count = max(2, math.ceil(math.hypot(dx, dy) / SPACING))

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csgraph
@@ -15,6 +14,7 @@ from scipy.sparse import csgraph
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.maps.free_space import CELL, FreeSpace, chain, dense, straightened
 from factors import se2
+from factors.compiled import compiled
 from factors.se2 import Array
 
 STEP = 0.25  # m, between the poses of a path
@@ -181,7 +181,7 @@ def _nearest_cell(space: FreeSpace, point: Array) -> int:
     return cell if cell >= 0 else int(np.argmin(np.hypot(*(space.centres - point).T)))
 
 
-@numba.njit(cache=True)
+@compiled
 def _free_steps(
     index: NDArray[np.int64],
     distance: Array,

@@ -9,11 +9,11 @@ Functions called per ray are inlined, as numba's reference counting of arrays at
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.simulation.scene import LEVELS
+from factors.compiled import compiled
 from factors.se2 import Array
 
 BINS = 2048  # directions in the plan
@@ -46,7 +46,7 @@ class Surroundings(NamedTuple):
     size: Array
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size: Array) -> Surroundings:
     """The faces visible from ``origin`` (3,), for :func:`cast`."""
     table = np.empty((len(faces), 13))
@@ -94,7 +94,7 @@ def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size:
     return Surroundings(origin, ordered, starts, items, size)
 
 
-@numba.njit(inline="always", error_model="numpy")
+@compiled(inline="always", error_model="numpy")
 def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: float, dz: float) -> tuple[int, float]:
     """The first hit of the ray along (dx, dy, dz): a row of the table, :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`; and
     its distance in lengths of the ray.
@@ -131,7 +131,7 @@ def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: f
     return found, best
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def cast_all(around: Surroundings, rays: Array) -> Array:
     """Distances (K,) in lengths of ``rays`` (K, 3), infinite without a hit."""
     distance = np.empty(len(rays))
@@ -143,7 +143,7 @@ def cast_all(around: Surroundings, rays: Array) -> Array:
     return distance
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def expose(
     around: Surroundings,
     texels: NDArray[np.uint8],
@@ -187,7 +187,7 @@ def expose(
                     out[i, j, 2] += weight * red
 
 
-@numba.njit(inline="always", error_model="numpy")
+@compiled(inline="always", error_model="numpy")
 def _look(
     table: Array,
     starts: Ints,
@@ -244,7 +244,7 @@ def _look(
     return found, share * blue, share * green, share * red
 
 
-@numba.njit(inline="always", error_model="numpy")
+@compiled(inline="always", error_model="numpy")
 def _sample(
     texels: NDArray[np.uint8], first: int, x: float, y: float, width: int, height: int
 ) -> tuple[np.float32, np.float32, np.float32]:
@@ -267,7 +267,7 @@ def _sample(
     return blue, green, red
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _direction(x: float, y: float) -> float:
     """A direction in the plan as a number in [0, BINS) that grows counter-clockwise, without trigonometric functions."""
     total = abs(x) + abs(y)
@@ -277,7 +277,7 @@ def _direction(x: float, y: float) -> float:
     return (BINS / 4.0) * ((1.0 + share) if x >= 0.0 else (3.0 - share))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def develop(
     light: NDArray[np.float32],
     gain: NDArray[np.float32],

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
 from factors.se2 import Array
 
 Integers = NDArray[np.int64]
@@ -14,7 +14,7 @@ NOWHERE = -1
 BITS = np.array([bin(i).count("1") for i in range(256)], dtype=np.int64)
 
 
-@numba.njit(cache=True)
+@compiled
 def agreeing_views(
     rows: Integers, place: Array, positions: Array, starts: Integers, seen_from: Array, cosine: float, ratio: float
 ) -> tuple[Integers, Integers]:
@@ -45,7 +45,7 @@ def agreeing_views(
     return views[:n], begins
 
 
-@numba.njit(cache=True)
+@compiled
 def in_view(
     positions: Array, place: Array, rotation: Array, nearest: float, farthest: float, slopes: Array
 ) -> Integers:
@@ -65,7 +65,7 @@ def in_view(
     return out[:n]
 
 
-@numba.njit(cache=True)
+@compiled
 def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Array, cell: float) -> Integers:
     """Pairs (N, 2) of a point and a feature inside the gate of the point's prediction.
 
@@ -115,7 +115,7 @@ def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Arr
     return pairs[:n]
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, seen: Any) -> Array:
     """Squared distance (N,) of each pair's feature (descriptors ``seen`` (K, D)) from the nearest of the point's views (``known``
     (V, D))."""
@@ -134,7 +134,7 @@ def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, se
     return out
 
 
-@numba.njit(cache=True)
+@compiled
 def bit_distances(pairs: Integers, begins: Integers, views: Integers, known: Any, seen: Any, bits: Integers) -> Array:
     """As :func:`distances`, with the Hamming distance."""
     out = np.empty(len(pairs))
@@ -149,7 +149,7 @@ def bit_distances(pairs: Integers, begins: Integers, views: Integers, known: Any
     return out
 
 
-@numba.njit(cache=True)
+@compiled
 def clear_pairs(
     pairs: Integers, costs: Array, predicted: Array, features: Array, ratio: float, apart: float
 ) -> Integers:

@@ -9,7 +9,6 @@ Robotics 27(5), 2010). The prediction of a planar robot has a covariance of rank
 from dataclasses import dataclass
 from functools import cache
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -20,6 +19,7 @@ from factors.camera import kernels as reprojection_kernels
 from factors.camera import model as reprojection
 from factors.camera.kernels import Lens
 from factors.camera.model import CameraModel
+from factors.compiled import compiled
 from factors.se2 import Array
 
 Truths = NDArray[np.bool_]
@@ -122,7 +122,7 @@ def _largest(dof: int) -> float:
     return float(chdtri(dof, 1.0 - JOINT))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _joint(
     lens: Lens, position: Array, rotation: Array, covariance: Array, points: Array, pixels: Array, spreads: Array
 ) -> float:

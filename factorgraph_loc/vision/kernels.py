@@ -5,11 +5,11 @@ Everything is ``float32``, to halve memory traffic.
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.vision.colour import Float
+from factors.compiled import compiled
 from factors.se2 import Array
 
 Int32 = NDArray[np.int32]
@@ -21,7 +21,7 @@ MAX_SHIFT = 0.7  # px: larger shifts from the largest pixel do not fit the parab
 FAST = {"contract", "reassoc"}
 
 
-@numba.njit(cache=True, fastmath=FAST)
+@compiled(fastmath=FAST)
 def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
     """Sum over the channels of the products of first derivatives: ``intensity`` (H, W) and ``colours`` (C, H, W) to ``products``
     (3, H, W): xx, xy, yy.
@@ -47,7 +47,7 @@ def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
                 yy[y, x] += dy * dy
 
 
-@numba.njit(cache=True, fastmath=FAST)
+@compiled(fastmath=FAST)
 def corner_strength(products: Float, scale: np.float32, strength: Float) -> None:
     """Half the harmonic mean of the eigenvalues of the second moment matrix, times ``scale``: determinant over trace.
 
@@ -61,7 +61,7 @@ def corner_strength(products: Float, scale: np.float32, strength: Float) -> None
             strength[y, x] = scale * (a * c - b * b) / (a + c + TINY)
 
 
-@numba.njit(cache=True)
+@compiled
 def _laplacian_near(plane: Float, y: int, x: int, weight: float) -> float:
     """The largest absolute Laplacian, times ``weight``, at a pixel and its eight neighbours."""
     largest = 0.0
@@ -72,7 +72,7 @@ def _laplacian_near(plane: Float, y: int, x: int, weight: float) -> float:
     return largest * weight
 
 
-@numba.njit(cache=True)
+@compiled
 def refined_peaks(
     strength: Float, threshold: float, planes: Float, variances: Array, pixels: Int32, peaks: Array
 ) -> int:
@@ -114,7 +114,7 @@ def refined_peaks(
     return count
 
 
-@numba.njit(cache=True)
+@compiled
 def spread(points: Float, scales: Float, reach: float, alike: float, count: int) -> Int64:
     """Indices of ``count`` of the points (N, 2), sorted by descending strength, without a stronger one nearby.
 
@@ -150,7 +150,7 @@ def spread(points: Float, scales: Float, reach: float, alike: float, count: int)
     return out
 
 
-@numba.njit(cache=True, fastmath=FAST)
+@compiled(fastmath=FAST)
 def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, offsets: Float, patches: Float) -> None:
     """Bilinear samples of patches around points, each in its own frame and plane.
 
@@ -173,7 +173,7 @@ def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, o
             patches[n, m] = top + fy * (low - top)
 
 
-@numba.njit(cache=True)
+@compiled
 def orientation_histograms(patches: Float, side: int, weights: Float, histograms: Float) -> None:
     """Histograms of gradient directions in patches (N, side * side), weighted by gradient magnitude and ``weights`` (side - 2,
     side - 2), linearly distributed over two bins. Added to ``histograms`` (N, bins), bin 0 at direction 0."""

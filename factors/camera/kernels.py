@@ -2,9 +2,9 @@
 
 import math
 
-import numba
 import numpy as np
 
+from factors.compiled import compiled
 from factors.robust import huber_loss
 from factors.se2 import Array
 
@@ -17,7 +17,7 @@ Lens = tuple[float, ...]
 Place = tuple[tuple[float, ...], ...]
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _brown(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float]:
     """The distortion polynomial at direction (x, y), and its derivatives xx, xy = yx and yy."""
     k1, k2, p1, p2 = k[4], k[5], k[6], k[7]
@@ -32,7 +32,7 @@ def _brown(k: Lens, x: float, y: float) -> tuple[float, float, float, float, flo
     return xd, yd, xx, xy, yy
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float, float]:
     """The distorted direction, and its Jacobian by rows. Beyond its valid radius the polynomial B is extrapolated radially, as
     t B(x / t) with t = r / radius, so that nothing far outside of the image appears in it."""
@@ -45,7 +45,7 @@ def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float,
     return t * xd, t * yd, xx + ax * tx, xy + ax * ty, xy + ay * tx, yy + ay * ty
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def pixel(
     k: Lens, p0: float, p1: float, p2: float
 ) -> tuple[float, float, tuple[float, float, float], tuple[float, float, float]]:
@@ -59,7 +59,7 @@ def pixel(
     return k[0] * xd + k[2], k[1] * yd + k[3], by_u, by_v
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def mounting(position: Array, rotation: Array) -> Place:
     """The camera's pose in the robot frame as numbers: position and axes."""
     p, r = position, rotation
@@ -67,7 +67,7 @@ def mounting(position: Array, rotation: Array) -> Place:
     return (p[0], p[1], p[2]), right, down, ahead
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def in_camera(
     place: Place, c: float, s: float, dx: float, dy: float, z: float
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
@@ -81,7 +81,7 @@ def in_camera(
     return (ax, ay, az), (lx, ly, lz)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def undistorted(k: Lens, seen: Array) -> tuple[Array, Array]:
     """The directions (K, 2) that are distorted to ``seen`` (K, 2) with positive determinant, and the remaining errors (K,) of the
     distorted directions; NaN for NaN."""
@@ -106,7 +106,7 @@ def undistorted(k: Lens, seen: Array) -> tuple[Array, Array]:
     return directions, errors
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def project(k: Lens, points: Array) -> tuple[Array, Array]:
     """Pixels (K, 2) of points (K, 3) in the camera frame, and their Jacobians (K, 2, 3)."""
     n = len(points)
@@ -119,7 +119,7 @@ def project(k: Lens, points: Array) -> tuple[Array, Array]:
     return pixels, jacobians
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array) -> tuple[Array, Array, Array]:
     """See :func:`factors.camera.model.linearize_in_space`."""
     n = len(points)
@@ -141,7 +141,7 @@ def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array)
     return pixels, by_camera, by_point
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def linearize(
     k: Lens, position: Array, rotation: Array, pose: Array, points: Array
 ) -> tuple[Array, Array, Array, Array]:
@@ -173,7 +173,7 @@ def linearize(
     return pixels, by_pose, by_point, by_parameters
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def log_likelihood(
     k: Lens,
     position: Array,

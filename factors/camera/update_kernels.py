@@ -7,10 +7,10 @@ because an update uses a dozen small matrices, for which NumPy's overhead exceed
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from factors.camera.kernels import Lens, in_camera, mounting, pixel
+from factors.compiled import compiled
 from factors.robust import huber_weight
 from factors.se2 import Array
 from factors.se2_kernels import exp
@@ -39,7 +39,7 @@ class Seen(NamedTuple):
     tempering: float
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def whitened(seen: Seen, pose: Array) -> tuple[Array, Array]:
     """See :meth:`~factors.camera.factor.ReprojectionFactor.whitened`: residual (K, 2) and Jacobian (K, 2, 3)."""
     residual, jacobian = np.empty((len(seen.points), 2)), np.empty((len(seen.points), 2, 3))
@@ -47,7 +47,7 @@ def whitened(seen: Seen, pose: Array) -> tuple[Array, Array]:
     return residual, jacobian
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def linearized(seen: Seen, pose: Array) -> tuple[Array, Array]:
     """See :meth:`~factors.camera.factor.ReprojectionFactor.linearize`: residual (2K,) and Jacobian (2K, 3)."""
     residual, jacobian = whitened(seen, pose)
@@ -60,7 +60,7 @@ def linearized(seen: Seen, pose: Array) -> tuple[Array, Array]:
     return residual.reshape(-1), jacobian.reshape(-1, 3)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def updated(
     seen: Seen, pose: Array, covariance: Array, iterations: int, converged: float, gate: float
 ) -> tuple[Array, Array, Array, float]:
@@ -105,7 +105,7 @@ def updated(
     return delta, after, first, nis
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def placed(position: Array, rotation: Array, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
     """Position (3,) and rotation (3, 3) in the world of a camera mounted at ``position`` with ``rotation`` on a robot at ``pose``
     (3,), and the covariance (6, 6) of its perturbation in its own frame, rotation first, from ``covariance`` (3, 3) of the pose."""
@@ -128,7 +128,7 @@ def placed(position: Array, rotation: Array, pose: Array, covariance: Array) -> 
     return where, turned, carried
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def spread(by_point: Array, covariances: Array, sigma: float) -> Array:
     """The covariance (K, 2, 2) of pixels with noise ``sigma`` [px], of points with ``covariances`` (K, 3, 3)."""
     out = np.empty((len(by_point), 2, 2))
@@ -141,7 +141,7 @@ def spread(by_point: Array, covariances: Array, sigma: float) -> Array:
     return out
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _product(matrix: Array, p: Row, q: Row) -> float:
     """p' M q."""
     x = matrix[0, 0] * q[0] + matrix[0, 1] * q[1] + matrix[0, 2] * q[2]
@@ -150,13 +150,13 @@ def _product(matrix: Array, p: Row, q: Row) -> float:
     return float(p[0] * x + p[1] * y + p[2] * z)
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _weight(seen: Seen, squared: float) -> float:
     """The robust weight of a squared whitened residual, tempered."""
     return float(seen.tempering * huber_weight(squared, seen.robust))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _whiten(seen: Seen, x: float, y: float, heading: float, residual: Array, jacobian: Array) -> None:
     """Whitened residuals (K, 2), predicted minus measured, and their Jacobians (K, 2, 3) by the pose (x, y, heading), in place."""
     place, scale, n = mounting(seen.position, seen.rotation), 1.0 / seen.sigma, len(seen.points)
@@ -210,7 +210,7 @@ def _whiten(seen: Seen, x: float, y: float, heading: float, residual: Array, jac
             jacobian[k, r, 2] = g[0] * back_y - g[1] * back_x + g[2]
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _along(rotation: Array, by_local: Row, scale: float) -> Row:
     """Gradient of a pixel coordinate by a point in the robot's axes."""
     a, b, c = scale * by_local[0], scale * by_local[1], scale * by_local[2]
@@ -221,7 +221,7 @@ def _along(rotation: Array, by_local: Row, scale: float) -> Row:
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _solved(
     prior: Array, residual: Array, jacobian: Array, weights: Array, at: Array
 ) -> tuple[Array, Array, tuple[float, float, float]]:
@@ -253,7 +253,7 @@ def _solved(
     return delta, after, (px, py, pa)
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _normalised(residual: Array, jacobian: Array, covariance: Array) -> float:
     """Normalised innovation squared of a single point."""
     p = (jacobian[0, 0], jacobian[0, 1], jacobian[0, 2])

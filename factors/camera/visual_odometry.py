@@ -16,12 +16,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import se2
 from factors.camera.model import CameraModel, linearize_in_space, rays
+from factors.compiled import compiled
 from factors.se2 import Array
 
 SHARED = 0.5  # share of the information that is used, because consecutive motions share an image
@@ -144,7 +144,7 @@ def _rays(model: CameraModel, pixels: Array) -> tuple[Array, Array]:
     return np.ascontiguousarray(local @ model.rotation.T), np.ascontiguousarray(model.rotation[:, :2] @ noise)
 
 
-@numba.njit(cache=True)
+@compiled
 def _sampson(
     first: Array,
     second: Array,

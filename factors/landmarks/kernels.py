@@ -2,9 +2,9 @@
 
 import math
 
-import numba
 import numpy as np
 
+from factors.compiled import compiled
 from factors.landmarks.model import TIME_OFFSET, whitened_into
 from factors.robust import geman_mcclure_weight
 from factors.se2 import Array, Integers
@@ -16,7 +16,7 @@ Model = tuple[tuple[float, float, float], tuple[float, float, float, float, floa
 Carried = tuple[bool, Array, bool, Array, float, bool, Array]
 
 
-@numba.njit(cache=True)
+@compiled
 def linearize(
     model: Model,
     pose: Array,
@@ -87,7 +87,7 @@ def linearize(
                 by_pose[k, i, 2] = u * lever_x + v * lever_y + w
 
 
-@numba.njit(cache=True)
+@compiled
 def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
     """The elements (0, 0), (1, 0) and (1, 1) of what a Jacobian (2, D) makes of a covariance (D, D)."""
     a = b = d = 0.0
@@ -99,7 +99,7 @@ def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
     return a, b, d
 
 
-@numba.njit(cache=True)
+@compiled
 def weigh(error: Array, by_pose: Array, by_sensor: Array, robust: float) -> None:
     """Multiply what :func:`linearize` found by the roots of the robust weights."""
     for k in range(len(error)):
@@ -112,7 +112,7 @@ def weigh(error: Array, by_pose: Array, by_sensor: Array, robust: float) -> None
                 by_sensor[k, i, j] *= root
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def beyond(
     model: Model,
     pose: Array,
@@ -145,7 +145,7 @@ def beyond(
     return found
 
 
-@numba.njit(cache=True)
+@compiled
 def linearize_all(
     model: Model,
     poses: Array,

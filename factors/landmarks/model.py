@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-import numba
 import numpy as np
 
 from factors import se2
+from factors.compiled import compiled
 from factors.robust import geman_mcclure_loss
 from factors.se2 import Array
 
@@ -194,7 +194,7 @@ def whitened_all(
     return error, by_pose, by_point, by_sensor
 
 
-@numba.njit(cache=True)
+@compiled
 def whitened_into(
     pose: Array,
     mounting: tuple[float, float, float],
@@ -239,7 +239,7 @@ def whitened_into(
             by_point[k, i, 1] = -s * by_pose[k, i, 0] - c * by_pose[k, i, 1]
 
 
-@numba.njit(cache=True)
+@compiled
 def _seen(
     sx: float,
     sy: float,
@@ -294,7 +294,7 @@ def log_likelihood(
     return -np.asarray(np.sum(geman_mcclure_loss(squared, model.robust) + widths, axis=-1))
 
 
-@numba.njit(cache=True)
+@compiled
 def _squared(
     poses: Array,
     constants: Array,

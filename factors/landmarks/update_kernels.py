@@ -5,9 +5,9 @@ A filter makes a dozen small matrices of each look, and NumPy takes longer for e
 
 import math
 
-import numba
 import numpy as np
 
+from factors.compiled import compiled
 from factors.landmarks.model import BEARING_SIGMA, DEPTH, PARAMETERS, RANGE_SIGMA, RELATIVE, ROBUST, TURN, whitened_into
 from factors.positive_kernels import inverse
 from factors.positive_kernels import root as lower_root
@@ -18,7 +18,7 @@ from factors.se2_kernels import exp
 _CONSTANTS = len(PARAMETERS)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def updated(
     model: Array,
     points: Array,
@@ -81,7 +81,7 @@ def updated(
     return there, delta, after, residual, max(0.0, nis), measured
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def weighted(
     model: Array, points: Array, ranges: Array, bearings: Array, pose: Array, values: Array, indices: Integers
 ) -> tuple[Array, Array, Array]:
@@ -103,7 +103,7 @@ def weighted(
     return out, by_pose, by_values
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
     """Measured less predicted ranges [m] and bearings [rad], of those that were measured, from whitened ``residual`` (K, 2)."""
     by_range, by_bearing = np.empty(len(ranges)), np.empty(len(ranges))
@@ -118,7 +118,7 @@ def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -
     return by_range[:r], by_bearing[:b]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _linearized(
     model: Array,
     seen: tuple[Array, Array, Array],
@@ -161,7 +161,7 @@ def _linearized(
     return measured
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _solved(
     prior: Array, residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array
 ) -> tuple[bool, Array, Array, Array]:
@@ -189,7 +189,7 @@ def _solved(
     return there, delta, after, pull
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _normalised(residual: Array, jacobian: Array, columns: Integers, covariance: Array) -> float:
     """Normalised innovation squared of one landmark by itself: residual (2,) and Jacobian (2, D)."""
     a, b, c = 1.0, 0.0, 1.0

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numba
 import numpy as np
 
 from factors import positive, se2
+from factors.compiled import compiled
 from factors.motion import Increment
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array
@@ -92,7 +92,7 @@ class LoopFactor:
         return positive.whitener(noise)
 
 
-@numba.njit(cache=True)
+@compiled
 def _linearize(
     later: Array,
     earlier: Array,
@@ -126,26 +126,26 @@ def _linearize(
             by_later[i, j], by_earlier[i, j] = to_later[i, j], -to_earlier[i, j]
 
 
-@numba.njit(cache=True)
+@compiled
 def _compose(a: Array, b: Array) -> Array:
     c, s = math.cos(a[2]), math.sin(a[2])
     return np.array((a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], wrapped(a[2] + b[2])))
 
 
-@numba.njit(cache=True)
+@compiled
 def _between(a: Array, b: Array) -> Array:
     c, s = math.cos(a[2]), math.sin(a[2])
     dx, dy = b[0] - a[0], b[1] - a[1]
     return np.array((c * dx + s * dy, c * dy - s * dx, wrapped(b[2] - a[2])))
 
 
-@numba.njit(cache=True)
+@compiled
 def _adjoint(pose: Array) -> Array:
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return np.array(((c, -s, pose[1]), (s, c, -pose[0]), (0.0, 0.0, 1.0)))
 
 
-@numba.njit(cache=True)
+@compiled
 def _right_jacobian(xi: Array) -> Array:
     angle = xi[2]
     p, q = arc(angle)

@@ -2,10 +2,10 @@
 
 import math
 
-import numba
 import numpy as np
 
 from factors import se2
+from factors.compiled import compiled
 from factors.odometry.kernels import State, carried, predicted, recalibrated, relative
 from factors.se2 import Array, Integers
 from factors.se2_kernels import body_to_world
@@ -25,16 +25,16 @@ _REST, _GYRO_REST = 1e-3, 0.02
 # indices in the array of the model's constants: an array, because a tuple is slower to pass to compiled code
 _COS, _SIN, _LAG, _HOLD, _GYRO_BIAS, _USES_GYRO = range(6, 12)  # behind scales and biases
 
-_arc_coefficients = numba.njit(cache=True)(se2.arc_coefficients)
+_arc_coefficients = compiled(se2.arc_coefficients)
 
 
-@numba.njit(cache=True)
+@compiled
 def _copy(row: Array, to: Array) -> None:
     for j in range(len(row)):
         to[j] = row[j]
 
 
-@numba.njit(cache=True)
+@compiled
 def without_old(rows: Array, knots: Array, count: int, horizon: float) -> int:
     """Forget old rows; returns the new count. Rarely, and many rows at once, because the remaining ones are moved to the front."""
     newest = knots[count - 1, T]
@@ -47,7 +47,7 @@ def without_old(rows: Array, knots: Array, count: int, horizon: float) -> int:
     return int(count - keep)
 
 
-@numba.njit(cache=True)
+@compiled
 def append(
     rows: Array,
     knots: Array,
@@ -70,7 +70,7 @@ def append(
     return without_old(rows, knots, count + len(t), horizon)
 
 
-@numba.njit(cache=True)
+@compiled
 def insert(
     rows: Array,
     knots: Array,
@@ -95,7 +95,7 @@ def insert(
     return without_old(rows, knots, count + 1, horizon) if i == count else count + 1
 
 
-@numba.njit(cache=True)
+@compiled
 def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array) -> None:
     """Compute the knots of the rows from ``begin`` to ``end``, each from the knot before it."""
     scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
@@ -143,13 +143,13 @@ def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array)
             _take_gyro(knot, t, a - gyro_bias)
 
 
-@numba.njit(cache=True)
+@compiled
 def _take_gyro(knot: Array, t: float, turn: float) -> None:
     knot[_GYRO_T] = t
     knot[_UW] = knot[_W] = 0.0 if knot[_STANDS] and abs(turn) <= _GYRO_REST else turn
 
 
-@numba.njit(cache=True)
+@compiled
 def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
     """Compute the knot of an increment in row ``i``, and again those of the gyro since the previous increment: the robot moves by
     the increment and rotates by the gyro."""
@@ -185,7 +185,7 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
     knots[i, _UNKNOWN] += max(0.0, duration - hold)
 
 
-@numba.njit(cache=True)
+@compiled
 def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> None:
     """The knot after ``duration`` seconds: the motion continues for at most ``hold`` seconds, then it is unknown."""
     ux, uy, uw = knot[_UX], knot[_UY], knot[_UW]
@@ -218,7 +218,7 @@ def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> 
     out[_STILL] = knot[_STILL] + (moving if rests else 0.0)
 
 
-@numba.njit(cache=True)
+@compiled
 def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
     """t, x, y, heading, path, turn, unknown and still at ``t``, from the last knot before it."""
     if count == 0:
@@ -232,7 +232,7 @@ def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
     return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN], k[_STILL]
 
 
-@numba.njit(cache=True)
+@compiled
 def travelled(
     knots: Array, count: int, constants: Array, noise: Array, start: State, t: float
 ) -> tuple[State, Array, Array, float, float]:
@@ -241,7 +241,7 @@ def travelled(
     return end, delta, covariance, duration, still
 
 
-@numba.njit(cache=True)
+@compiled
 def predicted_at(
     knots: Array,
     count: int,
@@ -267,7 +267,7 @@ def predicted_at(
     return end
 
 
-@numba.njit(cache=True)
+@compiled
 def moved_to(
     knots: Array,
     count: int,
@@ -288,7 +288,7 @@ def moved_to(
     return at, body, body_to_world(at, body)
 
 
-@numba.njit(cache=True)
+@compiled
 def states_at(knots: Array, count: int, times: Array, constants: Array, out: Array) -> None:
     for j in range(len(times)):
         s = state_at(knots, count, times[j], constants)

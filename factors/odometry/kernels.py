@@ -2,9 +2,9 @@
 
 import math
 
-import numba
 import numpy as np
 
+from factors.compiled import compiled
 from factors.se2 import Array, Integers
 from factors.se2_kernels import SMALL, arc, exp, log, wrapped
 from factors.small_kernels import product
@@ -19,7 +19,7 @@ Noise = tuple[float, ...]
 State = tuple[float, ...]  # of a chain: t, x, y, heading, path, turn, unknown, still
 
 
-@numba.njit(cache=True)
+@compiled
 def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, float, float]:
     """See :func:`factors.odometry.model.relative_motion`: pose (3,), covariance (3, 3), duration and time at rest, for two states
     of a chain (t, x, y, heading, path, turn, unknown, still)."""
@@ -48,7 +48,7 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
     return np.array((x, y, turned)), covariance, duration, still
 
 
-@numba.njit(cache=True)
+@compiled
 def relatives(noise: Array, starts: Array, ends: Array, constants: Array, indices: Integers) -> tuple[Array, Array]:
     """:func:`relative` for states (N, 8): poses (N, 3), :func:`recalibrated` by ``constants`` (P,), and covariances (N, 3, 3)."""
     count = len(starts)
@@ -66,7 +66,7 @@ def relatives(noise: Array, starts: Array, ends: Array, constants: Array, indice
     return deltas, covariances
 
 
-@numba.njit(cache=True)
+@compiled
 def carried(covariance: Array, delta: Array, noise: Array) -> Array:
     """The body-frame covariance (3, 3) of a pose after the motion ``delta`` (3,) with covariance ``noise``."""
     c, s = math.cos(delta[2]), math.sin(delta[2])
@@ -86,7 +86,7 @@ def carried(covariance: Array, delta: Array, noise: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True)
+@compiled
 def predicted(
     delta: Array,
     noise: Array,
@@ -136,7 +136,7 @@ def predicted(
     at[0], at[1], at[2] = pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrapped(pose[2] + turned)
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _widen(covariance: Array) -> None:
     """Keep a covariance (3, 3) invertible: see :data:`FAR`."""
     spread = covariance[0, 0] + covariance[1, 1]
@@ -145,7 +145,7 @@ def _widen(covariance: Array) -> None:
         covariance[1, 1] += ROUNDING * spread
 
 
-@numba.njit(cache=True)
+@compiled
 def recalibrated(delta: Array, moving: float, constants: Array, indices: Integers) -> Array:
     """``delta`` (3,) of :func:`factors.odometry.model.recalibrated`, for corrections ``constants`` (P,) with ``indices`` (P,) among
     all constants."""
@@ -155,13 +155,13 @@ def recalibrated(delta: Array, moving: float, constants: Array, indices: Integer
     return np.array(exp(x + changes[0] * x, y + changes[0] * y, turn))
 
 
-@numba.njit(cache=True)
+@compiled
 def twist(delta: Array) -> Array:
     """The logarithm (3,) of a relative pose (3,)."""
     return np.array(log(delta[0], delta[1], delta[2]))
 
 
-@numba.njit(cache=True)
+@compiled
 def whitener(covariance: Array) -> Array:
     """The inverse of the lower root of a covariance (3, 3)."""
     a = math.sqrt(covariance[0, 0])
@@ -178,7 +178,7 @@ def whitener(covariance: Array) -> Array:
     )
 
 
-@numba.njit(cache=True)
+@compiled
 def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Array]:
     """See :func:`factors.odometry.model.recalibrated`; ``twist`` (3,): log of the increment, ``moving``: its time in motion."""
     x, y, phi = twist[0], twist[1], twist[2]
@@ -195,7 +195,7 @@ def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Arr
     return np.array((p * cx - q * cy, q * cx + p * cy, wrapped(turn))), by_changes
 
 
-@numba.njit(cache=True)
+@compiled
 def changed(twist: Array, moving: float, constants: Array, indices: Integers) -> tuple[Array, Array]:
     """:func:`recalibrate` for corrections ``constants`` (P,) with ``indices`` (P,) among all constants; the Jacobian is (3, P)."""
     delta, by_changes = recalibrate(twist, moving, _full(constants, indices))
@@ -206,7 +206,7 @@ def changed(twist: Array, moving: float, constants: Array, indices: Integers) ->
     return delta, out
 
 
-@numba.njit(cache=True)
+@compiled
 def _full(constants: Array, indices: Integers) -> Array:
     changes = np.zeros(4)
     for i in range(len(indices)):
@@ -214,7 +214,7 @@ def _full(constants: Array, indices: Integers) -> Array:
     return changes
 
 
-@numba.njit(cache=True)
+@compiled
 def linearize(
     start: Array, end: Array, delta: Array, by_changes: Array, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
@@ -238,13 +238,13 @@ def linearize(
     return residual, product(by_end, adjoint), by_end, product(by_delta, by_changes)
 
 
-@numba.njit(cache=True)
+@compiled
 def _between(a: Array, b: Array) -> tuple[float, float, float]:
     c, s, dx, dy = math.cos(a[2]), math.sin(a[2]), b[0] - a[0], b[1] - a[1]
     return c * dx + s * dy, c * dy - s * dx, wrapped(b[2] - a[2])
 
 
-@numba.njit(cache=True)
+@compiled
 def _right_jacobian(x: float, y: float, angle: float) -> Array:
     p, q = arc(angle)
     if abs(angle) < SMALL:
@@ -254,7 +254,7 @@ def _right_jacobian(x: float, y: float, angle: float) -> Array:
     return np.array(((p, q, r * x - s * y), (-q, p, s * x + r * y), (0.0, 0.0, 1.0)))
 
 
-@numba.njit(cache=True)
+@compiled
 def _inverse(j: Array) -> Array:
     """The inverse of a right Jacobian."""
     p, q, u, v = j[0, 0], j[0, 1], j[0, 2], j[1, 2]
@@ -268,7 +268,7 @@ def _inverse(j: Array) -> Array:
     )
 
 
-@numba.njit(cache=True)
+@compiled
 def linearize_changed(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
@@ -277,7 +277,7 @@ def linearize_changed(
     return linearize(start, end, delta, by_changes, whitener)
 
 
-@numba.njit(cache=True)
+@compiled
 def linearize_all(
     poses: Array,
     first: Integers,
@@ -308,7 +308,7 @@ def linearize_all(
                 jacobian[row + i, j], jacobian[row + i, 3 + j] = found[1][i, j], found[2][i, j]
 
 
-@numba.njit(cache=True)
+@compiled
 def cost_of_all(
     poses: Array,
     first: Integers,

@@ -10,10 +10,10 @@ which for a beam is another ``r_max`` (with its ``s_r`` in proportion) and anoth
 (2 M,): ``a`` and ``b`` of the first model, then of the second. With zeros the model is as it was.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
 from factors.rfid.kernels import FAST, counted, detection, of_tag, place_looks, terms
 from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed
 from factors.se2 import Array
@@ -35,7 +35,7 @@ def adjusted(packed: Packed, parameters: Array) -> Packed:
     return packed._replace(scale=scale, reach=packed.reach * scale, rate=rates(packed.peak, parameters[1::2]))
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@compiled(error_model="numpy", fastmath=FAST)
 def score(
     packed: Packed,
     pose: Array,

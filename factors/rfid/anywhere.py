@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
 from factors.rfid.index import TagIndex, cells
 from factors.rfid.model import LOGISTIC, Packed, RfidModel
 from factors.rfid.tables import CELL, NEGLIGIBLE, Tables
@@ -96,7 +96,7 @@ def silence(tables: PlaceTables, antennas: Integers, rounds: Integers, odds: flo
     return TagSilence(untold, folded, odds, min(reach, tables.reach))
 
 
-@numba.njit(cache=True)
+@compiled
 def log_likelihood(
     poses: Array,
     index: TagIndex,
@@ -156,7 +156,7 @@ def far_from(
     return out
 
 
-@numba.njit(cache=True)
+@compiled
 def mixed(own: float, odds: float, elsewhere: float) -> float:
     """Log-likelihood of a tag that may not be where the map has it, ``own`` being that if it is."""
     if odds == -np.inf or elsewhere == -np.inf:
@@ -168,7 +168,7 @@ def mixed(own: float, odds: float, elsewhere: float) -> float:
     return own + math.log1p(math.exp(other - own)) - both
 
 
-@numba.njit(cache=True)
+@compiled
 def _fill(
     packed: Packed,
     tables: Tables,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import reduce
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
 from factors.rfid import kernels as rfid_kernels
 from factors.se2 import Array, Integers
 
@@ -101,7 +101,7 @@ def together(parts: list[TagReadCounts]) -> TagReadCounts:
     )
 
 
-@numba.njit(cache=True)
+@compiled
 def union(some: Integers, others: Integers) -> Integers:
     """All numbers of either, which are ascending both."""
     out = np.empty(len(some) + len(others), np.int64)
@@ -118,7 +118,7 @@ def union(some: Integers, others: Integers) -> Integers:
     return out[:count]
 
 
-@numba.njit(cache=True)
+@compiled
 def _listing(
     listed: Integers, hits: Integers, odds: Array, elsewhere: Array, others: float, tags: Integers
 ) -> tuple[Integers, Array, Array]:

@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import se2
+from factors.compiled import compiled
 from factors.rfid import adjustment, weighing
 from factors.rfid import kernels as rfid_kernels
 from factors.rfid.counts import TagReadCounts, union
@@ -273,7 +273,7 @@ class RfidLikelihood:
         return out
 
 
-@numba.njit(cache=True)
+@compiled
 def _reach(packed: Packed, offsets: Array, antennas: Integers) -> float:
     """How far [m] the antennas reach at most from the pose that looks (K,) are relative to."""
     way = farthest = 0.0
@@ -285,7 +285,7 @@ def _reach(packed: Packed, offsets: Array, antennas: Integers) -> float:
     return way + farthest
 
 
-@numba.njit(cache=True)
+@compiled
 def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
     """The corners of the box that holds what is within ``reach`` [m] of poses (N, 3), on the grid."""
     low_x, low_y = poses[:, 0].min() - reach, poses[:, 1].min() - reach

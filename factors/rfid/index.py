@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
 from factors.se2 import Array, Integers
 
 CELL = 2.0  # m
@@ -41,7 +41,7 @@ def tag_index(points: Array) -> TagIndex:
     return TagIndex(low, cell, columns, start, np.argsort(number, kind="stable"))
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def cells(index: TagIndex, low: float, high: float, axis: int, count: int) -> tuple[int, int]:
     """First and last of ``count`` cells along an axis that an interval touches; the last is before the first if none is."""
     first = (low - index.corner[axis]) / index.cell
@@ -51,7 +51,7 @@ def cells(index: TagIndex, low: float, high: float, axis: int, count: int) -> tu
     return int(max(first, 0.0)), int(min(last, count - 1.0))
 
 
-@numba.njit(cache=True)
+@compiled
 def within(index: TagIndex, low: Array | Corner, high: Array | Corner) -> NDArray[np.int64]:
     """Places, ascending, of the tags in the cells that a box from ``low`` to ``high`` (2,) [m] touches."""
     rows = (len(index.start) - 1) // index.columns
@@ -72,7 +72,7 @@ def within(index: TagIndex, low: Array | Corner, high: Array | Corner) -> NDArra
     return out
 
 
-@numba.njit(cache=True)
+@compiled
 def near(index: TagIndex, points: Array, poses: Array, reach: float) -> NDArray[np.int64]:
     """Places, ascending, of the tags at ``points`` (T, 3) within ``reach`` [m] of the box that holds poses (N, 3)."""
     low_x, high_x, low_y, high_y = poses[:, 0].min(), poses[:, 0].max(), poses[:, 1].min(), poses[:, 1].max()

@@ -2,10 +2,10 @@
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
 from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed, logit
 from factors.se2 import Array
 from factors.se2_kernels import wrapped
@@ -14,7 +14,7 @@ from factors.walls import farther
 FAST = {"contract", "reassoc", "arcp", "nsz"}  # fast-math flags that keep infinities
 
 
-@numba.njit(cache=True)
+@compiled
 def moved(offset: Array, offsets: Array) -> Array:
     """The poses (K, 3) ``offset`` (3,) composed with ``offsets`` (K, 3)."""
     c, s, out = math.cos(offset[2]), math.sin(offset[2]), np.empty_like(offsets)
@@ -25,7 +25,7 @@ def moved(offset: Array, offsets: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def seen(
     packed: Packed, antenna: int, p: float, q: float, height: float, c: float
 ) -> tuple[float, float, float, float, float]:
@@ -39,7 +39,7 @@ def seen(
     return value, cp * by_x - sp * by_z, by_y, sp * by_x + cp * by_z, by_c
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[float, float, float, float, float, float]:
     """The antenna's x, y, cosine and sine of its heading in the world, for a robot at ``offset`` from ``pose``; and the cosine and
     sine of the robot's heading."""
@@ -51,7 +51,7 @@ def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[fl
     return x, y, c * a[3] - s * a[4], s * a[3] + c * a[4], c, s
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def of_tag(
     packed: Packed, antenna: int, x: float, y: float, c: float, s: float, point: Array, normal: Array
 ) -> tuple[float, float, float, float, float]:
@@ -79,7 +79,7 @@ def of_tag(
     return value, by_p, by_q, by_heading, by_range
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, float]:
     """Probability of a read at a logit, floor included, and its derivatives by the logit and by the logarithm of ``rate``."""
     sigmoid = 1.0 / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))
@@ -89,7 +89,7 @@ def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, floa
     return q, by_rate * (1.0 - sigmoid), by_rate
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def terms(packed: Packed, z: float, rate: float, hits: int, rounds: int) -> tuple[float, float, float, float, float]:
     """Negative log-likelihood of k hits in n rounds, its derivative by the logit, Fisher's information on the logit, and mean and
     variance of the negative log-likelihood."""
@@ -103,7 +103,7 @@ def terms(packed: Packed, z: float, rate: float, hits: int, rounds: int) -> tupl
     return nll, gradient, information, expected, variance
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def place_looks(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[np.int64], out: Array) -> float:
     """Rows (K, 8) of looks: place and boresight of the antenna in the world, then in the frame of the pose. Returns how far from
     the pose [m] the farthest antenna reaches."""
@@ -119,7 +119,7 @@ def place_looks(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[n
     return farthest
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _surveyed(
     packed: Packed,
     at: Array,
@@ -161,7 +161,7 @@ def _surveyed(
     return e_sum, mean_sum, spread_sum, (g_x, g_y, g_a), (xx, xy, xa, yy, ya, aa)
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def counted(
     odds: float, elsewhere: float, e: float, mean: float, spread: float, none: float, tempering: float
 ) -> tuple[float, float, float, float]:
@@ -180,7 +180,7 @@ def counted(
     return tempering * own / total, nll, expected, usual * tempering * spread
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@compiled(error_model="numpy", fastmath=FAST)
 def score(
     packed: Packed,
     poses: Array,
@@ -241,7 +241,7 @@ def score(
         information[n, 1, 2] = information[n, 2, 1] = ya
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@compiled(error_model="numpy", fastmath=FAST)
 def by_tag(
     packed: Packed,
     pose: Array,
@@ -270,7 +270,7 @@ def by_tag(
             information[t, 1, 1] += f * gy * gy
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@compiled(error_model="numpy", fastmath=FAST)
 def probabilities(packed: Packed, antenna: int, poses: Array, points: Array, normals: Array, out: Array) -> None:
     none = np.zeros(3)
     for n in range(len(poses)):

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
 from factors.se2 import Array
 from factors.walls import Walls
 
@@ -236,7 +236,7 @@ def bake(
     return GridModel(found.reshape(h.shape), float(axis[0]), float(axis[0]), cell, np.asarray(heights, dtype=float))
 
 
-@numba.njit(cache=True)
+@compiled
 def _logits(
     kind: int,
     parameters: Array,
@@ -250,7 +250,7 @@ def _logits(
         out[i] = logit(kind, parameters, shape, knots, points[i, 0], points[i, 1], points[i, 2], facing[i])
 
 
-@numba.njit(cache=True)
+@compiled
 def logit(
     kind: int, parameters: Array, shape: NDArray[np.int64], knots: Array, x: float, y: float, z: float, c: float
 ) -> tuple[float, float, float, float, float]:
@@ -262,7 +262,7 @@ def logit(
     return _grid(parameters, shape, knots, x, y, z, c)
 
 
-@numba.njit(cache=True)
+@compiled
 def _beam(parameters: Array, x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
     log_p0, r_max, s_r, sigma_phi = parameters[0], parameters[1], parameters[2], parameters[3]
     r = math.sqrt(x * x + y * y + z * z + NEAR * NEAR)
@@ -278,7 +278,7 @@ def _beam(parameters: Array, x: float, y: float, z: float) -> tuple[float, float
     return value, by_log_p * (by_r * x - by_phi * y), by_log_p * (by_r * y + by_phi * x), by_log_p * by_r * z, 0.0
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def logistic_value(b: Array, r: float, w: float, height: float, c: float) -> float:
     """Logit of a logistic model with coefficients ``b`` of :data:`FEATURES`, at range r, one minus the cosine of the bearing w,
     height, and facing c."""
@@ -286,7 +286,7 @@ def logistic_value(b: Array, r: float, w: float, height: float, c: float) -> flo
     return float(value + c * (b[7] + b[8] * c + b[9] * r + b[10] * w))
 
 
-@numba.njit(cache=True)
+@compiled
 def _logistic_peak(b: Array, reach: float) -> float:
     """The largest logit at the antenna's height, over ranges, bearings and facings."""
     largest = -np.inf
@@ -297,7 +297,7 @@ def _logistic_peak(b: Array, reach: float) -> float:
     return largest
 
 
-@numba.njit(cache=True)
+@compiled
 def _logistic(b: Array, x: float, y: float, z: float, c: float) -> tuple[float, float, float, float, float]:
     r = math.sqrt(x * x + y * y + NEAR * NEAR)
     cosine = x / r
@@ -311,7 +311,7 @@ def _logistic(b: Array, x: float, y: float, z: float, c: float) -> tuple[float, 
     return value, by_x, by_y, b[6] if z > 0.0 else -b[6], by_c
 
 
-@numba.njit(cache=True)
+@compiled
 def _cubic(f: float) -> tuple[float, float, float, float]:
     """Weights of four knots for a position ``f`` in [0, 1] between the middle ones."""
     return (
@@ -322,7 +322,7 @@ def _cubic(f: float) -> tuple[float, float, float, float]:
     )
 
 
-@numba.njit(cache=True)
+@compiled
 def _slope(f: float) -> tuple[float, float, float, float]:
     """Derivatives of the weights of :func:`_cubic`."""
     return (
@@ -333,7 +333,7 @@ def _slope(f: float) -> tuple[float, float, float, float]:
     )
 
 
-@numba.njit(cache=True)
+@compiled
 def _place(s: float, count: int) -> tuple[int, float, float]:
     """The knot below ``s``, the fraction above it, and the derivative of clipping (1 inside, 0 outside)."""
     if count == 1 or s <= 0.0:
@@ -344,7 +344,7 @@ def _place(s: float, count: int) -> tuple[int, float, float]:
     return i, s - i, 1.0
 
 
-@numba.njit(cache=True)
+@compiled
 def _grid(
     parameters: Array, shape: NDArray[np.int64], knots: Array, x: float, y: float, z: float, c: float
 ) -> tuple[float, float, float, float, float]:

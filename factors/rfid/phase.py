@@ -19,11 +19,11 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import se2
+from factors.compiled import compiled
 from factors.rfid.detection import TagArray
 from factors.rfid.model import Antenna
 from factors.se2 import Array
@@ -150,7 +150,7 @@ class PhaseLikelihood:
         return self.model.tempering * self.model.kappa * out
 
 
-@numba.njit(cache=True)
+@compiled
 def _log_likelihood(
     places: Array,
     points: Array,
@@ -181,14 +181,14 @@ def _log_likelihood(
             out[n] += math.hypot(real, imaginary) - (bounds[g + 1] - bounds[g])
 
 
-@numba.njit(cache=True)
+@compiled
 def _on_robot(offset: Array, place: Array) -> tuple[float, float]:
     """Position of an antenna in the frame of the likelihood's pose."""
     c, s = math.cos(offset[2]), math.sin(offset[2])
     return offset[0] + c * place[0] - s * place[1], offset[1] + s * place[0] + c * place[1]
 
 
-@numba.njit(cache=True)
+@compiled
 def _score(
     places: Array,
     points: Array,
@@ -222,7 +222,7 @@ def _score(
             nll[n] += _add_group(psi, by, bounds[g], bounds[g + 1], gradient[n], information[n])
 
 
-@numba.njit(cache=True)
+@compiled
 def _add_group(psi: Array, by: Array, begin: int, end: int, gradient: Array, information: Array) -> float:
     """Add gradient (3,) and information (3, 3) of a group, for kappa 1; returns its negative log-likelihood."""
     real = imaginary = 0.0

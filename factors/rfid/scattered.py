@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
 from factors.rfid.anywhere import mixed
 from factors.rfid.index import TagIndex, cells
 from factors.rfid.kernels import FAST
@@ -46,7 +46,7 @@ class Looked(NamedTuple):
     others: float
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@compiled(error_model="numpy", fastmath=FAST)
 def log_likelihood(
     poses: Array,
     index: TagIndex,
@@ -112,7 +112,7 @@ def log_likelihood(
         out[n] += total
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _row(model: Antennas, antenna: int, along: float, across: float, height: float, facing: float, level: int) -> int:
     """The row of the tables of logarithms for a tag, placed along and across the antenna's heading, with its height and facing."""
     m = model.packed.which[antenna]

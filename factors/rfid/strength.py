@@ -14,11 +14,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import se2
+from factors.compiled import compiled
 from factors.rfid.detection import TagArray
 from factors.rfid.model import Antenna
 from factors.se2 import Array
@@ -125,7 +125,7 @@ def features(antennas: Sequence[Antenna], tags: TagArray, pose: Array, reads: Rs
     return out
 
 
-@numba.njit(cache=True)
+@compiled
 def _features(antenna: Array, point: Array, normal: Array, pose: Array, offset: Array, out: Array, by: Array) -> None:
     """Features (6,) and their derivatives (6, 3) by the pose's body-frame perturbation."""
     c0, s0 = math.cos(pose[2]), math.sin(pose[2])
@@ -155,7 +155,7 @@ def _features(antenna: Array, point: Array, normal: Array, pose: Array, offset: 
         by[4, i], by[5, i] = dc, 2.0 * c * dc
 
 
-@numba.njit(cache=True)
+@compiled
 def _log_likelihood(
     antennas: Array,
     points: Array,
@@ -192,7 +192,7 @@ def _log_likelihood(
             out[n] -= 0.5 * (dof + 1.0) * math.log1p(residual * residual / dof)
 
 
-@numba.njit(cache=True)
+@compiled
 def _score(
     antennas: Array,
     points: Array,

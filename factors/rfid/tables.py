@@ -7,10 +7,10 @@ them.
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
 from factors.rfid import knots
 from factors.rfid.kernels import seen
 from factors.rfid.model import (
@@ -112,7 +112,7 @@ def _made(model: RfidModel, packed: Packed, heights: Array) -> Tables:
     )
 
 
-@numba.njit(cache=True)
+@compiled
 def logit_row(z: float) -> int:
     """Place of a logit in the sigmoids."""
     return int((min(max(z, NEGLIGIBLE_LOGIT), -NEGLIGIBLE_LOGIT) - NEGLIGIBLE_LOGIT) / STEP + 0.5)
@@ -141,7 +141,7 @@ def _fill_level(planes: Array, packed: Packed, model: int, height: float, table:
     table[:] = z
 
 
-@numba.njit(cache=True)
+@compiled
 def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray[np.uint16]) -> None:
     facings = len(table)
     for f in range(facings):
@@ -152,7 +152,7 @@ def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray
                 table[f, i, j] = logit_row(z)
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def row_of(
     packed: Packed, tables: Tables, antenna: int, level: int, along: float, across: float, height: float, facing: float
 ) -> int:

@@ -4,10 +4,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
 from factors.compressed import compressed
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood
@@ -56,7 +56,7 @@ class RfidTagFactor:
         return alpha * nll, alpha * gradient, alpha * information
 
 
-@numba.njit(cache=True)
+@compiled
 def _joint(
     packed: Packed,
     pose: Array,

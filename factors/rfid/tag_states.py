@@ -17,11 +17,11 @@ scan is used twice.
 import math
 from collections import deque
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import se2_kernels
+from factors.compiled import compiled
 from factors.se2 import Array, Integers
 
 KEPT = 200.0  # s of evidence that can be taken back
@@ -117,7 +117,7 @@ class TagStates:
         self._told = kept
 
 
-@numba.njit(cache=True)
+@compiled
 def sigma_poses(pose: Array, root: Array) -> Array:
     """The poses (6, 3) that lie a column of ``root`` (3, 3) before and behind ``pose`` (3,)."""
     out = np.empty((6, 3))
@@ -129,7 +129,7 @@ def sigma_poses(pose: Array, root: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True)
+@compiled
 def _log_sum(weights: Array, told: Array) -> float:
     """The logarithm of the sum of all that ``weights`` and what is ``told``, which is added to all but the first, stand for."""
     most = weights[0]
@@ -143,7 +143,7 @@ def _log_sum(weights: Array, told: Array) -> float:
     return float(most + math.log(total))
 
 
-@numba.njit(cache=True)
+@compiled
 def _expected(weights: Array, tags: Integers, told: Array) -> Array:
     out, nothing = np.empty(len(tags)), np.zeros(told.shape[1])
     for u in range(len(tags)):
@@ -152,7 +152,7 @@ def _expected(weights: Array, tags: Integers, told: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True)
+@compiled
 def _hear(weights: Array, odds: Array, tags: Integers) -> None:
     """That ``tags`` are not dead."""
     for t in tags:
@@ -161,7 +161,7 @@ def _hear(weights: Array, odds: Array, tags: Integers) -> None:
             odds[t] = _odds(weights[t])
 
 
-@numba.njit(cache=True)
+@compiled
 def _learn(weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32], sign: float) -> None:
     for u in range(len(tags)):
         of_tag = weights[tags[u]]
@@ -171,6 +171,6 @@ def _learn(weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32
         odds[tags[u]] = _odds(of_tag)
 
 
-@numba.njit(cache=True)
+@compiled
 def _odds(weights: Array) -> float:
     return float(_log_sum(weights[DEAD:], np.zeros(len(weights) - DEAD)) - weights[0])

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from factors import positive, se2, se2_kernels
+from factors.compiled import compiled
 from factors.odometry.kernels import FAR, ROUNDING
 from factors.rfid import kernels as rfid_kernels
 from factors.rfid.counts import TagReadCounts
@@ -114,7 +114,7 @@ def scored_update(factor: RfidFactor, pose: Array, values: Array, covariance: Ar
     return TagUpdate(best, posterior, nis, dof, surprise, variance, 0.5 * log_ratio - cost, changed)
 
 
-@numba.njit(cache=True)
+@compiled
 def _updated(
     packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Array, covariance: Array, iterations: int
 ) -> tuple[Array, Array, float, int, float, float, float]:
@@ -152,7 +152,7 @@ def _updated(
     return best, posterior, nis, dof, surprise, variance, 0.5 * log_ratio - cost
 
 
-@numba.njit(cache=True)
+@compiled
 def _score(packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Array) -> Score:
     """The score of one pose (3,), see :meth:`~factors.rfid.detection.RfidLikelihood.score`."""
     points, normals = tags
@@ -180,14 +180,14 @@ def _score(packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Arr
     return Score(nll, gradient, information, *told)
 
 
-@numba.njit(cache=True)
+@compiled
 def _stepped(pose: Array, step: Array) -> Array:
     x, y, turned = se2_kernels.exp(step[0], step[1], step[2])
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, se2_kernels.wrapped(pose[2] + turned)))
 
 
-@numba.njit(cache=True)
+@compiled
 def _apart(pose: Array, other: Array) -> Array:
     """The twist from one pose to another."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -195,7 +195,7 @@ def _apart(pose: Array, other: Array) -> Array:
     return np.array(se2_kernels.log(c * dx + s * dy, c * dy - s * dx, other[2] - pose[2]))
 
 
-@numba.njit(cache=True)
+@compiled
 def _scoring_step(prior_information: Array, information: Array, gradient: Array, moved: Array, largest: Array) -> Array:
     """The step (D,) of Fisher scoring from where the state has ``moved`` (D,) to, shortened to the ``largest`` (D,) allowed."""
     size, both, pull = len(gradient), prior_information.copy(), np.empty((len(gradient), 1))
@@ -213,7 +213,7 @@ def _scoring_step(prior_information: Array, information: Array, gradient: Array,
     return step
 
 
-@numba.njit(cache=True)
+@compiled
 def _posterior(prior_information: Array, information: Array) -> tuple[Array, float]:
     """Covariance (D, D) after an update, and the log of its determinant's ratio to that before."""
     size, both = len(information), prior_information.copy()
@@ -224,7 +224,7 @@ def _posterior(prior_information: Array, information: Array) -> tuple[Array, flo
     return posterior, solved(prior_information, np.empty((size, 0)))[1] - after
 
 
-@numba.njit(cache=True)
+@compiled
 def _innovation(gradient: Array, information: Array, covariance: Array, tempering: float) -> tuple[float, int]:
     """Normalised square of a score, and its degrees of freedom."""
     size, spread, pull = (
@@ -253,7 +253,7 @@ def _innovation(gradient: Array, information: Array, covariance: Array, temperin
     return nis, _telling(information) if nis > 0.0 else 0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _telling(information: Array) -> int:
     """The number of eigenvalues above :data:`TELLING`: that of positive pivots of the matrix less this times the identity
     (Sylvester's law of inertia)."""

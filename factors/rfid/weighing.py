@@ -7,10 +7,10 @@ library computes one by one.
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
 from factors.rfid.adjustment import MOST_CERTAIN
 from factors.rfid.kernels import FAST
 from factors.rfid.model import LOGISTIC, NEGLIGIBLE_LOGIT, Packed
@@ -31,7 +31,7 @@ _Tags = tuple[Array, Array, Integers, Integers]  # points, normals, tables (A, T
 _MANTISSA, _HALF = 0x000FFFFFFFFFFFFF, 0x3FE0000000000000  # bits of a number, and of 0.5
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@compiled(error_model="numpy", fastmath=FAST)
 def add_log_likelihood(
     packed: Packed,
     tables: Tables,
@@ -78,7 +78,7 @@ def add_log_likelihood(
         _add_logs(mixed, count, found)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@compiled(error_model="numpy", fastmath=FAST)
 def displaced(
     packed: Packed,
     tables: Tables,
@@ -113,7 +113,7 @@ def displaced(
             out[t, i] = tempering * most + math.log(mean)
 
 
-@numba.njit(cache=True)
+@compiled
 def _near(packed: Packed, poses: Array, looks: _Looks, tags: _Tags, parameters: Array, seen: NDArray[np.bool_]) -> None:
     """Which tags (T,) are read, or in reach of any of the poses."""
     offsets, antennas, _ = looks
@@ -136,7 +136,7 @@ def _near(packed: Packed, poses: Array, looks: _Looks, tags: _Tags, parameters: 
             seen[t] |= hits[k, t] > 0
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@compiled(error_model="numpy", fastmath=FAST)
 def _place(
     packed: Packed, poses: Array, looks: _Looks, parameters: Array, first: int, at: Array, models: Array
 ) -> None:
@@ -162,13 +162,13 @@ def _place(
             c[n], s[n] = cosine[n] * c1 - sine[n] * s1, sine[n] * c1 + cosine[n] * s1
 
 
-@numba.njit(cache=True)
+@compiled
 def _silence(packed: Packed, rounds: Integers) -> float:
     """Log-likelihood of one tag out of reach that is not read."""
     return float(np.sum(rounds) * math.log1p(-packed.false_read - packed.span / (1.0 + math.exp(-NEGLIGIBLE_LOGIT))))
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@compiled(error_model="numpy", fastmath=FAST)
 def _of_tag(
     packed: Packed,
     tables: Tables,
@@ -207,7 +207,7 @@ def _of_tag(
     _add_logs(product, count, own)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@compiled(error_model="numpy", fastmath=FAST)
 def _attenuated(walls: Walls | None, at: Array, point: Array, shifts: Array, unit: Array, count: int) -> Array:
     """``unit`` (N,) times the factors of the walls between one antenna and one tag, see :func:`factors.walls.farther`."""
     if walls is None:
@@ -233,7 +233,7 @@ def _attenuated(walls: Walls | None, at: Array, point: Array, shifts: Array, uni
     return all_
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@compiled(error_model="numpy", fastmath=FAST)
 def _chances(
     packed: Packed,
     tables: Tables,
@@ -274,13 +274,13 @@ def _chances(
         chance[n] = table[np.uint32(cells[n])]
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _floored(packed: Packed, rate: float, chance: float) -> float:
     """Probability of a read."""
     return float(min(max(packed.false_read + rate * chance, LEAST), 1.0 - LEAST))
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _add_logs(values: Array, count: int, out: Array) -> None:
     """Add the logarithms of positive numbers (N,) to ``out``, to 1e-10; the numbers become one."""
     room = np.empty(count)
@@ -298,7 +298,7 @@ def _add_logs(values: Array, count: int, out: Array) -> None:
         values[n] = 1.0
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _exp(x: float) -> float:
     """The exponential of x from -20 to 0, to 1e-8."""
     y = x / 64.0

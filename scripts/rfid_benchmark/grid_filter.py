@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.model.belief import PosePrior
 from factors import se2
+from factors.compiled import compiled
 from factors.motion import Increment
 from factors.se2 import Array
 
@@ -112,7 +112,7 @@ class GridFilter:
         self._mass /= self._mass.sum()
 
 
-@numba.njit(cache=True)
+@compiled
 def _spread(mass: Array, whole: Array, offsets: Array, share: float, aside: Array, within: Array) -> Array:
     """All mass moved by ``whole`` cells (K, 2), the fraction ``share`` of it to either adjacent layer, ``aside`` (K, 2) cells
     away, and then distributed over neighbouring cells with covariance ``within`` (K, 2, 2) cells^2."""
@@ -151,7 +151,7 @@ def _spread(mass: Array, whole: Array, offsets: Array, share: float, aside: Arra
     return out
 
 
-@numba.njit(cache=True)
+@compiled
 def _divide(layer: Array, x: float, y: float, value: float) -> None:
     """Add ``value`` at a position (x, y) between cells."""
     nx, ny = layer.shape
@@ -165,7 +165,7 @@ def _divide(layer: Array, x: float, y: float, value: float) -> None:
                 layer[i + a - 1, j + b - 1] += wx[a] * wy[b] * value
 
 
-@numba.njit(cache=True)
+@compiled
 def _lagrange(f: float, out: Array) -> None:
     """Lagrange weights (4,) of the points -1, 0, 1, 2 for a position ``f`` between 0 and 1."""
     out[0] = -f * (f - 1.0) * (f - 2.0) / 6.0

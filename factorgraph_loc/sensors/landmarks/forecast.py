@@ -7,7 +7,6 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +15,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.interfaces import Array32, Places
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, SightingSettings
 from factorgraph_loc.sensors.landmarks.simulation import in_sight
+from factors.compiled import compiled
 from factors.landmarks import model as bearing_range
 from factors.landmarks.model import BearingRangeModel
 from factors.se2 import Array
@@ -70,7 +70,7 @@ def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> Land
     return LandmarkForecast(world, rig.of(BearingRangeSettings).model(), sightings.rate / speed, sightings)
 
 
-@numba.njit(cache=True)
+@compiled
 def _add(
     ranges: Array,
     bearings: Array,

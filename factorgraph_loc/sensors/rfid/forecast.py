@@ -10,11 +10,11 @@ contribute nothing. False reads of tags out of range are not simulated, nor are 
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.sensors.interfaces import Array32, Places
+from factors.compiled import compiled
 from factors.rfid.detection import RfidLikelihood
 from factors.rfid.kernels import FAST, detection, of_tag, placed
 from factors.rfid.model import Packed
@@ -83,7 +83,7 @@ def make_tables(likelihood: RfidLikelihood) -> ScanTables:
     )
 
 
-@numba.njit(cache=True)
+@compiled
 def _fill(packed: Packed, heights: Array, half: int, out: Array) -> None:
     levels, layers, size, _, antennas = out.shape
     none = np.zeros(3)
@@ -105,7 +105,7 @@ def _fill(packed: Packed, heights: Array, half: int, out: Array) -> None:
                         out[k, f, i, j, a] = detection(packed, z, packed.rate[packed.which[a]])[0]
 
 
-@numba.njit(cache=True)
+@compiled
 def _uniform(seed: np.uint64, number: int) -> float:
     """The random number with this index, the same for all candidates (SplitMix64: Steele, Lea, Flood, OOPSLA 2014)."""
     z = seed + np.uint64(number + 1) * np.uint64(0x9E3779B97F4A7C15)
@@ -115,7 +115,7 @@ def _uniform(seed: np.uint64, number: int) -> float:
     return (z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@numba.njit(cache=True)
+@compiled
 def look_poses(
     particles: Array, along: Array, steps: Places, last: Places, sigmas: Array, normals: Array, out: Array
 ) -> None:
@@ -153,7 +153,7 @@ def look_poses(
             out[k, i, 2] = heading + eh
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@compiled(error_model="numpy", fastmath=FAST)
 def _cells(tables: ScanTables, t: int, poses: Array, turns: Array32, out: NDArray[np.int32]) -> None:
     """The cells in which a tag is seen from poses (M, 3); ``turns`` (2, M): cosine and sine of their headings."""
     size = np.int32(tables.size)
@@ -176,7 +176,7 @@ def _cells(tables: ScanTables, t: int, poses: Array, turns: Array32, out: NDArra
         out[i] += np.int32((layer - angles) * size * size)
 
 
-@numba.njit(cache=True)
+@compiled
 def log_weights(
     tables: ScanTables,
     poses: Array,
@@ -216,7 +216,7 @@ def log_weights(
             out[n, i] *= np.float32(tempering)
 
 
-@numba.njit(cache=True)
+@compiled
 def _add_reads(
     tables: ScanTables, cells: NDArray[np.int32], rounds: Places, stops: Places, seed: np.uint64, out: Array32
 ) -> None:
@@ -250,7 +250,7 @@ def _add_reads(
                         out[n, i] += np.float32(hits) * row[a, i]
 
 
-@numba.njit(cache=True)
+@compiled
 def _binomial(count: int, q: float, uniform: float) -> tuple[int, float]:
     """Number of ``count`` rounds that read a tag, by inversion, and the rest of the draw, which is uniform again."""
     p = (1.0 - q) ** count
@@ -262,7 +262,7 @@ def _binomial(count: int, q: float, uniform: float) -> tuple[int, float]:
     return k, min(uniform / p, 1.0)
 
 
-@numba.njit(cache=True)
+@compiled
 def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> None:
     """Weighted covariances (J, 3, 3) of M particles at stations ``index`` (J,) of ``poses`` (S, M, 3), with ``weights`` (J, M).
     Headings are relative to the first particle's."""
@@ -290,7 +290,7 @@ def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> No
                 out[n, a, b] = out[n, b, a] = second[a, b] / total - first[a] * first[b] / (total * total)
 
 
-@numba.njit(cache=True)
+@compiled
 def cell_entropies(poses: Array, index: Places, weights: Array32, cell: Array, dims: int, out: Array) -> None:
     """Entropies (J,) [nats] of histograms of the first ``dims`` coordinates with cells of size ``cell`` (3,); otherwise as
     :func:`covariances`."""
@@ -317,7 +317,7 @@ def cell_entropies(poses: Array, index: Places, weights: Array32, cell: Array, d
         out[n] = entropy + volume
 
 
-@numba.njit(cache=True)
+@compiled
 def _number_cells(poses: Array, cell: Array, dims: int, out: Places) -> None:
     """Cell indices (M,) below M, equal for particles in one cell: a hash table with open addressing."""
     count = len(poses)
