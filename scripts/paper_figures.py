@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from factorgraph_loc.drawing.figures import COLOURS, dress, empty, lay_out, legend, styles
+from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend, styles
 from factorgraph_loc.evaluation.figures import Track, way, with_pauses
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.model.log import Log
@@ -40,7 +40,6 @@ def deviations(log: Log, tracks: Mapping[str, Track]) -> Figure:
         axes[what].set_ylim(bottom=0.0)
     axes[DEVIATIONS[-1][0]].set_xlabel("time [s]")
     legend(figure, [axes["map"]])
-    lay_out(figure)
     return figure
 
 
@@ -66,7 +65,6 @@ def fusion(log: Log, tracks: Mapping[str, Track]) -> Figure:
     axes["errors"].set_xlabel("time [s]")
     axes["errors"].set_ylabel("position error [m]")
     legend(figure, [axes["map"]])
-    lay_out(figure)
     return figure
 
 

@@ -26,7 +26,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 _STYLES = ("-", "--", ":", "-.")  # a second cue beside colour
 _WIDTH, _DPI, _PAGE_DPI = 16.0, 100, 80
 _TITLE, _LINES = 80, 3  # maximum length of a line of text, and number of lines
-_LABEL, _LEGEND = 60, 160  # maximum length of a label, and of a line of the legend
+_LABEL, _LEGEND, _SIGN = 60, 190, 13  # maximum length of a label, and of a line of the legend with its signs
 
 
 def empty(height: float, title: str = "") -> Figure:
@@ -35,7 +35,7 @@ def empty(height: float, title: str = "") -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(_WIDTH, height))
     FigureCanvasAgg(figure)
     if title:
         figure.suptitle(title, fontsize=16)
@@ -77,9 +77,9 @@ def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:
             entries.setdefault(label, handle)
     if entries:
         labels = [plain(label, _LABEL) for label in entries]
-        columns = min(len(labels), max(1, _LEGEND // max(map(len, labels))))
+        columns = min(len(labels), max(1, _LEGEND // (max(map(len, labels)) + _SIGN)))
         look = {"ncols": columns, "fontsize": 13, "markerscale": markers}
-        figure.legend(entries.values(), labels, loc="outside lower center", **look)
+        figure.legend(entries.values(), labels, loc="lower center", **look)
 
 
 @contextmanager
@@ -94,12 +94,6 @@ def drawing(figure: Figure) -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         yield
-
-
-def lay_out(figure: Figure) -> None:
-    """Lay a figure out once before it is saved, as a fixed aspect ratio needs a second layout pass."""
-    with drawing(figure):
-        figure.draw_without_rendering()
 
 
 def png(figure: Figure) -> bytes:
@@ -121,12 +115,31 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def _drawn(figure: Figure, dpi: float) -> Image:
-    """The figure as an image in full colour. ``savefig`` takes twice the time, as it lays the figure out once more."""
+    """The figure as an image in full colour."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from PIL.Image import fromarray  # noqa: PLC0415
 
     figure.set_dpi(dpi)
     canvas: Any = FigureCanvasAgg(figure)
     with drawing(figure):
+        _lay_out(figure)
         canvas.draw()
     return fromarray(np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[:, :, :3]))
+
+
+def _lay_out(figure: Figure) -> None:
+    """Place the axes between the title and the legend. The constrained layout of matplotlib takes up to four times as long."""
+    aspects = [(axis, axis.get_aspect()) for axis in figure.axes]
+    for axis in figure.axes:
+        axis.set_aspect("auto")  # as large as there is room: labels outside of that would have none
+    figure.tight_layout()
+    for axis, aspect in aspects:
+        axis.set_aspect(aspect)
+    places = figure.subplotpars
+    specs = [spec.get_topmost_subplotspec() for axis in figure.axes if (spec := axis.get_subplotspec())]
+    rows = max((spec.get_gridspec().nrows for spec in specs), default=1)
+    height = (places.top - places.bottom) / (rows + places.hspace * (rows - 1))
+    below = sum(legend.get_window_extent().height for legend in figure.legends) / figure.bbox.height
+    lower = height - below / rows
+    if lower > 0.0:
+        figure.subplots_adjust(bottom=places.bottom + below, hspace=places.hspace * height / lower)

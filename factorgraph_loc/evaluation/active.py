@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from factorgraph_loc.drawing.figures import COLOURS, dress, empty, grid, lay_out, legend, styles
+from factorgraph_loc.drawing.figures import COLOURS, dress, empty, grid, legend, styles
 from factorgraph_loc.evaluation.statistics import Interval, mcnemar, median_difference, median_ratio, quantile
 from factorgraph_loc.fitting.shares import wilson
 from factorgraph_loc.model.world import World
@@ -244,7 +244,6 @@ def run_picture(track: SeekingTrack) -> Figure:
     axes["belief"].axvline(track.metres, color="0.5", linestyle="--", label="end of the run")
     axes["belief"].set(xlabel="metres driven", ylabel="spread of the belief [m]")
     legend(figure, axes.values())
-    lay_out(figure)
     return figure
 
 

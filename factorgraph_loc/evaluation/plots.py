@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from factorgraph_loc.drawing.figures import COLOURS, grid, lay_out, legend, styles
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend, styles
 from factorgraph_loc.evaluation.figures import Track, consistency, mark_events, way, with_pauses, write_picture
 from factorgraph_loc.evaluation.metrics import Errors, errors
 from factorgraph_loc.model.log import Log
@@ -99,7 +99,6 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
                 axis.plot(*trajectory.poses[0, :2], "o", color=style["color"], markersize=5, zorder=4)
             axis.set_title(f"{kind} (dot: start)")
     legend(figure, axes[0])
-    lay_out(figure)  # the first layout changes the axes, and their labels would overlap the legend
     return figure
 
 
@@ -112,7 +111,6 @@ def overview(log: Log, odometry: Trajectory | None) -> Figure:
         axes[0, 0].plot(*way(odometry).T, label="odometry", linewidth=1.2, zorder=3, color=COLOURS[0])
         axes[0, 0].plot(*odometry.poses[0, :2], "o", label="start", color=COLOURS[0], markersize=5, zorder=4)
     legend(figure, axes[0])
-    lay_out(figure)
     return figure
 
 
@@ -132,7 +130,6 @@ def reliability_diagram(log: Log, estimator: str, found: Mapping[str, Reliabilit
         axis.set_xticks(place, one.groups, rotation=40, ha="right")
         axis.set_ylim(bottom=0.0)
     legend(figure, axes[:, 0])
-    lay_out(figure)
     return figure
 
 

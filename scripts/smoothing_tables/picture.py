@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from benchmarking.statistics import Ratio
 
-from factorgraph_loc.drawing.figures import COLOURS, dress, empty, lay_out, legend
+from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend
 from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS
 from smoothing_tables.cases import SMOOTHER, Case
 from smoothing_tables.tables import ALIGNED, shown
@@ -53,7 +53,6 @@ def picture(cases: Sequence[Case]) -> Figure:
     first.set_yticks(range(len(cases)), [case.name for case in cases])
     first.set_ylim(len(cases) - 0.5, -0.5)
     legend(figure, axes.values())
-    lay_out(figure)
     return figure
 
 

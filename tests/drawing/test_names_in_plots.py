@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorgraph_loc.drawing.figures import drawing, grid, lay_out, legend, save
+from factorgraph_loc.drawing.figures import drawing, grid, legend, save
 from factorgraph_loc.files.models import file_name
 
 NAMES = ["a $x^{$ b", "$$", r"\frac$", "n" * 3000, "", "_hidden", "a_b\\c", "two\nlines" * 50, "\x1b[31m", "廊下", "🤖"]
@@ -25,7 +25,6 @@ def test_any_name_can_stand_in_a_plot(name: str, tmp_path: Path) -> None:
             axis.set_title(name)
             axis.set_yscale("log")
         legend(figure, axes.flat)
-        lay_out(figure)
         save(figure, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 0
 
@@ -40,11 +39,11 @@ def test_a_dollar_is_no_formula() -> None:
         assert not any(text.get_parse_math() for text in shown)
 
 
-def test_numbers_at_the_axes_are_set_as_before() -> None:
+def test_numbers_at_the_axes_are_set_as_before(tmp_path: Path) -> None:
     figure, axes = grid(1, 1, 4.0, "")
     axes[0, 0].plot(np.logspace(0, 3, 4))
     axes[0, 0].set_yscale("log")
-    lay_out(figure)
+    save(figure, tmp_path / "a.png")
     assert any(label.get_parse_math() for label in axes[0, 0].get_yticklabels())
 
 

@@ -64,5 +64,4 @@ def leave_blank(patch):
         pytest.fail("a figure is drawn after all: blank_pictures has to replace what does it")
 
     patch.setattr(figures, "_drawn", drawn)
-    patch.setattr(Figure, "draw_without_rendering", lambda _: None)
     patch.setattr(Figure, "draw", draw)

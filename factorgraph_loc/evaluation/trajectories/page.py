@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.drawing.figures import COLOURS, grid, lay_out, legend, png
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
 from factorgraph_loc.drawing.markup import Html, Rows, image, number, table, tag
 from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.pairing import pauses
@@ -80,7 +80,6 @@ def _trajectories(score: TrajectoryScore) -> Figure:
     if not flat:
         axes[0, 1].set(xlabel=label, ylabel="z [m]")
     legend(figure, axes[0])
-    lay_out(figure)  # the first layout changes the axes, and their labels would overlap the legend
     return figure
 
 

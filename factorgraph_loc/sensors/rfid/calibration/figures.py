@@ -64,7 +64,8 @@ def field_figure(found: RfidKnowledge) -> bytes:
             image = _draw(panel, axis, probability(model, points, facing).reshape(x.shape))
             panel.set_title(f"model, tag {z:+.1f} m high" + (f", facing {facing:+.0f}" if len(facings) > 1 else ""))
     if image is not None:
-        figure.colorbar(image, ax=axes.ravel().tolist(), label="probability of a read in a round")
+        for panel in axes[:, -1]:
+            figure.colorbar(image, ax=panel, label="probability of a read in a round")
     return png(figure)
 
 

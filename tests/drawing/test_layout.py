@@ -1,0 +1,30 @@
+"""Where the parts of a picture are."""
+
+from itertools import combinations
+from pathlib import Path
+
+import pytest
+
+from factorgraph_loc.drawing.figures import grid, legend, save
+
+
+@pytest.mark.parametrize("wide", [0.2, 1.0, 30.0])
+@pytest.mark.parametrize("aspect", ["auto", "equal"])
+@pytest.mark.parametrize(("rows", "columns", "entries"), [(1, 1, 1), (1, 2, 12), (3, 2, 0), (3, 1, 40)])
+def test_nothing_overlaps(rows: int, columns: int, entries: int, aspect: str, wide: float, tmp_path: Path) -> None:
+    figure, axes = grid(rows, columns, 3.0 * rows + 2.0, "title")
+    for axis in axes.flat:
+        axis.set(title="panel", xlabel="x [m]", ylabel="y [m]", aspect=aspect)
+        for i in range(max(entries, 1)):
+            axis.plot([0.0, wide], [-1000.0, 1000.0], label=f"an estimator with number {i}" if entries else None)
+    legend(figure, axes.flat)
+    save(figure, tmp_path / "a.png")
+    parts = [*axes.flat, *figure.legends, *figure.texts]
+    extents = [part.get_tightbbox() for part in parts]
+    for one, other in combinations(extents, 2):
+        assert not one.overlaps(other)
+    for one in extents:
+        assert one.x0 > 0.0
+        assert one.y0 > 0.0
+        assert one.x1 < figure.bbox.width
+        assert one.y1 < figure.bbox.height
