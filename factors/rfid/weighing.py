@@ -55,7 +55,8 @@ def add_log_likelihood(
     for first in range(0, len(poses), size):
         count = min(size, len(poses) - first)
         found = out[first : first + count]
-        _place(packed, poses[first : first + count], looks, parameters, first, at, models)
+        own_parameters = parameters[first : first + count] if len(parameters) > 1 else parameters
+        _place(packed, poses[first : first + count], looks, own_parameters, at, models)
         factors = 0
         for t in range(len(odds)):
             if not seen[t]:
@@ -101,7 +102,7 @@ def displaced(
         moved[i, 0], moved[i, 1], moved[i, 2] = pose[0] - shift[0], pose[1] - shift[1], pose[2]
     at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
     own, product, room = np.empty(size), np.empty(size), np.empty(size)
-    _place(packed, moved, looks, parameters, 0, at, models)
+    _place(packed, moved, looks, parameters, at, models)
     for t in range(len(out)):
         _of_tag(packed, tables, at, models, size, looks, tags, t, shifts, own, product, room)
         for i in range(len(shifts)):
@@ -122,7 +123,8 @@ def _near(packed: Packed, poses: Array, looks: _Looks, tags: _Tags, parameters: 
     for k in range(len(antennas)):
         a, m = packed.antennas[antennas[k]], packed.which[antennas[k]]
         way = math.sqrt(offsets[k, 0] ** 2 + offsets[k, 1] ** 2) + math.sqrt(a[0] ** 2 + a[1] ** 2)
-        reach = max(reach, way + packed.reach[m] * math.exp(np.max(parameters[:, 2 * m])))
+        for n in range(len(parameters)):
+            reach = max(reach, way + packed.reach[m] * math.exp(parameters[n, 2 * m]))
     low_x = high_x = poses[0, 0]
     low_y = high_y = poses[0, 1]
     for n in range(1, len(poses)):
@@ -137,15 +139,14 @@ def _near(packed: Packed, poses: Array, looks: _Looks, tags: _Tags, parameters: 
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def _place(
-    packed: Packed, poses: Array, looks: _Looks, parameters: Array, first: int, at: Array, models: Array
-) -> None:
+def _place(packed: Packed, poses: Array, looks: _Looks, parameters: Array, at: Array, models: Array) -> None:
     """For each look ``at`` (K, 4, N): place of the antenna, cosine and sine of its heading; and for each of ``models`` (M, 2, N):
-    one over the scale of the range, and rate of the probabilities, at poses (N, 3) whose parameters begin at row ``first``."""
+    one over the scale of the range, and rate of the probabilities, at poses (N, 3) with ``parameters`` (N or 1, 2 M)."""
     offsets, antennas, _ = looks
-    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    cosine, sine = np.empty(len(poses)), np.empty(len(poses))
     for n in range(len(poses)):
-        row = first + n if len(parameters) > 1 else 0
+        cosine[n], sine[n] = math.cos(poses[n, 2]), math.sin(poses[n, 2])
+        row = n if len(parameters) > 1 else 0
         for m in range(len(models)):
             certain = min(packed.peak[m], MOST_CERTAIN)
             shift = SHIFT * np.rint(parameters[row, 2 * m + 1] / SHIFT)
@@ -165,7 +166,10 @@ def _place(
 @compiled
 def _silence(packed: Packed, rounds: Integers) -> float:
     """Log-likelihood of one tag out of reach that is not read."""
-    return float(np.sum(rounds) * math.log1p(-packed.false_read - packed.span / (1.0 + math.exp(-NEGLIGIBLE_LOGIT))))
+    count = 0
+    for k in range(len(rounds)):
+        count += rounds[k]
+    return count * math.log1p(-packed.false_read - packed.span / (1.0 + math.exp(-NEGLIGIBLE_LOGIT)))
 
 
 @compiled(error_model="numpy", fastmath=FAST)
@@ -187,8 +191,9 @@ def _of_tag(
     have been moved to where the walls are, N / S poses each."""
     points, normals, levels, hits = tags
     _, antennas, rounds = looks
-    own[:count], product[:count] = -_silence(packed, rounds), 1.0
-    factors = 0
+    silent, factors = -_silence(packed, rounds), 0
+    for n in range(count):
+        own[n], product[n] = silent, 1.0
     for k in range(len(antennas)):
         level = levels[antennas[k], t]
         model = models[packed.which[antennas[k]]]
