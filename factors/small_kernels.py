@@ -37,7 +37,7 @@ def product_by_transpose(left: Array, right: Array) -> Array:
 @compiled(error_model="numpy")
 def solved(matrix: Array, right: Array) -> tuple[Array, float]:
     """The solution (D, N) of ``matrix`` (D, D) times x = ``right`` (D, N), by elimination with pivots, and the logarithm of the
-    absolute determinant. LinAlgError if the matrix is singular."""
+    absolute determinant. LinAlgError if the matrix is singular or not finite."""
     size, width = matrix.shape[0], right.shape[1]
     left, out, log_determinant = matrix.copy(), right.copy(), 0.0
     for k in range(size):
@@ -45,8 +45,8 @@ def solved(matrix: Array, right: Array) -> tuple[Array, float]:
         for i in range(k + 1, size):
             if abs(left[i, k]) > abs(left[pivot, k]):
                 pivot = i
-        if left[pivot, k] == 0.0:
-            raise np.linalg.LinAlgError("a matrix is singular")
+        if not 0.0 < abs(left[pivot, k]) < np.inf:
+            raise np.linalg.LinAlgError("a matrix is singular, or not finite")
         log_determinant += math.log(abs(left[pivot, k]))
         for j in range(size):
             left[k, j], left[pivot, j] = left[pivot, j], left[k, j]
@@ -58,12 +58,20 @@ def solved(matrix: Array, right: Array) -> tuple[Array, float]:
                 left[i, j] -= share * left[k, j]
             for j in range(width):
                 out[i, j] -= share * out[k, j]
-    for i in range(size - 1, -1, -1):
-        for j in range(width):
-            for k in range(i + 1, size):
-                out[i, j] -= left[i, k] * out[k, j]
-            out[i, j] /= left[i, i]
+    _substitute(left, out)
     return out, log_determinant
+
+
+@compiled(error_model="numpy")
+def _substitute(upper: Array, out: Array) -> None:
+    """Solve ``upper`` (D, D), of which the upper half is read, times x = ``out`` (D, N), in place."""
+    size, width = out.shape
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            for j in range(width):
+                out[i, j] -= upper[i, k] * out[k, j]
+        for j in range(width):
+            out[i, j] /= upper[i, i]
 
 
 @compiled
