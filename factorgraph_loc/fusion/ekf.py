@@ -161,7 +161,7 @@ class Ekf(Filter):
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """The pose at the time of the newest measurement or tick, or at ``t`` if that is later; ``ambiguous`` while its heading is
-        sought, and while a sensor is silent where it should not be."""
+        sought, and while a sensor is silent where it should not be, or not as its model says."""
         if self._heading is not None:
             at = self._t if t is None else max(t, self._t)
             likeliest = self._heading.belief(at).modes[0]
@@ -309,7 +309,7 @@ class Ekf(Filter):
     def _estimate(self) -> PoseEstimate:
         status: Status = "localized"
         for sensor in self._sensors.values():
-            if sensor.silent:
+            if sensor.silent or sensor.inconsistent:
                 status = "ambiguous"
         return world_estimate(self._t, self._state.pose, self._state.covariance, status)
 

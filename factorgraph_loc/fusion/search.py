@@ -174,7 +174,7 @@ class Search:
     @property
     def doubts(self) -> bool:
         """Whether a track, or a sensor, is under suspicion."""
-        return any(s.suspicious_since is not None or s.silent for s in self._sensors.values())
+        return any(s.suspicious_since is not None or s.silent or s.inconsistent for s in self._sensors.values())
 
     def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
         """An observation is about to be applied to a track."""

@@ -288,6 +288,11 @@ class Sensor:
         """Whether nothing is detected although something should be."""
         return False
 
+    @property
+    def inconsistent(self) -> bool:
+        """Whether what is detected is not as the sensor's model says, so that covariances are not to be believed."""
+        return False
+
     def accept(self) -> None:
         """Accept the track although it was suspicious: the model or the map is wrong instead."""
 

@@ -265,6 +265,14 @@ class RfidLikelihood:
             rfid_kernels.probabilities(self.packed, antenna, at, *near.arrays[:2], out[k : k + 1])
         return near.looks, out
 
+    def distances(self, pose: Array, looks: TagReadCounts) -> Array:
+        """How far [m] the listed tags are from the antenna of each look, in the plane, (K, C), at a pose (3,)."""
+        antennas = se2.compose(
+            se2.compose(pose, looks.offsets), self.packed.antennas[looks.antennas, :3] * (1.0, 1.0, 0.0)
+        )
+        away = self.tags.points[looks.listed, :2] - antennas[:, None, :2]
+        return np.asarray(np.hypot(away[..., 0], away[..., 1]))
+
     def probabilities(self, poses: Array, antenna: int) -> Array:
         """Probability (N, T), floor included, that a round of an antenna reads each tag from poses (N, 3)."""
         out = np.empty((len(poses), len(self.tags.points)))

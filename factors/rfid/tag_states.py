@@ -82,9 +82,13 @@ class TagStates:
         tags = self.doubtful
         return dict(zip(tags.tolist(), (1.0 / (1.0 + np.exp(-self._odds[tags]))).tolist(), strict=True))
 
+    def were_read(self, tags: Integers) -> NDArray[np.bool_]:
+        """Which of ``tags`` (U,) were read, which are not dead then."""
+        return np.asarray(self._weights[tags, DEAD] == -np.inf)
+
     def was_read(self, tag: int) -> bool:
-        """Whether a tag was read, which is not dead then."""
-        return bool(self._weights[tag, DEAD] == -np.inf)
+        """Whether a tag was read."""
+        return bool(self.were_read(np.array((tag,)))[0])
 
     def hear(self, t: float, tags: Integers) -> None:
         """Tags (R,) were read at ``t``: they are not dead."""

@@ -13,9 +13,10 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
+from factorgraph_loc.sensors.rfid.consistency import KNOWN, ConsistencyMonitor
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags, TagEvidence
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.monitor import BurstMonitor, ScanMonitor, SettledParameters, SilenceMonitor
+from factorgraph_loc.sensors.rfid.monitor import POSSIBLE, BurstMonitor, ScanMonitor, SettledParameters, SilenceMonitor
 from factorgraph_loc.sensors.rfid.signals import TagSignals
 from factorgraph_loc.sensors.rfid.tag_map import extent
 from factors import positive, se2
@@ -132,7 +133,8 @@ class TagSensor(Sensor):
         self._diagnostics = diagnostics
         self._signals = TagSignals(setup, self.tags)
         self._monitor, self._silence = ScanMonitor(), SilenceMonitor()
-        self._bursts = BurstMonitor(self.tags.antennas, len(self.tags.map.names))
+        self._bursts = BurstMonitor(len(self.tags.antennas), len(self.tags.map.names))
+        self._consistency = ConsistencyMonitor(self.tags.antennas)
         self._settled = SettledParameters()
         self._for_search = self.tags.likelihood
         self._heard = -math.inf  # last scan that was checked for silence
@@ -186,13 +188,23 @@ class TagSensor(Sensor):
         return True
 
     def _count(self, observation: TagObservation, view: View) -> None:
-        """Count reads and misses against what is expected of them, and temper by how they go together."""
+        """Count reads and misses against what is expected of them, temper by how they go together, and doubt the models."""
         assert self.tags.likelihood is not None
         assert isinstance(observation.factor.seen, TagReadCounts)
-        looks, expected = self._estimated(self.tags.likelihood, view).expected(view.pose, observation.factor.seen)
-        self._bursts.add(observation.t, looks, expected, self.tags.states.odds_of(looks.listed) <= 0.0)
+        t, likelihood, states = observation.t, self._estimated(self.tags.likelihood, view), self.tags.states
+        looks, expected = likelihood.expected(view.pose, observation.factor.seen)
+        surveyed = states.odds_of(looks.listed) <= 0.0
+        self._bursts.add(t, looks, expected, surveyed)
         if self.tags.temper(1.0 / self._bursts.together):
             self._for_search = self.tags.likelihood.adjusted(self._settled.values)
+        if np.trace(view.covariance[:2, :2]) < KNOWN**2:
+            # not without those that are believed to have moved: with a wrong model most tags seem to
+            counts = (expected > POSSIBLE) & (surveyed | states.were_read(looks.listed))
+            together = 1.0 / self.tags.likelihood.model.tempering
+            doubted = self._consistency.doubted
+            self._consistency.add(t, looks, expected, likelihood.distances(view.pose, looks), counts, together)
+            if self._consistency.doubted and not doubted:
+                self._diagnostics.event(t, f"{ConsistencyMonitor.EVENT}: {self._consistency.shares}")
 
     def _estimated(self, likelihood: RfidLikelihood, view: View) -> RfidLikelihood:
         """The likelihood with the detection models as they are estimated to be."""
@@ -226,6 +238,10 @@ class TagSensor(Sensor):
     def silent(self) -> bool:
         return self._silence.lasts
 
+    @property
+    def inconsistent(self) -> bool:
+        return self._consistency.doubted
+
     def accept(self) -> None:
         self._monitor.accept()
 
@@ -250,6 +266,7 @@ class TagSensor(Sensor):
         self._settled.forget(t)
         self._monitor.clear()
         self._bursts.clear()
+        self._consistency.clear()
         self._signals.clear()
         self.tags.forget(t)
 

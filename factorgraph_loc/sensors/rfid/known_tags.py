@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,9 +68,9 @@ class KnownTags:
         self._waiting: deque[tuple[float, Integers, Array]] = deque()  # what reads told since `CONFIRMED` ago
 
     @property
-    def antennas(self) -> int:
-        """How many antennas the rig has."""
-        return len(self._antennas)
+    def antennas(self) -> Sequence[str]:
+        """The names of the rig's antennas."""
+        return list(self._antennas)
 
     def temper(self, tempering: float) -> bool:
         """Use this exponent of the likelihood where it is less than that of the rig; whether it is another one."""

@@ -16,6 +16,7 @@ from factorgraph_loc.model.reliability import Reliability
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.interfaces import Use
 from factorgraph_loc.sensors.odometry.calibration.constants import REFERENCE_GAP
+from factorgraph_loc.sensors.rfid.consistency import BAND, DIFFERENT, FEWEST, ReadGroups
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
@@ -23,13 +24,10 @@ from factorgraph_loc.sensors.smoothed import possible_poses
 from factors.rfid.detection import RfidLikelihood
 from factors.se2 import Array, Integers, transform_from
 
-BAND = 1.0  # m of distance
 MOST_ROUNDS = 6000  # of a long log so many are looked at, evenly spread
 BLOCK = 10.0  # s over which reads of a tag by an antenna are counted
 POSSIBLE = 0.01  # least probability of a read that is looked at
-FEWEST = 30.0  # predicted reads of a group that is told
-SHOWN = 4  # groups in a warning
-CLEARLY, DIFFERENT = 4.0, 0.15  # standard deviations, and share of the predicted reads, above which a group is doubted
+CLEARLY = 4.0  # standard deviations above which a group that is off is doubted
 TOGETHER = 2.0  # rounds that count as one: more is told, as estimators take `1 / tempering` for it
 
 
@@ -117,31 +115,25 @@ def _told(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Rel
     """The counts by bands of distance and by antennas, None if there are too few."""
     if looks.p.sum() < FEWEST:
         return None
-    band = (looks.distance // BAND).astype(np.int64)
-    together = _together(looks, band)
-    groups = [(f"{b * BAND:g} to {(b + 1) * BAND:g} m", band == b) for b in range(int(band.max(initial=0)) + 1)]
-    if len(antennas) > 1:
-        groups += [(f"antenna {name}", looks.antenna == a) for a, name in enumerate(antennas)]
-    told = [(name, mine) for name, mine in groups if looks.p[mine].sum() >= FEWEST]
-    if not told:
+    groups = ReadGroups(antennas)
+    groups.add(looks.antenna, looks.distance, looks.hit, 1.0, looks.p)
+    together, told = _together(looks, (looks.distance // BAND).astype(np.int64)), groups.told
+    if not len(told):
         return None
-    observed, predicted = (np.array([of[mine].sum() for _, mine in told]) for of in (looks.hit, looks.p))
-    variance = np.array([np.sum(looks.p[mine] * (1.0 - looks.p[mine])) for _, mine in told])
+    observed, predicted, variance = groups.sums[:, told]
     # what the estimators take successive rounds for is no reason to doubt the model either
     spread = np.sqrt(max(together, 1.0 / tempering) * variance)
     off = (np.abs(observed - predicted) > CLEARLY * spread) & (np.abs(observed / predicted - 1.0) > DIFFERENT)
     doubts = []
     if np.any(off):
-        worst = sorted(np.flatnonzero(off), key=lambda i: -abs(observed[i] - predicted[i]) / spread[i])[:SHOWN]
-        shares = ", ".join(f"{told[i][0]}: {observed[i] / predicted[i]:.2f}" for i in worst)
+        shares = groups.shares(told[off])
         doubts.append(f"{log}: reads over those that the detection models predict, by distance and antenna: {shares}")
     if together * tempering > TOGETHER:
         doubts.append(
             f"{log}: reads and misses come in bursts, {together:.0f} rounds tell as much as one; the tempering in the rig is "
             f"{tempering:g}"
         )
-    names = tuple(name for name, _ in told)
-    return Reliability("reads", names, observed, predicted, spread, together, tuple(doubts))
+    return Reliability("reads", groups.names(told), observed, predicted, spread, together, tuple(doubts))
 
 
 def _together(looks: _Looks, band: Integers) -> float:

@@ -1,0 +1,106 @@
+"""Reads that were observed against reads that were predicted, by distance and by antenna: of a log, and on the way."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import chi_squared
+from factors.rfid.counts import TagReadCounts
+from factors.se2 import Array, Integers
+
+BAND, BANDS = 1.0, 50  # m of distance, and how many bands; the last one has no end
+FEWEST = 30.0  # predicted reads of a group that is told
+SHOWN = 4  # groups that are named
+DIFFERENT = 0.15  # share of the predicted reads by which a model that is doubted is off
+WINDOW = 15.0  # s in which what was counted comes to count for 1 / e
+DOUBTED, TRUSTED = 1e-5, 1e-3  # probability of such counts with a right model at which doubts begin, and end
+KNOWN = BAND / 4.0  # m: standard deviation of the position up to which a scan tells of the model
+
+
+@dataclass(frozen=True, eq=False)
+class ReadGroups:
+    """Counts of reads in G groups: bands of distance, then ``antennas``. ``sums`` (3, G): observed reads, predicted ones, and the
+    variance of the former if rounds are independent."""
+
+    antennas: Sequence[str]
+    sums: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sums", np.zeros((3, BANDS + len(self.antennas))))
+
+    def add(
+        self, antenna: Integers, distance: Array, hits: Array | Integers, rounds: Integers | float, p: Array
+    ) -> None:
+        """Add ``hits`` (M,) of ``rounds`` of an antenna at a tag, with probability ``p`` (M,) each."""
+        band = np.minimum(distance // BAND, BANDS - 1).astype(np.int64)
+        for group in (band, BANDS + antenna):
+            for i, values in enumerate((hits, rounds * p, rounds * p * (1.0 - p))):
+                self.sums[i] += np.bincount(group, values, self.sums.shape[1])
+
+    @property
+    def told(self) -> Integers:
+        """The groups that are predicted to have :data:`FEWEST` reads or more; antennas only if there are several."""
+        count = len(self.sums[1]) if len(self.antennas) > 1 else BANDS
+        return np.flatnonzero(self.sums[1, :count] >= FEWEST)
+
+    def names(self, groups: Integers) -> list[str]:
+        bands = [f"{b * BAND:g} to {(b + 1) * BAND:g} m" for b in range(BANDS)]
+        return [(bands + [f"antenna {name}" for name in self.antennas])[g] for g in groups.tolist()]
+
+    def shares(self, groups: Integers) -> str:
+        """Reads over predicted reads of groups, those first that are off by the most standard deviations."""
+        observed, predicted, variance = self.sums[:, groups]
+        worst = np.argsort(-np.abs(observed - predicted) / np.sqrt(variance), kind="stable")[:SHOWN]
+        names = self.names(groups[worst])
+        return ", ".join(f"{name}: {observed[i] / predicted[i]:.2f}" for name, i in zip(names, worst, strict=True))
+
+
+class ConsistencyMonitor:
+    """Whether reads are as the detection models predict, in a window that forgets.
+
+    The bands of distance and the antennas have a chi-square each, where ``together`` rounds tell as much as one. The model is
+    doubted while one of them is beyond chance, and more than :data:`DIFFERENT` of the predicted reads are missing or too many.
+    """
+
+    EVENT = "reads are not as the detection models predict"
+
+    def __init__(self, antennas: Sequence[str]) -> None:
+        self._groups = ReadGroups(antennas)
+        self._last = -math.inf
+        self.doubted = False
+
+    def add(
+        self, t: float, looks: TagReadCounts, p: Array, distance: Array, counts: NDArray[np.bool_], together: float
+    ) -> None:
+        """Add looks, once, with the probabilities of a read, distances [m] and which are counted, (K, C) each."""
+        if t <= self._last:
+            return
+        forgotten = math.exp((self._last - t) / WINDOW)
+        self._last = t
+        self._groups.sums[:2] *= forgotten
+        self._groups.sums[2] *= forgotten**2
+        k, c = np.nonzero(counts)
+        self._groups.add(looks.antennas[k], distance[k, c], looks.hits[k, c], looks.rounds[k], p[k, c])
+        chance = min((self._chance(one, together) for one in (slice(0, BANDS), slice(BANDS, None))), default=1.0)
+        self.doubted = chance < (TRUSTED if self.doubted else DOUBTED)
+
+    def _chance(self, groups: slice, together: float) -> float:
+        """The probability of counts that are so far off with a right model; 1 if they are not off by much."""
+        observed, predicted, variance = self._groups.sums[:, groups]
+        told = predicted >= FEWEST
+        off = np.abs(observed - predicted)[told]
+        if np.sum(off) <= DIFFERENT * np.sum(predicted[told]):
+            return 1.0
+        return float(chi_squared.survival(np.sum(off**2 / variance[told]) / together, len(off)))
+
+    @property
+    def shares(self) -> str:
+        return self._groups.shares(self._groups.told)
+
+    def clear(self) -> None:
+        """Forget everything: the track was wrong."""
+        self._groups.sums[:] = 0.0
+        self.doubted = False

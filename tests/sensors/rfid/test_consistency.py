@@ -1,0 +1,96 @@
+"""Reads against those that the detection models predict, on the way: status and events."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.consistency import ConsistencyMonitor
+from factorgraph_loc.sensors.rfid.settings import BeamSettings, PriorSettings, RfidSettings
+from factorgraph_loc.simulation import preset, simulate
+from factors.rfid.counts import TagReadCounts
+
+ANTENNAS, TAGS, STEP = 4, 30, 0.5
+DISTANCE = np.tile(np.linspace(0.2, 5.8, TAGS), (ANTENNAS, 1))
+RIGHT = 1.0 / (1.0 + np.exp(2.0 * (DISTANCE - 4.0)))
+ALL = np.ones(RIGHT.shape, dtype=bool)
+KNOWN = PriorSettings(range_scale=0.0, read_rate=0.0)
+
+
+def scans(monitor, seed, count, chance, *, p=RIGHT, begin=0.0, stays=0.0, together=1.0):
+    """Whether a model that says ``p`` is doubted after each of some scans of tags that are read with a ``chance``. ``stays``: how
+    often a tag does as in the scan before."""
+    rng = np.random.default_rng(seed)
+    hits, out = rng.random(chance.shape) < chance, []
+    for i in range(count):
+        hits = np.where(rng.random(chance.shape) < stays, hits, rng.random(chance.shape) < chance)
+        looks = TagReadCounts(np.zeros((ANTENNAS, 3)), np.arange(ANTENNAS), np.ones(ANTENNAS, int), hits.astype(int))
+        monitor.add(begin + STEP * i, looks, p, DISTANCE, ALL, together)
+        out.append(monitor.doubted)
+    return np.array(out)
+
+
+def monitor():
+    return ConsistencyMonitor([str(a) for a in range(ANTENNAS)])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_right_model_is_not_doubted(seed):
+    """Some 70 windows with two chances of 1e-5: one in 700 such runs would be doubted if a difference of 15 % were none."""
+    assert not scans(monitor(), seed, 2000, RIGHT).any()
+
+
+@pytest.mark.parametrize(("share", "named"), [(0.6, "0 to 1 m: 0.6"), (2.0, "4 to 5 m: ")])
+def test_what_is_wrong_is_doubted_and_named_until_it_is_right_again(share, named):
+    one = monitor()
+    found = scans(one, 1, 60, np.minimum(share * RIGHT, 1.0))
+    assert not found[0]
+    assert found[20:].all()
+    assert named in one.shares
+    later = scans(one, 2, 200, RIGHT, begin=30.0)
+    assert not later[120:].any()
+
+
+def test_rounds_that_go_together_are_no_reason_for_doubt():
+    """Of a chain that stays with 0.8, nine rounds tell as much as one."""
+    p = np.full(RIGHT.shape, 0.1)
+    assert not scans(monitor(), 3, 1000, p, p=p, stays=0.8, together=9.0).any()
+    assert scans(monitor(), 3, 1000, p, p=p, stays=0.8).any()
+
+
+def test_scans_that_come_again_count_once():
+    one, again = monitor(), monitor()
+    for m in (one, again):
+        scans(m, 4, 40, 0.5 * RIGHT)
+    scans(again, 5, 40, RIGHT)
+    assert again.shares == one.shares
+
+
+@cache
+def office() -> Log:
+    return simulate(preset("office", {"drive": {"duration": 90.0}}), 7)
+
+
+def told(log: Log, **changes: float) -> Log:
+    """The log with a rig that is sure of other antennas."""
+    rfid = log.rig.of(RfidSettings)
+    models = {"default": BeamSettings(prior=KNOWN, **changes)}
+    return replace(log, rig=log.rig.model_copy(update={"rfid": rfid.model_copy(update={"models": models})}))
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "smoother", "particle_filter"])
+def test_an_estimate_with_antennas_that_are_not_as_the_rig_says_is_ambiguous(estimator):
+    settings = {"particles": 2000} if estimator == "particle_filter" else {}
+    for changes, right in (({}, True), ({"r_max": 5.4}, False)):
+        result = run(told(office(), **changes), RunConfig(estimator, settings))
+        late = [s for t, s in zip(result.t, result.status, strict=True) if t > 20.0]
+        events = [text for _, text in result.diagnostics.events if text.startswith(ConsistencyMonitor.EVENT)]
+        if right:
+            assert set(late) == {"localized"}
+            assert not events
+        else:
+            assert late.count("ambiguous") > 0.9 * len(late)
+            assert "m: 0." in events[0]
