@@ -7,7 +7,7 @@ too. A track whose pixels are outliers :data:`STRIKES` times in a row is separat
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -27,6 +27,7 @@ from factorgraph_loc.slam.point_looks import PointLooks
 from factorgraph_loc.slam.refound_points import refound
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.level import Stance, tilting
 from factorgraph_loc.vision.spread import spread_out
 from factors import positive, se2
 from factors.camera import model as reprojection
@@ -46,6 +47,7 @@ OPEN = np.full(3, 30.0)  # m: weak prior of a point, about the size of a buildin
 LOST = 10.0  # s for which a lost point is searched: after that, too many others in a building look like it
 AGREED = 0.5  # fraction of inliers required of points not seen for longer: similar descriptors agree by chance
 RECENT = 5.0  # s: the error of a point seen since is correlated with that of the track
+FEWEST_LEVELLED = 10  # points of the graph that tell the tilt of a robot
 REVISITED = 6  # features of points not seen for longer that are accepted together, whatever the others say
 HORIZON, BUNDLE = 60, 8  # keyframes for which sightings are kept, and keyframes that are adjusted together
 
@@ -81,6 +83,7 @@ class UnknownPoints:
     _anchored: dict[int, bool] = field(default_factory=dict)  # keyframes with sightings
 
     def __post_init__(self) -> None:
+        self._levels = not self.estimated.indices
         self._new = NewPoints(self.model)
         self._sightings = PointSightings(self.model)
 
@@ -104,7 +107,7 @@ class UnknownPoints:
         rows = list(rows)
         if keyframe.from_previous is not None:
             self._distance_travelled += float(np.hypot(*keyframe.from_previous.delta[:2]))
-        names = self._named(m, rows, lifted(model, *guess), graph)
+        names = self._named(m, rows, self._tilting(model, guess), graph)
         certain: set[int] = set()  # rows
         if m.frame is not None and self._loops.due(m.t):
             certain = self._revisited(
@@ -120,7 +123,10 @@ class UnknownPoints:
         points = [self._points[names[i]] for i in old]
         known = np.array([rows[i] in certain for i in old], dtype=bool)
         fewest = REVISITED if m.names is None else 2  # a name needs one other to confirm it
-        guess, right = self._placed(model, points, pixels[old], keyframe.t, guess, graph, known, fewest)
+        guess, right, stance = self._placed(model, points, pixels[old], keyframe.t, guess, graph, known, fewest)
+        if stance is not None:
+            positions = np.array([graph.current(point.key) for point in points])
+            pixels = _levelled(stance, pixels, old, positions, right)
         if m.frame is not None:
             seen_from = lifted(model, *guess).position
             self._remember(
@@ -249,6 +255,11 @@ class UnknownPoints:
         positions, covariances = (np.array([part[key] for key in keys.values()]) for part in (values, spreads))
         return self._looks.map_of(tuple(keys), tuple(keys.values()), positions, covariances)
 
+    def _tilting(self, model: CameraModel, guess: Guess) -> CameraPose:
+        """The camera at a predicted pose of a robot that may tilt."""
+        camera = lifted(model, *guess)
+        return replace(camera, covariance=camera.covariance + tilting(model)) if self._levels else camera
+
     def _placed(
         self,
         model: CameraModel,
@@ -259,38 +270,45 @@ class UnknownPoints:
         graph: GraphView,
         known: Truths,
         fewest: int,
-    ) -> tuple[Guess, Truths]:
-        """The pose corrected by points of the graph, and which of these are inliers.
+    ) -> tuple[Guess, Truths, Stance | None]:
+        """The pose corrected by points of the graph, which of these are inliers, and the stance of the robot that they tell.
 
         Points not seen for long need to agree with each other, at least ``fewest`` of them, but not with the rest, as the track has
         drifted since.
         """
         if not points:
-            return guess, np.zeros(0, dtype=bool)
+            return guess, np.zeros(0, dtype=bool), None
         positions = np.array([graph.current(point.key) for point in points])
         spreads = positive.inverse(np.array([point.information for point in points]))
-        camera = lifted(model, *guess)
+        camera = self._tilting(model, guess)
         _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, positions)
         noise = (model.sigma**2 + SLACK**2) * np.eye(2) + by_point @ spreads @ by_point.transpose(0, 2, 1)
         recent = np.array([t - point.last < RECENT for point in points])
         right = known.copy()
-        placed = guess
+        placed, stance = guess, None
         revisited = max(fewest, math.ceil(AGREED * np.count_nonzero(~recent & ~known)))
         for which, enough in ((recent, FEWEST), (~recent & ~known, revisited)):
             agrees = np.zeros(len(points), dtype=bool)
             if which.any():
                 agrees[which] = agreeing(model, camera, positions[which], pixels[which], noise[which])
             if np.count_nonzero(agrees) >= enough and placed is guess:
-                factor = ReprojectionFactor(model, positions[agrees], pixels[agrees], point_covariances=spreads[agrees])
+                seen, at = pixels[agrees], positions[agrees]
+                if len(seen) >= FEWEST_LEVELLED and self._levels:
+                    stance = Stance.of(model, camera, at, seen, noise[agrees])
+                    stance = None if stance.is_steep else stance
+                if stance is not None:
+                    seen = stance.levelled(at, seen)
+                factor = ReprojectionFactor(model, at, seen, point_covariances=spreads[agrees])
                 update = robust_update(factor, *guess, ITERATIONS, SETTLED)
                 placed = se2.compose(guess[0], se2.exp(update.delta)), guess[1]
             elif np.count_nonzero(agrees) < enough and placed is not guess:
-                error = reprojection.predict(model, placed[0], positions)[0] - pixels
+                seen = pixels if stance is None else stance.levelled(positions, pixels)
+                error = reprojection.predict(model, placed[0], positions)[0] - seen
                 agrees &= positive.squared(error, noise) < GATE
             elif np.count_nonzero(agrees) < enough:
                 agrees &= which & recent
             right |= agrees
-        return placed, right
+        return placed, right, stance
 
     def _again(
         self,
@@ -370,3 +388,12 @@ class UnknownPoints:
             variance = float(step.covariance[2, 2])
             to_anchor, since = (to_anchor, since + variance) if reached else (to_anchor + variance, since)
         return slacks
+
+
+def _levelled(stance: Stance, pixels: Array, old: list[int], positions: Array, right: Truths) -> Array:
+    """The pixels as of an upright robot: those of the points ``old`` at their ``positions``, others about as far away as the
+    ``right`` ones of these."""
+    depth = float(np.median((positions[right] - stance.position) @ stance.rotation[:, 2]))
+    places = stance.position + depth * reprojection.rays(stance.model, pixels) @ stance.rotation.T
+    places[old] = positions
+    return stance.levelled(places, pixels)

@@ -65,15 +65,15 @@ def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Arra
         return np.ones(count, dtype=bool)
     if count < FEWEST:
         return np.zeros(count, dtype=bool)
-    whiteners, root = positive.whitener(spreads), _root(camera)
+    whiteners, root = positive.whitener(spreads), root_of(camera)
     position, rotation, squared = _best_of_samples(model, camera, points, pixels, whiteners, REACH * root)
     inside = squared < LOOSE
     for _ in range(2):
         if np.count_nonzero(inside) < FEWEST:
             return np.zeros(count, dtype=bool)
-        residual, jacobian = _whitened(model, position, rotation, points[inside], pixels[inside], whiteners[inside])
+        residual, jacobian = whitened(model, position, rotation, points[inside], pixels[inside], whiteners[inside])
         step = np.linalg.lstsq((jacobian @ root).reshape(-1, 6), -residual.ravel(), rcond=1e-9)[0]
-        position, rotation = _moved(position[None], rotation[None], (root @ step)[None])
+        position, rotation = moved(position[None], rotation[None], (root @ step)[None])
         position, rotation = position[0], rotation[0]
         squared = _squared(model, position[None], rotation[None], points, pixels, whiteners)[0]
         inside = squared < GATE
@@ -91,19 +91,19 @@ def _best_of_samples(
         rows = np.argsort(rng.random((ROUND, count)), axis=1)[:, :SAMPLE]
         position = np.repeat(camera.position[None], ROUND, axis=0)
         rotation = np.repeat(camera.rotation[None], ROUND, axis=0)
-        moved = np.zeros((ROUND, 6))
+        total = np.zeros((ROUND, 6))
         for _ in range(3):
             # Gauss-Newton in the whitened perturbation, whose prior is the unit Gaussian
             residual, jacobian = _whitened_each(model, position, rotation, points[rows], pixels[rows], whiteners[rows])
             flat = jacobian @ root
             normal = flat.transpose(0, 2, 1) @ flat
             normal[:, range(6), range(6)] = 1.0 + (1.0 + RIDGE) * normal[:, range(6), range(6)]
-            gradient = np.einsum("hij,hi->hj", flat, residual) + moved
+            gradient = np.einsum("hij,hi->hj", flat, residual) + total
             step = -np.linalg.solve(normal, gradient[..., None])[..., 0]
             # three outliers may give any correction
             step *= np.minimum(1.0, FARTHEST / np.linalg.norm(step, axis=1))[:, None]
-            moved = moved + step
-            position, rotation = _moved(position, rotation, step @ root.T)
+            total = total + step
+            position, rotation = moved(position, rotation, step @ root.T)
         squared = _squared(model, position, rotation, points, pixels, whiteners)
         costs = np.minimum(squared, LOOSE).sum(axis=1)
         i = int(np.argmin(costs))
@@ -152,20 +152,20 @@ def _joint(
     return total
 
 
-def _root(camera: CameraPose) -> Array:
+def root_of(camera: CameraPose) -> Array:
     """A square root (6, 6) of the covariance, which may be singular."""
     values, vectors = np.linalg.eigh(camera.covariance)
     # rounding errors must not decide in which directions a sample may move
     return np.asarray(vectors * np.sqrt(np.where(values > ROUNDING * values[-1], values, 0.0)))
 
 
-def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:
+def moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:
     """H camera poses after perturbations (H, 6)."""
-    moved = position + (rotation @ step[:, 3:, None])[..., 0]
-    return moved, rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
+    there = position + (rotation @ step[:, 3:, None])[..., 0]
+    return there, rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
 
 
-def _whitened(
+def whitened(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> tuple[Array, Array]:
     """Whitened residuals (K, 2), predicted minus measured, and Jacobians (K, 2, 6) with respect to the camera's perturbation."""

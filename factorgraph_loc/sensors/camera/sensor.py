@@ -21,6 +21,7 @@ from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.level import Stance, tilting
 from factorgraph_loc.vision.relocalization import FoundOnFloor, found_on_floor, on_floor
 from factorgraph_loc.vision.spread import spread_out
 from factors import se2
@@ -84,6 +85,7 @@ class KnownPoints:
         self.used = np.empty(0, dtype=np.int64)  # features of the last image that match points of the map
         self.names: tuple[str, ...] = ()  # of the points of the last factor, where they are named
         self._estimated = estimated
+        self._levels = not estimated.indices  # else their errors would be taken for a tilt
         self._diagnostics = diagnostics
         self.associator: Associator | None = None
         if self.model is not None and "camera" in setup.sensors and len(self.map.owners):
@@ -179,10 +181,12 @@ class KnownPoints:
         agreed = int(np.count_nonzero(right))
         self.missed = agreed < FEW_SHARE * len(right)
         if agreed == len(right):
-            return factor
+            return self._levelled(factor, here, here.model, camera)
         self._diagnostics.reject(DISAGREES, len(right) - agreed)
         self.names = tuple(self.names[row] for row in np.flatnonzero(right).tolist())
-        return rows_of(factor, right) if agreed else None
+        if not agreed:
+            return None
+        return self._levelled(rows_of(factor, right), rows_of(here, right), here.model, camera)
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
         """The pose of an image without a prediction, or None, and the number of points that it seemed to show."""
@@ -244,7 +248,22 @@ class KnownPoints:
         chosen = spread_out(pixels, MOST)
         points = seen.points[chosen]
         spreads = self.map.covariances[points] if self._map_matters else None
-        return replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=spreads)
+        found = replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=spreads)
+        return self._levelled(found, found, model, camera)
+
+    def _levelled(
+        self, factor: ReprojectionFactor, here: ReprojectionFactor, model: CameraModel, camera: CameraPose
+    ) -> ReprojectionFactor | None:
+        """The factor with pixels as of an upright robot; ``here``: the same at the prediction, with points where they are. None if
+        no robot on a floor sees them there."""
+        if not self._levels:
+            return factor
+        stance = Stance.of(model, camera, here.points, here.pixels, noise_of(model, camera, here))
+        if stance.is_steep:
+            self._diagnostics.reject(DISAGREES, len(here.points))
+            return None
+        weighed = replace(factor.model, tempering=stance.kept * factor.model.tempering)
+        return replace(factor, model=weighed, pixels=stance.levelled(here.points, here.pixels))
 
     def _camera(self, here: ReprojectionFactor, predicted: Predicted) -> CameraPose:
         """The pose of the camera for an image, including the uncertainty of its constants."""
@@ -254,6 +273,8 @@ class KnownPoints:
             since = Increment(here.offset, noise, 0.0)
             pose, covariance = se2.compose(pose, here.offset), propagate(covariance, since)
         camera = lifted(here.model, pose, covariance)
+        if self._levels:
+            camera = replace(camera, covariance=camera.covariance + tilting(here.model))
         if predicted.spread is None:
             return camera
         model = here.model
@@ -312,16 +333,19 @@ def _agreeing(here: ReprojectionFactor, camera: CameraPose, focal: float) -> Tru
     model, count = here.model, len(here.pixels)
     if count < FEWEST:
         return np.ones(count, dtype=bool)
-    if here.point_covariances is None:
-        spreads = np.zeros((count, 2, 2))
-        spreads[:, (0, 1), (0, 1)] = model.sigma**2
-    else:
-        _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, here.points)
-        spreads = pixel_kernels.spread(by_point, here.point_covariances, float(model.sigma))
+    spreads = noise_of(model, camera, here)
     if focal > 0.0:
         away = focal * (here.pixels - (model.cx, model.cy))
         spreads = spreads + away[:, :, None] * away[:, None, :]
     return agreeing(model, camera, here.points, here.pixels, spreads)
+
+
+def noise_of(model: CameraModel, camera: CameraPose, seen: ReprojectionFactor) -> Array:
+    """Covariances (K, 2, 2) [px^2] of the pixels of points, with that of the points seen by ``camera``."""
+    if seen.point_covariances is None:
+        return np.repeat(model.sigma**2 * np.eye(2)[None], len(seen.points), axis=0)
+    _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, seen.points)
+    return pixel_kernels.spread(by_point, seen.point_covariances, float(model.sigma))
 
 
 def rows_of(factor: ReprojectionFactor, rows: Truths) -> ReprojectionFactor:

@@ -1,0 +1,88 @@
+"""A robot whose floor is not level: roll and pitch that no estimator in the plane knows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from camera_world import CAMERA, room, simulate
+from scipy.spatial.transform import Rotation
+
+from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.sensors.camera.sensor import lifted
+from factorgraph_loc.vision.consensus import CameraPose
+from factorgraph_loc.vision.level import TILT, Stance, tilting
+from factors.camera import model as reprojection
+
+SEEDS = (3, 4, 5)
+PERIODS = (4.1, 2.7)  # s, of roll and pitch
+SWAY = 0.014  # rad, at most; a pixel is 0.002 rad
+
+
+def standing(pose, roll, pitch):
+    """Position and rotation of the camera of a robot that tilts."""
+    turn = Rotation.from_euler("ZYX", (pose[2], pitch, roll)).as_matrix()
+    return reprojection.mounted(CAMERA.model(), np.array((pose[0], pose[1], 0.0)), turn)
+
+
+def uneven(log):
+    """The log with its pixels as seen by a robot that sways."""
+    stream, points, model = log.streams["sightings"], log.world.points, log.rig.camera.model()
+    u, v = stream.u.copy(), stream.v.copy()
+    for t in np.unique(stream.t):
+        rows = np.flatnonzero(stream.t == t)
+        pose, seen = (
+            log.reference.at(np.array((t,)))[0],
+            points.positions[[points.index[stream.point[i]] for i in rows]],
+        )
+        camera = standing(pose, *(SWAY * np.sin(2.0 * np.pi * t / period) for period in PERIODS))
+        moved = reprojection.linearize_in_space(model, *camera, seen)[0] - reprojection.predict(model, pose, seen)[0]
+        u[rows] += moved[:, 0]
+        v[rows] += moved[:, 1]
+    return replace(log, streams={**log.streams, "sightings": replace(stream, u=u, v=v)})
+
+
+def test_roll_and_pitch_are_found_and_taken_out_of_the_pixels():
+    model, points, rng = CAMERA.model(), room().positions, np.random.default_rng(2)
+    pose = np.array((1.0, -1.0, 0.4))
+    upright, depth = reprojection.predict(model, pose, points)
+    rows = np.flatnonzero(model.contains(upright) & (depth > 0.3))
+    upright, points = upright[rows], points[rows]
+    pixels = reprojection.linearize_in_space(model, *standing(pose, 0.02, -0.015), points)[0]
+    pixels += rng.standard_normal(pixels.shape)
+    camera = lifted(model, np.add(pose, (0.02, -0.02, 0.01)), np.diag((0.03, 0.03, 0.02)) ** 2)
+    camera = CameraPose(camera.position, camera.rotation, camera.covariance + tilting(model))
+
+    stance = Stance.of(model, camera, points, pixels, np.repeat(np.eye(2)[None], len(points), axis=0))
+
+    turn = reprojection.carrier(model, stance.position, stance.rotation)[1]
+    # some 30 points tell an angle to 1 px / 500 px / sqrt(30) or twice that: five of these
+    np.testing.assert_allclose(Rotation.from_matrix(turn).as_euler("ZYX")[1:], (-0.015, 0.02), atol=0.004)
+    off = stance.levelled(points, pixels) - upright
+    assert np.hypot(*np.median(off, axis=0)) < 3.0  # of 12 px; what is left is that of the place
+    assert 0.2 < stance.kept < 1.0
+
+
+def test_the_camera_moves_with_a_robot_that_tilts():
+    model, pose = CAMERA.model(), np.array((1.0, 2.0, 0.7))
+    level = CameraPose(*standing(pose, 0.0, 0.0), np.eye(6))
+    columns = []
+    for tilts in ((TILT, 0.0), (0.0, TILT)):
+        position, rotation = standing(pose, *tilts)
+        turned = Rotation.from_matrix(level.rotation.T @ rotation).as_rotvec()
+        columns.append(np.concatenate((turned, level.rotation.T @ (position - level.position))))
+
+    np.testing.assert_allclose(tilting(model), np.transpose(columns) @ columns, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", ["ekf", "smoother", "particle_filter"])
+def test_covariances_hold_on_an_uneven_floor(name):
+    found = []
+    for seed in SEEDS:
+        log = uneven(simulate(seconds=15.0, seed=seed))
+        scores = score(run(log, RunConfig(name)), log)
+        found.append([scores[f"causal.{figure}"] for figure in ("position_rmse", "anees")])
+    position, anees = np.mean(found, axis=0)
+    assert position < 0.03
+    # of 450 NEES of 3 degrees of freedom, of which some 15 are independent: five standard deviations below 6.2
+    assert anees < 6.2
