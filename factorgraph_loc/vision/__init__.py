@@ -11,6 +11,7 @@ __all__ = [
     "frame_motion",
     "images",
     "keypoints",
+    "level",
     "matching",
     "relocalization",
     "settings",
