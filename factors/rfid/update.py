@@ -88,14 +88,15 @@ def scored_update(factor: RfidFactor, pose: Array, values: Array, covariance: Ar
     first = factor.joint_score([pose, values])
     # tempering stands for what successive scans have in common: a score alone scatters as if there were no tempering
     tempering = factor.likelihood.model.tempering
-    nis, dof = _innovation(first.gradient[0], first.information[0], covariance, tempering)
+    nis, dof = _innovation(first.gradient[0], np.ascontiguousarray(first.information[0]), covariance, tempering)
     surprise = variance = 0.0
     if isinstance(first, Score):
         surprise, variance = float(first.nll[0] - first.expected[0]), float(first.variance[0])
     here, cost = first, float(first.nll[0])
     best, changed, moved = pose, values, np.zeros(len(covariance))
     for _ in range(iterations):
-        step = _scoring_step(prior_information, here.information[0], here.gradient[0], moved, largest)
+        information = np.ascontiguousarray(here.information[0])
+        step = _scoring_step(prior_information, information, here.gradient[0], moved, largest)
         if np.all(np.abs(step) < CONVERGED * sigmas):
             best, changed = se2.compose(best, se2.exp(step[:3])), changed + step[3:]
             break
@@ -110,7 +111,7 @@ def scored_update(factor: RfidFactor, pose: Array, values: Array, covariance: Ar
         else:
             break
         best, changed, cost, moved, here = tried, tried_values, tried_cost, error, there
-    posterior, log_ratio = _posterior(prior_information, here.information[0])
+    posterior, log_ratio = _posterior(prior_information, np.ascontiguousarray(here.information[0]))
     return TagUpdate(best, posterior, nis, dof, surprise, variance, 0.5 * log_ratio - cost, changed)
 
 

@@ -52,6 +52,7 @@ def add_log_likelihood(
     size = min(BLOCK, len(poses))
     at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
     own, product, room, mixed = np.empty(size), np.empty(size), np.empty(size), np.ones(size)
+    where_it_is = _WHERE_IT_IS.copy()  # as a constant is another type, for which all is compiled once more
     for first in range(0, len(poses), size):
         count = min(size, len(poses) - first)
         found = out[first : first + count]
@@ -61,7 +62,7 @@ def add_log_likelihood(
         for t in range(len(odds)):
             if not seen[t]:
                 continue
-            _of_tag(packed, tables, at, models, count, looks, tags, t, _WHERE_IT_IS, own, product, room)
+            _of_tag(packed, tables, at, models, count, looks, tags, t, where_it_is, own, product, room)
             if odds[t] == -np.inf or elsewhere[t] == -np.inf:
                 for n in range(count):
                     found[n] += tempering * own[n]
