@@ -125,15 +125,16 @@ def test_a_linear_gaussian_run_is_that_of_the_kalman_filter_and_smoother(name):
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_points_by_name_and_frames_of_features_keep_the_robot_within_centimetres(name, log):
+    bound = 0.025 if name == "particle_filter" else 0.02  # 20 points an image tell less where the floor may not be level
     for made in (log, with_frames(log, wrong=0.4)):
         result = run(made, CONFIGS[name])
         scores = score(result, made)
-        assert scores["final.position_rmse"] < 0.025
+        assert scores["final.position_rmse"] < bound
         nis = np.array([row[1:] for row in result.diagnostics.nis["camera"]])
         # of some 2,800 degrees of freedom: five standard deviations of the mean, below 1e-6 of false alarms
         assert abs(nis[:, 0].sum() / nis[:, 1].sum() - 1.0) < 5.0 * np.sqrt(2.0 / nis[:, 1].sum())
         if name in CAUSAL:
-            assert scores["causal.position_rmse"] < 0.02
+            assert scores["causal.position_rmse"] < bound
 
 
 def test_estimators_agree(log):
