@@ -125,7 +125,9 @@ def test_a_linear_gaussian_run_is_that_of_the_kalman_filter_and_smoother(name):
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_points_by_name_and_frames_of_features_keep_the_robot_within_centimetres(name, log):
-    bound = 0.025 if name == "particle_filter" else 0.02  # 20 points an image tell less where the floor may not be level
+    bound = (
+        0.025 if name == "particle_filter" else 0.02
+    )  # 20 points an image tell less where the floor may not be level
     for made in (log, with_frames(log, wrong=0.4)):
         result = run(made, CONFIGS[name])
         scores = score(result, made)
