@@ -29,8 +29,7 @@ from factors.update import CONVERGED, Correction, SightingFactor, update_state
 
 @dataclass(frozen=True)
 class Term:
-    """A factor of a graph and the names of the ``blocks`` that it depends on besides the pose, in the order of its values.
-    ``rows``: number of residuals."""
+    """A factor of a graph with ``rows`` residuals, and the names of the ``blocks`` of its values after the pose, in their order."""
 
     factor: Factor
     blocks: tuple[str, ...]
@@ -79,8 +78,7 @@ class Observation(Protocol):
         """The correction of a Gaussian with mean ``pose`` (3,) and ``values`` of the blocks by name.
 
         ``covariance`` (S, S): of the error state, whose first three components are the body-frame perturbation of the pose;
-        ``columns``: the components of each block. Other components are corrected by their correlation. ``iterations``: number of
-        linearisations.
+        ``columns``: those of each block; others are corrected by their correlation. ``iterations``: number of linearisations.
         """
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
@@ -301,8 +299,7 @@ class Sensor:
         return [term for observation in observations for term in observation.terms]
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """A factor of this sensor for the final solution, with its robust loss ``width`` times as wide. None to leave a
-        multimodal factor out while ``width`` is above 1."""
+        """A factor for the final solution, its loss ``width`` times as wide; None leaves it out while ``width`` is above 1."""
         return factor
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:
