@@ -63,10 +63,14 @@ class _Shared(FunctionCache):
             self._unlock()
 
     def _lock(self) -> None:
+        try:
+            locks = _locks(self.cache_path)
+        except OSError:  # it belongs to somebody else
+            return
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             try:
-                fcntl.lockf(_locks(self.cache_path), fcntl.LOCK_EX | fcntl.LOCK_NB, 1, self._place())
+                fcntl.lockf(locks, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, self._place())
                 return
             except (BlockingIOError, PermissionError):  # another process has it
                 time.sleep(_BEAT)

@@ -19,9 +19,7 @@ from factors.robust import huber_weight
 from factors.se2 import Array
 
 TILT = 0.005  # rad: standard deviation of roll and pitch on the floor of a building, as in `monoslam`
-STEEPEST = (
-    0.06  # rad: what tilts by more is no robot on a floor, or its camera is mounted in another way than the rig says
-)
+STEEPEST = 0.06  # rad: what tilts by more is no robot on a floor, or its camera is not mounted as the rig says
 RIDGE = 1e-9  # relative, for points that do not tell the pose
 STEPS, SETTLED = 5, 1e-3  # rounds, and standard deviations of the prediction that the last may move
 

@@ -47,6 +47,7 @@ class ReadGroups:
         return np.flatnonzero(self.sums[1, :count] >= FEWEST)
 
     def names(self, groups: Integers) -> list[str]:
+        """What groups are called."""
         bands = [f"{b * BAND:g} to {(b + 1) * BAND:g} m" for b in range(BANDS)]
         return [(bands + [f"antenna {name}" for name in self.antennas])[g] for g in groups.tolist()]
 
@@ -98,6 +99,7 @@ class ConsistencyMonitor:
 
     @property
     def shares(self) -> str:
+        """Reads over predicted reads of the groups that are off most."""
         return self._groups.shares(self._groups.told)
 
     def clear(self) -> None:

@@ -17,6 +17,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.interfaces import Use
 from factorgraph_loc.sensors.odometry.calibration.constants import REFERENCE_GAP
 from factorgraph_loc.sensors.rfid.consistency import BAND, DIFFERENT, FEWEST, ReadGroups
+from factorgraph_loc.sensors.rfid.monitor import BLOCK, POSSIBLE
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
@@ -25,8 +26,6 @@ from factors.rfid.detection import RfidLikelihood
 from factors.se2 import Array, Integers, transform_from
 
 MOST_ROUNDS = 6000  # of a long log so many are looked at, evenly spread
-BLOCK = 10.0  # s over which reads of a tag by an antenna are counted
-POSSIBLE = 0.01  # least probability of a read that is looked at
 CLEARLY = 4.0  # standard deviations above which a group that is off is doubted
 TOGETHER = 2.0  # rounds that count as one: more is told, as estimators take `1 / tempering` for it
 
