@@ -91,7 +91,7 @@ def body_to_world(pose: Array, covariance: Array) -> Array:
     return out
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", fastmath={"arcp", "contract", "reassoc"})
 def all_moved(poses: Array, delta: Array, twists: Array) -> Array:
     """Poses (N, 3) composed with ``delta`` (3,), and each then moved by a twist (N, 3) in its own frame."""
     out, cd, sd = np.empty_like(poses), math.cos(delta[2]), math.sin(delta[2])
@@ -105,7 +105,7 @@ def all_moved(poses: Array, delta: Array, twists: Array) -> Array:
     return out
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", fastmath={"arcp", "contract", "reassoc"})
 def twists_to(pose: Array, others: Array) -> Array:
     """The twists (N, 3) in the frame of a pose (3,) that lead from it to others (N, 3)."""
     out, c, s = np.empty_like(others), math.cos(pose[2]), math.sin(pose[2])

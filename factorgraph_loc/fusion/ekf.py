@@ -17,7 +17,7 @@ from scipy.linalg.lapack import dpotrf
 
 from factorgraph_loc.fusion.heading_search import HeadingSearch
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
-from factorgraph_loc.fusion.search import Search
+from factorgraph_loc.fusion.search import Search, Tracked
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -256,7 +256,7 @@ class Ekf(Filter):
             )
             if not seen.is_judged or sensor.judge(seen, correction, view):
                 self._state = s.plus(correction.delta, correction.covariance)
-        refuted = self._search.refuted(m, self._odometry, view.pose, view.covariance, self._pose_back)
+        refuted = self._search.refuted(m, lambda: Tracked(self._odometry, view.pose, view.covariance), self._pose_back)
         found = self._search.best if refuted is not None else None
         if refuted is not None and found is not None:
             what = f"lost: {refuted.why} since {refuted.since:.1f} s; goes on at another place"

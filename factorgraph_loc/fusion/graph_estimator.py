@@ -22,7 +22,7 @@ from factorgraph_loc.fusion.builder import Backend, Builder
 from factorgraph_loc.fusion.graph import Graph
 from factorgraph_loc.fusion.graph_parts import GraphSettings, Keyframe
 from factorgraph_loc.fusion.mapping import Mapper
-from factorgraph_loc.fusion.search import DURATION, Refuted, Search
+from factorgraph_loc.fusion.search import DURATION, Refuted, Search, Tracked
 from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, gaussian_belief
 from factorgraph_loc.model.diagnostics import NOTHING_WRITTEN, Diagnostics, Written
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -240,12 +240,14 @@ class GraphEstimator(ABC):
 
     def _doubt(self, m: Measurement) -> None:
         """See whether what is seen refutes the track, and go on at the place that it tells."""
-        pose, covariance, _ = self._graph.moved(m.t)
+
+        def track() -> Tracked:
+            return Tracked(self._motion.state(m.t), *self._graph.moved(m.t)[:2])
 
         def back(t: float, here: Array) -> Array:
-            return self._placed(t, PosePrior(m.t, here, covariance))
+            return self._placed(t, PosePrior(m.t, here, UNKNOWN))
 
-        refuted = self._search.refuted(m, self._motion.state(m.t), pose, covariance, back)
+        refuted = self._search.refuted(m, track, back)
         best = None if refuted is None else self._search.best
         if refuted is not None and best is not None:
             what = f"lost: {refuted.why} since {refuted.since:.1f} s; goes on at another place"

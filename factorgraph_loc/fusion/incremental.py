@@ -244,7 +244,7 @@ class Incremental:
             covariance = found.by_key[key]
         return value, positive.sound(covariance)
 
-    def _leave(self, now: float, constants: Iterable[int]) -> None:
+    def _leave(self, now: float, constants: Sequence[int]) -> None:
         """Keep the estimates of the keyframes older than the lag, before the next update marginalises the oldest out.
 
         ``constants``: those that are in the solver by now, which are brought up to date.
@@ -260,12 +260,13 @@ class Incremental:
         leaving = self._graph.keyframes[count:end]
         try:
             # of a start of the whole problem the covariance is not asked; a window with points takes long to eliminate
-            spreads = {} if self._is_whole or self._maps else self._solver.covariances([k.key for k in leaving])
+            alone = self._is_whole or self._maps
+            spreads = {} if alone else self._solver.covariances([*(k.key for k in leaving), *constants])
             for k in leaving:
                 spread = self._filtered[k.index][1] if self._is_whole else spreads.get(k.key)
                 self._left.append(self._marginal(k.key, spread))
             for key in constants:
-                self._graph.values[key], self._graph.spreads[key] = self._marginal(key)
+                self._graph.values[key], self._graph.spreads[key] = self._marginal(key, spreads.get(key))
         except RuntimeError:
             self._left += [self._filtered[k.index] for k in leaving[len(self._left) - count :]]
         for mapper in self._graph.mappers:

@@ -30,7 +30,7 @@ from factorgraph_loc.fusion.changes import Change, is_known
 from factorgraph_loc.fusion.cloud import Cloud, largest_share, normalised, systematic, vector_moments, weighable
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
-from factorgraph_loc.fusion.search import Search
+from factorgraph_loc.fusion.search import Search, Tracked
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, Taken, twin
 from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -240,7 +240,7 @@ class ParticleFilter(Filter):
 
     def _anchor(self) -> None:
         super()._anchor()
-        if self._state.odometry.t == self._t:
+        if self._state.odometry.t == self._t and self._state.odometry != self._odometry:
             self._state = replace(self._state, odometry=self._odometry)
 
     def _predict(self, t: float) -> None:
@@ -325,7 +325,7 @@ class ParticleFilter(Filter):
     def _doubt(self, m: Measurement) -> None:
         """See whether what is seen refutes the particles, and put them where it tells."""
         view = CloudView(self)
-        refuted = self._search.refuted(m, self._odometry, view.pose, view.covariance, self._pose_back)
+        refuted = self._search.refuted(m, lambda: Tracked(self._odometry, view.pose, view.covariance), self._pose_back)
         if refuted is not None:
             # for the final trajectory: since then the track was elsewhere
             self._records = [r.lost() if r.t >= refuted.since else r for r in self._records]

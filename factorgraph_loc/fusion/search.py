@@ -43,6 +43,14 @@ class WeighedObservation(NamedTuple):
     evidence: float
 
 
+class Tracked(NamedTuple):
+    """Where a track has come to: the odometry, and the ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
+
+    odometry: ChainState
+    pose: Array
+    covariance: Array
+
+
 class Refuted(NamedTuple):
     """Why a track is given up, and since when it was wrong; ``change``: between which times the robot left it."""
 
@@ -197,17 +205,15 @@ class Search:
         if self._population is not None:
             self._population.add(*self._kept[-1])
 
-    def refuted(
-        self, m: Any, odometry: ChainState, pose: Array, covariance: Array, pose_at: Callable[[float, Array], Array]
-    ) -> Refuted | None:
+    def refuted(self, m: Any, track: Callable[[], Tracked], pose_at: Callable[[float, Array], Array]) -> Refuted | None:
         """Why a track is wrong, if it is, after a measurement was applied to it, or at a tick; :attr:`best` is where the robot is.
 
-        ``pose`` (3,) with body-frame ``covariance`` (3, 3): of the track at the measurement, where the odometry is at
-        ``odometry``. ``pose_at(t, best)``: where the robot was at ``t`` if it is at ``best`` (3,) now.
+        ``track()``: the track at the measurement. ``pose_at(t, best)``: where the robot was at ``t`` if it is at ``best`` (3,) now.
         """
-        if isinstance(m, Tick):
-            return self._refuted_by_all(odometry, pose, covariance, pose_at) if self.waits else None
-        finder = self._finders.get(m.modality)
+        if isinstance(m, Tick) and not self.waits:
+            return None
+        odometry, pose, covariance = track()
+        finder = None if isinstance(m, Tick) else self._finders.get(m.modality)
         if finder is not None:
             since = finder.refuted_since(m, odometry, pose, covariance)
             if since is not None:

@@ -151,17 +151,20 @@ class Window:
         with gtsam_errors():
             return np.asarray(self._smoother.marginalCovariance(key))
 
-    def covariances(self, poses: Sequence[int]) -> dict[int, Array]:
-        """Marginal covariances of poses by key, from one elimination of the window; none where that fails, or has lost one."""
+    def covariances(self, keys: Sequence[int]) -> dict[int, Array]:
+        """Marginal covariances by key, from one elimination of the window; none where that fails, or has lost one."""
         order = gtsam.Ordering()
-        for key in poses:
+        for key in keys:
             order.push_back(key)
+        isam = self._smoother.getISAM2()
         try:
-            root = self.linear()[0].marginalMultifrontalBayesNet(order, function=gtsam.EliminateQR).matrix()[0]
-            rows = np.linalg.inv(root).reshape(len(poses), 3, -1)
-        except (RuntimeError, IndexError, ValueError, np.linalg.LinAlgError):
+            ends = np.cumsum([len(self._ours.at[key]) for key in keys])
+            factors = isam.getFactorsUnsafe().linearize(isam.getLinearizationPoint())
+            root = factors.marginalMultifrontalBayesNet(order, function=gtsam.EliminateQR).matrix()[0]
+            rows = np.split(np.linalg.inv(root), ends[:-1])
+        except (RuntimeError, LookupError, ValueError, np.linalg.LinAlgError):
             return {}
-        return dict(zip(poses, rows @ rows.transpose(0, 2, 1), strict=True))
+        return {key: part @ part.T for key, part in zip(keys, rows, strict=True)}
 
     def estimates(self) -> gtsam.Values:
         return self._smoother.calculateEstimate()

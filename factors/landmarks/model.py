@@ -239,7 +239,7 @@ def whitened_into(
             by_point[k, i, 1] = -s * by_pose[k, i, 0] - c * by_pose[k, i, 1]
 
 
-@compiled
+@compiled(error_model="numpy")
 def _seen(
     sx: float,
     sy: float,
@@ -294,7 +294,7 @@ def log_likelihood(
     return -np.asarray(np.sum(geman_mcclure_loss(squared, model.robust) + widths, axis=-1))
 
 
-@compiled
+@compiled(error_model="numpy", fastmath={"arcp", "contract", "reassoc"})
 def _squared(
     poses: Array,
     constants: Array,
@@ -314,13 +314,12 @@ def _squared(
     the determinants' roots.
     """
     range_sigma, range_sigma_relative, bearing_sigma = noise
-    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    axis = ahead_x = ahead_y = 0.0
     for i in range(len(poses)):
-        c, s = cosine[i], sine[i]
+        c, s = math.cos(poses[i, 2]), math.sin(poses[i, 2])
         x, y, bearing_bias, range_scale, depth_axis = constants[i]
-        ahead_x = ahead_y = 0.0
-        if depth:
-            ahead_x, ahead_y = math.cos(turn + depth_axis), math.sin(turn + depth_axis)
+        if depth and (i == 0 or depth_axis != axis):
+            axis, ahead_x, ahead_y = depth_axis, math.cos(turn + depth_axis), math.sin(turn + depth_axis)
         model = (range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma)
         for k in range(len(points)):
             dx, dy = points[k, 0] - poses[i, 0], points[k, 1] - poses[i, 1]
