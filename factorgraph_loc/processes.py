@@ -4,6 +4,7 @@ This module must import light modules only: a new process loads it before it is 
 """
 
 import ctypes
+import gc
 import multiprocessing
 import os
 import pickle
@@ -37,10 +38,15 @@ class ProcessDiedError(RunFailedError):
 
 
 class Child(SpawnProcess):
-    """A spawned process that ends with its parent; its own children end with it."""
+    """A spawned process that ends with its parent, and searches for garbage as rarely; its own children end with it."""
+
+    def start(self) -> None:
+        self._threshold = gc.get_threshold()
+        super().start()
 
     def run(self) -> None:
         _end_with_parent()
+        gc.set_threshold(*self._threshold)
         self.daemon = False  # a daemon could not start processes of its own
         super().run()
 

@@ -40,6 +40,16 @@ def test_names_cost_nothing_until_they_are_used():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_a_run_on_the_floor_loads_no_optimizers_and_no_rotations_of_scipy(tmp_path):
+    fgloc.write_native(fgloc.simulate("office", changes={"drive": {"duration": 4.0}}), tmp_path / "log")
+    code = (
+        "import sys, factorgraph_loc as fgloc\n"
+        "fgloc.run(fgloc.load(sys.argv[1])[0], 'dead_reckoning')\n"
+        "assert {'scipy.optimize', 'scipy.spatial', 'matplotlib', 'typer'}.isdisjoint(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code, tmp_path / "log"], check=True)
+
+
 @pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.name)
 def test_examples_import_from_the_package_alone(script):
     found = re.findall(r"^(?:from|import) ((?:factorgraph_loc|factors)\S*)", script.read_text(), re.MULTILINE)

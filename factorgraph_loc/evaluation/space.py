@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from factorgraph_loc.evaluation.pairing import pairs_in_space, rms
 from factorgraph_loc.model.scoring import MAX_GAP
@@ -55,5 +55,5 @@ def accuracy(found: Trajectory3 | None, reference: Trajectory3 | None, max_gap: 
 def pose_errors(found: Trajectory3, truth: Trajectory3) -> Array:
     """The perturbations (N, 6) from estimated to true poses, rotation first, in the estimate's frame."""
     back = found.rotations.transpose(0, 2, 1)
-    turns = Rotation.from_matrix(back @ truth.rotations).as_rotvec()
+    turns = scipy.spatial.transform.Rotation.from_matrix(back @ truth.rotations).as_rotvec()
     return np.column_stack((turns, np.einsum("nij,nj->ni", back, truth.positions - found.positions)))

@@ -17,8 +17,8 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import bdtr
 
 from factors.se2 import Array
 
@@ -156,7 +156,7 @@ def mcnemar(a: ArrayLike, b: ArrayLike) -> McNemar:
     first, second = np.asarray(a, dtype=bool), np.asarray(b, dtype=bool)
     only_a, only_b = int(np.sum(first & ~second)), int(np.sum(second & ~first))
     uneven = only_a + only_b
-    return McNemar(only_a, only_b, min(1.0, 2.0 * float(bdtr(min(only_a, only_b), uneven, 0.5))))
+    return McNemar(only_a, only_b, min(1.0, 2.0 * float(scipy.special.bdtr(min(only_a, only_b), uneven, 0.5))))
 
 
 def quantile(values: ArrayLike, share: float) -> float:

@@ -10,8 +10,8 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from factors.se2 import Array
 
@@ -74,7 +74,7 @@ def fit(constants: Sequence[Constant], start: Array, whitened: Callable[[Array],
         return np.column_stack([(residual(scaled + step) - here) / _STEP for step in _STEP * np.eye(len(scaled))])
 
     inside = np.clip(start, low + 1e-9 * typical, high - 1e-9 * typical) / typical
-    found = least_squares(
+    found = scipy.optimize.least_squares(
         residual,
         inside,
         jacobian,

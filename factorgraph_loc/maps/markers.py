@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from typing import Annotated, Literal, get_args
 
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.files.models import Coordinate, FileModel, InUnit
 from factorgraph_loc.maps.points import PointMap
@@ -62,7 +62,7 @@ class Marker(FileModel):
 
     def corners(self) -> Array:
         """Return the corners (4, 3) [m] in the world: upper left, upper right, lower right, lower left, seen from the front."""
-        turn = Rotation.from_euler("ZYX", (self.facing, -self.pitch, self.roll))
+        turn = scipy.spatial.transform.Rotation.from_euler("ZYX", (self.facing, -self.pitch, self.roll))
         return np.asarray(turn.apply(self.size * CORNERS) + np.array((self.x, self.y, self.z)))
 
 

@@ -7,7 +7,6 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
-from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.models import FileModel, InUnit
@@ -55,7 +54,14 @@ class Mounting(FileModel):
 
     def rotation(self) -> Array:
         """The rotation matrix (3, 3) from the sensor frame to the robot frame."""
-        return np.asarray(Rotation.from_euler("xyz", (self.roll, self.pitch, self.yaw)).as_matrix())
+        (cr, cp, cy), (sr, sp, sy) = (f((self.roll, self.pitch, self.yaw)) for f in (np.cos, np.sin))
+        return np.array(
+            [
+                [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+                [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+                [-sp, cp * sr, cp * cr],
+            ]
+        )
 
 
 class Turned(FileModel):
@@ -85,7 +91,13 @@ AS_IT_IS = Turned()
 def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Array:
     """Rotations (N, 3, 3) of quaternions (N, 4), (x, y, z, w); InputError if one is not a unit quaternion."""
     require_unit(source, rows, quaternions)
-    return np.asarray(Rotation.from_quat(quaternions).as_matrix()).reshape(-1, 3, 3)
+    x, y, z, w = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    matrix = [
+        [w * w + x * x - y * y - z * z, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+        [2.0 * (x * y + z * w), w * w - x * x + y * y - z * z, 2.0 * (y * z - x * w)],
+        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), w * w - x * x - y * y + z * z],
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.array(matrix), 2, 0))
 
 
 def require_unit(source: object, rows: Integers, quaternions: Array) -> None:

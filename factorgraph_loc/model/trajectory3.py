@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import write_text
@@ -51,7 +51,9 @@ class Trajectory3(Exchange):
             alike = self.rows(np.zeros(len(t), dtype=np.int64))
             return Trajectory3(t, alike.positions, alike.rotations, covariances)
         positions = np.column_stack([np.interp(t, self.t, self.positions[:, i]) for i in range(3)])
-        rotations = Slerp(self.t, Rotation.from_matrix(self.rotations))(t).as_matrix()
+        rotations = scipy.spatial.transform.Slerp(self.t, scipy.spatial.transform.Rotation.from_matrix(self.rotations))(
+            t
+        ).as_matrix()
         return Trajectory3(t, positions, rotations.reshape(-1, 3, 3), covariances)
 
     def spans(self, t: Array, *, max_gap: float) -> NDArray[np.bool_]:
@@ -76,7 +78,7 @@ class Trajectory3(Exchange):
         """The rotations as quaternions (N, 4): x, y, z, w, with w at least 0."""
         if not len(self):
             return np.empty((0, 4))
-        return np.asarray(Rotation.from_matrix(self.rotations).as_quat(canonical=True))
+        return np.asarray(scipy.spatial.transform.Rotation.from_matrix(self.rotations).as_quat(canonical=True))
 
     @classmethod
     def _columns(cls) -> tuple[str, ...]:

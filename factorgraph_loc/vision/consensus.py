@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
 
 from factors import positive, small_kernels
 from factors.camera import kernels as reprojection_kernels
@@ -119,7 +118,7 @@ def _best_of_samples(
 
 @cache
 def _largest(dof: int) -> float:
-    return float(chdtri(dof, 1.0 - JOINT))
+    return float(scipy.special.chdtri(dof, 1.0 - JOINT))
 
 
 @compiled(error_model="numpy")
@@ -162,7 +161,7 @@ def root_of(camera: CameraPose) -> Array:
 def moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:
     """H camera poses after perturbations (H, 6)."""
     there = position + (rotation @ step[:, 3:, None])[..., 0]
-    return there, rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
+    return there, rotation @ scipy.spatial.transform.Rotation.from_rotvec(step[:, :3]).as_matrix()
 
 
 def whitened(

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths
 from factorgraph_loc.vision.level import Stance
@@ -69,7 +69,7 @@ def located(model: CameraModel, points: Array, pixels: Array, spreads: Array | N
         return None
     if not found or inliers is None or not np.all(np.isfinite(turn)) or not np.all(np.isfinite(shift)):
         return None
-    rotation = Rotation.from_rotvec(turn.ravel()).as_matrix().T
+    rotation = scipy.spatial.transform.Rotation.from_rotvec(turn.ravel()).as_matrix().T
     return _refined(model, -rotation @ shift.ravel(), rotation, points, pixels, spreads)
 
 
@@ -122,7 +122,7 @@ def _refined(
             return None
         step = -np.linalg.solve(information, np.einsum("k,kri,kr->i", weight, by_camera, residual))
         position = position + rotation @ step[3:]
-        rotation = rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
+        rotation = rotation @ scipy.spatial.transform.Rotation.from_rotvec(step[:3]).as_matrix()
         if i >= 3 and np.abs(step).max() < CONVERGED:
             break
     inliers = squared < GATE

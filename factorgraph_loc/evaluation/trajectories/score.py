@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation import metrics
@@ -200,7 +200,9 @@ def _steps(path: PosePath) -> Array:
 
 def _angles(rotations: Array) -> Array:
     """The angles (K,) [rad] of rotations (K, 3, 3)."""
-    return np.asarray(Rotation.from_matrix(rotations).magnitude()) if len(rotations) else np.empty(0)
+    if not len(rotations):
+        return np.empty(0)
+    return np.asarray(scipy.spatial.transform.Rotation.from_matrix(rotations).magnitude())
 
 
 def _seconds(found: PosePath, truth: PosePath) -> Array | None:
