@@ -142,7 +142,7 @@ class BearingRangeFactor:
 
     def widened(self, width: float) -> BearingRangeFactor:
         """The factor with a robust loss that is ``width`` times as wide."""
-        return replace(self, model=widened(self.model, width))
+        return self if width == 1.0 else replace(self, model=widened(self.model, width))
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
