@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, Pipe, wait
 from multiprocessing.context import SpawnProcess
+from types import ModuleType
 from typing import Any, TypeVar
 
 from factorgraph_loc.errors import RunFailedError
@@ -70,13 +71,13 @@ class Started:
 def start(function: Callable[..., None], *args: Any) -> tuple[Child, Connection]:
     """Spawn a process that calls ``function(connection, *args)``. Returns the process and the parent's end of the connection.
 
-    A script that calls this needs ``if __name__ == "__main__"``. The module of ``function`` must be light, because the process is
-    tied to this one only after loading it. The process ignores keyboard interrupts.
+    The process does not import the script that starts it, so ``function`` must be of a module. That must be light, because the
+    process is tied to this one only after loading it. The process ignores keyboard interrupts.
     """
     use_one_thread()
     here, there = Pipe()
     process = Child(target=function, args=(there, *args), daemon=True)
-    with _undisturbed():
+    with _undisturbed(), _without_script():
         process.start()
     there.close()
     return process, here
@@ -94,7 +95,7 @@ def run_each(
 
     Each job runs in a process of its own, so a crash affects that job only and peak memory is measured per job; with ``lasting``
     a process runs several jobs. ``beat`` is called every :data:`BEAT` seconds. Closing the iterator ends the processes. Function,
-    jobs and values must be picklable, and a script that calls this needs ``if __name__ == "__main__"``.
+    jobs and values must be picklable, and of modules that can be imported.
     """
     waiting = deque(range(len(jobs)))
     team: list[Started] = []
@@ -195,6 +196,17 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def _without_script() -> Iterator[None]:
+    """Start processes that do not import the script that is running: it needs no ``if __name__ == "__main__"``."""
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
 
 
 @contextmanager

@@ -14,7 +14,7 @@ import pytest
 from factorgraph_loc.processes import ProcessDiedError, run_each
 
 # a child, and a child of a child, in native code that never lets go of the interpreter
-SCRIPT = """
+HOLDING = """
 import ctypes, os, sys
 from pathlib import Path
 
@@ -36,10 +36,12 @@ def hold(_):
 def nest(_):
     tell()
     list(run_each(hold, [0], 1))
+"""
+# which needs no guard: its processes do not import it
+SCRIPT = """
+from holding import nest, run_each
 
-
-if __name__ == "__main__":
-    list(run_each(nest, [0], 1))
+list(run_each(nest, [0], 1))
 """
 
 
@@ -97,6 +99,7 @@ def test_processes_end_when_the_caller_stops_listening():
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
 def test_no_process_outlives_the_first_not_even_in_native_code(how, tmp_path, processes):
+    (tmp_path / "holding.py").write_text(HOLDING)
     (tmp_path / "script.py").write_text(SCRIPT)
     first = processes.start(sys.executable, tmp_path / "script.py", tmp_path)
     processes.wait_until(lambda: len(list(tmp_path.glob("*.pid"))) == 2)

@@ -74,8 +74,7 @@ def execute(
     """Make ``runs`` in ``jobs`` processes, store them below ``folder``, and yield their outcomes.
 
     ``again``: retry stored failures. When the generator is closed, the processes end at once, and unfinished runs are not stored.
-    Processes are spawned, so a script needs ``if __name__ == "__main__"``. Raises StoreError if the store cannot be written,
-    ProcessDiedError if no process can be started.
+    Raises StoreError if the store cannot be written, ProcessDiedError if no process can be started.
     """
     pool = _Pool(folder, limits, again, min(jobs, len(runs)))
     for run in runs:
@@ -168,9 +167,7 @@ class _Pool:
         if not w.ready:
             self._stillborn += 1
             if self._stillborn >= ATTEMPTS:
-                raise ProcessDiedError(
-                    "a worker process ended before it began; a script needs `if __name__ == '__main__'`"
-                )
+                raise ProcessDiedError("a worker process ended before it began")
         if w.run is None:
             return None
         self._deaths[w.run.key] += 1

@@ -112,8 +112,8 @@ def with_images(
 ) -> Log:
     """Write images to ``folder`` for ``log``, simulated with the same settings and seed, and return the log with them.
 
-    ``workers``: number of processes spawned for many images, so that a script needs ``if __name__ == "__main__"``; ``tell``:
-    called with the number of images done and of all. Raises InputError as :func:`film` does.
+    ``workers``: number of processes for many images; ``tell``: called with the number of images done and of all. Raises InputError
+    as :func:`film` does.
     """
     assert log.reference is not None, "a simulated log has one"
     times = times_of(settings.images.rate, log.reference)

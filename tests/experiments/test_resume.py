@@ -10,8 +10,7 @@ SCRIPT = """
 import sys
 from pathlib import Path
 from factorgraph_loc.experiments.experiment import prepare, run_experiment
-if __name__ == "__main__":
-    run_experiment(prepare(Path(sys.argv[1]), out=Path(sys.argv[2])), jobs=1)
+run_experiment(prepare(Path(sys.argv[1]), out=Path(sys.argv[2])), jobs=1)
 """
 MANY = """
 name = "many"

@@ -70,8 +70,7 @@ def with_features(
     """Replace the images of a log by features and tracks. Returns the log and warnings, one line each.
 
     An image that is missing, cannot be decoded or has another size than the rig's camera becomes a frame without features.
-    ``progress`` is called with the completed share. Processes are spawned if many images are not in the cache, so a script that
-    calls this needs ``if __name__ == "__main__"``. A log without images is returned unchanged.
+    ``progress`` is called with the completed share. A log without images is returned unchanged.
 
     InputError if the rig has no camera, or is calibrated for another size than all images have; RunFailedError if a process dies.
     """
