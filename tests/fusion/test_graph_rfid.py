@@ -188,6 +188,13 @@ def test_nothing_known_is_read() -> None:
     assert np.sqrt(result.covariances[-1, 0, 0]) > 0.3
 
 
+def test_without_a_map_it_is_told_that_reads_are_of_no_use() -> None:
+    log, _ = plain()
+    unmapped = replace(log, world=log.world.model_copy(update={"tags": {}}))
+    result = run(unmapped, RunConfig("ekf"))
+    assert any("reads are of no use without a map" in warning for warning in result.warnings)
+
+
 def test_what_the_map_or_the_rig_lacks_is_counted() -> None:
     log, _ = plain()
     tags = dict(itertools.islice(log.world.tags.items(), 30))

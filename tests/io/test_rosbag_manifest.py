@@ -5,10 +5,11 @@ import tomllib
 import numpy as np
 import pytest
 import tomli_w
+from rosbags.typesys import get_types_from_msg
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.io.bags.file import open_bag
-from factorgraph_loc.io.bags.manifest import propose, read_fields
+from factorgraph_loc.io.bags.manifest import propose, range_fields, read_fields
 from factorgraph_loc.io.bags.proposed import manifest_of, manifest_text, remarks
 
 T0 = 1_700_000_000_000_000_000
@@ -148,6 +149,36 @@ def test_reads_by_the_names_of_fields(proposal):
 )
 def test_usual_names_of_fields(paths, expected):
     assert read_fields(paths) == expected
+
+
+def test_ranges_of_radios_by_the_names_of_fields(proposal, tmp_path):
+    def fill(made):
+        kind = "uwb/msg/Range"
+        made.store.register(get_types_from_msg("std_msgs/Header header\nuint16 anchor_id\nfloat32 distance\n", kind))
+        for i in range(3):
+            made.odometry("/odom", T0 + i * 10**8, (0.1 * i, 0.0, 0.0))
+            made.write("/uwb", T0, kind, header=made.header(T0 + i * 10**8), anchor_id=7, distance=2.0 + i)
+
+    found, manifest, text = proposal(fill)
+    fields = {"landmark": "anchor_id", "range": "distance"}
+    assert found.options["bearing_range"] == {"topic": "/uwb", "fields": fields}
+    assert "# /uwb is taken for ranges [m] to landmarks of the map that anchor_id names\n" in text
+    (tmp_path / "drive.toml").write_text(tomli_w.dumps(manifest))
+    ranges = fgloc.read_log(tmp_path / "drive.toml").streams["bearing_range"]
+    assert list(ranges.landmark) == ["7"] * 3
+    np.testing.assert_array_equal(ranges.range, (2.0, 3.0, 4.0))
+
+
+@pytest.mark.parametrize(
+    ("paths", "expected"),
+    [
+        (["header.stamp", "id", "anchor_id", "distance"], {"landmark": "anchor_id", "range": "distance"}),
+        (["id", "nodes[].id", "nodes[].dis"], {"landmark": "nodes[].id", "range": "nodes[].dis"}),
+        (["id", "angle", "samples[].distance"], {}),
+    ],
+)
+def test_usual_names_of_ranges(paths, expected):
+    assert range_fields(paths) == expected
 
 
 def test_images_and_what_tells_of_their_camera(proposal):

@@ -55,6 +55,9 @@ NAMES: dict[str, tuple[str, ...]] = {
         "timestamp",
     ),
 }
+# the same of a range to a radio or another landmark, the likeliest first
+LANDMARK = ("anchorid", "anchor", "anchorname", "responderid", "beaconid", "beacon", "landmarkid", "nodeid", "id")
+RANGE = ("range", "distance", "dist", "dis", "rangem", "distancem")
 # suffixes of field names that imply a unit; the first match is used
 UNITS = {
     "phase": {"deg": "deg", "degrees": "deg", "rad": "rad", "radians": "rad"},
@@ -86,7 +89,9 @@ def propose(bag: Bag) -> Proposal:
     _one_of(out, "imu", [topic for topic in topics if topic.type == IMU])
     _camera(out, topics)
     _tables(out, topics)
-    _rfid(out, bag, topics)
+    custom = _custom(out, bag, topics)
+    _rfid(out, custom)
+    _ranges(out, custom)
     if STATIC in bag.topics:
         out.uses[STATIC] = "sensor mounting"
     used = [bag.topics[one["topic"]] for one in out.options.values()]
@@ -225,8 +230,8 @@ def _tables(out: Proposal, topics: Sequence[Topic]) -> None:
             out.take("start", topic)
 
 
-def _rfid(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> None:
-    """The topic with a field for the EPC, and most other fields of a read."""
+def _custom(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:
+    """The topics without a use whose messages are not of ROS itself, with the paths of their fields."""
     found = []
     for topic in topics:
         if topic.name in out.uses or topic.type.startswith(
@@ -234,12 +239,15 @@ def _rfid(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> None:
         ):
             continue
         try:
-            fields = read_fields(leaves(bag.store(topic.name), topic.type))
+            found.append((topic, leaves(bag.store(topic.name), topic.type)))
         except InputError as error:  # the topic may be irrelevant
             out.notes.append(str(error))
-            continue
-        if "epc" in fields:
-            found.append((topic, fields))
+    return found
+
+
+def _rfid(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
+    """The topic with a field for the EPC, and most other fields of a read."""
+    found = [(topic, fields) for topic, paths in custom if "epc" in (fields := read_fields(paths))]
     if not found:
         return
     topic, fields = max(found, key=lambda entry: len(entry[1]))
@@ -260,6 +268,28 @@ def _rfid(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> None:
     if doubtful:
         out.notes.append(f"rfid: {', '.join(doubtful)}: assumed to be in rad, Hz and us, set units otherwise")
     _others(out, "rfid", [other for other, _ in found if other is not topic])
+
+
+def _ranges(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
+    """The topic with a field for a distance and one beside it for the name of what is that far away."""
+    found = [(t, fields) for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))]
+    if found and "bearing_range" not in out.options:
+        topic, fields = found[0]
+        out.take("bearing_range", topic, fields=fields)
+        out.notes.append(
+            f"{topic.name} is taken for ranges [m] to landmarks of the map that {fields['landmark']} names"
+        )
+        _others(out, "bearing_range", [other for other, _ in found[1:]])
+
+
+def range_fields(paths: Sequence[str]) -> dict[str, str]:
+    """The fields of a range among the paths of a message type, by common names; none if one of them is missing."""
+    distances = {p.rpartition(".")[0]: p for p in paths if _plain(p) in RANGE and p.count(LIST) <= 1}
+    named = [p for p in paths if _plain(p) in LANDMARK and p.rpartition(".")[0] in distances]
+    if not named:
+        return {}
+    landmark = min(named, key=lambda p: LANDMARK.index(_plain(p)))
+    return {"landmark": landmark, "range": distances[landmark.rpartition(".")[0]]}
 
 
 def read_fields(paths: Sequence[str]) -> dict[str, str]:

@@ -120,7 +120,7 @@ def remarks(bag: Bag, proposal: Proposal, beside: Mapping[str, str]) -> list[str
     """Remarks on a proposed manifest for the user, and the unused topics."""
     out = list(proposal.notes)
     if "rig" not in beside:
-        out.append('no rig is given: set rig = "NAME.rig.toml" to a file next to this one that describes the robot')
+        out.append('no rig is given: set rig = "NAME.rig.toml" to a file next to this one; `fgloc rigs new` writes one')
     if "world" not in beside:
         out.append('no map is given: set world = "NAME.world.toml" to a file next to this one with tags and landmarks')
     unused = [topic for topic in bag.topics.values() if topic.name not in proposal.uses]

@@ -30,16 +30,17 @@ def mappable(log: Log) -> str | None:
 
 
 def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
-    """That an estimator takes no tags, that none is read, which are believed dead or moved at the end, the surest first, and how
-    the antennas differ from the rig's models."""
+    """That an estimator takes no tags, that no tag of a map is read, which are believed dead or moved at the end, the surest first,
+    and how the antennas differ from the rig's models."""
     log, rounds = use.log, diagnostics.ignored.get("rfid", 0)
     if rounds and use.estimator != "dead_reckoning":  # obvious from its name
         yield f"{log.name}: {use.estimator} does not use RFID: all {rounds} inventory rounds are ignored"
     if "rfid" not in use.sensors:
         return
     stream, tags = log.streams.get("rfid"), log.world.tags
-    if isinstance(stream, RfidStream) and tags and not any(epc in tags for epc in stream.epc):
-        yield f"{log.name}: none of the {len(tags)} tags of the map is read"
+    if isinstance(stream, RfidStream) and not any(epc in tags for epc in stream.epc):
+        what = f"none of the {len(tags)} tags of the map is read" if tags else "reads are of no use without a map"
+        yield f"{log.name}: {what}"
         return
     for suspects, why in (
         (diagnostics.dead_tags, "are believed dead, as they were not read from where they should have been"),
