@@ -26,6 +26,7 @@ CONFIGS: Mapping[str, RunConfig] = {
     "EKF": RunConfig("ekf", PLAIN),
     "EKF, 5 constants": RunConfig("ekf"),
     "smoother, lag 10 s, 5 constants": RunConfig("smoother", {"lag": 10.0}),
+    "smoother, 5 constants": RunConfig("smoother"),
     "smoother, full history, 5 constants": RunConfig("smoother", {"lag": "all"}),
     "particle filter, 5,000": RunConfig("particle_filter", {**PLAIN, "particles": PARTICLES}),
     "batch": RunConfig("batch", PLAIN),
@@ -39,9 +40,10 @@ def timed(log: Log, config: RunConfig) -> RunResult:
 
 
 def seconds_of(result: RunResult) -> float:
-    """Of the loop over the measurements; and to the final trajectory, if that is all that there is."""
-    final = result.timings.final_seconds if result.config["estimator"] == "batch" else 0.0
-    return result.timings.causal_seconds + final
+    """Of the loop over the measurements; and to the final trajectory, where the whole problem is solved for it."""
+    estimator, settings = result.config["estimator"], result.config["settings"]
+    whole = estimator == "batch" or (estimator == "smoother" and settings.get("lag") is None)
+    return result.timings.causal_seconds + (result.timings.final_seconds if whole else 0.0)
 
 
 def measured(log: Log, problem: Problem, config: RunConfig) -> dict[str, float]:

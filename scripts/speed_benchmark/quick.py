@@ -106,7 +106,16 @@ def workloads() -> dict[str, Pair]:
         "GTSAM, iSAM2": _loop(gtsam_loops.full, problem),
         "GTSAM, batch": _loop(gtsam_loops.batch, problem),
     }
-    beside = dict(zip(CONFIGS, ("numpy EKF", "numpy EKF", *list(loops)[2:4], *list(loops)[1::3]), strict=True))
+    references = (
+        "numpy EKF",
+        "numpy EKF",
+        "GTSAM, fixed lag",
+        "GTSAM, iSAM2",
+        "GTSAM, iSAM2",
+        "numpy particles",
+        "GTSAM, batch",
+    )
+    beside = dict(zip(CONFIGS, references, strict=True))
     pairs = {name: Pair(_run(log, CONFIGS[name]), loops[what], what) for name, what in beside.items()}
     pairs["Localizer, EKF"] = Pair(lambda: _pushed(log), loops["numpy EKF"], "numpy EKF")
     tags, points = _tags(), _points()
