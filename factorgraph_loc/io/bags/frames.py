@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
@@ -189,7 +189,7 @@ def matrices(table: Array) -> Array:
     """Poses (N, 4, 4) from positions and quaternions x, y, z, w (N, 7)."""
     out = np.tile(np.eye(4), (len(table), 1, 1))
     out[:, :3, 3] = table[:, :3]
-    out[:, :3, :3] = Rotation.from_quat(table[:, 3:]).as_matrix()
+    out[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(table[:, 3:]).as_matrix()
     return out
 
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
+import scipy
 
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
@@ -141,9 +141,9 @@ def _by_range(seen: _Seen, place: Array) -> tuple[Array, float]:
         return np.hypot(away[:, 0], away[:, 1]) - seen.ranges
 
     scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual(place)))), 1e-3)
-    fit = least_squares(residual, place, loss="soft_l1", f_scale=scale)
+    fit = scipy.optimize.least_squares(residual, place, loss="soft_l1", f_scale=scale)
     scale = max(MAD_TO_SIGMA * float(np.median(np.abs(fit.fun))), 1e-3)
-    fit = least_squares(residual, fit.x, loss="cauchy", f_scale=scale)
+    fit = scipy.optimize.least_squares(residual, fit.x, loss="cauchy", f_scale=scale)
     information = fit.jac.T @ fit.jac / len(seen.t)
     weakest = max(float(np.linalg.eigvalsh(information)[0]), 1e-9)
     return fit.x, MAD_TO_SIGMA * float(np.median(np.abs(fit.fun))) / np.sqrt(weakest)

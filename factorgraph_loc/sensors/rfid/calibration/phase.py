@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
@@ -132,7 +132,9 @@ class _Focus:
         """The local maximum from ``state``."""
         # steps in metres, with a lever of a few metres for angles, to scale all five states equally
         unit = np.array((1.0, 1.0, 0.3, 1.0, 1.0))
-        result = minimize(lambda v: -self.agreement(v * unit), state / unit, options={"eps": 1e-5, "gtol": 1e-4})
+        result = scipy.optimize.minimize(
+            lambda v: -self.agreement(v * unit), state / unit, options={"eps": 1e-5, "gtol": 1e-4}
+        )
         return np.asarray(result.x * unit)
 
     def _pose(self, state: Array) -> Array:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor
 from factorgraph_loc.sensors.rfid.calibration.pairs import REACH, terms
@@ -156,7 +156,7 @@ def _moved(
     start = min(shifts, key=lambda shift: few.nll(shift, models, which, floor))
     here = reads.nll(np.zeros(2), models, which, floor)
     simplex = start + np.array(((0.0, 0.0), (0.2, 0.0), (0.0, 0.2)))
-    found = minimize(
+    found = scipy.optimize.minimize(
         reads.nll,
         start,
         (models, which, floor),
