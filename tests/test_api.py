@@ -49,6 +49,11 @@ def test_a_run_has_the_scores_of_its_files(office, tmp_path):
     )
     assert list((tmp_path / "run/plots").glob("*.png"))
     alone = fgloc.run(office, "ekf", sensors=["odometry", "bearing_range"], seed=2)
+    assert f"| {office.name} | ekf " in repr(alone)
+    assert f"{alone.scores['causal.position_rmse']:.3f}" in repr(alone)
+    assert repr(alone.result).startswith(f"RunResult(log='{office.name}', estimator='ekf', ")
+    assert f"bearing_range {len(office.streams['bearing_range'].t)} rows" in repr(office)
+    assert len(repr(alone)) + len(repr(alone.result)) + len(repr(office)) < 1000
     assert alone.result.final.poses == pytest.approx(kept.result.final.poses, abs=0.0)
     with pytest.raises(fgloc.InputError, match="holds results already"):
         fgloc.run(office, "ekf", out=tmp_path / "run")
@@ -65,6 +70,7 @@ def test_compare_takes_names_and_settings_by_estimator(office, tmp_path):
     config = tomllib.loads((tmp_path / "out/runs/office-3/ekf/seed0/config.toml").read_text())
     assert config["settings"]["iterations"] == 2
     assert not found.failures
+    assert repr(found).startswith("| log ")
     assert (tmp_path / "out/results.parquet").is_file()
     with pytest.raises(fgloc.InputError, match="settings are given for smoother"):
         fgloc.compare(office, ["ekf"], tmp_path / "other", settings={"smoother": {}})

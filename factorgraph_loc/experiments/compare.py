@@ -17,7 +17,7 @@ from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import plot_log, remove_plots
 from factorgraph_loc.evaluation.report import DEFAULT, RunFiles, Scene, write_report
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
-from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, further_tables, markdown
+from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, further_tables, markdown, unscored, verdict
 from factorgraph_loc.evaluation.warned import WARNINGS, lines, row_of
 from factorgraph_loc.experiments.output import remove_run, write_run
 from factorgraph_loc.experiments.preparation import check_prior, columns_of, fill_cache, use_of
@@ -45,6 +45,16 @@ class Comparison:
     rows: list[dict[str, Any]]
     failures: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        return told(self.rows)
+
+
+def told(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The table of runs, and what follows from it, as text."""
+    best = verdict(rows) if len({row["estimator"] for row in rows}) > 1 else []
+    failures = [f"failed: {row['log']}, {row['estimator']}: {row['reason']}" for row in rows if row["status"] != "ok"]
+    return "\n".join((markdown(*comparison_cells(rows)), *unscored(rows), *best, *failures))
 
 
 @dataclass(frozen=True)

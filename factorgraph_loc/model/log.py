@@ -54,6 +54,11 @@ class Log:
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", well_formed(self.name))  # it may come from a file name
 
+    def __repr__(self) -> str:
+        first, last = self.span()
+        streams = ", ".join(f"{name} {len(stream.t)} rows" for name, stream in self.streams.items())
+        return f"Log({self.name!r}, {last - first:.1f} s: {streams or 'no streams'})"
+
     def span(self) -> tuple[float, float]:
         """First and last timestamp of all streams [s], or of the reference of a log without any."""
         stamps = [(s.t.min(), s.t.max()) for s in self.streams.values() if len(s.t)]

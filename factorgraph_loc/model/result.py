@@ -62,6 +62,10 @@ class RunResult:
     final_space: Trajectory3 | None = None
     reliability: Mapping[str, Reliability] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        poses = f"{len(self.t)} causal and {len(self.final)} final poses"
+        return f"RunResult(log={self.log!r}, estimator={self.config.get('estimator')!r}, {poses})"
+
     @property
     def max_gap(self) -> float:
         """The longest time [s] between estimates across which scoring interpolates."""
