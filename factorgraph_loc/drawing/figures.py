@@ -42,10 +42,10 @@ def empty(height: float, title: str = "") -> Figure:
     return figure
 
 
-def grid(rows: int, columns: int, height: float, title: str = "") -> tuple[Figure, Any]:
-    """Return a figure and its axes (rows, columns)."""
+def grid(rows: int, columns: int, height: float, title: str = "", *, shared: bool = False) -> tuple[Figure, Any]:
+    """Return a figure and its axes (rows, columns); with ``shared``, those of a column have one x axis, those of a row one y axis."""
     figure = empty(height, title)
-    axes = figure.subplots(rows, columns, squeeze=False)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=shared and "col", sharey=shared and "row")
     dress(axes.flat)
     return figure, axes
 

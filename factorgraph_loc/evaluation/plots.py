@@ -136,7 +136,9 @@ def reliability_diagram(log: Log, estimator: str, found: Mapping[str, Reliabilit
 def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -> Figure:
     """Signed errors in x, y and heading over time, causal and final, with two-sigma bands."""
     rows = (("x", "m"), ("y", "m"), ("heading", "rad"))[: 3 if reference.has_heading else 2]
-    figure, axes = grid(len(rows), 2, 3.0 * len(rows), f"{log.name}, {estimator}: errors, with 2-sigma bands")
+    figure, axes = grid(
+        len(rows), 2, 3.0 * len(rows), f"{log.name}, {estimator}: errors, with 2-sigma bands", shared=True
+    )
     found = [None if one is None else errors(one, reference, track.max_gap) for _, one in track.kinds()]
     for column, (kind, trajectory) in enumerate(track.kinds()):
         axes[0, column].set_title(kind)
@@ -153,8 +155,7 @@ def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -
         limit = max(
             (_extent(e, t, row) for e, (_, t) in zip(found, track.kinds(), strict=True) if e and t), default=1.0
         )
-        for axis in axes[row]:
-            axis.set(ylim=(-limit, limit), ylabel=f"error in {what} [{unit}]")
+        axes[row, 0].set(ylim=(-limit, limit), ylabel=f"error in {what} [{unit}]")
     legend(figure, axes[0])
     return figure
 

@@ -126,6 +126,14 @@ def test_events_are_marked_in_all_panels_and_named_once(track):
     assert labels.count("event (see events.csv)") == 1
 
 
+def test_causal_and_final_errors_have_one_scale(track):
+    log = log_of(track)
+    axes = error_bands(log, log.reference, "ekf", track).axes
+    for causal, final in zip(axes[::2], axes[1::2], strict=True):
+        assert causal.get_ylim() == final.get_ylim()
+        assert not any(label.get_visible() for label in final.get_yticklabels())
+
+
 def test_no_panel_for_a_heading_that_is_not_scored(track):
     log = log_of(track, has_heading=False)
     assert len(error_bands(log, log.reference, "ekf", track).axes) == 4
