@@ -43,7 +43,7 @@ def empty(height: float, title: str = "") -> Figure:
 
 
 def grid(rows: int, columns: int, height: float, title: str = "", *, shared: bool = False) -> tuple[Figure, Any]:
-    """Return a figure and its axes (rows, columns); with ``shared``, those of a column have one x axis, those of a row one y axis."""
+    """Return a figure and its axes (rows, columns); ``shared``: columns have one x axis, rows one y axis."""
     figure = empty(height, title)
     axes = figure.subplots(rows, columns, squeeze=False, sharex=shared and "col", sharey=shared and "row")
     dress(axes.flat)
