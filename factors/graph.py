@@ -16,6 +16,8 @@ import numpy as np
 from factors import positive, se2
 from factors.se2 import Array, Integers
 
+MOST_TERMS = 3  # that a `gtsam.JacobianFactor` takes in Python; a conditional is one, and takes any number
+
 
 class Factor(Protocol):
     """A factor that :func:`jacobian_factor` accepts."""
@@ -67,11 +69,14 @@ def silenced(factor: Factor, rows: int, on_failure: Callable[[str], None]) -> Fa
     return _Silenced(factor, rows, on_failure)
 
 
-def jacobian_factor(factor: Factor, keys: Sequence[int], values: Sequence[Array]) -> gtsam.JacobianFactor:
+def jacobian_factor(factor: Factor, keys: Sequence[int], values: Sequence[Array]) -> gtsam.GaussianFactor:
     """``factor`` linearised at ``values``."""
     residual, blocks = factor.linearize(values)
+    unit = _unit(len(residual))
+    if len(blocks) > MOST_TERMS:
+        return gtsam.GaussianConditional(list(zip(keys, blocks, strict=True)), 1, -residual, unit)
     arguments: list[Any] = [part for pair in zip(keys, blocks, strict=True) for part in pair]
-    arguments += [-residual, _unit(len(residual))]
+    arguments += [-residual, unit]
     return gtsam.JacobianFactor(*arguments)
 
 

@@ -7,7 +7,7 @@ frequent, have a compiled version (:mod:`factors.camera.update_kernels`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -20,6 +20,7 @@ from factors.landmarks.factor import BearingRangeFactor
 from factors.se2 import Array
 
 CONVERGED = 1e-6  # m and rad; convergence limit of an iterated update
+TILT = 2  # roll and pitch, which all points of an image have in common
 GATE = 9.21  # 99 % of chi-square with two degrees of freedom
 GATES = {1: 6.63, 2: GATE, 3: 11.34}  # by degrees of freedom
 
@@ -57,29 +58,54 @@ class Correction:
 
 
 def robust_update(
-    factor: SightingFactor, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
+    factor: ReprojectionFactor, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
 ) -> Correction:
-    """Kalman update of ``pose`` (3,) and correlated states by a factor on the pose only; see :func:`update_state`.
+    """Kalman update of ``pose`` (3,) and correlated states by points in an image, as a factor on the pose only; see
+    :func:`update_state`.
 
     ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation.
     """
-    if isinstance(factor, ReprojectionFactor) and factor.of_pose_alone:
-        arrays = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
-        try:
-            found = Correction(
-                *pixel_kernels.updated(factor.packed(), *arrays, iterations, converged, GATE), factor.dof()
-            )
-            _require_sound(found.delta, found.covariance)
-        except np.linalg.LinAlgError:
-            return linearized_update(factor, pose, covariance, iterations, converged)
-        return found
-    return linearized_update(factor, pose, covariance, iterations, converged)
+    arrays = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
+    try:
+        found = Correction(*pixel_kernels.updated(factor.packed(), *arrays, iterations, converged, GATE), factor.dof())
+        _require_sound(found.delta, found.covariance)
+    except np.linalg.LinAlgError:
+        return image_update(factor, pose, covariance, (), (), iterations, converged)
+    return found
+
+
+def image_update(
+    factor: ReprojectionFactor,
+    pose: Array,
+    covariance: Array,
+    values: Sequence[Array],
+    columns: Sequence[slice],
+    iterations: int,
+    converged: float = CONVERGED,
+) -> Correction:
+    """:func:`robust_update` by a factor on other ``values`` too, whose ``columns`` in the error state are given. The covariance is
+    that of perturbations of the updated pose: pixels are so much better than a survey that it matters."""
+    size = len(covariance)
+
+    def linearize(delta: Array) -> tuple[Array, Array]:
+        at = [v + delta[column] for v, column in zip(values, columns, strict=True)]
+        residual, blocks = factor.whitened([se2.compose(pose, se2.exp(delta[:3])), *at])
+        jacobian = np.zeros((*residual.shape, len(delta)))
+        for column, block in zip((slice(3), *columns, slice(size, None)), blocks, strict=True):
+            jacobian[..., column] = block
+        jacobian[..., :3] = jacobian[..., :3] @ se2.right_jacobian(delta[:3])
+        return residual + blocks[-1] @ delta[size:], jacobian
+
+    found = update_state(linearize, covariance, factor.weight, iterations, factor.dof(), converged, TILT)
+    reset = np.eye(size)
+    reset[:3, :3] = se2.right_jacobian(found.delta[:3])
+    return replace(found, covariance=reset @ found.covariance @ reset.T)
 
 
 def linearized_update(
     factor: SightingFactor, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
 ) -> Correction:
-    """:func:`robust_update` by a factor of any kind."""
+    """Kalman update of ``pose`` (3,) and correlated states by a factor of any kind on the pose only; see :func:`update_state`."""
 
     def linearize(delta: Array) -> tuple[Array, Array]:
         residual, (block,) = factor.whitened([se2.compose(pose, se2.exp(delta[:3]))])
@@ -117,6 +143,7 @@ def update_state(
     iterations: int,
     dof: int,
     converged: float = CONVERGED,
+    common: int = 0,
 ) -> Correction:
     """Robust, iterated Kalman update in information form, or in square-root form if that is numerically insufficient.
 
@@ -125,15 +152,23 @@ def update_state(
     and tempered; at zero it is the tempering, which the innovation excludes. In the first iteration a sighting whose normalised
     innovation squared is outside the gate has its noise multiplied by the squared excess, which reduces its influence without
     locking the filter out. Further iterations divide the noise by the weight at the updated state (iteratively reweighted least
-    squares), until a step is below ``converged``.
+    squares), until a step is below ``converged``. ``common``: errors that all sightings have in common, unit Gaussians that follow
+    the error state as ``linearize`` gets it.
     """
-    iterated = iterations, dof, converged
+    size, priors = len(covariance), [covariance]
+    if common:  # where the sightings are tempered, so are these
+        priors = [np.eye(size + common), np.eye(size + common) / weight(np.zeros(1))[0]]
+        for prior in priors:
+            prior[:size, :size] = covariance
+    iterated = priors[0], weight, iterations, dof, converged
     try:
-        found = _iterated(_informed(np.asarray(np.linalg.inv(covariance))), linearize, covariance, weight, *iterated)
+        solve = [_informed(np.asarray(np.linalg.inv(prior))) for prior in priors]
+        found = _iterated(solve[0], solve[-1], linearize, *iterated)
         _require_sound(found.delta, found.covariance)
     except np.linalg.LinAlgError:
-        return _iterated(_rooted(positive.root(covariance)), linearize, covariance, weight, *iterated)
-    return found
+        solve = [_rooted(positive.root(prior)) for prior in priors]
+        found = _iterated(solve[0], solve[-1], linearize, *iterated)
+    return replace(found, delta=found.delta[:size], covariance=found.covariance[:size, :size])
 
 
 # Correction (S,) and covariance (S, S) from a Jacobian (K, g, D), residuals (K, g), their weights (K,), and the correction (D,) at
@@ -142,6 +177,7 @@ _Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 
 
 def _iterated(
+    first_solve: _Solver,
     solve: _Solver,
     linearize: Callable[[Array], tuple[Array, Array]],
     covariance: Array,
@@ -154,7 +190,7 @@ def _iterated(
     residual, blocks = linearize(zero)
     size = blocks.shape[2]
     widening = np.maximum(1.0, _each(residual, blocks, covariance[:size, :size]) / GATES[blocks.shape[1]])
-    delta, updated = solve(blocks, residual, np.ones(len(residual)), zero[:size])
+    delta, updated = first_solve(blocks, residual, np.ones(len(residual)), zero[:size])
     # by the matrix inversion lemma
     pull = np.einsum("kij,ki->j", blocks, residual)
     nis = max(0.0, float(np.vdot(residual, residual) - pull @ updated[:size, :size] @ pull))

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
@@ -26,6 +25,7 @@ from factorgraph_loc.fusion.variables import (
     gather,
     index_of,
     is_landmark,
+    is_of_keyframe,
     is_point,
     is_pose,
     landmark_key,
@@ -209,7 +209,6 @@ class Graph:
         ``link_width`` times."""
         assert self.prior is not None
         body = se2.world_to_body(self.prior.pose, self.prior.covariance)
-        natives: list[tuple[Factor, tuple[int, ...], gtsam.NonlinearFactor]] = []
         factors: list[tuple[Factor, tuple[int, ...]]] = [(PriorFactor(self.prior.pose, body), (pose_key(0),))]
         means, spreads = self.constant_priors()
         factors += [(VectorPriorFactor(means[key], np.sqrt(np.diag(spreads[key]))), (key,)) for key in means]
@@ -218,9 +217,6 @@ class Graph:
             for node in keyframe.nodes:
                 assert node.factor is not None
                 factor = node.factor
-                if node.native is not None:
-                    natives.append((factor, node.keys, node.native))
-                    continue
                 if node.sensor in self.sensors:
                     sensor = self.sensors[node.sensor]
                     final = sensor.at_end(factor, link_width if sensor.links else width)
@@ -228,7 +224,7 @@ class Graph:
                         continue
                     factor = final
                 factors.append((factor, node.keys))
-        return Problem(factors, natives)
+        return Problem(factors)
 
     def drop_astray(self, keyframes: Sequence[Keyframe], values: Values) -> bool:
         """Take sightings out of the graph that cannot be of their points, as these are estimated, and points of which too few are
@@ -261,6 +257,8 @@ class Graph:
             for key in [key for key in self.values if is_point(key) and key not in kept]:
                 del self.values[key], self.spreads[key]
             mapper.keep_only(kept)
+        for key in [k for k in self.values if is_of_keyframe(k) and index_of(k) >= self.newest.index]:
+            del self.values[key]  # the tilt of a keyframe that was taken back
 
     def forget_landmarks(self, known: Collection[int]) -> None:
         """Give up the landmarks that neither the keyframes that are left tell, nor a summary of what has left the graph, whose
@@ -273,12 +271,14 @@ class Graph:
     def settle(self, problem: Problem, values: Values) -> Array:
         """Take over a solution of the whole problem: the constants, and the body-frame covariances (M, 3, 3) that are returned."""
         try:
-            found = problem.covariances(values, values)
+            found = problem.covariances(values, [k for k in values if is_pose(k) or not is_of_keyframe(k)])
         except IndeterminateError as error:
             raise self.unsolved(error) from error
         self.report_damping(found.damping)
         for key in self.values:
-            self.values[key], self.spreads[key] = values[key], found.by_key[key]
+            self.values[key] = values[key]
+            if not is_of_keyframe(key):
+                self.spreads[key] = found.by_key[key]
         return np.array([found.by_key[k.key] for k in self.keyframes])
 
     def report_damping(self, damping: float) -> None:
@@ -300,8 +300,8 @@ class Graph:
 
     def _named(self, key: int) -> str:
         """A variable in words."""
-        if is_pose(key):
-            return f"the pose at {self.times[index_of(key)]:.3f} s"
+        if is_of_keyframe(key):
+            return f"the {'pose' if is_pose(key) else 'tilt'} at {self.times[index_of(key)]:.3f} s"
         if is_point(key):
             return f"point {index_of(key)}"
         name = {number: name for name, number in self.keys.items()}[key]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -27,9 +26,11 @@ from factorgraph_loc.fusion.variables import (
     Values,
     gtsam_errors,
     index_of,
+    is_constant,
     is_landmark,
-    is_point,
+    is_of_keyframe,
     is_pose,
+    tilt_key,
 )
 from factors import positive, se2
 from factors.se2 import Array
@@ -101,7 +102,8 @@ class Incremental:
         else:
             stalled, open_ones = isinstance(self._solver, Stalled), graph.keyframes[len(self._left) :]
             try:
-                for key in () if stalled else graph.values.keys() - waiting.keys():
+                known = [key for key in graph.values if not is_of_keyframe(key) and key not in waiting]
+                for key in () if stalled else known:
                     graph.values[key], graph.spreads[key] = self._marginal(key, graph=graph)
                 now = [
                     self._filtered[k.index] if stalled or k.key in waiting else self._marginal(k.key, graph=graph)
@@ -186,7 +188,7 @@ class Incremental:
         if isinstance(self._solver, Stalled) and newest.t < self._solver.until:
             self._graph.pose, self._graph.covariance = guess  # the next try takes in what keyframes and constants hold
             return
-        self._leave(newest.t, [k for k in self._graph.values if k not in values and not is_point(k)])
+        self._leave(newest.t, [k for k in self._graph.values if k not in values and is_constant(k)])
         try:
             with gtsam_errors():
                 self._solver.update(nodes, values, newest.t)
@@ -269,6 +271,9 @@ class Incremental:
                 self._graph.values[key], self._graph.spreads[key] = self._marginal(key, spreads.get(key))
         except RuntimeError:
             self._left += [self._filtered[k.index] for k in leaving[len(self._left) - count :]]
+        oldest = self._solver.oldest  # what is still in the solver is needed where that is rebuilt
+        for key in [key for key in self._graph.values if is_of_keyframe(key) and index_of(key) < oldest]:
+            del self._graph.values[key]
         for mapper in self._graph.mappers:
             self._forget(mapper.leave(now - lag))
 
@@ -285,21 +290,19 @@ class Incremental:
             del self._graph.values[key], self._graph.spreads[key]
 
     def _rebuild(self, newest: Keyframe, guess: Guess) -> None:
-        """A new solver after the old one failed, from what that told before; then without what may throw, then with QR, which
-        keeps more digits, then without what the newest keyframe tells. Where nothing helps there is none for a while."""
+        """A new solver after the old one failed, from what that told before; then with QR, which keeps more digits, then without
+        what the newest keyframe tells. Where nothing helps there is none for a while."""
         failure = RuntimeError()
         summary = self._solver.summary(failed=True)
         near = read_all(self._last, [*(k.key for k in self._graph.keyframes), *self._graph.values])
-        tries = [(True, self._factorization), (False, self._factorization), (False, "QR"), (False, "QR")]
-        for i, (throws, factorization) in enumerate(tries):
+        tries = ("CHOLESKY", "QR", "QR") if self._factorization == "CHOLESKY" else ("QR", "QR")
+        for i, factorization in enumerate(tries):
             if i == len(tries) - 1:
                 self._drop_newest(newest)
-            elif tries[i - 1] == (throws, factorization):
-                continue
             self._filtered[newest.index] = guess
             try:
                 with gtsam_errors():
-                    self._start_again(newest, summary, near, throws, factorization)
+                    self._start_again(newest, summary, near, factorization)
                     if summary is not None and any(node.has_pose for node in newest.nodes):
                         self._check_jump(newest, guess)
             except RuntimeError as error:
@@ -334,11 +337,9 @@ class Incremental:
         newest: Keyframe,
         summary: MarginalSummary | None,
         near: Mapping[int, Array] = NOWHERE,
-        throws: bool = False,
         factorization: str | None = None,
     ) -> None:
-        """A new solver with what is in the graph, which begins ``near`` there where that is known. ``throws``: with factors that
-        throw where a point gets behind a camera, at a tenth of the time.
+        """A new solver with what is in the graph, which begins ``near`` there where that is known.
 
         A window begins with the ``summary`` of what has left it, and with all measurements that this does not hold; else the graph
         begins with the priors.
@@ -356,11 +357,9 @@ class Incremental:
         nodes = [n for k in keyframes for n in k.nodes if is_missing(n, guesses, known)]
         if near and isinstance(self._solver, FullHistory):
             guesses = self._graph.problem().solve(guesses, ITERATIONS_AFTER_FAILURE).values
-        if not throws:
-            nodes = [n if n.factor is None or not n.has_pose else replace(n, native=None) for n in nodes]
         nodes = [*(self._odometry_node(k) for k in keyframes[1:]), *nodes]
         self._solver.begin(factors, nodes, guesses, self._stamps(keyframes, guesses))
-        self._read(newest, self._graph.values)
+        self._read(newest, [key for key in self._graph.values if not is_of_keyframe(key)])
 
     def _priors(self) -> list[gtsam.NonlinearFactor]:
         """What is known before any measurement."""
@@ -378,7 +377,7 @@ class Incremental:
         now = keyframes[-1].t
         oldest = -math.inf if self._lag is None else now - self._lag - MARGIN
         stamps = {key: now if key in self._graph.values else oldest for key in values}
-        return stamps | {k.key: k.t for k in keyframes}
+        return stamps | {key: k.t for k in keyframes for key in (k.key, tilt_key(k.index)) if key in values}
 
     def _odometry_node(self, keyframe: Keyframe) -> Node:
         factor, keys = self._graph.odometry_factor(keyframe)

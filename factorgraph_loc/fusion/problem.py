@@ -14,7 +14,7 @@ import gtsam
 from factorgraph_loc.fusion.chained import Chained
 from factorgraph_loc.fusion.least_squares import MAX_ITERATIONS, damped_step, optimum
 from factorgraph_loc.fusion.marginals import Covariances, covariances
-from factorgraph_loc.fusion.variables import Values, gather, retract, to_gtsam
+from factorgraph_loc.fusion.variables import Values, gather, retract
 from factors.graph import Factor, jacobian_factor
 
 
@@ -28,25 +28,16 @@ class Solution:
 
 
 class Problem:
-    """Factors of ours, each with the keys of its variables; ``natives``: more of them, with GTSAM's own that are the same but
-    throw where a point is behind a camera."""
+    """Factors, each with the keys of its variables."""
 
-    def __init__(
-        self,
-        factors: Sequence[tuple[Factor, tuple[int, ...]]],
-        natives: Sequence[tuple[Factor, tuple[int, ...], gtsam.NonlinearFactor]] = (),
-    ) -> None:
-        self._factors = list(factors)
-        self._natives = natives
-        self._graph = gtsam.NonlinearFactorGraph()
-        for _, _, native in natives:
-            self._graph.add(native)
+    def __init__(self, factors: Sequence[tuple[Factor, tuple[int, ...]]]) -> None:
+        self._factors = factors
 
     @cached_property
     def _chain(self) -> Chained | None:
         """The problem as a row of poses, None where it is none."""
         chain = Chained(self._factors)
-        return chain if not self._natives and chain.fits else None
+        return chain if chain.fits else None
 
     def solve(self, values: Values, max_iterations: int = MAX_ITERATIONS) -> Solution:
         """The optimum found from a guess, or where ``max_iterations`` lead."""
@@ -55,8 +46,6 @@ class Problem:
         if chain is not None and begin is not None:
             state, cost, iterations = optimum(chain.cost, chain.moved, begin, max_iterations)
             return Solution(values | chain.values(state), cost, iterations)
-        if not math.isfinite(self.cost(values)) and len(self._natives):
-            self._replace_natives()
         return Solution(*optimum(self.cost, self._moved, values, max_iterations))
 
     def _moved(self, values: Values, damping: float) -> Values | None:
@@ -67,13 +56,8 @@ class Problem:
         return {key: retract(key, value, step.at(key)) for key, value in values.items()}
 
     def cost(self, values: Values) -> float:
-        """The robust cost, infinite where one of GTSAM's factors throws and where it is not a number."""
+        """The robust cost, infinite where it is not a number."""
         cost = sum(factor.cost(gather(values, keys)) for factor, keys in self._factors)
-        if self._graph.size():
-            try:
-                cost += float(self._graph.error(to_gtsam(values)))
-            except RuntimeError:
-                return math.inf
         return math.inf if math.isnan(cost) else cost
 
     def linearize(self, values: Values) -> gtsam.GaussianFactorGraph:
@@ -81,18 +65,7 @@ class Problem:
         graph = gtsam.GaussianFactorGraph()
         for factor, keys in self._factors:
             graph.add(jacobian_factor(factor, keys, gather(values, keys)))
-        if self._graph.size():
-            try:
-                graph.push_back(self._graph.linearize(to_gtsam(values)))
-            except RuntimeError:  # one of them threw
-                self._replace_natives()
-                return self.linearize(values)
         return graph
-
-    def _replace_natives(self) -> None:
-        """From now on our own factors in place of GTSAM's."""
-        self._factors += [(factor, keys) for factor, keys, _ in self._natives]
-        self._natives, self._graph = (), gtsam.NonlinearFactorGraph()
 
     def covariances(self, values: Values, keys: Iterable[int]) -> Covariances:
         """Marginal covariances of variables at a solution, poses in the body frame; IndeterminateError where there are none."""

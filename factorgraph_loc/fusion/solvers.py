@@ -17,7 +17,17 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.fusion.summary import MarginalSummary, oldest_pose
-from factorgraph_loc.fusion.variables import Node, Values, gather, gtsam_errors, is_point, is_pose, read, to_gtsam
+from factorgraph_loc.fusion.variables import (
+    Node,
+    Values,
+    gather,
+    gtsam_errors,
+    is_constant,
+    is_point,
+    is_pose,
+    read,
+    to_gtsam,
+)
 from factors.graph import jacobian_factor, pose_array, silenced
 from factors.se2 import Array
 
@@ -121,7 +131,7 @@ class Window:
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
         stamps: dict[int, float] = dict.fromkeys(values, t)
         # what is constant never leaves the window, points do when they are seen no more
-        stamps |= dict.fromkeys((key for key in self._stamps if not is_pose(key) and not is_point(key)), t)
+        stamps |= dict.fromkeys((key for key in self._stamps if is_constant(key)), t)
         stamps |= dict.fromkeys((key for node in nodes for key in node.keys if is_point(key)), t)
         self.begin((), nodes, values, stamps)
 
@@ -181,7 +191,9 @@ class Window:
         return MarginalSummary.of(graph, at, ours) if graph.size() else None
 
     def _state(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, frozenset[int]]:
-        return self._smoother.getFactors(), self._smoother.getLinearizationPoint(), self._ours.slots
+        """A copy of what the solver has, which changes in place."""
+        graph, at = self._smoother.getFactors(), self._smoother.getLinearizationPoint()
+        return gtsam.NonlinearFactorGraph(graph), gtsam.Values(at), self._ours.slots
 
 
 class _Ours:

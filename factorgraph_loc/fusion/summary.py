@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import gtsam
 
-from factorgraph_loc.fusion.variables import Node, index_of, is_pose
+from factorgraph_loc.fusion.variables import Node, index_of, is_of_keyframe, is_pose
 
 KINDS = (gtsam.LinearContainerFactor, gtsam.PriorFactorPose2, gtsam.PriorFactorVector)
 
@@ -49,7 +49,7 @@ class MarginalSummary:
 
     def before(self, pose: int) -> MarginalSummary:
         """What is left once the poses from the index ``pose`` on are taken back: others come under their keys."""
-        kept = frozenset(key for key in self.keys if not is_pose(key) or index_of(key) < pose)
+        kept = frozenset(key for key in self.keys if not is_of_keyframe(key) or index_of(key) < pose)
         at = gtsam.Values(self.at)
         for key in self.keys - kept:
             at.erase(key)

@@ -1,6 +1,7 @@
 """The variables of a graph by GTSAM's keys, and what hangs on them.
 
-A variable is a pose (3,), or a vector: constants of a sensor that are estimated, or the position of a landmark (2,) or point (3,).
+A variable is a pose (3,), or a vector: roll and pitch (2,) of the robot at a pose, constants of a sensor that are estimated, or the
+position of a landmark (2,) or point (3,).
 """
 
 from __future__ import annotations
@@ -18,13 +19,18 @@ from factors.se2 import Array
 
 Values = dict[int, Array]
 
-_POSE, _POINT, _LANDMARK = ord("x"), ord("p"), ord("l")
+_POSE, _TILT, _POINT, _LANDMARK = ord("x"), ord("t"), ord("p"), ord("l")
 _CHARACTER = 56  # bits of a key below its character
 
 
 def pose_key(index: int) -> int:
     """The key of the pose of keyframe ``index``."""
     return int(gtsam.symbol("x", index))
+
+
+def tilt_key(index: int) -> int:
+    """The key of the tilt of the robot at keyframe ``index``."""
+    return int(gtsam.symbol("t", index))
 
 
 def constants_key(index: int) -> int:
@@ -57,8 +63,18 @@ def is_pose(key: int) -> bool:
     return key >> _CHARACTER == _POSE
 
 
+def is_of_keyframe(key: int) -> bool:
+    """Whether the variable is a pose or a tilt, which a window loses with its keyframe."""
+    return key >> _CHARACTER in (_POSE, _TILT)
+
+
+def is_constant(key: int) -> bool:
+    """Whether the variable is always there: constants, or a landmark."""
+    return not is_of_keyframe(key) and not is_point(key)
+
+
 def index_of(key: int) -> int:
-    """The number of a pose, landmark or point."""
+    """The number of a pose, tilt, landmark or point."""
     return key & ((1 << _CHARACTER) - 1)
 
 

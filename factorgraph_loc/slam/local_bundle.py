@@ -13,12 +13,11 @@ import numpy as np
 
 from factorgraph_loc.fusion.graph_parts import Keyframe
 from factorgraph_loc.fusion.problem import Problem
-from factorgraph_loc.fusion.variables import Values, point_key
+from factorgraph_loc.fusion.variables import Values, point_key, tilt_key
 from factorgraph_loc.slam.new_points import FEWEST, KeyframeCamera, PointSighting, agreed, apart
-from factors.camera.factor import ReprojectionFactor
-from factors.camera.model import CameraModel
-from factors.camera.native import PointSightings
-from factors.graph import PriorFactor
+from factors.camera.model import CameraModel, lens_of
+from factors.camera.point import PointFactor
+from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.odometry.model import OdometryFactor
 from factors.se2 import Array
 
@@ -34,15 +33,16 @@ def bundled(
     poses: Sequence[Array],
     slacks: Sequence[float],
     waiting: Mapping[Hashable, Sequence[PointSighting]],
-) -> list[Array] | None:
-    """Adjusted poses (3,) of consecutive ``keyframes``, the first one held, from the initial ``poses``, which displace points by
-    ``slacks`` [px]; None with fewer than :data:`ENOUGH` points.
+) -> list[tuple[Array, Array]] | None:
+    """Adjusted poses (3,) and tilts (2,) of consecutive ``keyframes``, the first pose held, from the initial
+    ``poses``, which displace points by ``slacks`` [px]; None with fewer than :data:`ENOUGH` points.
     """
     first = keyframes[0].index
     places = [KeyframeCamera.of(model, pose, slack) for pose, slack in zip(poses, slacks, strict=True)]
     values: Values = {k.key: pose for k, pose in zip(keyframes, poses, strict=True)}
-    make = PointSightings(model)
-    natives = []
+    lens, upright = lens_of(model), VectorPriorFactor(np.zeros(2), np.full(2, model.tilt))
+    values |= {tilt_key(k.index): np.zeros(2) for k in keyframes}
+    factors: list[tuple[Factor, tuple[int, ...]]] = [(upright, (tilt_key(k.index),)) for k in keyframes]
     often = [seen for w in waiting.values() if len(seen := [s for s in w if s.keyframe >= first]) >= FEWEST]
     ends = [(seen[i], places[seen[i].keyframe - first]) for seen in often for i in (0, -1)]
     often = [s for s, a, b in zip(often, ends[::2], ends[1::2], strict=True) if apart(model, *a, *b, ROUGH)]
@@ -56,16 +56,15 @@ def bundled(
         key = point_key(len(values))
         values[key] = point.position
         for s in right:
-            ours = ReprojectionFactor(model, np.zeros((1, 3)), s.pixel[None], free=True)
             pose = keyframes[s.keyframe - first].key
-            natives.append((ours, (pose, key), make.factor(pose, key, s.pixel)))
-    if len(values) < len(keyframes) + ENOUGH:
+            factors.append((PointFactor(model, lens, s.pixel), (pose, tilt_key(s.keyframe), key)))
+    if len(values) < 2 * len(keyframes) + ENOUGH:
         return None
     chain = [
         (OdometryFactor(k.from_previous), (before.key, k.key))
         for before, k in pairwise(keyframes)
         if k.from_previous is not None
     ]
-    problem = Problem([(PriorFactor(poses[0], ANCHOR), (keyframes[0].key,)), *chain], natives)
+    problem = Problem([(PriorFactor(poses[0], ANCHOR), (keyframes[0].key,)), *chain, *factors])
     solved = problem.solve(values, ITERATIONS).values
-    return [solved[k.key] for k in keyframes]
+    return [(solved[k.key], solved[tilt_key(k.index)]) for k in keyframes]

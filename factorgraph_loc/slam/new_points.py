@@ -24,7 +24,7 @@ NEAREST = 0.3  # m of depth
 ITERATIONS, SETTLED = 4, 1e-3  # m: step below which the solution has converged
 GATE = 0.999  # probability of the chi-square test of the residuals
 PATIENCE = 20  # keyframes after which a point not seen again is dropped
-ORIGIN, UNTURNED = np.zeros(3), np.eye(3)
+ORIGIN, UNTURNED, UPRIGHT = np.zeros(3), np.eye(3), np.zeros(2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +54,9 @@ class KeyframeCamera:
     slack: float
 
     @classmethod
-    def of(cls, model: CameraModel, pose: Array, slack: float) -> KeyframeCamera:
-        """The camera of a robot at ``pose`` (3,)."""
-        return cls(*reprojection.camera_pose(model, pose), slack)
+    def of(cls, model: CameraModel, pose: Array, slack: float, tilt: Array = UPRIGHT) -> KeyframeCamera:
+        """The camera of a robot at ``pose`` (3,) with this ``tilt`` (2,) [rad]."""
+        return cls(*reprojection.camera_pose(model, pose, tilt), slack)
 
 
 @dataclass(frozen=True, slots=True)

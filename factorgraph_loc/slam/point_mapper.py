@@ -7,7 +7,7 @@ from collections.abc import Hashable, Mapping, Sequence
 
 from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe
 from factorgraph_loc.fusion.mapping import GraphView
-from factorgraph_loc.fusion.variables import Node, Values, is_point
+from factorgraph_loc.fusion.variables import Node, Values, gather
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.base import Sensor
@@ -16,8 +16,8 @@ from factorgraph_loc.sensors.camera.sensor import Pixels
 from factorgraph_loc.slam.frame_pairs import FramePairs
 from factorgraph_loc.slam.new_points import FEWEST
 from factorgraph_loc.slam.unknown_points import HORIZON, UnknownPoints
-from factors.camera.factor import ReprojectionFactor
 from factors.camera.model import CameraModel
+from factors.camera.point import PointFactor
 from factors.se2 import Array
 
 KEYFRAME_INTERVAL = 0.5  # s between images that become keyframes for points that are estimated
@@ -79,13 +79,12 @@ class PointMapper:
 
     def is_astray(self, node: Node, values: Values) -> bool:
         factor = node.factor
-        if not isinstance(factor, ReprojectionFactor) or not factor.free or any(key not in values for key in node.keys):
+        if not isinstance(factor, PointFactor) or any(key not in values for key in node.keys):
             return False
-        return factor.is_astray(values[node.keys[0]], values[node.keys[-1]])
+        return factor.is_astray(gather(values, node.keys))
 
     def point(self, node: Node) -> int | None:
-        free = isinstance(node.factor, ReprojectionFactor) and node.factor.free
-        return node.keys[-1] if free and is_point(node.keys[-1]) else None
+        return node.keys[-1] if isinstance(node.factor, PointFactor) else None
 
     def leave(self, t: float) -> Sequence[int]:
         return [] if self._unknown is None else self._unknown.leave(t)

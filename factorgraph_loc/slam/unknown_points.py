@@ -7,14 +7,14 @@ too. A track whose pixels are outliers :data:`STRIKES` times in a row is separat
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 
 from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe
 from factorgraph_loc.fusion.mapping import GraphView
-from factorgraph_loc.fusion.variables import Node, point_key
+from factorgraph_loc.fusion.variables import Node, point_key, tilt_key
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING, Estimated
@@ -27,14 +27,13 @@ from factorgraph_loc.slam.point_looks import PointLooks
 from factorgraph_loc.slam.refound_points import refound
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
-from factorgraph_loc.vision.level import Stance, tilting
 from factorgraph_loc.vision.spread import spread_out
 from factors import positive, se2
 from factors.camera import model as reprojection
 from factors.camera.factor import ReprojectionFactor
 from factors.camera.kernels import NEAREST
 from factors.camera.model import CameraModel, recalibrated
-from factors.camera.native import PointSightings
+from factors.camera.point import PointFactor
 from factors.graph import VectorPriorFactor
 from factors.se2 import Array
 from factors.update import robust_update
@@ -43,11 +42,11 @@ PER_KEYFRAME, WAITING = 40, 60  # maximum number of estimated points per keyfram
 STRIKES = 2
 ANCHORED = 4  # points of the graph that determine a keyframe to SLACK pixels
 SLACK = 2.0  # px
+LEVEL = np.zeros(2)  # no tilt
 OPEN = np.full(3, 30.0)  # m: weak prior of a point, about the size of a building
 LOST = 10.0  # s for which a lost point is searched: after that, too many others in a building look like it
 AGREED = 0.5  # fraction of inliers required of points not seen for longer: similar descriptors agree by chance
 RECENT = 5.0  # s: the error of a point seen since is correlated with that of the track
-FEWEST_LEVELLED = 10  # points of the graph that tell the tilt of a robot
 REVISITED = 6  # features of points not seen for longer that are accepted together, whatever the others say
 HORIZON, BUNDLE = 60, 8  # keyframes for which sightings are kept, and keyframes that are adjusted together
 
@@ -83,9 +82,8 @@ class UnknownPoints:
     _anchored: dict[int, bool] = field(default_factory=dict)  # keyframes with sightings
 
     def __post_init__(self) -> None:
-        self._levels = not self.estimated.indices
         self._new = NewPoints(self.model)
-        self._sightings = PointSightings(self.model)
+        self._lens = reprojection.lens_of(self.model)
 
     def take(
         self,
@@ -107,7 +105,7 @@ class UnknownPoints:
         rows = list(rows)
         if keyframe.from_previous is not None:
             self._distance_travelled += float(np.hypot(*keyframe.from_previous.delta[:2]))
-        names = self._named(m, rows, self._tilting(model, guess), graph)
+        names = self._named(m, rows, lifted(model, *guess), graph)
         certain: set[int] = set()  # rows
         if m.frame is not None and self._loops.due(m.t):
             certain = self._revisited(
@@ -123,10 +121,8 @@ class UnknownPoints:
         points = [self._points[names[i]] for i in old]
         known = np.array([rows[i] in certain for i in old], dtype=bool)
         fewest = REVISITED if m.names is None else 2  # a name needs one other to confirm it
-        guess, right, stance = self._placed(model, points, pixels[old], keyframe.t, guess, graph, known, fewest)
-        if stance is not None:
-            positions = np.array([graph.current(point.key) for point in points])
-            pixels = _levelled(stance, pixels, old, positions, right)
+        guess, tilt, right = self._placed(model, points, pixels[old], keyframe.t, guess, graph, known, fewest)
+        self._tilts(keyframe, tilt, graph, addition)
         if m.frame is not None:
             seen_from = lifted(model, *guess).position
             self._remember(
@@ -255,10 +251,17 @@ class UnknownPoints:
         positions, covariances = (np.array([part[key] for key in keys.values()]) for part in (values, spreads))
         return self._looks.map_of(tuple(keys), tuple(keys.values()), positions, covariances)
 
-    def _tilting(self, model: CameraModel, guess: Guess) -> CameraPose:
-        """The camera at a predicted pose of a robot that may tilt."""
-        camera = lifted(model, *guess)
-        return replace(camera, covariance=camera.covariance + tilting(model)) if self._levels else camera
+    def _tilts(self, keyframe: Keyframe, tilt: Array, graph: GraphView, addition: Addition) -> None:
+        """Make a variable of the ``tilt`` of the robot at a new keyframe."""
+        key = tilt_key(keyframe.index)
+        if key in graph.values:
+            return
+        addition.values[key] = graph.values[key] = tilt
+        sigmas = np.full(2, self.model.tilt)
+        native = gtsam.PriorFactorVector(key, LEVEL, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+        prior = Node((key,), VectorPriorFactor(LEVEL, sigmas), 2, native)
+        keyframe.nodes.append(prior)
+        addition.nodes.append(prior)
 
     def _placed(
         self,
@@ -270,45 +273,40 @@ class UnknownPoints:
         graph: GraphView,
         known: Truths,
         fewest: int,
-    ) -> tuple[Guess, Truths, Stance | None]:
-        """The pose corrected by points of the graph, which of these are inliers, and the stance of the robot that they tell.
+    ) -> tuple[Guess, Array, Truths]:
+        """The pose corrected by points of the graph, the tilt (2,) of the robot that they tell, and which of them are inliers.
 
         Points not seen for long need to agree with each other, at least ``fewest`` of them, but not with the rest, as the track has
         drifted since.
         """
         if not points:
-            return guess, np.zeros(0, dtype=bool), None
+            return guess, LEVEL, np.zeros(0, dtype=bool)
         positions = np.array([graph.current(point.key) for point in points])
         spreads = positive.inverse(np.array([point.information for point in points]))
-        camera = self._tilting(model, guess)
+        camera = lifted(model, *guess)
         _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, positions)
         noise = (model.sigma**2 + SLACK**2) * np.eye(2) + by_point @ spreads @ by_point.transpose(0, 2, 1)
         recent = np.array([t - point.last < RECENT for point in points])
         right = known.copy()
-        placed, stance = guess, None
+        placed, tilt = guess, LEVEL
         revisited = max(fewest, math.ceil(AGREED * np.count_nonzero(~recent & ~known)))
         for which, enough in ((recent, FEWEST), (~recent & ~known, revisited)):
             agrees = np.zeros(len(points), dtype=bool)
             if which.any():
                 agrees[which] = agreeing(model, camera, positions[which], pixels[which], noise[which])
             if np.count_nonzero(agrees) >= enough and placed is guess:
-                seen, at = pixels[agrees], positions[agrees]
-                if len(seen) >= FEWEST_LEVELLED and self._levels:
-                    stance = Stance.of(model, camera, at, seen, noise[agrees])
-                    stance = None if stance.is_steep else stance
-                if stance is not None:
-                    seen = stance.levelled(at, seen)
-                factor = ReprojectionFactor(model, at, seen, point_covariances=spreads[agrees])
+                factor = ReprojectionFactor(model, positions[agrees], pixels[agrees], point_covariances=spreads[agrees])
                 update = robust_update(factor, *guess, ITERATIONS, SETTLED)
                 placed = se2.compose(guess[0], se2.exp(update.delta)), guess[1]
+                tilt = model.tilt * factor.levelled([placed[0]])[1]
             elif np.count_nonzero(agrees) < enough and placed is not guess:
-                seen = pixels if stance is None else stance.levelled(positions, pixels)
-                error = reprojection.predict(model, placed[0], positions)[0] - seen
+                seen_from = reprojection.camera_pose(model, placed[0], tilt)
+                error = reprojection.linearize_in_space(model, *seen_from, positions)[0] - pixels
                 agrees &= positive.squared(error, noise) < GATE
             elif np.count_nonzero(agrees) < enough:
                 agrees &= which & recent
             right |= agrees
-        return placed, right, stance
+        return placed, tilt, right
 
     def _again(
         self,
@@ -339,12 +337,8 @@ class UnknownPoints:
         self._hang(keyframe, point.key, pixel, graph, addition)
 
     def _hang(self, keyframe: Keyframe, key: int, pixel: Array, graph: GraphView, addition: Addition) -> None:
-        shared = graph.shared
-        native = None if shared else self._sightings.factor(keyframe.key, key, pixel)
-        factor = ReprojectionFactor(
-            self.model, np.zeros((1, 3)), pixel[None], estimated=self.estimated.indices, free=True
-        )
-        node = Node((keyframe.key, *shared, key), factor, 2, native)
+        keys = (keyframe.key, *graph.shared, tilt_key(keyframe.index), key)
+        node = Node(keys, PointFactor(self.model, self._lens, pixel, self.estimated.indices), 2)
         keyframe.nodes.append(node)
         addition.nodes.append(node)
 
@@ -364,11 +358,14 @@ class UnknownPoints:
             some = [slacks[i] for i in last]
             found = bundled(self.model, [graph.keyframes[i] for i in last], poses, some, self._new.waiting())
             if found is not None:
-                return {i: KeyframeCamera.of(self.model, p, SLACK) for i, p in zip(last, found, strict=True)}, found[-1]
-        places = {newest.index: KeyframeCamera.of(self.model, pose, slacks[newest.index])}
+                cameras = {i: KeyframeCamera.of(self.model, p, SLACK, t) for i, (p, t) in zip(last, found, strict=True)}
+                return cameras, found[-1][0]
+        tilt = graph.values[tilt_key(newest.index)]
+        places = {newest.index: KeyframeCamera.of(self.model, pose, slacks[newest.index], tilt)}
         for i in {s.keyframe for name in names for s in self._new.waiting()[name]}:
             if i not in places and i in slacks and graph.is_open(i):
-                places[i] = KeyframeCamera.of(self.model, graph.current(graph.keyframes[i].key), slacks[i])
+                there, tilt = graph.current(graph.keyframes[i].key), graph.values[tilt_key(i)]
+                places[i] = KeyframeCamera.of(self.model, there, slacks[i], tilt)
         return places, pose
 
     def _slacks(self, newest: Keyframe, graph: GraphView) -> dict[int, float]:
@@ -388,12 +385,3 @@ class UnknownPoints:
             variance = float(step.covariance[2, 2])
             to_anchor, since = (to_anchor, since + variance) if reached else (to_anchor + variance, since)
         return slacks
-
-
-def _levelled(stance: Stance, pixels: Array, old: list[int], positions: Array, right: Truths) -> Array:
-    """The pixels as of an upright robot: those of the points ``old`` at their ``positions``, others about as far away as the
-    ``right`` ones of these."""
-    depth = float(np.median((positions[right] - stance.position) @ stance.rotation[:, 2]))
-    places = stance.position + depth * reprojection.rays(stance.model, pixels) @ stance.rotation.T
-    places[old] = positions
-    return stance.levelled(places, pixels)

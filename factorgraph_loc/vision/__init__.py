@@ -11,7 +11,6 @@ __all__ = [
     "frame_motion",
     "images",
     "keypoints",
-    "level",
     "matching",
     "relocalization",
     "settings",

@@ -3,7 +3,7 @@
 If all together are compatible with the prediction (joint compatibility: Neira, Tardos, IEEE Transactions on Robotics and
 Automation 17(6), 2001), all are accepted. Otherwise samples of three points correct the prediction by a Kalman update, and the
 correction with most inliers is used (after Civera, Grasa, Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal of Field
-Robotics 27(5), 2010). The prediction of a planar robot has a covariance of rank 3, and so has the correction.
+Robotics 27(5), 2010). The prediction of a robot on a floor has a covariance of rank 5, and so has the correction.
 """
 
 from dataclasses import dataclass

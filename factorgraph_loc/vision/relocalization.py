@@ -13,7 +13,6 @@ import numpy as np
 import scipy
 
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths
-from factorgraph_loc.vision.level import Stance
 from factors import positive, se2
 from factors.camera import model as reprojection
 from factors.camera.factor import ReprojectionFactor
@@ -82,7 +81,6 @@ def on_floor(
     if abs(position[2]) > FLOATS or tilt > TILTS:
         return None
     pose = np.array((position[0], position[1], math.atan2(rotation[1, 0], rotation[0, 0])))
-    pixels = Stance(model, camera.position, camera.rotation).levelled(points, pixels)
     factor = ReprojectionFactor(model, points, pixels, point_covariances=spreads)
     information = np.zeros((3, 3))
     for _ in range(REFINEMENTS):
@@ -94,7 +92,7 @@ def on_floor(
         pose = se2.compose(pose, se2.exp(step))
         if np.abs(step).max() < CONVERGED:
             break
-    error, _ = factor.whitened([pose])
+    error, _ = factor.levelled([pose])
     inliers = np.sum(error**2, axis=1) < GATE
     if np.count_nonzero(inliers) < FEWEST:
         return None

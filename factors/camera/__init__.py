@@ -1,3 +1,3 @@
 """Pixels of points in space: model, kernels, factors."""
 
-__all__ = ["factor", "inverse_depth", "kernels", "model", "native", "update_kernels", "visual_odometry"]
+__all__ = ["factor", "inverse_depth", "kernels", "model", "point", "update_kernels", "visual_odometry"]

@@ -10,15 +10,13 @@ import numpy as np
 
 from factors import se2
 from factors.camera import update_kernels as pixel_kernels
-from factors.camera.kernels import NEAREST
 from factors.camera.model import (
     PARAMETERS,
     TIME_OFFSET,
     CameraModel,
-    in_camera,
+    by_tilt,
     lens_of,
     linearize,
-    project,
     recalibrated,
 )
 from factors.displaced import carried, common_error, delayed, displaced
@@ -26,7 +24,6 @@ from factors.robust import huber_loss, huber_weight
 from factors.se2 import Array
 
 NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
-BEHIND = 100.0  # residual of a point behind the camera, in standard deviations
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +35,8 @@ class ReprojectionFactor:
     covariance ``offset_covariance`` (3, 3) is added to the noise. ``twist`` (3,): the robot's velocity at that time.
 
     The values of the factor are the pose (3,); corrections (P,) of the constants with indices ``estimated`` in :data:`PARAMETERS`,
-    if any; and, if ``free``, the displacement of the points from ``points``: one for all (3,), or one for each (K, 3), with the
-    Jacobian (K, 2, 3) of each residual by its own. ``in_image``: the number of points of the image, of which these are a part; by
-    default K.
+    if any; and displacements (3,) from ``points``. ``moved_by`` (K,): the number of the one that moves a point, or -1; by default
+    there are none. The tilt of the robot is an error that all points have in common, in standard deviations.
     """
 
     model: CameraModel
@@ -50,20 +46,17 @@ class ReprojectionFactor:
     offset_covariance: Array | None = None
     point_covariances: Array | None = None
     estimated: tuple[int, ...] = ()
-    free: bool = False
+    moved_by: tuple[int, ...] = ()
     twist: Array | None = None
-    in_image: int | None = None
 
     @property
     def of_pose_alone(self) -> bool:
         """Whether the pose is its only variable."""
-        return not self.estimated and not self.free
+        return not self.estimated and not self.moved_by
 
     def packed(self) -> pixel_kernels.Seen:
         """The arguments of the compiled code, for a factor :attr:`of_pose_alone`."""
         model, offset, noise, spreads = self.model, self.offset, self.offset_covariance, self.point_covariances
-        if noise is not None and self.in_image is not None:  # which the code multiplies by the number of points here
-            noise = self.in_image / max(1, len(self.points)) * noise
         return pixel_kernels.Seen(
             lens_of(model),
             model.position,
@@ -76,73 +69,69 @@ class ReprojectionFactor:
             float(model.sigma),
             float(model.robust),
             float(model.tempering),
+            float(model.tilt),
         )
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
+        """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value, whatever the tilt."""
         if self.of_pose_alone:
             residual, jacobian = pixel_kernels.linearized(self.packed(), np.ascontiguousarray(values[0], dtype=float))
             return residual, [jacobian]
         error, blocks = self.whitened(values)
-        weight = np.sqrt(self.weight(np.einsum("ki,ki->k", error, error)))
-        weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
-        return (weight[:, None] * error).ravel(), weighted
+        model, jacobian = self.model, np.concatenate(blocks, axis=2)
+        residual, jacobian = pixel_kernels.marginal(error, jacobian, float(model.robust), float(model.tempering))
+        ends = np.cumsum([block.shape[2] for block in blocks[:-1]])
+        return residual, np.split(jacobian, ends[:-1], axis=1)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The robust loss."""
-        error, _ = self.whitened(values)
-        return self.model.tempering * float(np.sum(huber_loss(np.sum(error**2, axis=-1), self.model.robust)))
+        """The robust loss, with the tilt that fits best."""
+        error, tilt = self.levelled(values)
+        loss = np.sum(huber_loss(np.sum(error**2, axis=-1), self.model.robust)) + 0.5 * tilt @ tilt
+        return self.model.tempering * float(loss)
+
+    def levelled(self, values: Sequence[Array]) -> tuple[Array, Array]:
+        """Whitened residual (K, 2) with the tilt that fits best, and that tilt (2,)."""
+        error, (*_, by_tilt) = self.whitened(values)
+        roll, pitch, _ = pixel_kernels.tilted(error, np.ascontiguousarray(by_tilt), float(self.model.robust))
+        tilt = np.array((roll, pitch))
+        return error + by_tilt @ tilt, tilt
 
     def weight(self, squared: Array) -> Array:
         """The robust weight of squared whitened residuals."""
         return self.model.tempering * huber_weight(squared, self.model.robust)
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
+        """Whitened residual (K, 2), predicted minus measured, of a robot that does not tilt, and its Jacobian (K, 2, d) by each
+        value and by the tilt, without robust weights."""
         if self.of_pose_alone:
             residual, jacobian = pixel_kernels.whitened(self.packed(), np.ascontiguousarray(values[0], dtype=float))
-            return residual, [jacobian]
-        here = self.fixed(values[1 : 1 + bool(self.estimated)], values[-1] if self.free else None)
+            return residual, [jacobian[..., :3], jacobian[..., 3:]]
+        moved_by, displacements = np.array(self.moved_by, dtype=np.int64), values[1 + bool(self.estimated) :]
+        moves = None if not self.moved_by else np.array((*displacements, np.zeros(3)))[moved_by]
+        here = self.fixed(values[1 : 1 + bool(self.estimated)], moves)
         offset = here.offset
         at = values[0] if offset is None else se2.compose(values[0], offset)
         pixels, by_pose, by_point, by_parameters = linearize(here.model, at, here.points)
-        error = (pixels - self.pixels) / self.model.sigma
-        if self.free:
-            # a point behind the camera has a constant residual, as no gradient leads to its true position
-            behind = in_camera(here.model, at, here.points)[:, 2] < NEAREST
-            error[behind] = BEHIND
-            by_pose, by_point, by_parameters = (
-                np.where(behind[:, None, None], 0.0, part) for part in (by_pose, by_point, by_parameters)
-            )
         scale = 1.0 / self.model.sigma
-        by_pose = scale * by_pose
-        blocks = [by_pose]
+        error, by_pose, by_point = scale * (pixels - self.pixels), scale * by_pose, scale * by_point
+        by_parameters = scale * by_parameters
+        blocks, tilts = [by_pose], by_tilt(here.model, by_parameters)
         if self.estimated:
-            by_parameters = scale * by_parameters
             by_parameters[..., 3:6] = by_parameters[..., 3:6] @ _turns(self.estimated, values[1])
             if self.twist is not None:
                 by_parameters[..., TIME_OFFSET] = by_pose @ self.twist
             blocks.append(by_parameters[..., list(self.estimated)])
-        if self.free:
-            blocks.append(scale * by_point)
+        blocks += [np.where((moved_by == i)[:, None, None], by_point, 0.0) for i in range(len(displacements))]
         spread = None
         if self.point_covariances is not None:
-            spread = carried(scale * by_point, self.point_covariances)
+            spread = carried(by_point, self.point_covariances)
         if self.offset_covariance is not None:
-            common = common_error(by_pose, self.offset_covariance, self.in_image)
+            common = common_error(by_pose, self.offset_covariance)
             spread = common if spread is None else spread + common
-        return displaced(error, blocks, offset, spread)
-
-    def is_astray(self, pose: Array, displacement: Array) -> bool:
-        """Whether a free point, with this ``displacement`` (3,), cannot be what a robot at the variable's ``pose`` (3,) saw: it is
-        behind the camera, or :data:`BEHIND` standard deviations away."""
-        at = pose if self.offset is None else se2.compose(pose, self.offset)
-        local = in_camera(self.model, at, self.points + displacement)
-        error = (project(self.model, local) - self.pixels) / self.model.sigma
-        return bool(np.any((local[:, 2] < NEAREST) | (np.sum(error**2, axis=1) > BEHIND**2)))
+        return displaced(error, [*blocks, tilts], offset, spread)
 
     def fixed(self, parameters: Sequence[Array], displacement: Array | None) -> ReprojectionFactor:
-        """The factor on the pose only, at given constants (one array (P,), or none) and ``displacement`` of free points."""
+        """The factor on the pose only, at given constants (one array (P,), or none) and a ``displacement`` (K, 3) of the points."""
         if not parameters and displacement is None:
             return self
         model, offset = self.model, self.offset
@@ -152,7 +141,7 @@ class ReprojectionFactor:
             model = recalibrated(model, changes)
             offset = delayed(offset, self.twist, float(changes[TIME_OFFSET]))
         points = self.points if displacement is None else self.points + displacement
-        return replace(self, model=model, points=points, offset=offset, estimated=(), free=False)
+        return replace(self, model=model, points=points, offset=offset, estimated=(), moved_by=())
 
     def dof(self) -> int:
         """Number of measured pixel coordinates."""

@@ -42,6 +42,8 @@ class CameraModel:
     ``fx``, ``fy``, ``cx``, ``cy`` [px]; ``distortion`` (k1, k2, p1, p2); ``width``, ``height`` [px] of its images. ``position``
     (3,) [m] and ``rotation`` (3, 3) of the camera in the robot frame. ``sigma`` [px] in u and in v; ``robust``: scale of Huber's
     loss in standard deviations. ``tempering``: exponent of the likelihood, below 1 if errors are correlated between images.
+    ``tilt``: standard deviation [rad] of the robot's roll and pitch, which all points of an image have in common: no floor is level
+    to a pixel.
     """
 
     fx: float
@@ -56,6 +58,7 @@ class CameraModel:
     sigma: float = 1.0
     robust: float = 2.0
     tempering: float = 1.0
+    tilt: float = 0.005
 
     def intrinsics(self) -> Array:
         """(fx, fy, cx, cy, k1, k2, p1, p2) as an array (8,)."""
@@ -132,10 +135,13 @@ def carrier(model: CameraModel, position: Array, rotation: Array) -> tuple[Array
     return position - turn @ model.position, turn
 
 
-def camera_pose(model: CameraModel, pose: Array) -> tuple[Array, Array]:
-    """Position (3,) and rotation (3, 3) in the world of the camera of a robot at ``pose`` (3,)."""
+def camera_pose(model: CameraModel, pose: Array, tilt: Array | None = None) -> tuple[Array, Array]:
+    """Position (3,) and rotation (3, 3) in the world of the camera of a robot at ``pose`` (3,) with the ``tilt`` (2,) [rad], a
+    rotation about its own x and y axes, by default none."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     turn = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+    if tilt is not None:
+        turn = turn @ gtsam.Rot3.Expmap(np.append(tilt, 0.0)).matrix()
     return mounted(model, np.array((pose[0], pose[1], 0.0)), turn)
 
 
@@ -183,6 +189,14 @@ def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Ar
     return found
 
 
+def by_tilt(model: CameraModel, by_parameters: Array) -> Array:
+    """Jacobian (K, 2, 2) by the robot's roll and pitch about its axes on the floor, in standard deviations, from that by
+    :data:`PARAMETERS` (K, 2, 8): the camera turns, and is moved."""
+    x, y, z = model.position
+    arm = np.array(((0.0, z), (-z, 0.0), (y, -x)))
+    return np.asarray(model.tilt * (by_parameters[..., 3:5] + by_parameters[..., :3] @ arm))
+
+
 def linearize_in_space(
     model: CameraModel, position: Array, rotation: Array, points: Array
 ) -> tuple[Array, Array, Array]:
@@ -196,10 +210,15 @@ def linearize_in_space(
 
 
 def log_likelihood(
-    model: CameraModel, poses: Array, points: Array, pixels: Array, covariances: Array | None = None
+    model: CameraModel,
+    poses: Array,
+    points: Array,
+    pixels: Array,
+    tilts: Array,
+    covariances: Array | None = None,
 ) -> Array:
     """The robust, tempered log-likelihood (N,), up to a constant, of seeing ``points`` (K, 3) at ``pixels`` (K, 2) from ``poses``
-    (N, 3).
+    (N, 3), each with the tilt that fits best; ``tilts`` (K, 2, 2): see :func:`by_tilt`.
 
     ``covariances`` (K, 2, 2) [px^2]: of each pixel, including the map's error; by default the pixel noise only.
     """
@@ -207,16 +226,10 @@ def log_likelihood(
         whiteners = np.broadcast_to(np.eye(2) / model.sigma, (len(points), 2, 2)).copy()
     else:
         whiteners = positive.whitener(covariances)
-    arguments = (lens_of(model), model.position, model.rotation, np.ascontiguousarray(poses, dtype=float))
-    return model.tempering * np.asarray(
-        reprojection_kernels.log_likelihood(
-            *arguments,
-            np.ascontiguousarray(points, dtype=float),
-            np.ascontiguousarray(pixels, dtype=float),
-            whiteners,
-            model.robust,
-        )
-    )
+    camera = lens_of(model), model.position, model.rotation
+    poses, points, pixels = (np.ascontiguousarray(part, dtype=float) for part in (poses, points, pixels))
+    seen = poses, points, pixels, whiteners, np.ascontiguousarray(whiteners @ tilts)
+    return np.asarray(reprojection_kernels.log_likelihood(*camera, *seen, model.robust, model.tempering))
 
 
 def lens_of(model: CameraModel) -> Lens:

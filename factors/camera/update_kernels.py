@@ -17,6 +17,8 @@ from factors.se2_kernels import exp
 from factors.small_kernels import inverse
 
 Row = tuple[float, float, float]
+WIDTH = 5  # of a Jacobian by a pose, and by roll and pitch of the robot in standard deviations
+REWEIGHTED, STILL = 50, 1e-5  # most rounds to find a tilt, and standard deviations that the last may change it
 
 
 class Seen(NamedTuple):
@@ -37,12 +39,14 @@ class Seen(NamedTuple):
     sigma: float
     robust: float
     tempering: float
+    tilt: float
 
 
 @compiled(error_model="numpy")
 def whitened(seen: Seen, pose: Array) -> tuple[Array, Array]:
-    """See :meth:`~factors.camera.factor.ReprojectionFactor.whitened`: residual (K, 2) and Jacobian (K, 2, 3)."""
-    residual, jacobian = np.empty((len(seen.points), 2)), np.empty((len(seen.points), 2, 3))
+    """See :meth:`~factors.camera.factor.ReprojectionFactor.whitened`: residual (K, 2), and its Jacobian (K, 2, 5) by pose and
+    tilt."""
+    residual, jacobian = np.empty((len(seen.points), 2)), np.empty((len(seen.points), 2, WIDTH))
     _whiten(seen, pose[0], pose[1], pose[2], residual, jacobian)
     return residual, jacobian
 
@@ -51,13 +55,71 @@ def whitened(seen: Seen, pose: Array) -> tuple[Array, Array]:
 def linearized(seen: Seen, pose: Array) -> tuple[Array, Array]:
     """See :meth:`~factors.camera.factor.ReprojectionFactor.linearize`: residual (2K,) and Jacobian (2K, 3)."""
     residual, jacobian = whitened(seen, pose)
-    for k in range(len(residual)):
-        root = math.sqrt(_weight(seen, residual[k, 0] ** 2 + residual[k, 1] ** 2))
+    return marginal(residual, jacobian, seen.robust, seen.tempering)
+
+
+@compiled(error_model="numpy")
+def tilted(residual: Array, by_tilt: Array, robust: float) -> tuple[float, float, Array]:
+    """Roll and pitch, in standard deviations, that fit best to whitened residuals (K, 2) with Jacobians (K, 2, 2), and the robust
+    weights (K,) there: by iteratively reweighted least squares, of a convex cost."""
+    n, roll, pitch = len(residual), 0.0, 0.0
+    weights = np.ones(n)
+    for _ in range(REWEIGHTED):
+        xx, xy, yy, x, y = 1.0, 0.0, 1.0, 0.0, 0.0
+        for k in range(n):
+            for r in range(2):
+                a, b, w = by_tilt[k, r, 0], by_tilt[k, r, 1], weights[k]
+                xx, xy, yy = xx + w * a * a, xy + w * a * b, yy + w * b * b
+                x, y = x + w * a * residual[k, r], y + w * b * residual[k, r]
+        determinant = xx * yy - xy * xy
+        before_roll, before_pitch = roll, pitch
+        roll, pitch = (xy * y - yy * x) / determinant, (xy * x - xx * y) / determinant
+        for k in range(n):
+            u = residual[k, 0] + by_tilt[k, 0, 0] * roll + by_tilt[k, 0, 1] * pitch
+            v = residual[k, 1] + by_tilt[k, 1, 0] * roll + by_tilt[k, 1, 1] * pitch
+            weights[k] = huber_weight(u * u + v * v, robust)
+        if abs(roll - before_roll) + abs(pitch - before_pitch) < STILL:
+            break
+    return roll, pitch, weights
+
+
+@compiled(error_model="numpy")
+def marginal(residual: Array, jacobian: Array, robust: float, tempering: float) -> tuple[Array, Array]:
+    """Whitened, robustly weighted residual (2K,) and Jacobian (2K, D) of points (K, 2) whose Jacobian (K, 2, D + 2) ends with that
+    by the tilt, an error that all have in common: with weights W the covariance of the residuals is 1 / W + T T', before it is
+    tempered.
+
+    The root of its inverse is that of W times 1 - A C A', with A = W^(1/2) T, H^2 = 1 + A'A, and 1 / C = H (H + 1).
+    """
+    n, size = len(residual), jacobian.shape[2] - 2
+    _, _, weights = tilted(residual, jacobian[:, :, size:], robust)
+    out = np.empty((2 * n, size + 3))  # by the values, by the tilt, and the residual
+    for k in range(n):
+        root = math.sqrt(weights[k])
         for r in range(2):
-            residual[k, r] *= root
-            for j in range(3):
-                jacobian[k, r, j] *= root
-    return residual.reshape(-1), jacobian.reshape(-1, 3)
+            for j in range(size + 2):
+                out[2 * k + r, j] = root * jacobian[k, r, j]
+            out[2 * k + r, size + 2] = root * residual[k, r]
+    shared = np.zeros((2, size + 3))
+    for i in range(2 * n):
+        for j in range(size + 3):
+            shared[0, j] += out[i, size] * out[i, j]
+            shared[1, j] += out[i, size + 1] * out[i, j]
+    a, b, d = 1.0 + shared[0, size], shared[0, size + 1], 1.0 + shared[1, size + 1]
+    determinant = math.sqrt(a * d - b * b)
+    trace = math.sqrt(a + d + 2.0 * determinant)
+    # H (H + 1) = H^2 + H, and H = (H^2 + determinant) / trace
+    a, b, d = a + (a + determinant) / trace, b + b / trace, d + (d + determinant) / trace
+    determinant = a * d - b * b
+    for j in range(size + 3):
+        p, q = shared[0, j], shared[1, j]
+        shared[0, j], shared[1, j] = (d * p - b * q) / determinant, (a * q - b * p) / determinant
+    scale = math.sqrt(tempering)
+    for i in range(2 * n):
+        p, q = out[i, size], out[i, size + 1]
+        for j in range(size + 3):
+            out[i, j] = scale * (out[i, j] - p * shared[0, j] - q * shared[1, j])
+    return out[:, size + 2].copy(), out[:, :size].copy()
 
 
 @compiled(error_model="numpy")
@@ -66,18 +128,20 @@ def updated(
 ) -> tuple[Array, Array, Array, float]:
     """See :func:`~factors.update.robust_update`: correction (S,) and covariance (S, S) afterwards; whitened residuals (K, 2) at the
     prediction, and their normalised square. ``gate``: of a single point."""
-    n, size = len(seen.points), len(covariance)
-    prior = inverse(covariance)
-    first, jacobian = np.empty((n, 2)), np.empty((n, 2, 3))
+    n, size = len(seen.points), len(covariance) + 2  # the tilt comes last
+    prior = np.eye(size)
+    prior[: size - 2, : size - 2] = inverse(covariance)
+    first, jacobian = np.empty((n, 2)), np.empty((n, 2, WIDTH))
     _whiten(seen, pose[0], pose[1], pose[2], first, jacobian)
     weights, before = np.ones(n), np.zeros(size)
     delta, after, pull = _solved(prior, first, jacobian, weights, before)
     nis = 0.0
     for k in range(n):
         nis += first[k, 0] ** 2 + first[k, 1] ** 2
-    for i in range(3):
-        for j in range(3):
-            nis -= pull[i] * after[i, j] * pull[j]
+    for i in range(WIDTH):
+        for j in range(WIDTH):
+            nis -= pull[i] * after[_place(i, size), _place(j, size)] * pull[j]
+    prior[size - 2, size - 2] = prior[size - 1, size - 1] = seen.tempering
     widest = 1.0
     for k in range(n):
         widening = max(1.0, _normalised(first[k], jacobian[k], covariance) / gate)
@@ -97,34 +161,34 @@ def updated(
         c, s = math.cos(pose[2]), math.sin(pose[2])
         _whiten(seen, pose[0] + c * dx - s * dy, pose[1] + s * dx + c * dy, pose[2] + turned, residual, jacobian)
         for k in range(n):
-            weights[k] = _weight(seen, residual[k, 0] ** 2 + residual[k, 1] ** 2)
+            weights[k] = _weight(seen, residual[k], jacobian[k], delta[size - 2], delta[size - 1])
         delta, after, pull = _solved(prior, residual, jacobian, weights, before)
     for i in range(size):
         for j in range(i):
             after[i, j] = after[j, i] = 0.5 * (after[i, j] + after[j, i])
-    return delta, after, first, nis
+    return delta[: size - 2].copy(), after[: size - 2, : size - 2].copy(), first, nis
 
 
 @compiled(error_model="numpy")
-def placed(position: Array, rotation: Array, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
+def placed(position: Array, rotation: Array, tilt: float, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
     """Position (3,) and rotation (3, 3) in the world of a camera mounted at ``position`` with ``rotation`` on a robot at ``pose``
-    (3,), and the covariance (6, 6) of its perturbation in its own frame, rotation first, from ``covariance`` (3, 3) of the pose."""
+    (3,), and the covariance (6, 6) of its perturbation in its own frame, rotation first, from ``covariance`` (3, 3) of the pose
+    and the standard deviation ``tilt`` [rad] of roll and pitch."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    where, turned, lift, carried = np.empty(3), np.empty((3, 3)), np.zeros((6, 3)), np.empty((6, 6))
-    where[0] = pose[0] + c * position[0] - s * position[1]
-    where[1] = pose[1] + s * position[0] + c * position[1]
-    where[2] = position[2]
+    where, turned, lift, carried = np.empty(3), np.empty((3, 3)), np.zeros((6, WIDTH)), np.empty((6, 6))
+    x, y, z = position[0], position[1], position[2]
+    where[0], where[1], where[2] = pose[0] + c * x - s * y, pose[1] + s * x + c * y, z
     for i in range(3):
-        turned[0, i] = c * rotation[0, i] - s * rotation[1, i]
-        turned[1, i] = s * rotation[0, i] + c * rotation[1, i]
-        turned[2, i] = rotation[2, i]
-        lift[i, 2] = rotation[2, i]
-        lift[3 + i, 0], lift[3 + i, 1] = rotation[0, i], rotation[1, i]
-        lift[3 + i, 2] = position[0] * rotation[1, i] - position[1] * rotation[0, i]
+        a, b, d = rotation[0, i], rotation[1, i], rotation[2, i]
+        turned[0, i], turned[1, i], turned[2, i] = c * a - s * b, s * a + c * b, d
+        lift[i, 2], lift[i, 3], lift[i, 4] = d, tilt * a, tilt * b
+        lift[3 + i, 0], lift[3 + i, 1], lift[3 + i, 2] = a, b, x * b - y * a
+        lift[3 + i, 3], lift[3 + i, 4] = tilt * (y * d - z * b), tilt * (z * a - x * d)
     for i in range(6):
         p = (lift[i, 0], lift[i, 1], lift[i, 2])
         for j in range(6):
-            carried[i, j] = _product(covariance, p, (lift[j, 0], lift[j, 1], lift[j, 2]))
+            by_tilt = lift[i, 3] * lift[j, 3] + lift[i, 4] * lift[j, 4]
+            carried[i, j] = _product(covariance, p, (lift[j, 0], lift[j, 1], lift[j, 2])) + by_tilt
     return where, turned, carried
 
 
@@ -151,14 +215,17 @@ def _product(matrix: Array, p: Row, q: Row) -> float:
 
 
 @compiled(inline="always")
-def _weight(seen: Seen, squared: float) -> float:
-    """The robust weight of a squared whitened residual, tempered."""
-    return float(seen.tempering * huber_weight(squared, seen.robust))
+def _weight(seen: Seen, residual: Array, jacobian: Array, roll: float, pitch: float) -> float:
+    """The robust weight, tempered, of a whitened residual (2,) of a robot that tilts."""
+    u = residual[0] + jacobian[0, 3] * roll + jacobian[0, 4] * pitch
+    v = residual[1] + jacobian[1, 3] * roll + jacobian[1, 4] * pitch
+    return float(seen.tempering * huber_weight(u * u + v * v, seen.robust))
 
 
 @compiled(error_model="numpy")
 def _whiten(seen: Seen, x: float, y: float, heading: float, residual: Array, jacobian: Array) -> None:
-    """Whitened residuals (K, 2), predicted minus measured, and their Jacobians (K, 2, 3) by the pose (x, y, heading), in place."""
+    """Whitened residuals (K, 2), predicted minus measured, and their Jacobians (K, 2, 5) by the pose (x, y, heading) and the tilt,
+    about the robot's axes on the floor, in place."""
     place, scale, n = mounting(seen.position, seen.rotation), 1.0 / seen.sigma, len(seen.points)
     c, s = math.cos(heading), math.sin(heading)
     dx, dy, turned = seen.offset[0], seen.offset[1], seen.offset[2]
@@ -175,6 +242,10 @@ def _whiten(seen: Seen, x: float, y: float, heading: float, residual: Array, jac
         u, v, by_u, by_v = pixel(seen.lens, local[0], local[1], local[2])
         p, q = _along(seen.rotation, by_u, scale), _along(seen.rotation, by_v, scale)
         by_p, by_q = (-p[0], -p[1], p[0] * ry - p[1] * rx), (-q[0], -q[1], q[0] * ry - q[1] * rx)
+        rz = seen.tilt * seen.points[k, 2]
+        tx, ty = seen.tilt * rx, seen.tilt * ry
+        tilt_p = p[1] * rz - p[2] * ty, p[2] * tx - p[0] * rz
+        tilt_q = q[1] * rz - q[2] * ty, q[2] * tx - q[0] * rz
         eu, ev = scale * (u - seen.pixels[k, 0]), scale * (v - seen.pixels[k, 1])
         if common or not exact:
             uu, uv, vv = 1.0, 0.0, 1.0
@@ -203,9 +274,12 @@ def _whiten(seen: Seen, x: float, y: float, heading: float, residual: Array, jac
             ev = (ev - b * eu) / d
             by_p = (by_p[0] / a, by_p[1] / a, by_p[2] / a)
             by_q = ((by_q[0] - b * by_p[0]) / d, (by_q[1] - b * by_p[1]) / d, (by_q[2] - b * by_p[2]) / d)
+            tilt_p = tilt_p[0] / a, tilt_p[1] / a
+            tilt_q = (tilt_q[0] - b * tilt_p[0]) / d, (tilt_q[1] - b * tilt_p[1]) / d
         residual[k, 0], residual[k, 1] = eu, ev
         for r in range(2):
-            g = by_p if r == 0 else by_q
+            g, t = (by_p, tilt_p) if r == 0 else (by_q, tilt_q)
+            jacobian[k, r, 3], jacobian[k, r, 4] = t
             jacobian[k, r, 0], jacobian[k, r, 1] = co * g[0] - so * g[1], so * g[0] + co * g[1]
             jacobian[k, r, 2] = g[0] * back_y - g[1] * back_x + g[2]
 
@@ -221,36 +295,38 @@ def _along(rotation: Array, by_local: Row, scale: float) -> Row:
     )
 
 
+@compiled(inline="always")
+def _place(i: int, size: int) -> int:
+    """Of a column of the Jacobian in a state of this ``size``, which ends with the tilt."""
+    return i if i < 3 else size - WIDTH + i
+
+
 @compiled(error_model="numpy")
-def _solved(
-    prior: Array, residual: Array, jacobian: Array, weights: Array, at: Array
-) -> tuple[Array, Array, tuple[float, float, float]]:
+def _solved(prior: Array, residual: Array, jacobian: Array, weights: Array, at: Array) -> tuple[Array, Array, Array]:
     """Correction (S,) and covariance (S, S) from weighted residuals (K, 2) linearised at the correction ``at`` (S,), and the
-    gradient at the correction."""
-    information = prior.copy()
-    xx = xy = xa = yy = ya = aa = px = py = pa = 0.0
+    gradient (5,) at the correction. The residuals are those without a tilt."""
+    size, pull, told = len(prior), np.zeros(WIDTH), np.zeros((WIDTH, WIDTH))
     for k in range(len(residual)):
         w = weights[k]
         for r in range(2):
-            x, y, a = jacobian[k, r, 0], jacobian[k, r, 1], jacobian[k, r, 2]
-            e = w * (x * at[0] + y * at[1] + a * at[2] - residual[k, r])
-            xx, xy, xa = xx + w * x * x, xy + w * x * y, xa + w * x * a
-            yy, ya, aa = yy + w * y * y, ya + w * y * a, aa + w * a * a
-            px, py, pa = px + e * x, py + e * y, pa + e * a
-    information[0, 0] += xx
-    information[1, 1] += yy
-    information[2, 2] += aa
-    information[0, 1] += xy
-    information[1, 0] += xy
-    information[0, 2] += xa
-    information[2, 0] += xa
-    information[1, 2] += ya
-    information[2, 1] += ya
+            e = -residual[k, r]
+            for i in range(3):
+                e += jacobian[k, r, i] * at[i]
+            for i in range(WIDTH):
+                weighted = w * jacobian[k, r, i]
+                pull[i] += e * weighted
+                for j in range(i + 1):
+                    told[i, j] += weighted * jacobian[k, r, j]
+    information = prior.copy()
+    for i in range(WIDTH):
+        for j in range(WIDTH):
+            information[_place(i, size), _place(j, size)] += told[max(i, j), min(i, j)]
     after = inverse(information)
-    delta = np.empty(len(prior))
-    for i in range(len(prior)):
-        delta[i] = after[i, 0] * px + after[i, 1] * py + after[i, 2] * pa
-    return delta, after, (px, py, pa)
+    delta = np.zeros(size)
+    for i in range(size):
+        for j in range(WIDTH):
+            delta[i] += after[i, _place(j, size)] * pull[j]
+    return delta, after, pull
 
 
 @compiled(inline="always")
@@ -259,5 +335,8 @@ def _normalised(residual: Array, jacobian: Array, covariance: Array) -> float:
     p = (jacobian[0, 0], jacobian[0, 1], jacobian[0, 2])
     q = (jacobian[1, 0], jacobian[1, 1], jacobian[1, 2])
     a, b, c = 1.0 + _product(covariance, p, p), _product(covariance, p, q), 1.0 + _product(covariance, q, q)
+    for i in range(3, WIDTH):
+        tp, tq = jacobian[0, i], jacobian[1, i]
+        a, b, c = a + tp * tp, b + tp * tq, c + tq * tq
     x, y = residual[0], residual[1]
     return float((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))

@@ -60,24 +60,13 @@ def test_a_factor_is_that_of_a_camera_whose_constants_stay(rng, inexact, offset,
     ):
         np.testing.assert_allclose(compiled[0], plain[0], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(compiled[1][0], plain[1][0], rtol=1e-9, atol=1e-7)
-
-
-def test_an_error_of_odometry_is_common_to_the_points_of_all_parts_of_an_image(rng):
-    factor, pose = seen(rng, offset=OFFSET, noise=NOISE)
-    whole = factor.whitened([pose])
-    parts = [
-        replace(factor, points=factor.points[r], pixels=factor.pixels[r], in_image=12) for r in (slice(5), slice(5, 12))
-    ]
-    for twin in (lambda f: f.whitened([pose]), lambda f: replace(f, estimated=(2,)).whitened([pose, np.zeros(1)])):
-        found = [twin(part) for part in parts]
-        np.testing.assert_allclose(np.concatenate([f[0] for f in found]), whole[0], rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(np.concatenate([f[1][0] for f in found]), whole[1][0], rtol=1e-9, atol=1e-7)
+    np.testing.assert_allclose(factor.whitened([pose])[1][1], twin.whitened([pose, np.zeros(1)])[1][2], atol=1e-9)
 
 
 def test_the_camera_of_a_robot_moves_as_the_robot_does(rng):
     pose, step = rng.standard_normal(3), 1e-6
     root = rng.standard_normal((3, 3))
-    position, rotation, covariance = pixel_kernels.placed(MODEL.position, MODEL.rotation, pose, root @ root.T)
+    position, rotation, covariance = pixel_kernels.placed(MODEL.position, MODEL.rotation, 0.0, pose, root @ root.T)
     np.testing.assert_allclose(position, camera_pose(MODEL, pose)[0])
     np.testing.assert_allclose(rotation, camera_pose(MODEL, pose)[1])
     lift = np.empty((6, 3))

@@ -12,7 +12,6 @@ from factorgraph_loc.fusion.marginals import IndeterminateError, covariances
 from factorgraph_loc.fusion.problem import Problem
 from factorgraph_loc.fusion.solvers import Window
 from factorgraph_loc.fusion.variables import constants_key, pose_key
-from factors.graph import VectorPriorFactor
 
 STEP = np.array(((1.0, 0.0, 0.03), (0.0, 1.0, 0.3), (0.0, 0.0, 1.0)))
 WHITENER = np.diag((300.0, 3000.0, 200.0))
@@ -89,20 +88,6 @@ def test_a_start_without_a_cost_stays_where_nothing_better_is():
     solution = Problem([(Hole(), (KEY,))]).solve({KEY: np.array([0.5])})
     assert solution.values[KEY][0] == 0.5
     assert solution.cost == np.inf
-
-
-def test_a_factor_of_gtsam_that_throws_is_replaced_by_ours_wherever_it_throws():
-    def error(_, values, jacobians):
-        if jacobians is not None:
-            raise RuntimeError("")
-        return values.atVector(KEY)
-
-    native = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [KEY], error)
-    ours = VectorPriorFactor(np.zeros(1), np.ones(1))
-    problem = Problem([], [(ours, (KEY,), native)])
-    solution = problem.solve({KEY: np.array([3.0])})
-    assert solution.values[KEY][0] == pytest.approx(0.0, abs=1e-3)
-    assert problem.covariances(solution.values, [KEY]).by_key[KEY][0, 0] == pytest.approx(1.0)
 
 
 def test_the_window_survives_marginals_that_fail(monkeypatch):

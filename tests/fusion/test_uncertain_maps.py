@@ -120,7 +120,7 @@ def test_particles_count_the_looks_at_a_marker():
 
 
 @pytest.mark.parametrize(
-    ("estimator", "most"), [("ekf", 5.0), ("smoother", 5.0), ("batch", 5.5), ("particle_filter", 6.0)]
+    ("estimator", "most"), [("ekf", 5.0), ("smoother", 5.0), ("batch", 5.0), ("particle_filter", 6.0)]
 )
 def test_points_of_a_poor_survey_while_driving(estimator, most):
     """Before, where the error was noise of each look, the mean was 11 to 15."""

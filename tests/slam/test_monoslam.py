@@ -23,11 +23,12 @@ from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNo
 from factorgraph_loc.simulation import preset, simulate
 from factorgraph_loc.slam.monoslam_state import Innovation
 from factorgraph_loc.vision.frame import CameraFrame
-from factorgraph_loc.vision.level import TILT
 from factors.camera import model as reprojection
+from factors.camera.model import CameraModel
 
 SENSORS = ("odometry", "sightings")
 EXACT_FLOOR = {"height_sigma": 1e-4, "tilt_sigma": 1e-4}  # which the simulated one is
+TILT = CameraModel(1.0, 1.0, 0.0, 0.0, 1, 1).tilt
 ALIKE_FLOOR = {"height_sigma": 1e-4, "tilt_sigma": TILT}  # as the planar estimators take it to be
 SECONDS = 30.0
 WRONG = 0.4
@@ -60,13 +61,12 @@ def test_in_a_known_map_it_is_the_planar_filter(drive, self_calibration):
     planar = estimated(log, "ekf", self_calibration=self_calibration)
     sigmas = np.sqrt(planar.covariances[:, [0, 1, 2], [0, 1, 2]])
     seen = planar.t > 2.0  # until then the start is far off, and the two linearise differently
-    # the planar filter has no tilt as a state: it weighs an image as a whole by what is left for the pose
-    assert np.quantile(np.abs(ours.poses - planar.poses)[seen] / sigmas[seen], 0.95) < 0.6
+    assert np.quantile(np.abs(ours.poses - planar.poses)[seen] / sigmas[seen], 0.95) < 0.3
     assert np.median(ours.covariances[seen, 0, 0] / planar.covariances[seen, 0, 0]) == pytest.approx(1.0, abs=0.1)
     assert np.median(np.abs(ours.final.poses - planar.final.poses)) < 1e-3
     assert set(ours.learnt.values) == set(planar.learnt.values)
     for name, (value, sigma) in ours.learnt.values.items():
-        assert value == pytest.approx(planar.learnt.values[name][0], abs=0.2 * sigma)
+        assert value == pytest.approx(planar.learnt.values[name][0], abs=0.25 * sigma)
         assert sigma == pytest.approx(planar.learnt.values[name][1], rel=0.1)
 
 

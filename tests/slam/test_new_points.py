@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import gtsam
 import numpy as np
 import pytest
 
@@ -16,10 +15,7 @@ from factorgraph_loc.slam.new_points import (
     sightings_of,
     triangulate,
 )
-from factors.camera.factor import ReprojectionFactor
 from factors.camera.model import CameraModel, mounting, predict
-from factors.camera.native import PointSightings
-from factors.graph import jacobian_factor
 from factors.se2 import Array
 
 MODEL = CameraModel(
@@ -161,18 +157,3 @@ def test_what_waits_is_bounded() -> None:
     waiting.forget(40)
     assert waiting.count("once") == 0
     assert waiting.count("always") >= FEWEST
-
-
-def test_gtsam_s_factor_is_ours() -> None:
-    pose = np.array((0.1, 0.2, 0.3))
-    pose_key, point_key = gtsam.symbol("x", 3), gtsam.symbol("p", 4)
-    for error in ((0.4, -0.3), (5.0, 8.0)):
-        pixel = predict(MODEL, pose, POINT[None])[0][0] + error
-        native = PointSightings(MODEL).factor(pose_key, point_key, pixel)
-        ours = ReprojectionFactor(MODEL, np.zeros((1, 3)), pixel[None], free=True)
-        values = gtsam.Values()
-        values.insert(pose_key, gtsam.Pose2(*pose))
-        values.insert(point_key, POINT)
-        assert native.error(values) == pytest.approx(ours.cost([pose, POINT]))
-        expected = jacobian_factor(ours, (pose_key, point_key), [pose, POINT]).information()
-        np.testing.assert_allclose(native.linearize(values).information(), expected, rtol=1e-6, atol=1e-3)

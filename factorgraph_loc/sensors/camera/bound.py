@@ -19,16 +19,13 @@ from factorgraph_loc.sensors.camera.sensor import (
     KnownPoints,
     Pixels,
     Predicted,
-    pixel_update,
-    rows_of,
 )
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factors import se2
 from factors.camera import model as reprojection
 from factors.camera.factor import ReprojectionFactor
 from factors.camera.model import TIME_OFFSET
 from factors.se2 import Array
-from factors.update import Correction, update_state
+from factors.update import Correction, image_update, robust_update
 
 PASS = 10.0  # s: looks within it have the error of a point's survey in common, where that is not estimated
 SOLVE_EVERY = 0.45  # s between solver updates; in between, images only update the newest pose, as in a filter
@@ -36,35 +33,23 @@ SOLVE_EVERY = 0.45  # s between solver updates; in between, images only update t
 
 @dataclass(frozen=True)
 class PixelObservation(ResidualObservation):
-    """Points seen in one image: one term for those that are where the map has them, and one for each block of others.
+    """Points seen in one image.
 
-    ``seen``: all as one factor on the pose and the camera's constants, where the map has them; ``names`` (K,): the blocks of their
-    displacements, empty for those that have none. ``expected`` (3,): the predicted pose used to match them. ``held``: the camera's
-    constants (P,) with their covariance (P, P), if the observation depends on the pose only.
+    ``seen``: as a factor on the pose, and perhaps on the camera's constants and on displacements of points. ``expected`` (3,): the
+    predicted pose used to match them. ``held``: the camera's constants (P,) with their covariance (P, P), if the observation
+    depends on the pose only.
     """
 
     iterations: ClassVar[int] = ITERATIONS
     settled: ClassVar[float] = SETTLED
     seen: ReprojectionFactor
-    names: tuple[str, ...]
     expected: Array = field(default_factory=lambda: np.zeros(3))
     held: tuple[Array, Array] | None = None
 
     @classmethod
-    def of(
-        cls, t: float, seen: ReprojectionFactor, names: tuple[str, ...], shared: tuple[str, ...], expected: Array
-    ) -> Self:
-        """The observation of ``seen``, whose points have the blocks ``names`` (K,); ``shared``: that of the constants, if any."""
-        if not any(names):
-            return cls(t, (Term(seen, shared, 2 * len(names)),), seen, names, expected)
-        terms = []
-        for name in dict.fromkeys(names):
-            part = rows_of(seen, np.array([one == name for one in names]))
-            part = replace(part, in_image=len(names))
-            if name:
-                part = replace(part, point_covariances=None, free=True)
-            terms.append(Term(part, (*shared, name) if name else shared, 2 * len(part.points)))
-        return cls(t, tuple(terms), seen, names, expected)
+    def of(cls, t: float, seen: ReprojectionFactor, blocks: tuple[str, ...], expected: Array) -> Self:
+        """The observation of ``seen``, whose values but for the pose are these ``blocks``."""
+        return cls(t, (Term(seen, blocks, seen.dof()),), seen, expected)
 
     def correct(
         self,
@@ -75,47 +60,21 @@ class PixelObservation(ResidualObservation):
         iterations: int = ITERATIONS,
     ) -> Correction:
         if self.held is not None:
-            found = pixel_update(self.seen, pose, covariance, *self.held)
+            size = 3 + len(self.held[0])
+            both = np.zeros((size, size))
+            both[:3, :3], both[3:, 3:] = covariance, self.held[1]
+            found = image_update(self.seen, pose, both, self.held[:1], (slice(3, size),), iterations, self.settled)
             return replace(found, delta=found.delta[:3], covariance=found.covariance[:3, :3])
-        if self.seen.of_pose_alone and len(covariance) == 3:
-            return pixel_update(self.seen, pose, covariance)
-        if not any(self.names):
-            return super().correct(pose, covariance, values, columns, iterations)
-        free, size = self._as_free(), max((3, *(columns[name].stop for name in self.blocks)))
-        shared = [name for name in self.blocks if name not in self.names]
-        own = [(row, name) for row, name in enumerate(self.names) if name]
-
-        def linearize(delta: Array) -> tuple[Array, Array]:
-            at, displacement = se2.compose(pose, se2.exp(delta[:3])), np.zeros((len(self.names), 3))
-            for row, name in own:
-                displacement[row] = values[name] + delta[columns[name]]
-            constants = [values[name] + delta[columns[name]] for name in shared]
-            residual, (by_pose, *by_shared, by_point) = free.whitened([at, *constants, displacement])
-            jacobian = np.zeros((*residual.shape, size))
-            jacobian[..., :3] = by_pose @ se2.right_jacobian(delta[:3])
-            for name, block in zip(shared, by_shared, strict=True):
-                jacobian[..., columns[name]] = block
-            for row, name in own:
-                jacobian[row, :, columns[name]] = by_point[row]
-            return residual, jacobian
-
-        found = update_state(linearize, covariance, free.weight, iterations, free.dof(), self.settled)
-        # pixels are so much better than the survey that it matters in which frame the covariance is: that of the updated pose
-        reset = np.eye(len(covariance))
-        reset[:3, :3] = se2.right_jacobian(found.delta[:3])
-        return replace(found, covariance=reset @ found.covariance @ reset.T)
-
-    def _as_free(self) -> ReprojectionFactor:
-        """All points as free ones: the covariances of those that have a block are in the state."""
-        spreads = self.seen.point_covariances
-        if spreads is not None:
-            spreads = np.where([[[not name]] for name in self.names], spreads, 0.0)
-        return replace(self.seen, free=True, point_covariances=spreads)
+        if self.seen.of_pose_alone:
+            return robust_update(self.seen, pose, covariance, iterations, self.settled)
+        at, places = [values[name] for name in self.blocks], [columns[name] for name in self.blocks]
+        return image_update(self.seen, pose, covariance, at, places, iterations, self.settled)
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
         factor, spreads = self.seen, None
+        _, by_pose, by_point, by_constants = reprojection.linearize(factor.model, self.expected, factor.points)
+        tilts = reprojection.by_tilt(factor.model, by_constants)
         if factor.point_covariances is not None or self.held is not None:
-            _, by_pose, by_point, by_constants = reprojection.linearize(factor.model, self.expected, factor.points)
             spreads = np.broadcast_to(factor.model.sigma**2 * np.eye(2), (len(by_point), 2, 2))
             if factor.point_covariances is not None:
                 spreads = spreads + by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
@@ -126,25 +85,24 @@ class PixelObservation(ResidualObservation):
                 # the error of the constants is common to all pixels, so it must not average out
                 common = by_constants @ self.held[1] @ by_constants.transpose(0, 2, 1)
                 spreads = spreads + len(common) * common
-        return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, spreads)
+        return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, tilts, spreads)
 
     def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
         """The observation on the pose only; the uncertainty of the camera's constants and of points is added to the noise."""
         if not self.blocks:
             return self
-        seen = self.seen
-        if any(self.names):
+        seen, held, blocks = self.seen, None, self.blocks
+        if seen.estimated:
+            held, blocks = (values[blocks[0]], spreads[blocks[0]]), blocks[1:]
+        if seen.moved_by:
             assert seen.point_covariances is not None
             points, noise = seen.points.copy(), seen.point_covariances.copy()
-            for row, name in enumerate(self.names):
-                if name:  # several points with one displacement tell no more of it than one
-                    points[row] += values[name]
-                    noise[row] = self.names.count(name) * spreads[name]
-            seen = replace(seen, points=points, point_covariances=noise)
-        shared = [name for name in self.blocks if name not in self.names]
-        held = (values[shared[0]], spreads[shared[0]]) if shared else None
-        terms = (Term(seen, (), 2 * len(seen.points)),)
-        return replace(self, terms=terms, seen=seen, names=("",) * len(self.names), held=held)
+            for row, which in enumerate(seen.moved_by):
+                if which >= 0:  # several points with one displacement tell no more of it than one
+                    points[row] += values[blocks[which]]
+                    noise[row] = seen.moved_by.count(which) * spreads[blocks[which]]
+            seen = replace(seen, points=points, point_covariances=noise, moved_by=())
+        return replace(self, terms=(Term(seen, (), seen.dof()),), seen=seen, held=held)
 
 
 class CameraSensor(Sensor):
@@ -192,9 +150,12 @@ class CameraSensor(Sensor):
         factor = self.points.factor(m, predicted, view.offset, twist, displaced)
         if factor is None:
             return
-        names = tuple(blocks.get(name, "") for name in self.points.names) or ("",) * len(factor.points)
-        seen = PixelObservation.of(m.t, factor, names, self._shared, view.pose)
-        yield seen if self.constants.names or any(names) else seen.on_pose(values, spreads)
+        names = [blocks.get(name, "") for name in self.points.names]
+        moving = tuple(dict.fromkeys(filter(None, names)))
+        if moving:
+            factor = displaced_by(factor, [moving.index(name) if name else -1 for name in names])
+        seen = PixelObservation.of(m.t, factor, (*self._shared, *moving), view.pose)
+        yield seen if self.constants.names or moving else seen.on_pose(values, spreads)
 
     def _looks_now(self, name: str, t: float) -> int:
         """Add a look at a point or marker; how many there were within :data:`PASS`, with the error of its survey in common."""
@@ -212,6 +173,14 @@ class CameraSensor(Sensor):
     def judge(self, observation: PixelObservation, correction: Correction, view: View) -> bool:
         self.points.report(observation.t, observation.seen, correction)
         return True
+
+
+def displaced_by(factor: ReprojectionFactor, which: list[int]) -> ReprojectionFactor:
+    """The factor on displacements too: the number of that of each point, or -1, ``which`` has its covariance in the state."""
+    spreads = factor.point_covariances
+    if spreads is not None:
+        spreads = np.where(np.array(which)[:, None, None] < 0, spreads, 0.0)
+    return replace(factor, point_covariances=spreads, moved_by=tuple(which))
 
 
 def bind(binding: Binding) -> CameraSensor | None:

@@ -21,7 +21,6 @@ from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
-from factorgraph_loc.vision.level import Stance, tilting
 from factorgraph_loc.vision.relocalization import FoundOnFloor, found_on_floor, on_floor
 from factorgraph_loc.vision.spread import spread_out
 from factors import se2
@@ -31,7 +30,7 @@ from factors.camera.factor import ReprojectionFactor
 from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel
 from factors.motion import Increment, propagate
 from factors.se2 import Array
-from factors.update import Correction, robust_update, update_state
+from factors.update import Correction
 
 DISAGREES = "camera: does not agree with the others"  # reason of a rejection
 CAMERAS = ("camera", "sightings")  # channels that use the rig's camera: features, and named points
@@ -39,6 +38,7 @@ FEW_SHARE = 0.3  # of named points: with fewer inliers, points are missing
 FEW, MANY = 6, 20  # of matched points: fewer than FEW inliers where MANY are expected means that points are missing
 UNSURE = 1.0  # m: a prediction with a larger standard deviation may miss the map
 MOST = 100  # points used per image; more add little, as errors of neighbouring points are correlated
+STEEPEST = 0.06  # rad: what tilts by more is no robot on a floor, or its camera is not mounted as the rig says
 NEAR = 3.0  # m: from where `exact_survey` compares the survey of a point with a pixel
 EXACT = 0.1  # a map is treated as exact if its errors are below this share of a pixel's, seen from 1 m
 # Pixels are so precise that one step from a poor prediction does not reach the optimum
@@ -85,7 +85,6 @@ class KnownPoints:
         self.used = np.empty(0, dtype=np.int64)  # features of the last image that match points of the map
         self.names: tuple[str, ...] = ()  # of the points of the last factor, where they are named
         self._estimated = estimated
-        self._levels = not estimated.indices  # else their errors would be taken for a tilt
         self._diagnostics = diagnostics
         self.associator: Associator | None = None
         if self.model is not None and "camera" in setup.sensors and len(self.map.owners):
@@ -176,17 +175,18 @@ class KnownPoints:
             place = self._estimated.indices.index(FOCAL)
             focal = math.sqrt(predicted.spread[place, place])
         if isinstance(m, CameraFrame):
-            return self._found(m, factor, here.model, camera, focal)
+            found = self._found(m, factor, here.model, camera, focal)
+            return None if found is None or self._is_steep(found, predicted) else found
         right = _agreeing(here, camera, focal)
         agreed = int(np.count_nonzero(right))
+        if agreed and self._is_steep(rows_of(here, right), predicted):
+            right, agreed = np.zeros_like(right), 0
         self.missed = agreed < FEW_SHARE * len(right)
         if agreed == len(right):
-            return self._levelled(factor, here, here.model, camera)
+            return factor
         self._diagnostics.reject(DISAGREES, len(right) - agreed)
         self.names = tuple(self.names[row] for row in np.flatnonzero(right).tolist())
-        if not agreed:
-            return None
-        return self._levelled(rows_of(factor, right), rows_of(here, right), here.model, camera)
+        return rows_of(factor, right) if agreed else None
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
         """The pose of an image without a prediction, or None, and the number of points that it seemed to show."""
@@ -248,22 +248,18 @@ class KnownPoints:
         chosen = spread_out(pixels, MOST)
         points = seen.points[chosen]
         spreads = self.map.covariances[points] if self._map_matters else None
-        found = replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=spreads)
-        return self._levelled(found, found, model, camera)
+        return replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=spreads)
 
-    def _levelled(
-        self, factor: ReprojectionFactor, here: ReprojectionFactor, model: CameraModel, camera: CameraPose
-    ) -> ReprojectionFactor | None:
-        """The factor with pixels as of an upright robot; ``here``: the same at the prediction, with points where they are. None if
-        no robot on a floor sees them there."""
-        if not self._levels:
-            return factor
-        stance = Stance.of(model, camera, here.points, here.pixels, noise_of(model, camera, here))
-        if stance.is_steep:
-            self._diagnostics.reject(DISAGREES, len(here.points))
-            return None
-        weighed = replace(factor.model, tempering=stance.kept * factor.model.tempering)
-        return replace(factor, model=weighed, pixels=stance.levelled(here.points, here.pixels))
+    def _is_steep(self, here: ReprojectionFactor, predicted: Predicted) -> bool:
+        """Whether only a robot that tilts by more than :data:`STEEPEST` sees the points where they are, which is not believed.
+        Constants that are estimated would explain it."""
+        if here.estimated:
+            return False
+        residual, blocks = here.whitened([predicted.pose])
+        jacobian, information = np.concatenate(blocks, axis=2).reshape(2 * len(residual), -1), np.eye(5)
+        information[:3, :3] = np.linalg.inv(predicted.covariance)
+        step = np.linalg.solve(information + jacobian.T @ jacobian, jacobian.T @ residual.ravel())
+        return here.model.tilt * math.hypot(*step[3:]) > STEEPEST
 
     def _camera(self, here: ReprojectionFactor, predicted: Predicted) -> CameraPose:
         """The pose of the camera for an image, including the uncertainty of its constants."""
@@ -273,8 +269,6 @@ class KnownPoints:
             since = Increment(here.offset, noise, 0.0)
             pose, covariance = se2.compose(pose, here.offset), propagate(covariance, since)
         camera = lifted(here.model, pose, covariance)
-        if self._levels:
-            camera = replace(camera, covariance=camera.covariance + tilting(here.model))
         if predicted.spread is None:
             return camera
         model = here.model
@@ -289,32 +283,10 @@ class KnownPoints:
         return replace(camera, covariance=camera.covariance + full @ predicted.spread @ full.T)
 
 
-def pixel_update(
-    factor: ReprojectionFactor,
-    pose: Array,
-    covariance: Array,
-    constants: Array | None = None,
-    spread: Array | None = None,
-) -> Correction:
-    """Iterated Kalman update of ``pose`` (3,) with body-frame ``covariance`` (3, 3), and of the corrections of the camera's
-    constants (P,) with covariance ``spread`` (P, P) if they are estimated."""
-    if constants is None or spread is None:
-        return robust_update(factor, pose, covariance, ITERATIONS, SETTLED)
-    size = 3 + len(constants)
-    both = np.zeros((size, size))
-    both[:3, :3], both[3:, 3:] = covariance, spread
-
-    def linearize(delta: Array) -> tuple[Array, Array]:
-        residual, blocks = factor.whitened([se2.compose(pose, se2.exp(delta[:3])), constants + delta[3:]])
-        return residual, np.concatenate(blocks, axis=2)
-
-    return update_state(linearize, both, factor.weight, ITERATIONS, factor.dof(), SETTLED)
-
-
 def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
-    """The pose of the camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
+    """The pose of the camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3), which may tilt."""
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (pose, covariance))
-    return CameraPose(*pixel_kernels.placed(model.position, model.rotation, *arrays))
+    return CameraPose(*pixel_kernels.placed(model.position, model.rotation, float(model.tilt), *arrays))
 
 
 def _lift(model: CameraModel) -> Array:
@@ -333,19 +305,16 @@ def _agreeing(here: ReprojectionFactor, camera: CameraPose, focal: float) -> Tru
     model, count = here.model, len(here.pixels)
     if count < FEWEST:
         return np.ones(count, dtype=bool)
-    spreads = noise_of(model, camera, here)
+    if here.point_covariances is None:
+        spreads = np.zeros((count, 2, 2))
+        spreads[:, (0, 1), (0, 1)] = model.sigma**2
+    else:
+        _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, here.points)
+        spreads = pixel_kernels.spread(by_point, here.point_covariances, float(model.sigma))
     if focal > 0.0:
         away = focal * (here.pixels - (model.cx, model.cy))
         spreads = spreads + away[:, :, None] * away[:, None, :]
     return agreeing(model, camera, here.points, here.pixels, spreads)
-
-
-def noise_of(model: CameraModel, camera: CameraPose, seen: ReprojectionFactor) -> Array:
-    """Covariances (K, 2, 2) [px^2] of the pixels of points, with that of the points seen by ``camera``."""
-    if seen.point_covariances is None:
-        return np.repeat(model.sigma**2 * np.eye(2)[None], len(seen.points), axis=0)
-    _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, seen.points)
-    return pixel_kernels.spread(by_point, seen.point_covariances, float(model.sigma))
 
 
 def rows_of(factor: ReprojectionFactor, rows: Truths) -> ReprojectionFactor:

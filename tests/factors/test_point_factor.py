@@ -1,0 +1,81 @@
+"""A point of unknown position in an image: agreement with GTSAM's factor in space, Jacobians, what lies behind the camera."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import se2
+from factors.camera.model import CameraModel, camera_pose, lens_of, linearize_in_space, mounting
+from factors.camera.point import PointFactor
+from factors.robust import huber_loss
+
+MODEL = CameraModel(
+    500.0,
+    510.0,
+    319.5,
+    239.5,
+    640,
+    480,
+    distortion=(-0.1, 0.02, 0.001, -0.002),
+    position=np.array((0.2, -0.05, 0.8)),
+    rotation=mounting(0.02, -0.1, 0.3),
+    sigma=0.7,
+)
+POSE, TILT, POINT = np.array((0.1, 0.2, 0.3)), np.array((0.02, -0.03)), np.array((5.0, 2.5, 1.4))
+ESTIMATED = (0, 3, 5, 6)
+CHANGES = np.array((0.02, -0.03, 0.04, 0.02))
+
+
+def seen(error=(0.0, 0.0), tilt=TILT):
+    pixel = linearize_in_space(MODEL, *camera_pose(MODEL, POSE, tilt), POINT[None])[0][0] + error
+    return PointFactor(MODEL, lens_of(MODEL), pixel)
+
+
+@pytest.mark.parametrize("error", [(0.4, -0.3), (5.0, 8.0)])
+@pytest.mark.parametrize("tilt", [np.zeros(2), TILT])
+def test_it_is_gtsam_s_factor_of_a_robot_in_space(error, tilt):
+    factor = seen(error, tilt)
+    robot = gtsam.Pose3(gtsam.Rot3.Rz(POSE[2]) * gtsam.Rot3.Expmap(np.append(tilt, 0.0)), (POSE[0], POSE[1], 0.0))
+    loss = gtsam.noiseModel.mEstimator.Huber.Create(MODEL.robust)
+    noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(2, MODEL.sigma))
+    mounted = gtsam.Pose3(gtsam.Rot3(MODEL.rotation), MODEL.position)
+    theirs = gtsam.GenericProjectionFactorCal3DS2(factor.pixel, noise, 0, 1, MODEL.calibration(), mounted)
+    values = gtsam.Values()
+    values.insert(0, robot)
+    values.insert(1, POINT)
+    assert theirs.error(values) == pytest.approx(factor.cost([POSE, tilt, POINT]))
+    residual, (_, _, by_point) = factor.linearize([POSE, tilt, POINT])
+    linear = theirs.linearize(values)
+    np.testing.assert_allclose(by_point, linear.jacobian()[0][:, 6:], atol=1e-6)
+    np.testing.assert_allclose(residual, -linear.jacobian()[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("estimated", [(), ESTIMATED])
+def test_its_jacobians_are_the_numerical_ones(estimated):
+    factor = replace(seen((0.5, -0.4)), estimated=estimated)
+    values = [POSE, *([CHANGES] if estimated else []), TILT, POINT]
+    residual, blocks = factor.linearize(values)
+    for place, block in enumerate(blocks):
+        for column in range(len(values[place])):
+            ends = []
+            for step in (1e-6, -1e-6):
+                moved, by = list(values), step * np.eye(len(values[place]))[column]
+                moved[place] = se2.compose(POSE, se2.exp(by)) if place == 0 else values[place] + by
+                ends.append(factor.cost(moved))
+            slope = (ends[0] - ends[1]) / 2e-6
+            assert residual @ block[:, column] == pytest.approx(slope, rel=1e-2, abs=1e-2)
+
+
+def test_a_point_behind_the_camera_is_astray_and_pulls_at_nothing():
+    factor = seen()
+    position, rotation = camera_pose(MODEL, POSE, TILT)
+    behind = position + rotation @ (0.1, 0.2, -2.0)
+    assert not factor.is_astray([POSE, TILT, POINT])
+    assert not factor.is_astray([POSE, TILT, POINT + 0.1])
+    assert factor.is_astray([POSE, TILT, behind])
+    assert factor.is_astray([POSE, TILT, position + rotation @ (2.0, 0.2, 2.0)])
+    _, blocks = factor.linearize([POSE, TILT, behind])
+    assert not np.any(np.concatenate(blocks, axis=1))
+    assert factor.cost([POSE, TILT, behind]) > factor.cost([POSE, TILT, POINT + 0.1]) > huber_loss(0.0, MODEL.robust)
