@@ -47,12 +47,12 @@ class PointMapper:
 
     def is_due(self, m: Pixels) -> bool:
         # estimated points need keyframes of their own
-        return self._unknown is not None and m.modality == self._camera.modality and m.t - self._taken >= self._interval
+        return self._unknown is not None and self._maps(m) and m.t - self._taken >= self._interval
 
     def take(
         self, m: Pixels, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition, *, is_new: bool
     ) -> Guess:
-        if m.modality != self._camera.modality:
+        if not self._maps(m):
             return guess
         points = self._camera.points
         if m.frame is None:
@@ -76,6 +76,10 @@ class PointMapper:
                 keyframe.nodes.append(node)
                 addition.nodes.append(node)
         return guess
+
+    def _maps(self, m: Pixels) -> bool:
+        """Whether points that are not in the map are taken from an image: it is of the first camera."""
+        return m.modality == self._camera.modality and not m.right
 
     def is_astray(self, node: Node, values: Values) -> bool:
         factor = node.factor

@@ -77,6 +77,8 @@ class KnownPoints:
         used = any(sensor in setup.sensors for sensor in CAMERAS)
         settings = setup.rig.camera if used else None
         self.model: CameraModel | None = None if settings is None else replace(settings.model(), tempering=1.0)
+        second = setup.rig.camera_right if used and "sightings_right" in setup.sensors else None
+        self._second: CameraModel | None = None if second is None else replace(second.model(), tempering=1.0)
         self._tempering = 1.0 if settings is None else settings.tempering  # for matched points
         self.map = PointMap.of((), np.empty((0, 3)))
         if setup.world.points is not None and use != "unknown":
@@ -127,18 +129,19 @@ class KnownPoints:
 
     def named(self, m: PixelSightings) -> ReprojectionFactor | None:
         """All named points of the map without outlier rejection, on the pose at their time."""
-        if self.model is None:
+        model = self._model_of(m)
+        if model is None:
             self._diagnostics.ignore("camera", len(m.pixels))
             return None
         places = [self.map.index.get(name, -1) for name in m.points]
         pixels = m.pixels
         if -1 in places:
             rows = [i for i, place in enumerate(places) if place >= 0]
-            if not self._others_matter:
+            if m.right or not self._others_matter:
                 self._diagnostics.ignore("point not in the map", len(places) - len(rows))
             places, pixels = [places[i] for i in rows], pixels[rows]
         self.names = tuple(self.map.names[place] for place in places)
-        return self._factor(self.model, places, pixels) if places else None
+        return self._factor(model, places, pixels) if places else None
 
     def factor(
         self,
@@ -166,7 +169,7 @@ class KnownPoints:
             factor = replace(factor, point_covariances=spreads)
         if offset is not None:
             factor = replace(factor, offset=offset.delta, offset_covariance=offset.covariance)
-        if self._estimated.indices:
+        if self._estimated.indices and not m.right:
             factor = replace(factor, estimated=self._estimated.indices, twist=twist)
         here = factor.fixed([] if predicted.constants is None else [predicted.constants], moved)
         camera = self._camera(here, predicted)
@@ -190,13 +193,14 @@ class KnownPoints:
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
         """The pose of an image without a prediction, or None, and the number of points that it seemed to show."""
-        if self.model is None or not self.known:
+        model = self._model_of(m)
+        if model is None or not self.known:
             return None, 0
         if isinstance(m, PixelSightings):
             rows = [i for i, name in enumerate(m.points) if name in self.map.index]
             points = np.array([self.map.index[m.points[i]] for i in rows], dtype=np.int64)
             spreads = self.map.covariances[points] if self._map_matters else None
-            return found_on_floor(self.model, self.map.positions[points], m.pixels[rows], spreads), len(rows)
+            return found_on_floor(model, self.map.positions[points], m.pixels[rows], spreads), len(rows)
         found = None if self.associator is None else self.associator.relocalized(m)
         if found is None:
             return None, 0
@@ -204,7 +208,7 @@ class KnownPoints:
         spreads = self.map.covariances[seen.points] if self._map_matters else None
         pixels = np.asarray(m.pixels[seen.features], dtype=float)
         camera = CameraPose(position, rotation, covariance)
-        return on_floor(self.model, camera, self.map.positions[seen.points], pixels, spreads), seen.expected
+        return on_floor(model, camera, self.map.positions[seen.points], pixels, spreads), seen.expected
 
     def report(self, t: float, factor: ReprojectionFactor, update: Correction) -> None:
         """Record the innovation of an update at time ``t``."""
@@ -214,6 +218,10 @@ class KnownPoints:
         self._diagnostics.add_residuals("camera.v", v)
         if self._clock is not None:
             self._clock.add(t, median(u) / factor.model.fx)
+
+    def _model_of(self, m: Pixels) -> CameraModel | None:
+        """Of the camera that took an image. The constants of the second one are not estimated."""
+        return self._second if m.right else self.model
 
     def _factor(self, model: CameraModel, points: list[int], pixels: Array) -> ReprojectionFactor:
         spreads = self.map.covariances[points] if self._map_matters else None
