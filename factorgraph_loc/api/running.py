@@ -26,7 +26,7 @@ class Run:
     scores: dict[str, Any]
 
     def __repr__(self) -> str:
-        done = {"log": self.result.log, "estimator": self.result.config["estimator"], "seed": 0, "status": "ok"}
+        done = {"log": self.result.log, "estimator": self.result.config["estimator"], "status": "ok"}
         return comparing.told([done | self.scores])
 
 

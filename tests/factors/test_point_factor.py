@@ -5,24 +5,13 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from mounted_camera import MODEL
 
 from factors import se2
-from factors.camera.model import CameraModel, camera_pose, lens_of, linearize_in_space, mounting
+from factors.camera.model import camera_pose, lens_of, linearize_in_space
 from factors.camera.point import PointFactor
 from factors.robust import huber_loss
 
-MODEL = CameraModel(
-    500.0,
-    510.0,
-    319.5,
-    239.5,
-    640,
-    480,
-    distortion=(-0.1, 0.02, 0.001, -0.002),
-    position=np.array((0.2, -0.05, 0.8)),
-    rotation=mounting(0.02, -0.1, 0.3),
-    sigma=0.7,
-)
 POSE, TILT, POINT = np.array((0.1, 0.2, 0.3)), np.array((0.02, -0.03)), np.array((5.0, 2.5, 1.4))
 ESTIMATED = (0, 3, 5, 6)
 CHANGES = np.array((0.02, -0.03, 0.04, 0.02))

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from mounted_camera import MODEL
 
 from factorgraph_loc.slam.new_points import (
     FEWEST,
@@ -15,21 +16,9 @@ from factorgraph_loc.slam.new_points import (
     sightings_of,
     triangulate,
 )
-from factors.camera.model import CameraModel, mounting, predict
+from factors.camera.model import CameraModel, predict
 from factors.se2 import Array
 
-MODEL = CameraModel(
-    500.0,
-    510.0,
-    319.5,
-    239.5,
-    640,
-    480,
-    distortion=(-0.1, 0.02, 0.001, -0.002),
-    position=np.array((0.2, -0.05, 0.8)),
-    rotation=mounting(0.02, -0.1, 0.3),
-    sigma=0.7,
-)
 POINT = np.array((5.0, 2.5, 1.4))
 
 
