@@ -27,9 +27,9 @@ from factorgraph_loc.fusion.search import Search, laplace_evidence
 from factorgraph_loc.fusion.variables import Node
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation, Sensor
-from factors import se2
+from factors import se2_kernels
 from factors.graph import VectorPriorFactor
-from factors.motion import Increment, propagate
+from factors.motion import Increment
 from factors.se2 import Array
 
 ITERATIONS_OF_GUESS = 1
@@ -200,7 +200,7 @@ class Builder:
                 continue
             evidence = partial(laplace_evidence, here, *view.guess, correction)
             self._waiting.append(seen)
-            graph.pose = se2.compose(view.pose, se2.exp(correction.delta[:3]))
+            graph.pose = se2_kernels.moved(view.pose, correction.delta)
             graph.covariance = correction.covariance
             view.guess = graph.pose, graph.covariance
             self._backend.refine(graph.newest, view.guess)
@@ -209,10 +209,8 @@ class Builder:
     def _add_keyframe(self, t: float, m: Measurement | None) -> None:
         graph = self._graph
         newest, odometry = graph.newest, graph.motion.state(t)
-        increment = graph.motion.relative(newest.odometry, odometry)
-        moved = graph.recalibrated(increment)
-        keyframe = Keyframe(newest.index + 1, t, odometry, increment)
-        guess: Guess | None = (se2.compose(graph.pose, moved.delta), propagate(graph.covariance, moved))
+        keyframe = Keyframe(newest.index + 1, t, odometry, graph.motion.relative(newest.odometry, odometry))
+        guess: Guess | None = graph.moved(t)[:2]
         addition = Addition(self.gather())
         graph.append(keyframe)
         if m is not None:
@@ -257,8 +255,7 @@ class Builder:
             if guess is not None:
                 self._search.expect(sensor, here, odometry, view)
                 self._search.keep(sensor, here, odometry, partial(laplace_evidence, here, *view.guess, correction))
-                pose = se2.compose(view.pose, se2.exp(correction.delta[:3]))
-                view.guess = pose, correction.covariance[:3, :3]
+                view.guess = se2_kernels.moved(view.pose, correction.delta), correction.covariance[:3, :3]
         if guess is None:
             return None
         guess = view.guess

@@ -18,7 +18,7 @@ from factorgraph_loc.fusion.graph import Graph
 from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe, SmootherSettings
 from factorgraph_loc.fusion.kept import Kept
 from factorgraph_loc.fusion.marginals import IndeterminateError, covariances
-from factorgraph_loc.fusion.solvers import MARGIN, FullHistory, Solver, Window, read_all
+from factorgraph_loc.fusion.solvers import MARGIN, WITH_POINTS, FullHistory, Solver, Window, read_all
 from factorgraph_loc.fusion.stalled import Stalled
 from factorgraph_loc.fusion.summary import MarginalSummary, is_missing
 from factorgraph_loc.fusion.variables import (
@@ -51,6 +51,7 @@ class Incremental:
         self._graph, self._settings = graph, settings
         self._waits = settings.landmarks != "known"  # what is seen between keyframes: an update takes long then
         self._maps = any(mapper.estimates for mapper in graph.mappers)
+        self._margin = WITH_POINTS if self._maps else MARGIN
         # whether the final trajectory is that of the whole problem; and the length of the window, None where all is in the solver
         self._is_whole = settings.lag is None or settings.lag == math.inf
         self._lag = None if settings.lag == math.inf else settings.lag
@@ -254,11 +255,13 @@ class Incremental:
         if not isinstance(self._solver, Window) or self._lag is None:
             return
         lag, count = self._lag, len(self._left)
-        if self._graph.keyframes[count].t >= now - lag - MARGIN:
+        if self._graph.keyframes[count].t >= now - lag - self._margin:
             return
         end = count
         while self._graph.keyframes[end].t < now - lag:
             end += 1
+        if not self._maps:
+            self._solver.release(lag)
         leaving = self._graph.keyframes[count:end]
         try:
             # of a start of the whole problem the covariance is not asked; a window with points takes long to eliminate
@@ -352,7 +355,7 @@ class Incremental:
         guesses |= {key: value for key, value in near.items() if key in guesses}
         self._graph.drop_astray(keyframes[1:], guesses)
         if summary is not None:  # what is marginalised is linearised there, and fits to nothing else
-            guesses |= read_all(summary.at, guesses)
+            guesses |= {key: value for key, value in summary.at.items() if key in guesses}
         factors = self._priors() if summary is None else summary.on(guesses)
         nodes = [n for k in keyframes for n in k.nodes if is_missing(n, guesses, known)]
         if near and isinstance(self._solver, FullHistory):
@@ -375,7 +378,7 @@ class Incremental:
     def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
         """The time of each variable of a window that begins; points are as if they were seen now."""
         now = keyframes[-1].t
-        oldest = -math.inf if self._lag is None else now - self._lag - MARGIN
+        oldest = -math.inf if self._lag is None else now - self._lag - self._margin
         stamps = {key: now if key in self._graph.values else oldest for key in values}
         return stamps | {key: k.t for k in keyframes for key in (k.key, tilt_key(k.index)) if key in values}
 
@@ -396,4 +399,5 @@ class Incremental:
             return FullHistory(parameters, threshold)
         parameters.findUnusedFactorSlots = True
         threshold = min(threshold, NEAR_POINTS) if self._maps else threshold
-        return Window(parameters, threshold, self._lag, self._failed.append)
+        # with points each pose leaves by itself: a window that is built anew soon linearises what it knew where it knew it
+        return Window(parameters, threshold, self._lag + self._margin if self._maps else math.inf, self._failed.append)

@@ -9,6 +9,7 @@ Research 29(5), 2010).
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol, cast
@@ -31,7 +32,9 @@ from factorgraph_loc.fusion.variables import (
 from factors.graph import jacobian_factor, pose_array, silenced
 from factors.se2 import Array
 
-MARGIN = 1.0  # s that a pose stays longer in a window
+_State = tuple[gtsam.NonlinearFactorGraph, Values, frozenset[int]]
+# s that a pose may stay longer in a window, so that several are read at a time; less with points, which make it large
+MARGIN, WITH_POINTS = 2.0, 1.0
 
 
 class Solver(Protocol):
@@ -115,25 +118,31 @@ class FullHistory:
 
 
 class Window:
-    """Poses older than ``lag``, and a margin so that they can be read several at a time, are marginalised out."""
+    """Poses older than ``lag`` are marginalised out; where that is infinite, only with an update after :meth:`release`. An update
+    with which nothing leaves takes less time: iSAM2 then puts the newest pose at the root of its tree."""
 
     def __init__(
         self, parameters: gtsam.ISAM2Params, threshold: float, lag: float, on_failure: Callable[[str], None]
     ) -> None:
         parameters.setRelinearizeThreshold(threshold)
-        self._lag = lag + MARGIN
-        self._smoother = gtsam.IncrementalFixedLagSmoother(self._lag, parameters)
+        self._lag = lag
+        self._smoother = gtsam.IncrementalFixedLagSmoother(lag, parameters)
         self._ours = _Ours(threshold, parameters.relinearizeSkip, on_failure)
         self._stamps: dict[int, float] = {}  # of the variables in the window
-        # before the last update: all factors, where they were linearised, and which of them are ours
-        self._before = gtsam.NonlinearFactorGraph(), gtsam.Values(), frozenset[int]()
+        # before the last update: all factors, where the variables were linearised, and which factors are ours
+        self._before: _State = gtsam.NonlinearFactorGraph(), {}, frozenset()
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
         stamps: dict[int, float] = dict.fromkeys(values, t)
         # what is constant never leaves the window, points do when they are seen no more
-        stamps |= dict.fromkeys((key for key in self._stamps if is_constant(key)), t)
+        if self._smoother.smootherLag() < math.inf:
+            stamps |= dict.fromkeys((key for key in self._stamps if is_constant(key)), t)
         stamps |= dict.fromkeys((key for node in nodes for key in node.keys if is_point(key)), t)
         self.begin((), nodes, values, stamps)
+
+    def release(self, lag: float) -> None:
+        """Poses older than ``lag`` leave with the next update."""
+        self._smoother.setSmootherLag(lag)
 
     def begin(
         self,
@@ -148,7 +157,11 @@ class Window:
             self._smoother.update(graph, to_gtsam(values), cast("Mapping[Any, Any]", stamps), removed)
             self._ours.place(self._smoother.getISAM2Result().getNewFactorsIndices())
         self._stamps |= stamps
-        oldest = max(self._stamps.values()) - self._lag
+        lag = self._smoother.smootherLag()
+        if lag == math.inf:
+            return
+        self._smoother.setSmootherLag(self._lag)
+        oldest = max(self._stamps.values()) - lag
         for key in [key for key, t in self._stamps.items() if t < oldest]:
             del self._stamps[key]
             self._ours.forget(key)
@@ -190,10 +203,9 @@ class Window:
         graph, at, ours = self._before if failed else self._state()
         return MarginalSummary.of(graph, at, ours) if graph.size() else None
 
-    def _state(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, frozenset[int]]:
+    def _state(self) -> _State:
         """A copy of what the solver has, which changes in place."""
-        graph, at = self._smoother.getFactors(), self._smoother.getLinearizationPoint()
-        return gtsam.NonlinearFactorGraph(graph), gtsam.Values(at), self._ours.slots
+        return gtsam.NonlinearFactorGraph(self._smoother.getFactors()), dict(self._ours.at), self._ours.slots
 
 
 class _Ours:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import gtsam
 
-from factorgraph_loc.fusion.variables import Node, index_of, is_of_keyframe, is_pose
+from factorgraph_loc.fusion.variables import Node, Values, index_of, is_of_keyframe, is_pose, to_gtsam
 
 KINDS = (gtsam.LinearContainerFactor, gtsam.PriorFactorPose2, gtsam.PriorFactorVector)
 
@@ -24,19 +24,20 @@ def oldest_pose(keys: Iterable[int]) -> int:
 
 @dataclass(frozen=True)
 class MarginalSummary:
-    """``factors``: marginal ones, and priors; ``keys`` of all variables of the graph; ``at``: where the graph is linearised."""
+    """``factors``: marginal ones, and priors; ``keys`` of all variables of the graph; ``at``: where each is linearised."""
 
     factors: tuple[gtsam.NonlinearFactor, ...]
     keys: frozenset[int]
-    at: gtsam.Values
+    at: Values
 
     @classmethod
-    def of(cls, graph: gtsam.NonlinearFactorGraph, at: gtsam.Values, ours: Collection[int] = ()) -> MarginalSummary:
+    def of(cls, graph: gtsam.NonlinearFactorGraph, at: Values, ours: Collection[int] = ()) -> MarginalSummary:
         """Of a graph that is linearised ``at`` there. ``ours``: places of factors of our own, which are not marginal ones."""
         every = (graph.at(i) for i in range(graph.size()) if i not in ours)
+        there = to_gtsam(at)
         kept = tuple(
             # iSAM2 never moves what a marginal factor is on, and so gives it no place: elsewhere it needs one
-            gtsam.LinearContainerFactor(f.factor(), at) if isinstance(f, gtsam.LinearContainerFactor) else f
+            gtsam.LinearContainerFactor(f.factor(), there) if isinstance(f, gtsam.LinearContainerFactor) else f
             for f in every
             if isinstance(f, KINDS)
         )
@@ -50,20 +51,17 @@ class MarginalSummary:
     def before(self, pose: int) -> MarginalSummary:
         """What is left once the poses from the index ``pose`` on are taken back: others come under their keys."""
         kept = frozenset(key for key in self.keys if not is_of_keyframe(key) or index_of(key) < pose)
-        at = gtsam.Values(self.at)
-        for key in self.keys - kept:
-            at.erase(key)
-        return MarginalSummary(tuple(self.on(kept)), kept, at)
+        return MarginalSummary(tuple(self.on(kept)), kept, {key: self.at[key] for key in kept})
 
     def on(self, present: Collection[int]) -> list[gtsam.NonlinearFactor]:
         """The factors on variables that are ``present``, with all that those on others tell of these."""
         kept: list[gtsam.NonlinearFactor] = []
-        linear, gone = gtsam.GaussianFactorGraph(), set[int]()
+        linear, gone, at = gtsam.GaussianFactorGraph(), set[int](), to_gtsam(self.at)
         for factor in self.factors:
             absent = [key for key in factor.keys() if key not in present]  # noqa: SIM118
             gone.update(absent)
             if absent:
-                linear.add(factor.linearize(self.at))
+                linear.add(factor.linearize(at))
             else:
                 kept.append(factor)
         if gone:
@@ -71,7 +69,7 @@ class MarginalSummary:
             for key in sorted(gone):
                 order.push_back(key)
             _, rest = linear.eliminatePartialMultifrontal(order)
-            kept += [gtsam.LinearContainerFactor(rest.at(i), self.at) for i in range(rest.size())]
+            kept += [gtsam.LinearContainerFactor(rest.at(i), at) for i in range(rest.size())]
         return kept
 
 
