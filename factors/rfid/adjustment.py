@@ -10,6 +10,8 @@ which for a beam is another ``r_max`` (with its ``s_r`` in proportion) and anoth
 (2 M,): ``a`` and ``b`` of the first model, then of the second. With zeros the model is as it was.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,17 +24,37 @@ PARAMETERS = ("range_scale", "read_rate")  # of each model
 MOST_CERTAIN = 0.99  # a larger peak is taken for this: it would leave the rate nothing to change
 
 
-def rates(peak: Array, shift: Array) -> Array:
-    """The factor of the probabilities of models with largest probabilities ``peak``, whose logits shift by ``shift``; they
-    broadcast."""
-    certain = np.minimum(peak, MOST_CERTAIN)
-    return np.asarray(1.0 / (certain + (1.0 - certain) * np.exp(-shift)))
+@compiled
+def rate_of(peak: float, shift: float) -> float:
+    """The factor of the probabilities of a model with largest probability ``peak``, whose logit shifts by ``shift``."""
+    certain = min(peak, MOST_CERTAIN)
+    return float(1.0 / (certain + (1.0 - certain) * math.exp(-shift)))
 
 
+@compiled
 def adjusted(packed: Packed, parameters: Array) -> Packed:
     """A model (as it was packed first) with these parameters (2 M,)."""
-    scale = np.exp(parameters[0::2])
-    return packed._replace(scale=scale, reach=packed.reach * scale, rate=rates(packed.peak, parameters[1::2]))
+    models = len(packed.reach)
+    scale, reach, rate = np.empty(models), np.empty(models), np.empty(models)
+    for m in range(models):
+        scale[m] = math.exp(parameters[2 * m])
+        reach[m] = packed.reach[m] * scale[m]
+        rate[m] = rate_of(packed.peak[m], parameters[2 * m + 1])
+    return Packed(
+        packed.antennas,
+        packed.which,
+        packed.kinds,
+        packed.parameters,
+        packed.shapes,
+        packed.knots,
+        reach,
+        packed.false_read,
+        packed.span,
+        scale,
+        rate,
+        packed.peak,
+        packed.walls,
+    )
 
 
 @compiled(error_model="numpy", fastmath=FAST)

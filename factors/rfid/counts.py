@@ -46,6 +46,11 @@ class TagReadCounts:
         return self.offsets, self.antennas, self.rounds, self.hits, self.odds, self.elsewhere
 
     @property
+    def seen(self) -> tuple[Array, Integers, Integers, Integers, Array, Array, Integers, float]:
+        """The arrays, the places in the map that are listed, and the odds of the others."""
+        return (*self.arrays, self.listed, self.others)
+
+    @property
     def listed(self) -> Integers:
         """Places (C,) in the map of the tags that are listed."""
         return np.arange(self.hits.shape[1]) if self.tags is None else self.tags
@@ -63,12 +68,12 @@ class TagReadCounts:
         """The same with ``tags`` listed, ascending, which are among them all that are listed now."""
         if self.tags is None or len(tags) == len(self.tags):
             return self
-        hits, odds, elsewhere = _listing(self.tags, self.hits, self.odds, self.elsewhere, self.others, tags)
+        hits, odds, elsewhere = listing(self.tags, self.hits, self.odds, self.elsewhere, self.others, tags)
         return replace(self, hits=hits, odds=odds, elsewhere=elsewhere, tags=tags)
 
     def hits_of(self, tags: Integers) -> Integers:
         """The number of rounds (K, U) that read each of ``tags`` (U,), ascending."""
-        return _listing(self.listed, self.hits, self.odds, self.elsewhere, self.others, tags)[0]
+        return listing(self.listed, self.hits, self.odds, self.elsewhere, self.others, tags)[0]
 
     def with_odds(self, odds: Array) -> TagReadCounts:
         """The same with log-odds ``odds`` (T,) of all tags of the map."""
@@ -119,7 +124,7 @@ def union(some: Integers, others: Integers) -> Integers:
 
 
 @compiled
-def _listing(
+def listing(
     listed: Integers, hits: Integers, odds: Array, elsewhere: Array, others: float, tags: Integers
 ) -> tuple[Integers, Array, Array]:
     """Hits, odds and elsewhere of ``tags``, of which not all are listed, nor all that are listed among them."""

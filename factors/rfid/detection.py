@@ -10,7 +10,7 @@ lost by the unknown state (Louis, JRSS B 44(2), 1982, eq. 3.2').
 from __future__ import annotations
 
 import copy
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -18,14 +18,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import se2
-from factors.compiled import compiled
-from factors.rfid import adjustment, weighing
+from factors.rfid import adjustment, near, weighing
 from factors.rfid import kernels as rfid_kernels
-from factors.rfid.counts import TagReadCounts, union
-from factors.rfid.index import Corner, TagIndex, near, tag_index, within
-from factors.rfid.kernels import terms
-from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed, RfidModel
+from factors.rfid.counts import TagReadCounts
+from factors.rfid.index import tag_index
+from factors.rfid.model import Packed, RfidModel
+from factors.rfid.near import MapTags
 from factors.rfid.places import Places, in_reach
 from factors.rfid.tables import Tables, make_tables
 from factors.se2 import Array, Integers
@@ -33,7 +31,6 @@ from factors.walls import NO_WALLS, walls_around
 
 ROUNDING = 0.02, 0.05  # of the parameters of a detection model, in tables of places
 KEPT = 3  # such tables, those of the rig among them
-SPARE = 0.5  # m: tags are looked up in a box on a grid of this size, which neighbouring poses share
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,21 +62,14 @@ class Score(NamedTuple):
     variance: Array
 
 
-class NearTags(NamedTuple):
-    """Tags that matter to some poses: the ``looks`` at them, and as ``arrays`` points, normals, and those of the looks;
-    ``unlisted``: negative log-likelihood, its mean and variance, not tempered, of all others together."""
+class ExpectedReads(NamedTuple):
+    """Of C tags, by their places in the map, and K looks: the ``hits``, the probability ``p`` of a read, and the ``distance`` [m]
+    in the plane from the antenna, (K, C) each."""
 
-    looks: TagReadCounts
-    arrays: tuple[Array, Array, Array, Integers, Integers, Integers, Array, Array]
-    unlisted: tuple[float, float, float]
-
-
-class _Last(NamedTuple):
-    """The tags that mattered last, in a box."""
-
-    looks: TagReadCounts
-    box: tuple[Corner, Corner]
-    near: NearTags
+    tags: Integers
+    hits: Integers
+    p: Array
+    distance: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +84,6 @@ class RfidLikelihood:
     packed: Packed = field(init=False, repr=False)
     parameters: Array = field(init=False, repr=False)
     _unadjusted: RfidLikelihood = field(init=False, repr=False)
-    _last: list[_Last] = field(init=False, repr=False, default_factory=list)
     _of_parameters: dict[tuple[float, ...], Places] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -122,55 +111,36 @@ class RfidLikelihood:
         for name in ("_tables", "_places"):
             getattr(self._unadjusted, name)
 
-    def joint_score(self, pose: Array, parameters: Array, looks: TagReadCounts) -> Score:
-        """Likelihood, gradient (1, 3 + 2 M) and information (1, 3 + 2 M, 3 + 2 M) at one pose (3,), by its body-frame perturbation
-        and the ``parameters`` (2 M,) of the detection models."""
-        size = 3 + len(parameters)
-        gradient, information = np.empty(size), np.empty((size, size))
-        packed, pose = adjustment.adjusted(self._unadjusted.packed, parameters), np.asarray(pose, dtype=float)
-        near = self.around(pose[None], looks, packed)
-        told = adjustment.score(packed, pose, *near.arrays, self.model.tempering, gradient, information)
-        others = self.model.tempering * np.array(near.unlisted)
-        nll, expected, variance = (np.array([a + b]) for a, b in zip(told, others, strict=True))
-        return Score(nll, gradient[None], information[None], expected, variance)
+    @property
+    def arrays(self) -> tuple[Packed, MapTags]:
+        """The models without adjustment and the map, for compiled code."""
+        return self._unadjusted.packed, self._unadjusted._map
+
+    def joint_score(
+        self, pose: Array, parameters: Array, looks: TagReadCounts, estimated: Sequence[int] | None = None
+    ) -> Score:
+        """Likelihood, gradient (1, 3 + P) and information (1, 3 + P, 3 + P) at one pose (3,), by its body-frame perturbation and
+        those of the ``parameters`` (2 M,) of the detection models that are ``estimated`` (P,), by default all."""
+        places = np.array(range(len(parameters)) if estimated is None else estimated, dtype=np.int64)
+        pose, alpha = np.ascontiguousarray(pose, dtype=float), float(self.model.tempering)
+        nll, gradient, information, *told = near.score(*self.arrays, looks.seen, alpha, pose, parameters, places)
+        expected, variance = (np.array([value]) for value in told)
+        return Score(np.array([nll]), gradient[None], information[None], expected, variance)
 
     def score(self, poses: Array, looks: TagReadCounts) -> Score:
         """Likelihood, gradient and information at poses (N, 3)."""
         poses = np.ascontiguousarray(np.atleast_2d(poses), dtype=float)
-        n = len(poses)
-        out = Score(np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n), np.empty(n))
-        near = self.around(poses, looks, self.packed)
-        rfid_kernels.score(self.packed, poses, *near.arrays, self.model.tempering, *out)
-        nll, expected, variance = self.model.tempering * np.array(near.unlisted)
-        return out._replace(nll=out.nll + nll, expected=out.expected + expected, variance=out.variance + variance)
+        return Score(*near.scores(self.packed, self.arrays[1], looks.seen, float(self.model.tempering), poses))
 
-    def around(self, poses: Array, looks: TagReadCounts, packed: Packed, margin: float = 0.0) -> NearTags:
-        """The tags that are in reach of poses (N, 3), or of others within a ``margin`` [m] of these, and those that are listed."""
-        if looks.tags is None:
-            return NearTags(looks, (self.tags.points, self.tags.normals, *looks.arrays), (0.0, 0.0, 0.0))
-        # on a grid, so that the same tags count whatever was looked at before: to the last bit, sums depend on them
-        box = _box(poses, margin + _reach(packed, looks.offsets, looks.antennas))
-        last = self._unadjusted._last
-        if last and last[0].looks is looks and last[0].box == box:
-            return last[0].near
-        tags = union(within(self._unadjusted._index, *box), looks.tags)
-        listed = looks.listing(tags)
-        of_tags = self.tags.points[tags], self.tags.normals[tags]
-        count = len(self.tags.points) - len(tags)
-        nll, _, _, mean, spread = terms(packed, NEGLIGIBLE_LOGIT, 1.0, 0, int(looks.rounds.sum()))
-        found = NearTags(listed, (*of_tags, *listed.arrays), (count * nll, count * mean, count * spread))
-        last[:] = [_Last(looks, box, found)]
-        return found
-
-    def displaced(self, poses: Array, looks: TagReadCounts, tags: NDArray[np.int64], shifts: Array) -> Array:
-        """Tempered log-likelihood (U, K) of what was seen of U ``tags`` if each were ``shifts`` (K, 2) from where the map has it,
-        relative to a silence out of reach: the mean of the likelihood over poses (N, 3)."""
-        found = np.empty((len(tags), len(shifts)))
-        of_tags = self._of_tags(tags, looks.hits_of(tags))
-        weighing.displaced(
-            *self._tabled, poses, looks.arrays[:3], of_tags, shifts, self.model.tempering, self.parameters[None], found
-        )
-        return found
+    def displaced(
+        self, poses: Array, looks: TagReadCounts, shifts: Array, margin: float, parameters: Array, odds: Array
+    ) -> tuple[Integers, Array, NDArray[np.bool_]]:
+        """The tags (U,) within a ``margin`` [m] of the reach from any of the poses (N, 3), or read, whose ``odds`` (T,) are not
+        ``-inf``; the tempered log-likelihood (U, K) of what was seen of each if it were ``shifts`` (K, 2) from where the map has
+        it, relative to a silence out of reach: the mean of the likelihood over the poses; and which of them were read.
+        ``parameters`` (2 M,): of the detection models."""
+        alpha = float(self.model.tempering)
+        return weighing.displaced(*self._tabled, looks.seen, poses, margin, odds, shifts, alpha, parameters)
 
     def log_likelihood(self, poses: Array, looks: TagReadCounts, parameters: Array | None = None) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.weighing`, :mod:`factors.rfid.anywhere`):
@@ -182,40 +152,16 @@ class RfidLikelihood:
         if parameters is None and not looks.offsets.any() and self._places.is_wide(poses):
             return self._places.log_likelihood(poses, looks, self.model.tempering)
         parameters = self.parameters[None] if parameters is None else np.ascontiguousarray(parameters)
-        packed = self._unadjusted.packed
-        largest = float(np.exp(parameters[:, 0::2].max(initial=0.0)))
-        around = self.around(poses, looks, packed._replace(reach=largest * packed.reach))
-        near = around.looks
-        silence = terms(packed, NEGLIGIBLE_LOGIT, 1.0, 0, int(looks.rounds.sum()))[0]
-        out = np.full(len(poses), -self.model.tempering * len(self.tags.points) * silence)
-        of_tags = self._of_tags(near.listed, near.hits)
-        states = near.odds, near.elsewhere
-        weighing.add_log_likelihood(
-            *self._tabled, poses, near.arrays[:3], of_tags, states, self.model.tempering, parameters, out
-        )
-        return out
+        return weighing.log_likelihood(*self._tabled, looks.seen, poses, float(self.model.tempering), parameters)
 
     @property
-    def _tabled(self) -> tuple[Packed, Tables]:
-        return self._unadjusted.packed, self._unadjusted._tables
-
-    def _of_tags(self, tags: Integers, hits: Integers) -> tuple[Array, Array, Integers, Integers]:
-        """Points, normals, tables and ``hits`` (K, U) of U ``tags``."""
-        return (
-            self.tags.points[tags],
-            self.tags.normals[tags],
-            np.take(self._unadjusted._tables.level, tags, axis=1),
-            hits,
-        )
-
-    def reachable(self, poses: Array, looks: TagReadCounts, margin: float) -> NDArray[np.int64]:
-        """Places in the map, ascending, of the tags within a ``margin`` [m] of the reach of an antenna from any of the poses."""
-        reach = margin + _reach(self.packed, looks.offsets, looks.antennas)
-        return near(self._unadjusted._index, self.tags.points, poses, reach)
+    def _tabled(self) -> tuple[Packed, Tables, MapTags]:
+        return self._unadjusted.packed, self._unadjusted._tables, self._unadjusted._map
 
     @cached_property
-    def _index(self) -> TagIndex:
-        return tag_index(self.tags.points)
+    def _map(self) -> MapTags:
+        points = np.ascontiguousarray(self.tags.points, dtype=float)
+        return MapTags(tag_index(points), points, np.ascontiguousarray(self.tags.normals))
 
     @cached_property
     def _tables(self) -> Tables:
@@ -256,22 +202,10 @@ class RfidLikelihood:
         alpha = self.model.tempering
         return alpha * nll, alpha * gradient, alpha * information
 
-    def expected(self, pose: Array, looks: TagReadCounts) -> tuple[TagReadCounts, Array]:
-        """The looks at the tags that are in reach of a pose (3,) or listed, and the probability (K, C) of a read in each."""
-        near = self.around(pose[None], looks, self.packed)
-        out = np.empty(near.looks.hits.shape)
-        for k, antenna in enumerate(looks.antennas.tolist()):
-            at = se2.compose(pose, looks.offsets[k])[None]
-            rfid_kernels.probabilities(self.packed, antenna, at, *near.arrays[:2], out[k : k + 1])
-        return near.looks, out
-
-    def distances(self, pose: Array, looks: TagReadCounts) -> Array:
-        """How far [m] the listed tags are from the antenna of each look, in the plane, (K, C), at a pose (3,)."""
-        antennas = se2.compose(
-            se2.compose(pose, looks.offsets), self.packed.antennas[looks.antennas, :3] * (1.0, 1.0, 0.0)
-        )
-        away = self.tags.points[looks.listed, :2] - antennas[:, None, :2]
-        return np.asarray(np.hypot(away[..., 0], away[..., 1]))
+    def expected(self, pose: Array, looks: TagReadCounts, parameters: Array) -> ExpectedReads:
+        """What was seen from a pose (3,) of the tags that are in reach of it or listed, and what is expected with ``parameters``
+        (2 M,) of the detection models."""
+        return ExpectedReads(*near.predicted(*self.arrays, looks.seen, pose, parameters))
 
     def probabilities(self, poses: Array, antenna: int) -> Array:
         """Probability (N, T), floor included, that a round of an antenna reads each tag from poses (N, 3)."""
@@ -279,24 +213,3 @@ class RfidLikelihood:
         poses = np.ascontiguousarray(poses, dtype=float)
         rfid_kernels.probabilities(self.packed, antenna, poses, self.tags.points, self.tags.normals, out)
         return out
-
-
-@compiled
-def _reach(packed: Packed, offsets: Array, antennas: Integers) -> float:
-    """How far [m] the antennas reach at most from the pose that looks (K,) are relative to."""
-    way = farthest = 0.0
-    for k in range(len(antennas)):
-        way = max(way, math.hypot(offsets[k, 0], offsets[k, 1]))
-    for a in range(len(packed.which)):
-        lever = math.hypot(packed.antennas[a, 0], packed.antennas[a, 1])
-        farthest = max(farthest, packed.reach[packed.which[a]] + lever)
-    return way + farthest
-
-
-@compiled
-def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
-    """The corners of the box that holds what is within ``reach`` [m] of poses (N, 3), on the grid."""
-    low_x, low_y = poses[:, 0].min() - reach, poses[:, 1].min() - reach
-    high_x, high_y = poses[:, 0].max() + reach, poses[:, 1].max() + reach
-    low = SPARE * math.floor(low_x / SPARE), SPARE * math.floor(low_y / SPARE)
-    return low, (SPARE * math.ceil(high_x / SPARE), SPARE * math.ceil(high_y / SPARE))

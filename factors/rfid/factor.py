@@ -72,9 +72,7 @@ class RfidFactor:
             return self.score(values[0])
         assert isinstance(self.likelihood, RfidLikelihood)
         assert isinstance(self.seen, TagReadCounts)
-        found = self.likelihood.joint_score(values[0], self._parameters(values[1]), self.seen)
-        kept = [0, 1, 2, *(3 + i for i in self.estimated)]
-        return found._replace(gradient=found.gradient[:, kept], information=found.information[:, kept][:, :, kept])
+        return self.likelihood.joint_score(values[0], self._parameters(values[1]), self.seen, self.estimated)
 
     def score(self, pose: Array) -> TagScore:
         """The score of one pose (3,); every field has a leading axis of length 1."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -70,18 +69,3 @@ def within(index: TagIndex, low: Array | Corner, high: Array | Corner) -> NDArra
                 count += 1
     out.sort()
     return out
-
-
-@compiled
-def near(index: TagIndex, points: Array, poses: Array, reach: float) -> NDArray[np.int64]:
-    """Places, ascending, of the tags at ``points`` (T, 3) within ``reach`` [m] of the box that holds poses (N, 3)."""
-    low_x, high_x, low_y, high_y = poses[:, 0].min(), poses[:, 0].max(), poses[:, 1].min(), poses[:, 1].max()
-    tags = within(index, (low_x - reach, low_y - reach), (high_x + reach, high_y + reach))
-    count = 0
-    for t in tags:
-        x, y = points[t, 0], points[t, 1]
-        dx, dy = max(low_x - x, 0.0, x - high_x), max(low_y - y, 0.0, y - high_y)
-        if math.sqrt(dx * dx + dy * dy) < reach:
-            tags[count] = t
-            count += 1
-    return tags[:count]

@@ -26,6 +26,7 @@ from factors.se2 import Array, Integers
 
 KEPT = 200.0  # s of evidence that can be taken back
 BELIEVED = 0.5  # probability above which a tag is believed to be dead, or moved
+LIMIT = math.log(BELIEVED / (1.0 - BELIEVED))
 PITCH, FARTHEST = 0.5, 1.5  # m: of the grid of displacements, and the largest of them
 DEAD = 1  # column of the weights: as surveyed, dead, and moved to each place
 
@@ -47,24 +48,23 @@ class TagStates:
     log-odds of both."""
 
     def __init__(self, count: int, dead: float, moved: float) -> None:
-        self.shifts = displacements()
-        each = _log(moved / len(self.shifts))
-        prior = np.array((math.log(1.0 - dead - moved), _log(dead), *(each for _ in self.shifts)))
+        moves = displacements()
+        # of a tag as surveyed, then of moved ones
+        self.places = np.concatenate((np.zeros((1, 2)), moves))
+        each = _log(moved / len(moves))
+        prior = np.array((math.log(1.0 - dead - moved), _log(dead), *(each for _ in moves)))
         self._weights = np.tile(prior, (count, 1))  # logarithms, not normalised
         self.prior = float(_log(dead + moved) - prior[0])
         self._odds = np.full(count, self.prior)
+        self._doubtful: Integers | None = None  # not known
         # time, tags, and what they told of each state
         self._told: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
         self._heard = -math.inf
 
     @property
     def odds(self) -> Array:
-        """Log-odds (T,) of dead or moved against as surveyed."""
-        return self._odds.copy()
-
-    def odds_of(self, tags: Integers) -> Array:
-        """Those (U,) of U ``tags``."""
-        return np.asarray(self._odds[tags])
+        """Log-odds (T,) of dead or moved against as surveyed, which change with what is learnt."""
+        return self._odds
 
     @property
     def heard(self) -> float:
@@ -73,8 +73,10 @@ class TagStates:
 
     @property
     def doubtful(self) -> Integers:
-        """The tags that are dead or moved with a probability above :data:`BELIEVED`."""
-        return np.flatnonzero(self._odds > math.log(BELIEVED / (1.0 - BELIEVED)))
+        """The tags that are dead or moved with a probability above :data:`BELIEVED`, ascending."""
+        if self._doubtful is None:
+            self._doubtful = np.flatnonzero(self._odds > LIMIT)
+        return self._doubtful
 
     @property
     def suspects(self) -> dict[int, float]:
@@ -93,7 +95,7 @@ class TagStates:
     def hear(self, t: float, tags: Integers) -> None:
         """Tags (R,) were read at ``t``: they are not dead."""
         if len(tags):
-            _hear(self._weights, self._odds, tags)
+            self._changed(_hear(self._weights, self._odds, tags))
             self._heard = max(self._heard, t)
 
     def expect(self, tags: Integers, told: Array) -> Array:
@@ -105,7 +107,7 @@ class TagStates:
         """Take what was ``told`` (U, 1 + K) of U ``tags`` at ``t``, see :meth:`expect`."""
         if len(tags):
             self._told.append((t, tags, told.astype(np.float32)))
-            _learn(self._weights, self._odds, tags, self._told[-1][2], 1.0)
+            self._changed(_learn(self._weights, self._odds, tags, self._told[-1][2], 1.0))
         while self._told and self._told[0][0] < t - KEPT:
             self._told.popleft()
 
@@ -117,8 +119,13 @@ class TagStates:
             if row[0] < since:
                 kept.append(row)
             else:
-                _learn(self._weights, self._odds, row[1], row[2], -1.0)
+                self._changed(_learn(self._weights, self._odds, row[1], row[2], -1.0))
         self._told = kept
+
+    def _changed(self, doubtful: bool) -> None:
+        """Which tags are doubtful has changed, or not."""
+        if doubtful:
+            self._doubtful = None
 
 
 @compiled
@@ -157,22 +164,29 @@ def _expected(weights: Array, tags: Integers, told: Array) -> Array:
 
 
 @compiled
-def _hear(weights: Array, odds: Array, tags: Integers) -> None:
-    """That ``tags`` are not dead."""
+def _hear(weights: Array, odds: Array, tags: Integers) -> bool:
+    """That ``tags`` are not dead; whether others are doubtful now."""
+    changed = False
     for t in tags:
         if weights[t, DEAD] > -np.inf:
             weights[t, DEAD] = -np.inf
-            odds[t] = _odds(weights[t])
+            before, odds[t] = odds[t], _odds(weights[t])
+            changed |= (before > LIMIT) != (odds[t] > LIMIT)
+    return changed
 
 
 @compiled
-def _learn(weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32], sign: float) -> None:
+def _learn(weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32], sign: float) -> bool:
+    """Add what was ``told``; whether others are doubtful now."""
+    changed = False
     for u in range(len(tags)):
-        of_tag = weights[tags[u]]
+        of_tag, before = weights[tags[u]], odds[tags[u]]
         of_tag[0] += sign * told[u, 0]
         for k in range(1, told.shape[1]):
             of_tag[DEAD + k] += sign * told[u, k]
         odds[tags[u]] = _odds(of_tag)
+        changed |= (before > LIMIT) != (odds[tags[u]] > LIMIT)
+    return changed
 
 
 @compiled

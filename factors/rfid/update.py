@@ -10,16 +10,14 @@ import numpy as np
 from factors import positive, se2, se2_kernels
 from factors.compiled import compiled
 from factors.odometry.kernels import FAR, ROUNDING
-from factors.rfid import kernels as rfid_kernels
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood, Score
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Packed
+from factors.rfid.near import MapTags, Seen, score
 from factors.se2 import Array, Integers
 from factors.small_kernels import inverse, product, solved
 
-_Tags = tuple[Array, Array]  # points and normals
-_Seen = tuple[Array, Integers, Integers, Integers, Array, Array]  # offsets, antennas, rounds, hits, odds and elsewhere
 CONVERGED = 0.1  # of a standard deviation: a step of an update that is not worth another
 NOTHING = np.zeros(0)
 LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: how far a step may go before the likelihood is looked at again
@@ -66,26 +64,22 @@ def updated(
     """
     pose, covariance = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
     likelihood, looks = factor.likelihood, factor.seen
-    if factor.estimated or not isinstance(likelihood, RfidLikelihood) or not isinstance(looks, TagReadCounts):
-        return scored_update(factor, pose, values, covariance, iterations)
-    farthest = iterations * float(np.hypot(*LARGEST_STEP[:2]))
-    near = likelihood.around(pose[None], looks, likelihood.packed, farthest)
-    arguments = (likelihood.packed, near.arrays[:2], near.arrays[2:], float(likelihood.model.tempering))
+    if not isinstance(likelihood, RfidLikelihood) or not isinstance(looks, TagReadCounts):
+        return scored_update(factor, pose, covariance, iterations)
+    estimated = np.array(factor.estimated, dtype=np.int64)
+    problem = (*likelihood.arrays, looks.seen, float(likelihood.model.tempering), likelihood.parameters, estimated)
     try:
-        found = _updated(*arguments, pose, covariance, iterations)
+        found = _updated(*problem, pose, values, covariance, iterations)
     except np.linalg.LinAlgError:  # rounding made it singular
-        found = _updated(*arguments, pose, positive.nearest(covariance), iterations)
-    at, posterior, nis, dof, excess, variance, evidence = found
-    nll, expected, spread = likelihood.model.tempering * np.array(near.unlisted)
-    return TagUpdate(at, posterior, nis, dof, excess + nll - expected, variance + spread, evidence - nll, values)
+        found = _updated(*problem, pose, values, positive.nearest(covariance), iterations)
+    return TagUpdate(*found)
 
 
-def scored_update(factor: RfidFactor, pose: Array, values: Array, covariance: Array, iterations: int) -> TagUpdate:
-    """:func:`updated` by a factor of any kind."""
+def scored_update(factor: RfidFactor, pose: Array, covariance: Array, iterations: int) -> TagUpdate:
+    """:func:`updated` by a factor of any kind on the pose alone."""
     prior_information: Array = positive.inverse(covariance)
     sigmas = np.sqrt(np.diag(covariance))
-    largest = np.concatenate((LARGEST_STEP, np.full(len(values), LARGEST_CHANGE)))
-    first = factor.joint_score([pose, values])
+    first = factor.score(pose)
     # tempering stands for what successive scans have in common: a score alone scatters as if there were no tempering
     tempering = factor.likelihood.model.tempering
     nis, dof = _innovation(first.gradient[0], np.ascontiguousarray(first.information[0]), covariance, tempering)
@@ -93,92 +87,86 @@ def scored_update(factor: RfidFactor, pose: Array, values: Array, covariance: Ar
     if isinstance(first, Score):
         surprise, variance = float(first.nll[0] - first.expected[0]), float(first.variance[0])
     here, cost = first, float(first.nll[0])
-    best, changed, moved = pose, values, np.zeros(len(covariance))
+    best, moved = pose, np.zeros(3)
     for _ in range(iterations):
         information = np.ascontiguousarray(here.information[0])
-        step = _scoring_step(prior_information, information, here.gradient[0], moved, largest)
+        step = _scoring_step(prior_information, information, here.gradient[0], moved, LARGEST_STEP)
         if np.all(np.abs(step) < CONVERGED * sigmas):
-            best, changed = se2.compose(best, se2.exp(step[:3])), changed + step[3:]
+            best = se2.compose(best, se2.exp(step))
             break
         for _ in range(4):
-            tried, tried_values = se2.compose(best, se2.exp(step[:3])), changed + step[3:]
-            there = factor.joint_score([tried, tried_values])
-            error = np.concatenate((se2.log(se2.between(pose, tried)), tried_values - values))
+            tried = se2.compose(best, se2.exp(step))
+            there, error = factor.score(tried), se2.log(se2.between(pose, tried))
             tried_cost = float(there.nll[0]) + 0.5 * float(error @ prior_information @ error)
             if tried_cost <= cost:
                 break
             step = step / 2.0
         else:
             break
-        best, changed, cost, moved, here = tried, tried_values, tried_cost, error, there
+        best, cost, moved, here = tried, tried_cost, error, there
     posterior, log_ratio = _posterior(prior_information, np.ascontiguousarray(here.information[0]))
-    return TagUpdate(best, posterior, nis, dof, surprise, variance, 0.5 * log_ratio - cost, changed)
+    return TagUpdate(best, posterior, nis, dof, surprise, variance, 0.5 * log_ratio - cost, NOTHING)
 
 
 @compiled
 def _updated(
-    packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Array, covariance: Array, iterations: int
-) -> tuple[Array, Array, float, int, float, float, float]:
-    """:func:`scored_update` by one factor of read counts."""
-    here = _score(packed, tags, seen, tempering, pose)
+    packed: Packed,
+    of_map: MapTags,
+    seen: Seen,
+    tempering: float,
+    known: Array,
+    estimated: Integers,
+    pose: Array,
+    values: Array,
+    covariance: Array,
+    iterations: int,
+) -> tuple[Array, Array, float, int, float, float, float, Array]:
+    """:func:`updated` by one factor of read counts, with parameters ``known`` (2 M,) but for those that are ``estimated`` (P,)."""
+    size = 3 + len(values)
+    parameters, largest = known.copy(), np.full(size, LARGEST_CHANGE)
+    for i in range(3):
+        largest[i] = LARGEST_STEP[i]
+    _set(parameters, estimated, values)
+    nll, gradient, information, expected, variance = score(packed, of_map, seen, tempering, pose, parameters, estimated)
     prior_information = inverse(covariance)
-    nis, dof = _innovation(here.gradient[0], here.information[0], covariance, tempering)
-    surprise, variance, cost = here.nll[0] - here.expected[0], here.variance[0], here.nll[0]
-    best, moved, largest = pose.copy(), np.zeros(3), LARGEST_STEP.copy()  # as a constant is another type
+    nis, dof = _innovation(gradient, information, covariance, tempering)
+    surprise, cost = nll - expected, nll
+    best, changed, moved = pose.copy(), values.copy(), np.zeros(size)
     for _ in range(iterations):
-        step = _scoring_step(prior_information, here.information[0], here.gradient[0], moved, largest)
+        step = _scoring_step(prior_information, information, gradient, moved, largest)
         small = True
-        for i in range(3):
+        for i in range(size):
             small = small and abs(step[i]) < CONVERGED * math.sqrt(covariance[i, i])
         if small:
-            best = _stepped(best, step)
+            best, changed = _stepped(best, step), changed + step[3:]
             break
         lower = False
         for _ in range(4):
-            tried = _stepped(best, step)
-            there, error = _score(packed, tags, seen, tempering, tried), _apart(pose, tried)
-            tried_cost = there.nll[0]
-            for i in range(3):
-                for j in range(3):
+            tried, tried_values, error = _stepped(best, step), changed + step[3:], np.empty(size)
+            _set(parameters, estimated, tried_values)
+            nll, there, curve, _, _ = score(packed, of_map, seen, tempering, tried, parameters, estimated)
+            error[:3], error[3:] = _apart(pose, tried), tried_values - values
+            tried_cost = nll
+            for i in range(size):
+                for j in range(size):
                     tried_cost += 0.5 * error[i] * prior_information[i, j] * error[j]
             lower = tried_cost <= cost
             if lower:
-                best, cost, moved, here = tried, tried_cost, error, there
+                best, changed, cost, moved = tried, tried_values, tried_cost, error
+                gradient, information = there, curve
                 break
-            for i in range(3):
+            for i in range(size):
                 step[i] /= 2.0
         if not lower:
             break
-    posterior, log_ratio = _posterior(prior_information, here.information[0])
-    return best, posterior, nis, dof, surprise, variance, 0.5 * log_ratio - cost
+    posterior, log_ratio = _posterior(prior_information, information)
+    return best, posterior, nis, dof, surprise, variance, 0.5 * log_ratio - cost, changed
 
 
 @compiled
-def _score(packed: Packed, tags: _Tags, seen: _Seen, tempering: float, pose: Array) -> Score:
-    """The score of one pose (3,), see :meth:`~factors.rfid.detection.RfidLikelihood.score`."""
-    points, normals = tags
-    offsets, antennas, rounds, hits, odds, elsewhere = seen
-    nll, gradient, information = np.empty(1), np.empty((1, 3)), np.empty((1, 3, 3))
-    told = np.empty(1), np.empty(1)
-    at = pose.copy().reshape(1, 3)
-    rfid_kernels.score(
-        packed,
-        at,
-        points,
-        normals,
-        offsets,
-        antennas,
-        rounds,
-        hits,
-        odds,
-        elsewhere,
-        tempering,
-        nll,
-        gradient,
-        information,
-        *told,
-    )
-    return Score(nll, gradient, information, *told)
+def _set(parameters: Array, estimated: Integers, values: Array) -> None:
+    for i in range(len(estimated)):
+        parameters[estimated[i]] = values[i]
 
 
 @compiled

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid.adjustment import MOST_CERTAIN
+from factors.rfid.adjustment import MOST_CERTAIN, adjusted
 from factors.rfid.kernels import FAST
 from factors.rfid.model import LOGISTIC, NEGLIGIBLE_LOGIT, Packed
+from factors.rfid.near import MapTags, NearTags, Seen, near_tags, reach_of
 from factors.rfid.tables import CELL, Tables, row_of
 from factors.se2 import Array, Integers
 from factors.walls import Walls, around, crosses
@@ -32,23 +33,24 @@ _MANTISSA, _HALF = 0x000FFFFFFFFFFFFF, 0x3FE0000000000000  # bits of a number, a
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def add_log_likelihood(
+def log_likelihood(
     packed: Packed,
     tables: Tables,
+    of_map: MapTags,
+    seen: Seen,
     poses: Array,
-    looks: _Looks,
-    tags: _Tags,
-    states: tuple[Array, Array],
     tempering: float,
     parameters: Array,
-    out: Array,
-) -> None:
-    """Add to ``out`` (N,) the tempered log-likelihood of read counts of T tags, above that of a silence out of reach, for poses
-    (N, 3). ``states``: ``odds`` and ``elsewhere`` (T,), see :mod:`factors.rfid.tag_states`; ``parameters`` (N or 1, 2 M): of the
-    detection models at each pose."""
-    odds, elsewhere = states
-    seen = np.empty(len(odds), np.bool_)
-    _near(packed, poses, looks, tags, parameters, seen)
+) -> Array:
+    """The tempered log-likelihood (N,) of what was ``seen`` of a map's tags, for poses (N, 3) with ``parameters`` (N or 1, 2 M) of
+    the detection models."""
+    looks = seen[:3]
+    reach = _reach(packed, looks, parameters)
+    near = near_tags(of_map, seen, poses, reach)
+    tags, odds, elsewhere = _tabled(tables, near), near.odds, near.elsewhere
+    matters = np.empty(len(odds), np.bool_)
+    _near(poses, tags, reach, matters)
+    out = np.full(len(poses), tempering * len(of_map.points) * _silence(packed, looks[2]))
     size = min(BLOCK, len(poses))
     at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
     own, product, room, mixed = np.empty(size), np.empty(size), np.empty(size), np.ones(size)
@@ -60,7 +62,7 @@ def add_log_likelihood(
         _place(packed, poses[first : first + count], looks, own_parameters, at, models)
         factors = 0
         for t in range(len(odds)):
-            if not seen[t]:
+            if not matters[t]:
                 continue
             _of_tag(packed, tables, at, models, count, looks, tags, t, where_it_is, own, product, room)
             if odds[t] == -np.inf or elsewhere[t] == -np.inf:
@@ -78,22 +80,36 @@ def add_log_likelihood(
                 _add_logs(mixed, count, found)
                 factors = 0
         _add_logs(mixed, count, found)
+    return out
 
 
 @compiled(error_model="numpy", fastmath=FAST)
 def displaced(
     packed: Packed,
     tables: Tables,
+    of_map: MapTags,
+    seen: Seen,
     poses: Array,
-    looks: _Looks,
-    tags: _Tags,
+    margin: float,
+    odds: Array,
     shifts: Array,
     tempering: float,
     parameters: Array,
-    out: Array,
-) -> None:
-    """Fill ``out`` (T, S) with the tempered log-likelihoods, above that of a silence out of reach, of what was seen of T tags, each
-    moved by ``shifts`` (S, 2): the logarithm of the mean over poses (N, 3)."""
+) -> tuple[Integers, Array, NDArray[np.bool_]]:
+    """See :meth:`factors.rfid.detection.RfidLikelihood.displaced`."""
+    looks = seen[:3]
+    reach = margin + reach_of(adjusted(packed, parameters), looks[0], looks[1])
+    near = near_tags(of_map, seen, poses, reach)
+    tags, heard = _tabled(tables, near), np.zeros(len(near.tags), np.bool_)
+    for u in range(len(heard)):
+        for k in range(len(looks[1])):
+            heard[u] |= near.hits[k, u] > 0
+    kept = np.empty(len(heard), np.bool_)
+    _near(poses, tags, reach, kept)
+    for u in range(len(heard)):
+        kept[u] &= odds[near.tags[u]] > -np.inf
+    found = np.flatnonzero(kept)
+    out = np.empty((len(found), len(shifts)))
     each = len(poses)
     size = len(shifts) * each
     # what is seen of a tag that was moved is what is seen of the map's from poses that were moved the other way
@@ -103,29 +119,53 @@ def displaced(
         moved[i, 0], moved[i, 1], moved[i, 2] = pose[0] - shift[0], pose[1] - shift[1], pose[2]
     at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
     own, product, room = np.empty(size), np.empty(size), np.empty(size)
-    _place(packed, moved, looks, parameters, at, models)
-    for t in range(len(out)):
-        _of_tag(packed, tables, at, models, size, looks, tags, t, shifts, own, product, room)
+    _place(packed, moved, looks, parameters.reshape(1, -1), at, models)
+    for u in range(len(found)):
+        _of_tag(packed, tables, at, models, size, looks, tags, found[u], shifts, own, product, room)
         for i in range(len(shifts)):
-            most = mean = 0.0
+            most = own[i * each]
+            for n in range(i * each + 1, (i + 1) * each):
+                most = max(most, own[n])
+            out[u, i] = tempering * most
             for n in range(i * each, (i + 1) * each):
-                most = own[n] if n == i * each else max(most, own[n])
+                own[n] = max(tempering * (own[n] - most), -FARTHEST)
+        for n in range(size):
+            own[n] = _exp(own[n])
+        for i in range(len(shifts)):
+            mean = 0.0
             for n in range(i * each, (i + 1) * each):
-                mean += math.exp(tempering * (own[n] - most)) / each
-            out[t, i] = tempering * most + math.log(mean)
+                mean += own[n] / each
+            out[u, i] += math.log(mean)
+    return near.tags[found], out, heard[found]
 
 
 @compiled
-def _near(packed: Packed, poses: Array, looks: _Looks, tags: _Tags, parameters: Array, seen: NDArray[np.bool_]) -> None:
-    """Which tags (T,) are read, or in reach of any of the poses."""
+def _tabled(tables: Tables, near: NearTags) -> _Tags:
+    """What tables are needed of tags."""
+    levels = np.empty((len(tables.level), len(near.tags)), np.int64)
+    for a in range(len(levels)):
+        for u in range(len(near.tags)):
+            levels[a, u] = tables.level[a, near.tags[u]]
+    return near.points, near.normals, levels, near.hits
+
+
+@compiled
+def _reach(packed: Packed, looks: _Looks, parameters: Array) -> float:
+    """How far [m] the antennas of ``looks`` reach at most, with any of the ``parameters`` (N or 1, 2 M), from the pose."""
     offsets, antennas, _ = looks
-    points, hits = tags[0], tags[3]
     reach = 0.0
     for k in range(len(antennas)):
         a, m = packed.antennas[antennas[k]], packed.which[antennas[k]]
         way = math.sqrt(offsets[k, 0] ** 2 + offsets[k, 1] ** 2) + math.sqrt(a[0] ** 2 + a[1] ** 2)
         for n in range(len(parameters)):
             reach = max(reach, way + packed.reach[m] * math.exp(parameters[n, 2 * m]))
+    return reach
+
+
+@compiled
+def _near(poses: Array, tags: _Tags, reach: float, out: NDArray[np.bool_]) -> None:
+    """Which tags (T,) are read, or within ``reach`` [m] of the box that holds the poses (N, 3)."""
+    points, hits = tags[0], tags[3]
     low_x = high_x = poses[0, 0]
     low_y = high_y = poses[0, 1]
     for n in range(1, len(poses)):
@@ -134,9 +174,9 @@ def _near(packed: Packed, poses: Array, looks: _Looks, tags: _Tags, parameters: 
     for t in range(len(points)):
         x, y = points[t, 0], points[t, 1]
         dx, dy = max(low_x - x, 0.0, x - high_x), max(low_y - y, 0.0, y - high_y)
-        seen[t] = dx * dx + dy * dy < reach * reach
-        for k in range(len(antennas)):
-            seen[t] |= hits[k, t] > 0
+        out[t] = dx * dx + dy * dy < reach * reach
+        for k in range(len(hits)):
+            out[t] |= hits[k, t] > 0
 
 
 @compiled(error_model="numpy", fastmath=FAST)

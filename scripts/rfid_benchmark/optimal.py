@@ -83,7 +83,7 @@ def optimal_filter(log: Log) -> Trajectory:
             grid.predict(motion.relative(before, state))
             before = state
             mean, covariance = grid.moments()
-            told = tags.told(looks, mean, se2.world_to_body(mean, covariance), likelihood)
+            told = tags.told(looks, mean, se2.world_to_body(mean, covariance), likelihood.parameters)
             looks = tags.with_states(looks, told)
             tags.learn(m.t, told)
             grid.update(partial(_log_likelihood, likelihood, looks))

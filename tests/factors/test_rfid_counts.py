@@ -34,11 +34,16 @@ def scene(seed=0):
     return likelihood, whole, replace(whole, **listed, tags=tags, others=PRIOR)
 
 
+def displaced(likelihood, poses, looks):
+    shifts, odds = np.array(((0.0, 0.0), (1.0, -0.5))), np.zeros(len(likelihood.tags.points))
+    return likelihood.displaced(poses, looks, shifts, 1.5, likelihood.parameters, odds)
+
+
 def test_few_tags_are_looked_at():
     likelihood, _, some = scene()
-    near = likelihood.around(POSE[None], some, likelihood.packed)
-    assert len(some.listed) < len(near.looks.listed) < 200
-    reachable = likelihood.reachable(POSE[None], some, 1.5)
+    near = likelihood.expected(POSE, some, likelihood.parameters).tags
+    assert len(some.listed) < len(near) < 200
+    reachable = displaced(likelihood, POSE[None], some)[0]
     assert 10 < len(reachable) < 150
 
 
@@ -57,11 +62,11 @@ def test_scores_are_the_same(parameters):
 def test_scores_do_not_depend_on_what_was_looked_at_before():
     """To the last bit, and with the same tags."""
     likelihood, _, some = scene()
-    tags, told = likelihood.around(POSE[None], some, likelihood.packed).looks.listed, likelihood.score(POSE, some)
+    tags, told = likelihood.expected(POSE, some, likelihood.parameters).tags, likelihood.score(POSE, some)
     for pose in POSE + np.linspace(-0.45, 0.45, 6)[:, None] * (1.0, 0.5, 0.0):
         likelihood, _, some = scene()
         likelihood.score(pose, some)
-        np.testing.assert_array_equal(likelihood.around(POSE[None], some, likelihood.packed).looks.listed, tags)
+        np.testing.assert_array_equal(likelihood.expected(POSE, some, likelihood.parameters).tags, tags)
         for a, b in zip(likelihood.score(POSE, some), told, strict=True):
             np.testing.assert_array_equal(a, b)
 
@@ -87,10 +92,10 @@ def test_particles_weigh_the_same(spread):
 
 def test_what_scans_tell_of_tags_is_the_same():
     likelihood, whole, some = scene()
-    tags, shifts = likelihood.reachable(POSE[None], some, 1.5), np.array(((0.0, 0.0), (1.0, -0.5)))
     poses = POSE + np.random.default_rng(1).normal(size=(6, 3)) * 0.1
-    told = [likelihood.displaced(poses, looks, tags, shifts) for looks in (whole, some)]
-    assert told[0] == pytest.approx(told[1], abs=1e-12)
+    told = [displaced(likelihood, poses, looks) for looks in (whole, some)]
+    for a, b in zip(*told, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
 
 
 def test_merged_counts_list_what_any_of_them_lists():

@@ -250,7 +250,10 @@ def test_likelihood_of_a_tag_that_was_moved(name: str) -> None:
     likelihood, looks, _ = doubtful(2, name)
     poses = POSE + np.random.default_rng(2).normal(size=(4, 3)) * 0.2
     shifts, tags = np.array(((0.0, 0.0), (1.0, -0.5), (40.0, 0.0))), np.array((0, 2, 7, 11))
-    found = likelihood.displaced(poses, looks, tags, shifts)
+    every, told, heard = likelihood.displaced(poses, looks, shifts, 50.0, likelihood.parameters, np.zeros(15))
+    assert np.array_equal(every, np.arange(15))
+    assert np.array_equal(heard, looks.hits.any(axis=0))
+    found = told[tags]
     assert found.shape == (4, 3)
     for k, shift in enumerate(shifts):
         points = likelihood.tags.points + np.append(shift, 0.0)

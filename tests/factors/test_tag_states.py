@@ -48,7 +48,7 @@ def test_a_tag_that_was_read_is_not_dead_but_may_have_moved() -> None:
 def test_what_is_expected_elsewhere_is_what_the_odds_change_by() -> None:
     states, rng = TagStates(1, 0.03, 0.1), np.random.default_rng(1)
     for t in range(5):
-        scan, before = rng.normal(size=(1, 1 + PLACES)), states.odds
+        scan, before = rng.normal(size=(1, 1 + PLACES)), states.odds.copy()
         expected = states.expect(TAG, scan)
         states.learn(float(t), TAG, scan)
         assert states.odds == pytest.approx(before + expected - scan[:, 0], abs=1e-6)
@@ -68,7 +68,7 @@ def test_what_was_learnt_is_taken_back_and_reads_are_not() -> None:
     states = TagStates(2, 0.1, 0.1)
     both = np.arange(2)
     states.learn(1.0, both, np.concatenate((told(-1.0), told(-1.0, -0.5))))
-    before = states.odds
+    before = states.odds.copy()
     states.learn(2.0, both, np.concatenate((told(-3.0), told(-3.0))))
     states.hear(2.5, both[1:])
     states.learn(3.0, TAG, told(-4.0))

@@ -126,7 +126,7 @@ def test_by_what_antennas_read_and_did_not_read(rng, iterations):
         start, covariance = se2.compose(pose, se2.exp(scale * rng.standard_normal(3))), spread(rng, 3, scale)
         factor = RfidFactor(likelihood, looks)
         found = rfid_update.updated(factor, start, np.zeros(0), covariance, iterations)
-        expected = rfid_update.scored_update(factor, start, np.zeros(0), covariance, iterations)
+        expected = rfid_update.scored_update(factor, start, covariance, iterations)
         sigmas = np.sqrt(np.diag(expected.covariance))
         close(found.pose, expected.pose, sigmas)
         close(found.covariance, expected.covariance, np.outer(sigmas, sigmas))

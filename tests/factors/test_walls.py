@@ -108,9 +108,8 @@ def test_tables_of_particles_and_of_a_search_know_the_walls(name, parameters):
 def test_a_tag_that_moved_is_looked_for_behind_the_walls():
     likelihood, looks, _ = scene(MODELS["beam"])
     poses = POSE + np.zeros((1, 3))
-    tags = likelihood.reachable(poses, looks, 0.0)
-    shifts = TagStates(60, 0.03, 0.03).shifts[:6]
-    found = likelihood.displaced(poses, looks, tags, shifts)
+    shifts = TagStates(60, 0.03, 0.03).places[1:7]
+    tags, found, _ = likelihood.displaced(poses, looks, shifts, 0.0, likelihood.parameters, np.zeros(60))
     for i, shift in enumerate(shifts):
         points = likelihood.tags.points + np.array((*shift, 0.0))
         there = RfidLikelihood(likelihood.model, replace(likelihood.tags, points=points))

@@ -146,8 +146,8 @@ class TagSensor(Sensor):
         here = looks if view.offset is None else looks.moved(view.offset.delta)
         told = None
         if view.localized:
-            estimated = self._estimated(likelihood, view)
-            if view.newest and self.suspicious_since is None and self._settled.add(m.t, estimated.parameters):
+            estimated = self._estimated(view)
+            if view.newest and self.suspicious_since is None and self._settled.add(m.t, estimated):
                 self._for_search = likelihood.adjusted(self._settled.values)
             told = self.tags.told(here, view.pose, view.covariance, estimated)
             looks = self.tags.with_states(looks, told)
@@ -191,27 +191,27 @@ class TagSensor(Sensor):
         """Count reads and misses against what is expected of them, temper by how they go together, and doubt the models."""
         assert self.tags.likelihood is not None
         assert isinstance(observation.factor.seen, TagReadCounts)
-        t, likelihood, states = observation.t, self._estimated(self.tags.likelihood, view), self.tags.states
-        looks, expected = likelihood.expected(view.pose, observation.factor.seen)
-        surveyed = states.odds_of(looks.listed) <= 0.0
-        self._bursts.add(t, looks, expected, surveyed)
+        t, looks, states = observation.t, observation.factor.seen, self.tags.states
+        reads = self.tags.likelihood.expected(view.pose, looks, self._estimated(view))
+        surveyed = states.odds[reads.tags] <= 0.0
+        self._bursts.add(t, looks, reads, surveyed)
         if self.tags.temper(1.0 / self._bursts.together):
             self._for_search = self.tags.likelihood.adjusted(self._settled.values)
         if np.trace(view.covariance[:2, :2]) < KNOWN**2:
             # not without those that are believed to have moved: with a wrong model most tags seem to
-            counts = (expected > POSSIBLE) & (surveyed | states.were_read(looks.listed))
+            counts = (reads.p > POSSIBLE) & (surveyed | states.were_read(reads.tags))
             together = 1.0 / self.tags.likelihood.model.tempering
             doubted = self._consistency.doubted
-            self._consistency.add(t, looks, expected, likelihood.distances(view.pose, looks), counts, together)
+            self._consistency.add(t, looks, reads, counts, together)
             if self._consistency.doubted and not doubted:
                 self._diagnostics.event(t, f"{ConsistencyMonitor.EVENT}: {self._consistency.shares}")
 
-    def _estimated(self, likelihood: RfidLikelihood, view: View) -> RfidLikelihood:
-        """The likelihood with the detection models as they are estimated to be."""
+    def _estimated(self, view: View) -> Array:
+        """The parameters (2 M,) of the detection models as they are estimated to be."""
+        assert self.tags.likelihood is not None
+        nominal = self.tags.likelihood.parameters
         value = view.value(self.modality) if self._blocks else None
-        return (
-            likelihood if value is None else likelihood.adjusted(self.constants.full(value, len(likelihood.parameters)))
-        )
+        return nominal if value is None else self.constants.full(value, len(nominal))
 
     def _is_evidence(self, observation: TagObservation, evidence: float) -> bool:
         # a scan without reads that is repeated after going back in time counts once

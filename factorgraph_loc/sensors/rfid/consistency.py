@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import chi_squared
+from factors.compiled import compiled
 from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import ExpectedReads
 from factors.se2 import Array, Integers
 
 BAND, BANDS = 1.0, 50  # m of distance, and how many bands; the last one has no end
@@ -31,14 +33,9 @@ class ReadGroups:
     def __post_init__(self) -> None:
         object.__setattr__(self, "sums", np.zeros((3, BANDS + len(self.antennas))))
 
-    def add(
-        self, antenna: Integers, distance: Array, hits: Array | Integers, rounds: Integers | float, p: Array
-    ) -> None:
-        """Add ``hits`` (M,) of ``rounds`` of an antenna at a tag, with probability ``p`` (M,) each."""
-        band = np.minimum(distance // BAND, BANDS - 1).astype(np.int64)
-        for group in (band, BANDS + antenna):
-            for i, values in enumerate((hits, rounds * p, rounds * p * (1.0 - p))):
-                self.sums[i] += np.bincount(group, values, self.sums.shape[1])
+    def add(self, antennas: Integers, rounds: Integers, reads: ExpectedReads, counts: NDArray[np.bool_]) -> None:
+        """Add ``reads`` in ``rounds`` (K,) of ``antennas`` (K,); ``counts`` (K, C): which of them are counted."""
+        _add(self.sums, antennas, rounds, reads.hits, reads.p, reads.distance, counts)
 
     @property
     def told(self) -> Integers:
@@ -74,17 +71,16 @@ class ConsistencyMonitor:
         self.doubted = False
 
     def add(
-        self, t: float, looks: TagReadCounts, p: Array, distance: Array, counts: NDArray[np.bool_], together: float
+        self, t: float, looks: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_], together: float
     ) -> None:
-        """Add looks, once, with the probabilities of a read, distances [m] and which are counted, (K, C) each."""
+        """Add what was read in looks, once; ``counts`` (K, C): which of it is counted."""
         if t <= self._last:
             return
         forgotten = math.exp((self._last - t) / WINDOW)
         self._last = t
         self._groups.sums[:2] *= forgotten
         self._groups.sums[2] *= forgotten**2
-        k, c = np.nonzero(counts)
-        self._groups.add(looks.antennas[k], distance[k, c], looks.hits[k, c], looks.rounds[k], p[k, c])
+        self._groups.add(looks.antennas, looks.rounds, reads, counts)
         chance = min((self._chance(one, together) for one in (slice(0, BANDS), slice(BANDS, None))), default=1.0)
         self.doubted = chance < (TRUSTED if self.doubted else DOUBTED)
 
@@ -106,3 +102,24 @@ class ConsistencyMonitor:
         """Forget everything: the track was wrong."""
         self._groups.sums[:] = 0.0
         self.doubted = False
+
+
+@compiled
+def _add(
+    sums: Array,
+    antennas: Integers,
+    rounds: Integers,
+    hits: Integers,
+    p: Array,
+    distance: Array,
+    counts: NDArray[np.bool_],
+) -> None:
+    """Add to the groups of :class:`ReadGroups`."""
+    for k in range(len(antennas)):
+        for c in range(p.shape[1]):
+            if counts[k, c]:
+                expected = rounds[k] * p[k, c]
+                for group in (min(int(distance[k, c] / BAND), BANDS - 1), BANDS + antennas[k]):
+                    sums[0, group] += hits[k, c]
+                    sums[1, group] += expected
+                    sums[2, group] += expected * (1.0 - p[k, c])

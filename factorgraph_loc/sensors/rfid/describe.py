@@ -3,8 +3,6 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-import numpy as np
-
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
@@ -12,7 +10,7 @@ from factorgraph_loc.sensors.interfaces import Use
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.text import quoted
-from factors.rfid.adjustment import MOST_CERTAIN, rates
+from factors.rfid.adjustment import MOST_CERTAIN, rate_of
 
 SHOWN = 5  # names in a warning
 CLEARLY = 3.0  # standard deviations
@@ -74,7 +72,7 @@ def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
         if abs(ranges[0]) > CLEARLY * ranges[1] and abs(factor - 1.0) > DIFFERENT:
             more = f"{100.0 * abs(factor - 1.0):.0f} % {'farther' if factor > 1.0 else 'less far'}"
             yield f"{of} reach {more} than the rig says"
-        found = peak * float(rates(np.asarray(peak), np.asarray(rate[0])))
+        found = peak * rate_of(peak, rate[0])
         if abs(rate[0]) > CLEARLY * rate[1] and abs(found - peak) > DIFFERENT:
             yield f"{of} read {100.0 * found:.0f} % of the tags next to them, where the rig says {100.0 * peak:.0f} %"
 

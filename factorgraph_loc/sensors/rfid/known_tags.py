@@ -111,28 +111,26 @@ class KnownTags:
         hits = np.zeros((len(used), len(tags)), dtype=np.int64)
         for row, place in reads:
             hits[row, number[place]] += 1
-        odds = self.states.odds_of(tags)
+        odds = self.states.odds[tags]
         # what is read of a tag that is believed to have moved tells nothing of an unknown pose
         elsewhere = np.where(hits.any(axis=0) & (odds <= 0.0), -np.inf, 0.0)
         prior = self.states.prior
         return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere, tags, prior)
 
-    def told(self, looks: TagReadCounts, pose: Array, covariance: Array, likelihood: RfidLikelihood) -> TagEvidence:
-        """What looks tell of the tags in reach at a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3); ``likelihood``:
-        with the detection models as they are estimated to be."""
+    def told(self, looks: TagReadCounts, pose: Array, covariance: Array, parameters: Array) -> TagEvidence:
+        """What looks tell of the tags in reach at a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3); ``parameters``
+        (2 M,): the detection models as they are estimated to be."""
+        assert self.likelihood is not None
         poses = sigma_poses(pose, WIDENED * math.sqrt(3.0) * positive.root(covariance))
-        tags = union(likelihood.reachable(poses, looks, FARTHEST), looks.heard)
-        tags = tags[self.states.odds_of(tags) > -np.inf]
-        shifts = np.concatenate((np.zeros((1, 2)), self.states.shifts))
-        heard = np.asarray(looks.hits_of(tags).any(axis=0))
-        return TagEvidence(tags, likelihood.displaced(poses, looks, tags, shifts), heard)
+        places = self.states.places, FARTHEST, parameters, self.states.odds
+        return TagEvidence(*self.likelihood.displaced(poses, looks, *places))
 
     def with_states(self, looks: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
         """The looks at tags that may be dead or moved, of which they tell ``evidence``."""
         looks = looks.listing(union(looks.listed, evidence.tags))
         at = np.searchsorted(looks.listed, evidence.tags)
         odds, elsewhere = looks.odds.copy(), looks.elsewhere.copy()
-        odds[at] = self.states.odds_of(evidence.tags)
+        odds[at] = self.states.odds[evidence.tags]
         elsewhere[at] = self.states.expect(evidence.tags, evidence.told)
         return replace(looks, odds=odds, elsewhere=elsewhere)
 
@@ -178,8 +176,7 @@ class KnownTags:
         where the map has it."""
         antennas = np.array([self._antennas.get(name, -1) for name in m.antennas], dtype=np.int64)
         tags = np.array([self.map.index.get(name, -1) for name in m.tags], dtype=np.int64)
-        # the last one stands for those that the map lacks
-        tags[np.append(self.states.odds, -np.inf)[tags] > 0.0] = -1
+        tags[(tags >= 0) & (self.states.odds[tags] > 0.0)] = -1
         return antennas[m.antenna], tags
 
 

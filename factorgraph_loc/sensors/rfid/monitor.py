@@ -7,8 +7,10 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.rfid.counts import TagReadCounts
-from factors.se2 import Array
+from factors.compiled import compiled
+from factors.rfid.counts import TagReadCounts, union
+from factors.rfid.detection import ExpectedReads
+from factors.se2 import Array, Integers
 
 DURATION = 5.0  # s of scans that are tested jointly
 KEPT = 60.0  # s
@@ -19,6 +21,7 @@ BLOCK, POSSIBLE = 10.0, 0.01  # s in which reads are counted; least probability 
 INDEPENDENT = 1.5  # ratio of variances up to which reads are taken to be independent
 PRIOR = 50.0  # variance of independent reads that is believed beforehand
 REMEMBERED = 0.95  # share of what was counted that still counts a block later
+NO_TAGS = np.empty(0, dtype=np.int64)
 SILENT = 8.0  # log odds above which silence is attributed to a failure instead of the pose
 
 
@@ -113,8 +116,9 @@ class BurstMonitor:
     section 4.5). Counted for each of A antennas and T tags."""
 
     def __init__(self, antennas: int, tags: int) -> None:
-        # reads less expected ones, and their variance, in this block
-        self._cells = np.zeros((2, antennas, tags))
+        # reads less expected ones, and their variance, in this block; and the tags of which there are some
+        self._cells = np.zeros((tags, 2, antennas))
+        self._tags = NO_TAGS
         self._sums = np.full(2, PRIOR)  # of the squares, and of the variances, of all blocks
         self._begun = -math.inf
         self._last = -math.inf
@@ -125,24 +129,52 @@ class BurstMonitor:
         found = float(self._sums[0] / self._sums[1])
         return found if found > INDEPENDENT else 1.0
 
-    def add(self, t: float, looks: TagReadCounts, expected: Array, counts: NDArray[np.bool_]) -> None:
-        """Add looks with the probabilities (K, C) of a read, once; ``counts`` (C,): which of the tags are counted."""
+    def add(self, t: float, looks: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_]) -> None:
+        """Add what was read in looks, once; ``counts`` (C,): which of the tags are counted."""
         if t <= self._last:
             return
         self._last = t
         if t >= self._begun + BLOCK:
-            self._sums = REMEMBERED * self._sums + (np.sum(self._cells[0] ** 2), np.sum(self._cells[1]))
-            self._cells[:] = 0.0
-            self._begun = t
-        told = np.where(counts & (expected > POSSIBLE), looks.rounds[:, None], 0)
-        at = np.ix_(looks.antennas, looks.listed)
-        self._cells[0][at] += np.where(told, looks.hits - told * expected, 0.0)
-        self._cells[1][at] += told * expected * (1.0 - expected)
+            squares, variances = _taken(self._cells, self._tags)
+            self._sums = REMEMBERED * self._sums + (squares, variances)
+            self._tags, self._begun = NO_TAGS, t
+        _count(self._cells, looks.antennas, looks.rounds, reads.tags, reads.hits, reads.p, counts)
+        self._tags = union(self._tags, reads.tags)
 
     def clear(self) -> None:
         """Forget this block: the track was wrong."""
-        self._cells[:] = 0.0
-        self._begun = -math.inf
+        _taken(self._cells, self._tags)
+        self._tags, self._begun = NO_TAGS, -math.inf
+
+
+@compiled
+def _count(
+    cells: Array,
+    antennas: Integers,
+    rounds: Integers,
+    tags: Integers,
+    hits: Integers,
+    p: Array,
+    counts: NDArray[np.bool_],
+) -> None:
+    """Add to the cells of :class:`BurstMonitor`."""
+    for c in range(len(tags)):
+        for k in range(len(antennas)):
+            if counts[c] and p[k, c] > POSSIBLE:
+                cells[tags[c], 0, antennas[k]] += hits[k, c] - rounds[k] * p[k, c]
+                cells[tags[c], 1, antennas[k]] += rounds[k] * p[k, c] * (1.0 - p[k, c])
+
+
+@compiled
+def _taken(cells: Array, tags: Integers) -> tuple[float, float]:
+    """The sums of the squares and of the variances in the cells of some tags, which are empty then."""
+    squares = variances = 0.0
+    for t in tags:
+        for a in range(cells.shape[2]):
+            squares += cells[t, 0, a] ** 2
+            variances += cells[t, 1, a]
+            cells[t, 0, a] = cells[t, 1, a] = 0.0
+    return squares, variances
 
 
 class SettledParameters:

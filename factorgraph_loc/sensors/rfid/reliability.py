@@ -22,7 +22,7 @@ from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.sensors.smoothed import possible_poses
-from factors.rfid.detection import RfidLikelihood
+from factors.rfid.detection import ExpectedReads, RfidLikelihood
 from factors.se2 import Array, Integers, transform_from
 
 MOST_ROUNDS = 6000  # of a long log so many are looked at, evenly spread
@@ -115,7 +115,9 @@ def _told(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Rel
     if looks.p.sum() < FEWEST:
         return None
     groups = ReadGroups(antennas)
-    groups.add(looks.antenna, looks.distance, looks.hit, 1.0, looks.p)
+    one = np.ones(len(looks.p), dtype=np.int64)
+    reads = ExpectedReads(looks.tag, looks.hit.astype(np.int64)[:, None], looks.p[:, None], looks.distance[:, None])
+    groups.add(looks.antenna, one, reads, one[:, None] > 0)
     together, told = _together(looks, (looks.distance // BAND).astype(np.int64)), groups.told
     if not len(told):
         return None

@@ -8,10 +8,15 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.sensors.rfid.monitor import BurstMonitor
 from factorgraph_loc.simulation import preset, simulate
 from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import ExpectedReads
 
 ANTENNAS, TAGS, STEP = 4, 60, 0.5
 ALL = np.ones(TAGS, dtype=bool)
 BURSTS = {"faults": {"fading": {"duration": 5.0, "share": 0.4}}}
+
+
+def reads(looks, p):
+    return ExpectedReads(looks.listed, looks.hits, p, np.zeros(p.shape))
 
 
 def scans(seed, count, stays=0.0, share=0.6):
@@ -26,7 +31,7 @@ def scans(seed, count, stays=0.0, share=0.6):
         looks = TagReadCounts(
             np.zeros((ANTENNAS, 3)), np.arange(ANTENNAS), np.ones(ANTENNAS, int), (hits & reached).astype(int)
         )
-        monitor.add(STEP * i, looks, np.where(reached, 0.5, 1e-3), ALL)
+        monitor.add(STEP * i, looks, reads(looks, np.where(reached, 0.5, 1e-3)), ALL)
         if not stays:
             assert monitor.together == 1.0
     return monitor
@@ -49,9 +54,9 @@ def test_rounds_that_go_together_are_counted_as_fewer(stays):
 def test_scans_that_come_again_count_once():
     monitor, again = (scans(6, 40, 0.8) for _ in range(2))
     looks = TagReadCounts(np.zeros((1, 3)), np.zeros(1, int), np.ones(1, int), np.ones((1, TAGS), int))
-    again.add(5.0, looks, np.full((1, TAGS), 0.5), ALL)
+    again.add(5.0, looks, reads(looks, np.full((1, TAGS), 0.5)), ALL)
     for one in (monitor, again):
-        one.add(40.0, looks, np.full((1, TAGS), 0.5), ALL)
+        one.add(40.0, looks, reads(looks, np.full((1, TAGS), 0.5)), ALL)
     assert again.together == monitor.together > 2.0
 
 

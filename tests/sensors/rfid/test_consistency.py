@@ -12,6 +12,7 @@ from factorgraph_loc.sensors.rfid.consistency import ConsistencyMonitor
 from factorgraph_loc.sensors.rfid.settings import BeamSettings, PriorSettings, RfidSettings
 from factorgraph_loc.simulation import preset, simulate
 from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import ExpectedReads
 
 ANTENNAS, TAGS, STEP = 4, 30, 0.5
 DISTANCE = np.tile(np.linspace(0.2, 5.8, TAGS), (ANTENNAS, 1))
@@ -28,7 +29,8 @@ def scans(monitor, seed, count, chance, *, p=RIGHT, begin=0.0, stays=0.0, togeth
     for i in range(count):
         hits = np.where(rng.random(chance.shape) < stays, hits, rng.random(chance.shape) < chance)
         looks = TagReadCounts(np.zeros((ANTENNAS, 3)), np.arange(ANTENNAS), np.ones(ANTENNAS, int), hits.astype(int))
-        monitor.add(begin + STEP * i, looks, p, DISTANCE, ALL, together)
+        reads = ExpectedReads(looks.listed, looks.hits, p, DISTANCE)
+        monitor.add(begin + STEP * i, looks, reads, ALL, together)
         out.append(monitor.doubted)
     return np.array(out)
 

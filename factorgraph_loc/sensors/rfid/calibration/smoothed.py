@@ -26,7 +26,7 @@ from factorgraph_loc.sensors.rfid.calibration.tempering import bursts
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings
 from factorgraph_loc.sensors.smoothed import Corrections, Smoothed, pooled, possible_poses
 from factorgraph_loc.text import quoted
-from factors.rfid.adjustment import MOST_CERTAIN, PARAMETERS, rates
+from factors.rfid.adjustment import MOST_CERTAIN, PARAMETERS, rate_of
 from factors.rfid.model import FEATURES, BeamModel, DetectionModel, GridModel, LogisticModel
 
 MIN_READS = 100.0  # weighted reads that a model is learnt from
@@ -178,7 +178,7 @@ def _grid(
     """A grid changed by the mean changes of its range and rate, and what they are since the grid ``before`` all turns."""
     scale, shift = (told[kind].mean if kind in told else 0.0 for kind in PARAMETERS)
     peak = min(model.peak, MOST_CERTAIN)
-    p = rates(np.asarray(peak), np.asarray(shift)) / (1.0 + np.exp(-model.logits))
+    p = rate_of(peak, shift) / (1.0 + np.exp(-model.logits))
     p = np.clip(p, 1e-6, 1.0 - 1e-6)
     factor = float(np.exp(scale))
     changed = replace(
