@@ -17,6 +17,7 @@ from factors.camera import update_kernels as pixel_kernels
 from factors.camera.factor import ReprojectionFactor
 from factors.landmarks import update_kernels as landmark_kernels
 from factors.landmarks.factor import BearingRangeFactor
+from factors.landmarks.model import packed
 from factors.se2 import Array
 
 CONVERGED = 1e-6  # m and rad; convergence limit of an iterated update
@@ -123,16 +124,12 @@ def landmark_update(
     iterations: int,
     converged: float = CONVERGED,
 ) -> Correction | None:
-    """:func:`update_state` by landmarks of an exact map that were seen at the pose, compiled; None for others, and where the
-    information form has not the digits. ``constants`` (P,): those that are estimated, whose columns begin at ``first``."""
-    found = factor.packed()
-    if found is None:
+    """:func:`update_state` by landmarks of a map, compiled; None for others, and where the information form has not the digits.
+    ``constants`` (P,): those that are estimated, whose columns begin at ``first``."""
+    if factor.free:
         return None
-    model, indices = found
-    seen = factor.points, factor.ranges, factor.bearings
-    there, delta, after, residual, nis, dof = landmark_kernels.updated(
-        model, *seen, pose, covariance, constants, indices, first, iterations, converged, GATE
-    )
+    known = packed(factor.model), factor.look, pose, covariance, constants, factor.places, first
+    there, delta, after, residual, nis, dof = landmark_kernels.updated(*known, iterations, converged, GATE)
     return Correction(delta, after, residual, nis, dof) if there else None
 
 

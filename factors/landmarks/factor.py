@@ -59,17 +59,11 @@ class BearingRangeFactor:
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
-        plain = self.packed()
-        if plain is not None:
-            seen = self.points, self.ranges, self.bearings
-            held = values[1] if self.estimated else NOTHING
-            residual, by_pose, by_sensor = update_kernels.weighted(plain[0], *seen, values[0], held, plain[1])
-            return residual, [by_pose, by_sensor] if self.estimated else [by_pose]
         if not self.free:
-            found = self._compiled(values)
-            kernels.weigh(*found, self.model.robust)
-            error, *blocks = self._of_values(*found)
-            return error.ravel(), [block.reshape(-1, block.shape[2]) for block in blocks]
+            held = values[1] if self.estimated else NOTHING
+            found = update_kernels.weighted(packed(self.model), self.look, values[0], held, self.places)
+            residual, by_pose, by_sensor = found
+            return residual, [by_pose, by_sensor] if self.estimated else [by_pose]
         error, blocks = self.whitened(values)
         weight = np.sqrt(geman_mcclure_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
         weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
@@ -91,39 +85,36 @@ class BearingRangeFactor:
         if self.estimated:
             changes[list(self.estimated)] = values[1]
         found = np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros((count, 2, len(PARAMETERS)))
-        spreads = EXACT if self.point_covariances is None else self.point_covariances
-        seen = self.points, self.ranges, self.bearings
-        kernels.linearize(self.packed_model, values[0], changes, *seen, self.carried, spreads, *found)
+        kernels.linearize(packed(self.model), values[0], changes, self.look, *found)
         return found
 
     def count_beyond(self, limit: float, pose: Array, covariance: Array) -> int:
         """How many of the landmarks of a factor on the pose only have a normalised innovation squared above ``limit`` at the
         predicted ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
-        spreads = EXACT if self.point_covariances is None else self.point_covariances
-        seen = self.points, self.ranges, self.bearings, self.carried, spreads
-        return int(kernels.beyond(self.packed_model, pose, *seen, np.ascontiguousarray(covariance), limit))
+        spread = np.ascontiguousarray(covariance)
+        return int(kernels.beyond(packed(self.model), pose, self.look, spread, limit))
 
     def _of_values(self, error: Array, by_pose: Array, by_sensor: Array) -> list[Array]:
         """The residual, and the Jacobians by the values of the factor."""
         return [error, by_pose, by_sensor[..., list(self.estimated)]] if self.estimated else [error, by_pose]
 
     @property
-    def packed_model(self) -> kernels.Model:
-        """The model for compiled code."""
-        m = self.model
-        sensor = m.range_scale, m.range_sigma, m.range_sigma_relative, m.bearing_bias, m.bearing_sigma
-        return m.mounting, sensor, m.depth, m.depth_axis, m.robust
+    def look(self) -> kernels.Look:
+        """What was seen, for compiled code."""
+        offset, spread, twist, spreads = self.offset, self.offset_covariance, self.twist, self.point_covariances
+        return (
+            *(self.points, self.ranges, self.bearings),
+            *(offset is not None, _NOWHERE if offset is None else offset),
+            *(spread is not None, _EXACTLY if spread is None else spread),
+            float(len(self.points) if self.in_look is None else self.in_look),
+            *(twist is not None, _NOWHERE if twist is None else twist),
+            EXACT if spreads is None else spreads,
+        )
 
     @property
-    def carried(self) -> kernels.Carried:
-        """Offset, its covariance and the velocity for compiled code, each with whether there is one."""
-        offset, spread, twist = self.offset, self.offset_covariance, self.twist
-        count = float(len(self.points) if self.in_look is None else self.in_look)
-        return (
-            *(offset is not None, _NOWHERE if offset is None else offset),
-            *(spread is not None, _EXACTLY if spread is None else spread, count),
-            *(twist is not None, _NOWHERE if twist is None else twist),
-        )
+    def places(self) -> Integers:
+        """Those of the estimated constants (P,)."""
+        return _places(self.estimated)
 
     def cost(self, values: Sequence[Array]) -> float:
         """The robust loss."""
@@ -180,13 +171,6 @@ class BearingRangeFactor:
         spreads, seen = (self.offset_covariance, self.point_covariances), (self.ranges, self.bearings)
         points = self.points if point is None else point[None]
         return BearingRangeFactor(model, points, *seen, offset, *spreads, twist=self.twist, in_look=self.in_look)
-
-    def packed(self) -> tuple[Array, Integers] | None:
-        """Model (11,) and places (P,) of the estimated constants, as compiled code takes them; None where the landmarks were not
-        seen at the pose's time, or are not exactly where they stand."""
-        if self.offset is not None or self.point_covariances is not None or self.free or self.twist is not None:
-            return None
-        return packed(self.model), _places(self.estimated)
 
     def dof(self) -> int:
         """Number of measured ranges and bearings."""

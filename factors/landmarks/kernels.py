@@ -5,36 +5,25 @@ import math
 import numpy as np
 
 from factors.compiled import compiled
-from factors.landmarks.model import TIME_OFFSET, whitened_into
+from factors.landmarks.model import BEARING_SIGMA, DEPTH, RANGE_SIGMA, RELATIVE, TIME_OFFSET, TURN, whitened_into
 from factors.robust import geman_mcclure_weight
 from factors.se2 import Array, Integers
 from factors.se2_kernels import exp, wrapped
 
-# mounting; range scale, its two sigmas, bearing bias and sigma; whether a range is a depth, and the angle of its axis; robust scale
-Model = tuple[tuple[float, float, float], tuple[float, float, float, float, float], bool, float, float]
-# what a look may have: of the motion since its pose the offset (3,) and its covariance (3, 3), and the velocity (3,)
-Carried = tuple[bool, Array, bool, Array, float, bool, Array]
+# points (K, 2), ranges (K,), bearings (K,); of the motion since the pose, each with whether there is one: the offset (3,), its
+# covariance (3, 3) with the number of landmarks that have it in common, the velocity (3,); and spreads of the points (K, 2, 2), or
+# (0, 2, 2)
+Look = tuple[Array, Array, Array, bool, Array, bool, Array, float, bool, Array, Array]
 
 
 @compiled
 def linearize(
-    model: Model,
-    pose: Array,
-    changes: Array,
-    points: Array,
-    ranges: Array,
-    bearings: Array,
-    carried: Carried,
-    spreads: Array,
-    error: Array,
-    by_pose: Array,
-    by_sensor: Array,
+    model: Array, pose: Array, changes: Array, look: Look, error: Array, by_pose: Array, by_sensor: Array
 ) -> None:
     """What :meth:`factors.landmarks.factor.BearingRangeFactor.whitened` returns of one look, with ``changes`` (6,) of the
-    constants and ``spreads`` (K, 2, 2) of the points, or (0, 2, 2): whitened ``error`` (K, 2), ``by_pose`` (K, 2, 3), ``by_sensor``
-    (K, 2, 6)."""
-    mounting, (scale, sigma, relative, bias, bearing_sigma), depth, axis, _ = model
-    displaced, offset, widened, covariance, count, moves, twist = carried
+    constants: whitened ``error`` (K, 2), ``by_pose`` (K, 2, 3), ``by_sensor`` (K, 2, 6), which hold zeros. ``model``: of
+    :func:`~factors.landmarks.model.packed`."""
+    points, ranges, bearings, displaced, offset, widened, covariance, count, moves, twist, spreads = look
     x, y, turned = offset[0], offset[1], offset[2]
     if moves and changes[TIME_OFFSET] != 0.0:
         later = changes[TIME_OFFSET]
@@ -46,10 +35,21 @@ def linearize(
         c, s = math.cos(pose[2]), math.sin(pose[2])
         at = np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrapped(pose[2] + turned)))
     by_point = np.zeros((len(points), 2, 2))
-    mounted = mounting[0] + changes[0], mounting[1] + changes[1], mounting[2]
-    sensor = scale * (1.0 + changes[3]), sigma, relative, bias + changes[2], bearing_sigma
+    mounted = model[0] + changes[0], model[1] + changes[1], model[TURN]
+    noise = model[RANGE_SIGMA], model[RELATIVE], model[2] + changes[2], model[BEARING_SIGMA]
     whitened_into(
-        at, mounted, sensor, depth, axis + changes[4], points, ranges, bearings, error, by_pose, by_point, by_sensor
+        at,
+        mounted,
+        (model[3] * (1.0 + changes[3]), *noise),
+        model[DEPTH] > 0.0,
+        model[4] + changes[4],
+        points,
+        ranges,
+        bearings,
+        error,
+        by_pose,
+        by_point,
+        by_sensor,
     )
     c, s = math.cos(turned), math.sin(turned)
     lever_x, lever_y = s * x - c * y, c * x + s * y
@@ -113,23 +113,12 @@ def weigh(error: Array, by_pose: Array, by_sensor: Array, robust: float) -> None
 
 
 @compiled(error_model="numpy")
-def beyond(
-    model: Model,
-    pose: Array,
-    points: Array,
-    ranges: Array,
-    bearings: Array,
-    carried: Carried,
-    spreads: Array,
-    covariance: Array,
-    limit: float,
-) -> int:
+def beyond(model: Array, pose: Array, look: Look, covariance: Array, limit: float) -> int:
     """How many landmarks have a normalised innovation squared above ``limit``, seen from a pose with body-frame ``covariance``
     (3, 3)."""
-    count = len(points)
+    count = len(look[0])
     error, by_pose, by_sensor = np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros((count, 2, TIME_OFFSET + 1))
-    changes = np.zeros(TIME_OFFSET + 1)
-    linearize(model, pose, changes, points, ranges, bearings, carried, spreads, error, by_pose, by_sensor)
+    linearize(model, pose, np.zeros(TIME_OFFSET + 1), look, error, by_pose, by_sensor)
     found = 0
     for k in range(count):
         a, b, c = 1.0, 0.0, 1.0
@@ -147,7 +136,7 @@ def beyond(
 
 @compiled
 def linearize_all(
-    model: Model,
+    model: Array,
     poses: Array,
     pose_of: Integers,
     changes: Array,
@@ -172,18 +161,7 @@ def linearize_all(
     for i in range(len(ends)):
         rows = slice(first, ends[i])
         first = ends[i]
-        carried = flags[i, 0], offsets[i], flags[i, 1], covariances[i], counts[i], flags[i, 2], twists[i]
         spread = spreads[rows] if flags[i, 3] else spreads[:0]
-        linearize(
-            model,
-            poses[pose_of[i]],
-            changes,
-            points[rows],
-            ranges[rows],
-            bearings[rows],
-            carried,
-            spread,
-            error[rows],
-            by_pose[rows],
-            by_sensor[rows],
-        )
+        carried = flags[i, 0], offsets[i], flags[i, 1], covariances[i], counts[i], flags[i, 2], twists[i], spread
+        look = (points[rows], ranges[rows], bearings[rows], *carried)
+        linearize(model, poses[pose_of[i]], changes, look, error[rows], by_pose[rows], by_sensor[rows])

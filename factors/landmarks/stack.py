@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from factors.landmarks import kernels
-from factors.landmarks.model import PARAMETERS
+from factors.landmarks.model import PARAMETERS, packed
 from factors.robust import geman_mcclure_loss
 from factors.se2 import Array, Integers
 
@@ -22,7 +22,7 @@ class BearingRangeStack:
 
     def __init__(self, factors: Sequence[BearingRangeFactor], pose_of: Sequence[int], column: int) -> None:
         first = factors[0]
-        self._model, self._estimated, self._column = first.packed_model, list(first.estimated), column
+        self._model, self._estimated, self._column = packed(first.model), list(first.estimated), column
         self._robust = first.model.robust
         self._pose_of = np.array(pose_of, dtype=np.int64)
         sizes = np.array([len(f.points) for f in factors])
@@ -32,11 +32,11 @@ class BearingRangeStack:
             np.concatenate([f.ranges for f in factors]),
             np.concatenate([f.bearings for f in factors]),
         )
-        parts = [f.carried for f in factors]
+        parts = [f.look for f in factors]
         spreads = [f.point_covariances for f in factors]
-        self._flags = np.array([(p[0], p[2], p[5], s is not None) for p, s in zip(parts, spreads, strict=True)])
-        self._offsets, self._covariances = np.array([p[1] for p in parts]), np.array([p[3] for p in parts])
-        self._counts, self._twists = np.array([p[4] for p in parts]), np.array([p[6] for p in parts])
+        self._flags = np.array([(p[3], p[5], p[8], s is not None) for p, s in zip(parts, spreads, strict=True)])
+        self._offsets, self._covariances = np.array([p[4] for p in parts]), np.array([p[6] for p in parts])
+        self._counts, self._twists = np.array([p[7] for p in parts]), np.array([p[9] for p in parts])
         none = [np.zeros((size, 2, 2)) for size in sizes.tolist()]
         self._spreads = np.concatenate([n if s is None else s for n, s in zip(none, spreads, strict=True)])
         self.rows = 2 * int(self._ends[-1])

@@ -1,4 +1,4 @@
-"""The Kalman update by landmarks of a map that is exact, compiled: that of :func:`factors.update.update_state`, by information.
+"""The Kalman update by landmarks, compiled: that of :func:`factors.update.update_state`, by information.
 
 A filter makes a dozen small matrices of each look, and NumPy takes longer for each than its arithmetic does.
 """
@@ -8,7 +8,8 @@ import math
 import numpy as np
 
 from factors.compiled import compiled
-from factors.landmarks.model import BEARING_SIGMA, DEPTH, PARAMETERS, RANGE_SIGMA, RELATIVE, ROBUST, TURN, whitened_into
+from factors.landmarks.kernels import Look, linearize
+from factors.landmarks.model import BEARING_SIGMA, PARAMETERS, RANGE_SIGMA, RELATIVE, ROBUST
 from factors.positive_kernels import inverse
 from factors.positive_kernels import root as lower_root
 from factors.robust import geman_mcclure_weight
@@ -21,9 +22,7 @@ _CONSTANTS = len(PARAMETERS)
 @compiled(error_model="numpy")
 def updated(
     model: Array,
-    points: Array,
-    ranges: Array,
-    bearings: Array,
+    look: Look,
     pose: Array,
     covariance: Array,
     values: Array,
@@ -37,16 +36,18 @@ def updated(
     their normalised square, and how many numbers were measured.
 
     ``model``: of :func:`~factors.landmarks.model.packed`. ``values`` (P,): of the sensor's constants that are estimated;
-    ``indices`` (P,): their places in :data:`~factors.landmarks.model.PARAMETERS`, that of the time offset not among them;
-    ``first``: of their columns in the error state. ``gate``: beyond which a landmark's noise is widened.
+    ``indices`` (P,): their places in :data:`~factors.landmarks.model.PARAMETERS`; ``first``: of their columns in the error state.
+    ``gate``: beyond which a landmark's noise is widened.
     """
-    seen = points, ranges, bearings
-    count, size = len(points), len(covariance)
+    count, size = len(look[0]), len(covariance)
     columns = np.empty(3 + len(values), np.int64)
     for j in range(len(columns)):
         columns[j] = j if j < 3 else first + j - 3
     residual, jacobian = np.empty((count, 2)), np.empty((count, 2, len(columns)))
-    measured = _linearized(model, seen, pose, values, indices, residual, jacobian)
+    _linearized(model, look, pose, values, indices, residual, jacobian)
+    measured = 0
+    for k in range(count):
+        measured += (not math.isnan(look[1][k])) + (not math.isnan(look[2][k]))
     before, weights = np.zeros(size), np.ones(count)
     prior, there = inverse(covariance)
     if not there:
@@ -73,7 +74,7 @@ def updated(
         dx, dy, turned = exp(delta[0], delta[1], delta[2])
         c, s = math.cos(pose[2]), math.sin(pose[2])
         moved[0], moved[1], moved[2] = pose[0] + c * dx - s * dy, pose[1] + s * dx + c * dy, pose[2] + turned
-        _linearized(model, seen, moved, values + delta[columns[3:]], indices, now, jacobian)
+        _linearized(model, look, moved, values + delta[columns[3:]], indices, now, jacobian)
         for k in range(count):
             weights[k] = geman_mcclure_weight(now[k, 0] ** 2 + now[k, 1] ** 2, model[ROBUST])
         there, delta, after, _ = _solved(prior, now, jacobian, columns, weights, before)
@@ -82,14 +83,12 @@ def updated(
 
 
 @compiled(error_model="numpy")
-def weighted(
-    model: Array, points: Array, ranges: Array, bearings: Array, pose: Array, values: Array, indices: Integers
-) -> tuple[Array, Array, Array]:
+def weighted(model: Array, look: Look, pose: Array, values: Array, indices: Integers) -> tuple[Array, Array, Array]:
     """Whitened, robustly weighted residual (2K,) and its Jacobians by the pose (2K, 3) and by the constants (2K, P); arguments as
     of :func:`updated`."""
-    count, wide = len(points), len(indices)
+    count, wide = len(look[0]), len(indices)
     residual, jacobian = np.empty((count, 2)), np.empty((count, 2, 3 + wide))
-    _linearized(model, (points, ranges, bearings), pose, values, indices, residual, jacobian)
+    _linearized(model, look, pose, values, indices, residual, jacobian)
     out, by_pose, by_values = np.empty(2 * count), np.empty((2 * count, 3)), np.empty((2 * count, wide))
     for k in range(count):
         root = math.sqrt(geman_mcclure_weight(residual[k, 0] ** 2 + residual[k, 1] ** 2, model[ROBUST]))
@@ -120,45 +119,21 @@ def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -
 
 @compiled(error_model="numpy")
 def _linearized(
-    model: Array,
-    seen: tuple[Array, Array, Array],
-    pose: Array,
-    values: Array,
-    indices: Integers,
-    residual: Array,
-    jacobian: Array,
-) -> int:
-    """Whitened residuals (K, 2) at constants that differ by ``values``, and their Jacobian (K, 2, 3+P); how many were measured."""
-    points, ranges, bearings = seen
-    count = len(points)
+    model: Array, look: Look, pose: Array, values: Array, indices: Integers, residual: Array, jacobian: Array
+) -> None:
+    """Whitened residuals (K, 2) at constants that differ by ``values``, and their Jacobian (K, 2, 3+P)."""
+    count = len(residual)
     changes = np.zeros(_CONSTANTS)
     for j in range(len(values)):
         changes[indices[j]] = values[j]
-    scale = model[3] * (1.0 + changes[3])
-    by_pose, by_point, by_sensor = np.zeros((count, 2, 3)), np.zeros((count, 2, 2)), np.zeros((count, 2, _CONSTANTS))
-    whitened_into(
-        pose,
-        (model[0] + changes[0], model[1] + changes[1], model[TURN]),
-        (scale, model[RANGE_SIGMA], model[RELATIVE], model[2] + changes[2], model[BEARING_SIGMA]),
-        model[DEPTH] > 0.0,
-        model[4] + changes[4],
-        points,
-        ranges,
-        bearings,
-        residual,
-        by_pose,
-        by_point,
-        by_sensor,
-    )
-    measured = 0
+    by_pose, by_sensor = np.zeros((count, 2, 3)), np.zeros((count, 2, _CONSTANTS))
+    linearize(model, pose, changes, look, residual, by_pose, by_sensor)
     for k in range(count):
-        measured += (not math.isnan(ranges[k])) + (not math.isnan(bearings[k]))
         for i in range(2):
             for j in range(3):
                 jacobian[k, i, j] = by_pose[k, i, j]
             for j in range(len(values)):
                 jacobian[k, i, 3 + j] = by_sensor[k, i, indices[j]]
-    return measured
 
 
 @compiled(error_model="numpy")
