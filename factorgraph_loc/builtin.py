@@ -19,6 +19,7 @@ ESTIMATORS.own |= {
     "smoother": "factorgraph_loc.fusion.smoother:Smoother",
     "batch": "factorgraph_loc.fusion.batch:Batch",
     "space_batch": "factorgraph_loc.slam.space_batch:SpaceBatch",
+    "space_smoother": "factorgraph_loc.slam.space_smoother:SpaceSmoother",
 }
 MAPPERS.own["points"] = "factorgraph_loc.slam.point_mapper:bind"
 READERS.own |= {

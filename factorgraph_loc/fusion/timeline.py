@@ -167,7 +167,7 @@ class Filter(ABC):
     def _record(self) -> Any:
         """What :meth:`trajectory` needs of this time, with its time as ``t``."""
 
-    def _seek(self, m: Measurement) -> Any:
+    def _seek(self, m: Any) -> Any:
         """The state from a measurement alone, for an unknown start; None where it does not tell one."""
         return None
 

@@ -47,9 +47,9 @@ class Localizer:
     """An estimator for online use; any number of threads may push measurements and pull estimates.
 
     ``rig`` and ``world``: robot and map. ``estimator``: its name; ``settings``: overrides of its settings. The smoother has a
-    fixed lag of 10 s unless ``settings`` change it; with ``lag = None`` it keeps the whole past, as ``batch`` and ``space_batch``
-    do. ``sensors``: the channels to use, by default the rig's; measurements of others are counted as ignored. ``history`` [s]:
-    length of the past that :meth:`trajectory` returns, which bounds the memory. ``seed``: of the random generator.
+    fixed lag of 10 s unless ``settings`` change it; with ``lag = None`` it keeps the whole past, as ``batch``, ``space_batch`` and
+    ``space_smoother`` do. ``sensors``: the channels to use, by default the rig's; measurements of others are counted as ignored.
+    ``history`` [s]: length of the past that :meth:`trajectory` returns, which bounds the memory. ``seed``: of the random generator.
 
     Call :meth:`initialize` first, and again to restart; there is nothing to close. Timestamps are seconds of any clock that all
     sensors share; the time offsets of the rig are added here. A lock guards the estimator: a push waits while another measurement

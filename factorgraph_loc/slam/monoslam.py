@@ -73,7 +73,7 @@ class MonoslamSettings(FilterSettings):
     inconsistent, and the final trajectory is the causal one."""
 
     planar: bool | None = None
-    """whether the robot is on a floor; by default unless it starts with a pose in space"""
+    """whether the robot is on a floor; by default if its start is a pose on one, or unknown with wheels"""
     acceleration: Annotated[float, Field(ge=1e-3, le=100.0), InUnit("m/s^2")] = 4.0
     """standard deviation of the constant-velocity model, as published"""
     angular_acceleration: Annotated[float, Field(ge=1e-3, le=100.0), InUnit("rad/s^2")] = 6.0
@@ -104,11 +104,12 @@ class Monoslam(Filter):
     def __init__(self, setup: Setup, settings: MonoslamSettings) -> None:
         super().__init__(setup, settings)
         self._settings = settings
+        self.supports_unknown_start = settings.landmarks == "known"
         self._looker = FeatureMatcher(setup, self.diagnostics, settings.landmarks)
         twist = twist_settings(setup)
         self._twists = None if twist is None else TwistChain(twist, HORIZON)
-        self._planar = settings.planar is not False
         self._wheels = bool(moving(setup.sensors, "floor"))
+        self._planar = self._wheels if settings.planar is None else settings.planar
         camera = setup.rig.find(CameraSettings) if any(name in setup.sensors for name in CAMERAS) else None
         constants = self._motion.constants.names
         self._scale = constants.index(SCALE) if SCALE in constants else None
@@ -118,6 +119,13 @@ class Monoslam(Filter):
         # without a map the start is unobservable: its uncertainty is kept out of the state, where it would shrink as the
         # linearization point moves (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010)
         self._origin: Origin | None = None
+
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a Gaussian, or where an image says, if the heading is unknown."""
+        if prior.has_heading:
+            super().initialize(prior)
+        else:
+            self._wait(prior.t)
 
     def process(self, measurement: Measurement) -> None:
         """Process one measurement, in order or late by at most ``max_delay``."""
@@ -175,7 +183,8 @@ class Monoslam(Filter):
         s = self._settings
         constants = self._motion.constants
         covariance = _starting(constants.sigmas)
-        self._planar = prior.space is None if s.planar is None else s.planar
+        if s.planar is None:
+            self._planar = prior.space is None
         if prior.space is not None:
             position, rotation = prior.space.position, prior.space.rotation
             covariance[:6, :6] = prior.space.covariance
@@ -191,6 +200,15 @@ class Monoslam(Filter):
             self._origin = Origin(robot, spread)
             covariance[free] = covariance[:, free] = 0.0
         return SlamState(robot, np.zeros(len(constants.names)), covariance)
+
+    def _seek(self, m: Pixels) -> SlamState | None:
+        eye = self._looker.eye(m)
+        camera = None if eye is None else self._looker.relocated(m, eye)
+        if eye is None or camera is None:
+            return None
+        sigmas = self._motion.constants.sigmas
+        nowhere = RobotState(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+        return self._standing(camera, eye, SlamState(nowhere, np.zeros(len(sigmas)), _starting(sigmas)))
 
     @property
     def _by_velocity(self) -> bool:

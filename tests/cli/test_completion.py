@@ -55,7 +55,10 @@ def test_the_settings_are_those_of_the_models(name):
         ("fgloc run plaza", ["plaza1", "plaza2"]),
         ("fgloc compare plaza2 woods-r", ["woods-r1", "woods-r3", "woods-r5"]),
         ("fgloc run plaza2 -e sm", ["smoother"]),
-        ("fgloc compare plaza2 -e ekf,smoother,s", ["ekf,smoother,switching", "ekf,smoother,space_batch"]),
+        (
+            "fgloc compare plaza2 -e ekf,smoother,s",
+            ["ekf,smoother,switching", "ekf,smoother,space_batch", "ekf,smoother,space_smoother"],
+        ),
         ("fgloc simulate c", ["corridor"]),
         ("fgloc run plaza2 -e ekf --prior u", ["unknown"]),
         ("fgloc run plaza2 -e ekf --set ek", ["ekf."]),

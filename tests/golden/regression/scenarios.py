@@ -32,6 +32,7 @@ RUNS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "switching": ("switching", {"particles": 300}),
     "monoslam": ("monoslam", {}),
     "space_batch": ("space_batch", {}),
+    "space_smoother": ("space_smoother", {}),
 }
 LAG = "smoother_lag"
 GRAPHS = ("smoother", LAG, "batch")
@@ -40,7 +41,7 @@ MAPPERS = ("ekf", *GRAPHS)
 ON_FLOOR = ("dead_reckoning", *FINDERS, "switching")
 READERS = ("particle_filter", "smoother", "batch", "switching")
 WATCHERS = (*FINDERS, "monoslam")
-IN_SPACE = ("monoslam", "space_batch")
+IN_SPACE = ("monoslam", "space_batch", "space_smoother")
 
 LANDMARKS = ("odometry", "bearing_range")
 TAGS = ("odometry", "rfid")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import short_logs
 from camera_benchmark.reprojection import reprojection_residuals, spread_of
 from scipy.stats import chi2
 from space_world import RIG, carried, with_features
@@ -15,14 +16,29 @@ from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.io.readers import load
+from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
 
 
 def estimated(log, name, sensors=None, **settings):
     return run(log, RunConfig(name, settings, sensors))
+
+
+def at_the_end(log, *, forget=False):
+    """The window when the last measurement has come, with ticks; ``forget``: it may forget what is older than a second."""
+    setup = Setup(RIG, log.world, RIG.sensors, np.random.default_rng(1))
+    estimator = create("space_smoother", setup, settings_of("space_smoother", {}))
+    estimator.initialize(resolve_prior(log, None)[0])
+    for m in log.measurements(RIG.sensors):
+        estimator.process(m)
+        estimator.process(Tick(m.t))
+        if forget:
+            estimator.forget(m.t - 1.0)
+    return estimator
 
 
 def nees(found, log, row=-1):
@@ -41,6 +57,65 @@ def test_the_batch_is_where_the_smoothed_filter_is():
     assert np.median(ratio) == pytest.approx(1.0, abs=0.05)
 
 
+def test_the_window_is_where_the_filter_is():
+    """Both know the same at any time of a problem that is nearly linear."""
+    log = carried(1)
+    filtered, window = (estimated(log, name).causal_space for name in ("monoslam", "space_smoother"))
+    sigmas = np.sqrt(np.array([np.diag(c) for c in window.covariances]))
+    assert np.quantile(np.abs(space.pose_errors(filtered, window)) / sigmas, 0.95) < 0.4
+    ratio = np.array([np.diag(c) for c in filtered.covariances]) / sigmas**2
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_final_trajectory_of_the_window_is_that_of_the_batch():
+    log = carried(2)
+    window, batch = (estimated(log, name).final_space for name in ("space_smoother", "space_batch"))
+    np.testing.assert_array_equal(window.positions, batch.positions)
+    np.testing.assert_array_equal(window.covariances, batch.covariances)
+
+
+def test_what_leaves_the_window_is_not_lost():
+    log = carried(3)
+    whole, short = (estimated(log, "space_smoother", lag=lag).causal_space for lag in (100.0, 1.0))
+    sigmas = np.sqrt(np.array([np.diag(c) for c in whole.covariances]))
+    assert np.max(np.abs(space.pose_errors(short, whole)) / sigmas) < 0.01
+
+
+def test_a_late_image_counts_once():
+    """When all have come, what is known is what it would be without delay, but for the robust weights of before."""
+    log = carried(3)
+    late, whole = (at_the_end(one).estimate().space for one in (short_logs.late(log, "sightings_right"), log))
+    sigmas = np.sqrt(np.diag(whole.covariance))
+    np.testing.assert_array_less(np.abs(late.position - whole.position) / sigmas[3:], 0.4)
+    np.testing.assert_allclose(np.diag(late.covariance), sigmas**2, rtol=0.02)
+
+
+def test_a_whole_problem_forgets_nothing():
+    log = carried(3)
+    asked, whole = (at_the_end(log, forget=forget).space_trajectory() for forget in (True, False))
+    np.testing.assert_array_equal(asked.positions, whole.positions)
+
+
+@pytest.mark.parametrize("name", ["monoslam", "space_batch", "space_smoother"])
+def test_a_camera_finds_its_place_in_the_map(name):
+    log = carried(1)
+    known = score(estimated(log, name), log)
+    found = run(log, RunConfig(name, prior="unknown"))
+    figures = score(found, log)
+    assert figures["final.space_position_rmse"] < 1.1 * known["final.space_position_rmse"]
+    assert figures["final.space_anees"] < 1.2 * known["final.space_anees"]
+    assert not found.warnings
+
+
+@pytest.mark.parametrize("name", ["monoslam", "space_batch", "space_smoother"])
+def test_where_no_image_tells_the_place_there_is_no_trajectory(name):
+    log = carried(1)
+    empty = replace(log, world=World(points=PointMap.of(("elsewhere",), np.zeros((1, 3)))))
+    found = run(empty, RunConfig(name, prior="unknown"))
+    assert not len(found.final_space)
+    assert "never localized" in found.warnings[0]
+
+
 def test_features_of_a_map_are_tempered_in_the_batch_as_in_the_filter():
     log = with_features(carried(1), 0.05)
     smoothed, batch = estimated(log, "monoslam").final_space, estimated(log, "space_batch").final_space
@@ -51,15 +126,17 @@ def test_features_of_a_map_are_tempered_in_the_batch_as_in_the_filter():
 
 
 def test_covariances_in_space_are_those_of_the_errors():
-    """NEES of 8 independent runs, causal at their end and of the batch in their middle: each fails a right one with 0.1 %."""
-    causal, final = [], []
+    """NEES of 8 independent runs, causal at their end and of the final ones in their middle: each fails a right one with 0.1 %."""
+    causal, final, window = [], [], []
     for seed in range(8):
         log = carried(seed)
-        result = estimated(log, "space_batch")
+        result = estimated(log, "space_smoother")
         final.append(nees(result.final_space, log, len(result.final_space) // 2))
+        window.append(nees(result.causal_space, log))
         causal.append(nees(estimated(log, "monoslam", smooth=False).final_space, log))
     low, high = chi2.ppf((5e-4, 1.0 - 5e-4), 6 * 8)
     assert low < sum(causal) < high
+    assert low < sum(window) < high
     assert low < sum(final) < high
 
 
@@ -114,7 +191,7 @@ def test_a_random_walk_stands_in_for_measured_motion_in_the_batch():
 
 @pytest.mark.parametrize("name", ["dead_reckoning", "ekf", "particle_filter", "smoother", "batch"])
 def test_planar_estimators_refuse(name):
-    with pytest.raises(InputError, match="moves in space, expected one of monoslam, space_batch"):
+    with pytest.raises(InputError, match="moves in space, expected one of monoslam, space_batch, space_smoother"):
         estimated(carried(5), name)
 
 
@@ -140,7 +217,7 @@ def test_recorded_starry_night(data_root):
     assert found["u_mad"] < 0.5 * spread_of(reprojection_residuals(log.reference3, log))["u_mad"]
 
 
-@pytest.mark.parametrize("name", ["monoslam", "space_batch"])
+@pytest.mark.parametrize("name", ["monoslam", "space_batch", "space_smoother"])
 def test_asking_changes_no_answer(name):
     """What is known at the end is the same to the last bit, whatever was asked on the way."""
     log = carried(4)

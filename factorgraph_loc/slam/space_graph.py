@@ -1,0 +1,246 @@
+"""The factor graph of a camera in space: all its poses, from measured motion and points of a known map.
+
+One ``gtsam.Pose3`` per stamp; between-factors of the measured motion (``twist``), or of a random walk without it; and for each
+image the points that the monoSLAM filter matched, with Huber loss. That filter runs along and provides initial values. Points that
+the map lacks are not used.
+
+Point factors are linearised here, as in :mod:`~factorgraph_loc.fusion.problem`, and GTSAM solves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.fusion.least_squares import damped_step, optimum
+from factorgraph_loc.fusion.marginals import IndeterminateError, covariances, damped
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.sensors.camera.sensor import Pixels
+from factorgraph_loc.sensors.twist.measurement import in_space, twist_settings
+from factorgraph_loc.sensors.twist.settings import TwistSettings
+from factorgraph_loc.slam.monoslam import Monoslam, MonoslamSettings
+from factorgraph_loc.slam.monoslam_sighting import Match
+from factorgraph_loc.slam.monoslam_state import Eye, SlamState, squared
+from factorgraph_loc.slam.space_motion import Displacement, RobotState, TwistChain
+from factors import positive
+from factors.robust import huber_loss, huber_weight
+from factors.se2 import Array
+
+RANDOM_WALK = (1.0, 1.0, 1.0)  # m and rad per sqrt(s), without measured motion
+
+
+class SpaceGraphSettings(MonoslamSettings):
+    """Settings of the filter that provides initial values; ``landmarks`` must be ``known``, and ``planar`` off."""
+
+
+@dataclass(frozen=True)
+class KnownPose:
+    """What is known of the pose at ``t``: its mean, and the covariance (6, 6) of a perturbation."""
+
+    t: float
+    pose: gtsam.Pose3
+    covariance: Array
+
+    def moved(self, by: Displacement, t: float) -> KnownPose:
+        """The pose at ``t``, after that motion."""
+        step = gtsam.Pose3(gtsam.Rot3(by.rotation), by.shift)
+        adjoint = step.inverse().AdjointMap()
+        return KnownPose(t, self.pose.compose(step), adjoint @ self.covariance @ adjoint.T + by.covariance)
+
+    def factor(self, key: int) -> gtsam.NonlinearFactor:
+        """The prior that says so of a variable."""
+        return gtsam.PriorFactorPose3(key, self.pose, gtsam.noiseModel.Gaussian.Covariance(self.covariance))
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """The image of a camera at ``t``: ``pixels`` (K, 2) of ``points`` (K, 3) with covariances ``spreads`` (K, 3, 3);
+    ``tempering``: exponent of the likelihood.
+    """
+
+    t: float
+    eye: Eye
+    pixels: Array
+    points: Array
+    spreads: Array | None
+    tempering: float
+
+    def linearize(self, pose: gtsam.Pose3) -> tuple[Array, Array]:
+        """Whitened, robustly weighted residual (2K,) and Jacobian (2K, 6) with respect to the pose."""
+        error, whitener, jacobian = self._whitened(pose)
+        weight = np.sqrt(self.tempering * huber_weight(np.sum(error**2, axis=1), self.eye.model.robust))
+        return (weight[:, None] * error).ravel(), (weight[:, None, None] * (whitener @ jacobian)).reshape(-1, 6)
+
+    def cost(self, pose: gtsam.Pose3) -> float:
+        """The robust loss, tempered."""
+        sights = self.eye.known(_robot(pose), self.points, self.spreads)
+        losses = huber_loss(squared(sights.pixels - self.pixels, sights.noise), self.eye.model.robust)
+        return self.tempering * float(np.sum(losses))
+
+    def _whitened(self, pose: gtsam.Pose3) -> tuple[Array, Array, Array]:
+        sights = self.eye.known(_robot(pose), self.points, self.spreads)
+        whitener = positive.whitener(sights.noise)
+        return np.einsum("kij,kj->ki", whitener, sights.pixels - self.pixels), whitener, sights.by_pose
+
+
+class SpaceGraph(Monoslam):
+    """Estimates in space of which the final ones are the robust optimum over the whole log. See the module."""
+
+    name: str  # of the estimator, in messages
+    estimates_points = False
+    starts_in_space = True
+
+    def __init__(self, setup: Setup, settings: SpaceGraphSettings) -> None:
+        if settings.landmarks != "known" or settings.planar:
+            raise InputError(
+                f"{self.name}: works with points of a known map and a robot in space, expected planar = false"
+            )
+        super().__init__(setup, settings.model_copy(update={"planar": False}))
+        twist = twist_settings(setup)
+        self._chain = TwistChain(twist or TwistSettings(shift=RANDOM_WALK, turn=RANDOM_WALK))
+        self._images: dict[tuple[float, bool], SeenPoints] = {}
+        self._first: KnownPose | None = None  # the start
+        self._conclusion: tuple[Trajectory3, Diagnostics] | None = None  # the result, until the next measurement
+
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a pose in space. Raises InputError for a planar pose."""
+        if prior.space is None:
+            raise InputError(
+                f"{self.name}: the start is a pose on a floor, expected one in space: a log with such a reference, or unknown"
+            )
+        start = prior.space
+        pose = gtsam.Pose3(gtsam.Rot3(start.rotation), start.position)
+        self._first = KnownPose(prior.t, pose, start.covariance)
+        super().initialize(prior)
+
+    def process(self, measurement: Measurement) -> None:
+        """Process one measurement, in order or late by at most ``max_delay``."""
+        self._conclusion = None
+        twist = in_space(measurement)
+        if twist is not None:
+            self._chain.add(twist.t, twist.v, twist.w)
+        super().process(measurement)
+
+    def forget(self, before: float) -> None:
+        """Forget nothing: the problem is that of the whole log."""
+
+    def space_trajectory(self) -> Trajectory3:
+        """The optimum over the whole log, at the ticks."""
+        return self._concluded()[0]
+
+    def final_diagnostics(self) -> Diagnostics:
+        """The diagnostics, including those of the final trajectory."""
+        return self._concluded()[1]
+
+    def _concluded(self) -> tuple[Trajectory3, Diagnostics]:
+        """The final trajectory, and the diagnostics including it."""
+        if self._conclusion is None:
+            diagnostics = self.diagnostics.copy()
+            self._conclusion = self._solution(diagnostics), diagnostics
+        return self._conclusion
+
+    def _solution(self, diagnostics: Diagnostics) -> Trajectory3:
+        past = {record.t: record.robot for record in self._past()}
+        if not past:  # nothing told where an unknown start was
+            return Trajectory3(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 6, 6)))
+        t = np.array(sorted(past))
+        values = gtsam.Values()
+        for i, stamp in enumerate(t.tolist()):
+            values.insert(i, pose_of(past[stamp]))
+        images = [(int(np.searchsorted(t, image.t)), image) for image in self._images.values()]
+        motion = self._motion_graph(t)
+        values, linear = _solved(motion, images, values)
+        ticks = np.unique(np.array(self._ticks))
+        rows = np.searchsorted(t, ticks).tolist()
+        spreads = self._covariances(linear, rows, t, diagnostics)
+        poses = [values.atPose3(i) for i in rows]
+        return Trajectory3(
+            ticks,
+            np.array([pose.translation() for pose in poses]).reshape(-1, 3),
+            np.array([pose.rotation().matrix() for pose in poses]).reshape(-1, 3, 3),
+            np.array([spreads[i] + self._mounting for i in rows]).reshape(-1, 6, 6),
+        )
+
+    def _seek(self, m: Pixels) -> SlamState | None:
+        state = super()._seek(m)
+        self._first = None if state is None else KnownPose(m.t, pose_of(state.robot), state.covariance[:6, :6])
+        return state
+
+    def _matched(self, m: Pixels, match: Match, eye: Eye) -> None:
+        key = (m.t, m.right)
+        self._images.pop(key, None)  # it may have been matched before a late measurement
+        if len(match.pixels):
+            self._images[key] = SeenPoints(m.t, eye, match.pixels, match.points, match.spreads, match.tempering)
+
+    def _motion_graph(self, t: Array) -> gtsam.NonlinearFactorGraph:
+        first = self._first
+        assert first is not None
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(self._later(first, float(t[0])).factor(0))
+        for i in range(len(t) - 1):
+            graph.add(between(i, i + 1, self._chain.between(float(t[i]), float(t[i + 1]))))
+        return graph
+
+    def _later(self, known: KnownPose, t: float) -> KnownPose:
+        """What is known at ``t``, by the measured motion."""
+        return known.moved(self._chain.between(known.t, t), t) if t > known.t else known
+
+    def _covariances(
+        self, linear: gtsam.GaussianFactorGraph, rows: list[int], t: Array, diagnostics: Diagnostics
+    ) -> dict[int, Array]:
+        """Covariances (6, 6) of the poses ``rows``. Raises RunFailedError if they are not determined."""
+        try:
+            found = covariances(linear, dict.fromkeys(range(len(t)), 6), rows)
+        except IndeterminateError as error:
+            what = "all poses" if error.key is None else f"the pose at {t[error.key]:.3f} s"
+            raise RunFailedError(f"{self.name}: the measurements do not determine {what}") from error
+        if found.damping:
+            diagnostics.events.append((float(t[-1]), damped(found.damping)))
+        return found.by_key
+
+
+def between(key: int, later: int, by: Displacement) -> gtsam.NonlinearFactor:
+    """The factor of a measured motion from one pose to the next."""
+    step = gtsam.Pose3(gtsam.Rot3(by.rotation), by.shift)
+    return gtsam.BetweenFactorPose3(key, later, step, gtsam.noiseModel.Gaussian.Covariance(by.covariance))
+
+
+def _solved(
+    motion: gtsam.NonlinearFactorGraph, images: list[tuple[int, SeenPoints]], values: gtsam.Values
+) -> tuple[gtsam.Values, gtsam.GaussianFactorGraph]:
+    """The optimum, and the problem linearised there."""
+    units = {2 * len(image.pixels): gtsam.noiseModel.Unit.Create(2 * len(image.pixels)) for _, image in images}
+    sizes = dict.fromkeys(range(values.size()), 6)
+
+    def cost(at: gtsam.Values) -> float:
+        return float(motion.error(at)) + sum(image.cost(at.atPose3(key)) for key, image in images)
+
+    def linearized(at: gtsam.Values) -> gtsam.GaussianFactorGraph:
+        graph = motion.linearize(at)
+        for key, image in images:
+            residual, jacobian = image.linearize(at.atPose3(key))
+            graph.add(gtsam.JacobianFactor(key, jacobian, -residual, units[len(residual)]))
+        return graph
+
+    def moved(at: gtsam.Values, damping: float) -> gtsam.Values | None:
+        step = damped_step(linearized(at), sizes, damping)
+        return None if step is None else at.retract(step)
+
+    found, _, _ = optimum(cost, moved, values)
+    return found, linearized(found)
+
+
+def _robot(pose: gtsam.Pose3) -> RobotState:
+    return RobotState(np.asarray(pose.translation()), np.asarray(pose.rotation().matrix()), np.zeros(3), np.zeros(3))
+
+
+def pose_of(robot: RobotState) -> gtsam.Pose3:
+    """The pose of the filter's robot."""
+    return gtsam.Pose3(gtsam.Rot3(robot.rotation), robot.position)

@@ -1,0 +1,147 @@
+"""The incremental sibling of ``space_batch``: iSAM2 with a window of the last seconds gives causal estimates, and the whole problem
+is solved at the end.
+
+The monoSLAM filter runs along: it matches points, and a new pose is linearised first where the filter has it. Its estimates do not
+enter those of the window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import gtsam
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc.files.models import InUnit
+from factorgraph_loc.fusion.timeline import Taken
+from factorgraph_loc.model.belief import PoseEstimate, PosePrior, SpacePose
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.trajectory3 import planar_estimate
+from factorgraph_loc.sensors.camera.sensor import Pixels
+from factorgraph_loc.slam.monoslam_past import UpdateRecord
+from factorgraph_loc.slam.monoslam_state import SlamState
+from factorgraph_loc.slam.space_graph import (
+    KnownPose,
+    SeenPoints,
+    SpaceGraph,
+    SpaceGraphSettings,
+    between,
+    pose_of,
+)
+from factorgraph_loc.slam.space_motion import Displacement
+from factors.se2 import Array
+
+THRESHOLD = 0.01  # m, rad: how far a pose moves before its factors are linearised again
+
+
+class SpaceSmootherSettings(SpaceGraphSettings):
+    """Settings of the window, and of the filter that matches points; ``landmarks`` must be ``known``, and ``planar`` off."""
+
+    lag: Annotated[float, Field(gt=0.0, le=3600.0), InUnit("s")] = 10.0
+    """length of the window that causal estimates come from"""
+
+
+@dataclass(frozen=True)
+class _WindowRecord(UpdateRecord):
+    """``known``: what the window knew then."""
+
+    known: KnownPose | None = None
+
+
+class SpaceSmoother(SpaceGraph):
+    """Incremental factor graph (iSAM2) in space: a window, and the whole problem at the end. See the module."""
+
+    name = "space_smoother"
+
+    def __init__(self, setup: Setup, settings: SpaceSmootherSettings) -> None:
+        super().__init__(setup, settings)
+        self._lag = settings.lag
+        self._window: _Window | None = (
+            None  # begun anew from what is known, after the start and after a late measurement
+        )
+        self._known: KnownPose | None = None
+
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a pose in space. Raises InputError for a planar pose."""
+        super().initialize(prior)
+        self._known, self._window = self._first, None
+
+    def _seek(self, m: Pixels) -> SlamState | None:
+        state = super()._seek(m)
+        self._known, self._window = self._first, None
+        return state
+
+    def _see(self, m: Pixels) -> None:
+        super()._see(m)
+        known, image = self._known, self._images.get((m.t, m.right))
+        if image is None or known is None:
+            return
+        if self._window is None:
+            self._window = _Window(known, self._lag)
+        moved = self._chain.between(known.t, m.t) if m.t > known.t else None
+        self._known = self._window.add(image, moved, pose_of(self._state.robot))
+
+    def _estimate(self) -> PoseEstimate:
+        assert self._known is not None
+        now = self._later(self._known, self._t)
+        position, rotation = np.asarray(now.pose.translation()), np.asarray(now.pose.rotation().matrix())
+        return planar_estimate(self._t, SpacePose(position, rotation, now.covariance + self._mounting))
+
+    def _record(self) -> UpdateRecord:
+        return _WindowRecord(**vars(super()._record()), known=self._known)
+
+    def _go_back(self, taken: Taken) -> None:
+        super()._go_back(taken)
+        known = self._records[-1].known if self._records else self._first
+        if known is not self._known:
+            self._known, self._window = known, None
+
+
+class _Window:
+    """The poses of the images of the last ``lag`` seconds; older ones are marginalised out."""
+
+    def __init__(self, start: KnownPose, lag: float) -> None:
+        parameters = gtsam.ISAM2Params()
+        parameters.setRelinearizeThreshold(THRESHOLD)
+        parameters.relinearizeSkip = 1
+        self._solver = gtsam.IncrementalFixedLagSmoother(lag, parameters)
+        self._key, self._t = 0, start.t
+        self._update([start.factor(0)], start.pose)
+
+    def add(self, image: SeenPoints, moved: Displacement | None, guess: gtsam.Pose3) -> KnownPose:
+        """Add an image, of the newest pose or of one after the motion ``moved``, and return what is known of its pose then."""
+        if moved is None:
+            self._update([_factor(image, self._key)])
+        else:
+            self._key, self._t = self._key + 1, image.t
+            self._update([between(self._key - 1, self._key, moved), _factor(image, self._key)], guess)
+        covariance = np.asarray(self._solver.marginalCovariance(self._key))
+        return KnownPose(self._t, self._solver.calculateEstimatePose3(self._key), covariance)
+
+    def _update(self, factors: list[gtsam.NonlinearFactor], guess: gtsam.Pose3 | None = None) -> None:
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for factor in factors:
+            graph.push_back(factor)
+        if guess is not None:
+            values.insert(self._key, guess)
+        try:
+            self._solver.update(graph, values, {self._key: self._t})
+        except RuntimeError as error:
+            raise RunFailedError(
+                f"space_smoother: the measurements do not determine the pose at {self._t:.3f} s"
+            ) from error
+
+
+def _factor(image: SeenPoints, key: int) -> gtsam.NonlinearFactor:
+    """The points of an image, as a factor that GTSAM linearises where it likes."""
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        residual, jacobian = image.linearize(values.atPose3(key))
+        if jacobians is not None:
+            jacobians[0] = jacobian
+        return residual
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(2 * len(image.pixels)), [key], error)
