@@ -15,6 +15,7 @@ __all__ = [
     "motion",
     "odometry",
     "positive",
+    "positive_kernels",
     "rfid",
     "robust",
     "rts_kernels",

@@ -42,6 +42,7 @@ ITERATIONS_AFTER_FAILURE = 10
 LAG = 10.0  # s of the window that causal estimates come from, where none is set
 # m, rad: a window, whose oldest points are soon linearised for good, linearises anew what moves that far from where it saw points
 NEAR_POINTS = 0.02
+ROUNDING = 1e-6  # s; differences of times are as exact as that
 
 
 class Incremental:
@@ -255,13 +256,14 @@ class Incremental:
         if not isinstance(self._solver, Window) or self._lag is None:
             return
         lag, count = self._lag, len(self._left)
-        if self._graph.keyframes[count].t >= now - lag - self._margin:
+        first = self._graph.keyframes[count].t
+        if not self._maps:  # those read before leave by now: both takes time
+            self._solver.lag = now - first + ROUNDING
+        if first >= now - lag - self._margin:
             return
         end = count
         while self._graph.keyframes[end].t < now - lag:
             end += 1
-        if not self._maps:
-            self._solver.release(lag)
         leaving = self._graph.keyframes[count:end]
         try:
             # of a start of the whole problem the covariance is not asked; a window with points takes long to eliminate

@@ -30,6 +30,7 @@ from factorgraph_loc.fusion.variables import (
     to_gtsam,
 )
 from factors.graph import jacobian_factor, pose_array, silenced
+from factors.positive_kernels import inverse
 from factors.se2 import Array
 
 _State = tuple[gtsam.NonlinearFactorGraph, Values, frozenset[int]]
@@ -118,31 +119,24 @@ class FullHistory:
 
 
 class Window:
-    """Poses older than ``lag`` are marginalised out; where that is infinite, only with an update after :meth:`release`. An update
-    with which nothing leaves takes less time: iSAM2 then puts the newest pose at the root of its tree."""
+    """Poses older than ``lag`` [s] are marginalised out with each update. One with which nothing leaves takes less time: iSAM2 then
+    puts the newest pose at the root of its tree."""
 
     def __init__(
         self, parameters: gtsam.ISAM2Params, threshold: float, lag: float, on_failure: Callable[[str], None]
     ) -> None:
         parameters.setRelinearizeThreshold(threshold)
-        self._lag = lag
+        self.lag = lag
         self._smoother = gtsam.IncrementalFixedLagSmoother(lag, parameters)
         self._ours = _Ours(threshold, parameters.relinearizeSkip, on_failure)
-        self._stamps: dict[int, float] = {}  # of the variables in the window
+        self._stamps: dict[int, float] = {}  # of the variables that may leave
         # before the last update: all factors, where the variables were linearised, and which factors are ours
         self._before: _State = gtsam.NonlinearFactorGraph(), {}, frozenset()
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
-        stamps: dict[int, float] = dict.fromkeys(values, t)
-        # what is constant never leaves the window, points do when they are seen no more
-        if self._smoother.smootherLag() < math.inf:
-            stamps |= dict.fromkeys((key for key in self._stamps if is_constant(key)), t)
-        stamps |= dict.fromkeys((key for node in nodes for key in node.keys if is_point(key)), t)
-        self.begin((), nodes, values, stamps)
-
-    def release(self, lag: float) -> None:
-        """Poses older than ``lag`` leave with the next update."""
-        self._smoother.setSmootherLag(lag)
+        # points leave when they are seen no more
+        seen = (key for node in nodes for key in node.keys if is_point(key))
+        self.begin((), nodes, values, dict.fromkeys((*values, *seen), t))
 
     def begin(
         self,
@@ -152,17 +146,18 @@ class Window:
         stamps: Mapping[int, float],
     ) -> None:
         self._before = self._state()
+        self._stamps |= {key: t for key, t in stamps.items() if not is_constant(key)}
+        now, lag = max(self._stamps.values()), math.inf
+        leaving = [key for key, t in self._stamps.items() if t < now - self.lag]
+        if leaving:
+            stamps = {**stamps, **dict.fromkeys(filter(is_constant, self._ours.at), now)}
+            lag = self.lag
         with gtsam_errors():
             graph, removed = self._ours.added(self._smoother, factors, nodes, values)
+            self._smoother.setSmootherLag(lag)
             self._smoother.update(graph, to_gtsam(values), cast("Mapping[Any, Any]", stamps), removed)
             self._ours.place(self._smoother.getISAM2Result().getNewFactorsIndices())
-        self._stamps |= stamps
-        lag = self._smoother.smootherLag()
-        if lag == math.inf:
-            return
-        self._smoother.setSmootherLag(self._lag)
-        oldest = max(self._stamps.values()) - lag
-        for key in [key for key, t in self._stamps.items() if t < oldest]:
+        for key in leaving:
             del self._stamps[key]
             self._ours.forget(key)
 
@@ -179,15 +174,16 @@ class Window:
         order = gtsam.Ordering()
         for key in keys:
             order.push_back(key)
-        isam = self._smoother.getISAM2()
+        isam, found, end = self._smoother.getISAM2(), {}, 0
         try:
-            ends = np.cumsum([len(self._ours.at[key]) for key in keys])
             factors = isam.getFactorsUnsafe().linearize(isam.getLinearizationPoint())
-            root = factors.marginalMultifrontalBayesNet(order, function=gtsam.EliminateQR).matrix()[0]
-            rows = np.split(np.linalg.inv(root), ends[:-1])
-        except (RuntimeError, LookupError, ValueError, np.linalg.LinAlgError):
+            joint, there = inverse(factors.marginal(keys).hessian(order)[0])
+            for key in keys:
+                start, end = end, end + len(self._ours.at[key])
+                found[key] = joint[start:end, start:end].copy()
+        except (RuntimeError, LookupError, ValueError):
             return {}
-        return {key: part @ part.T for key, part in zip(keys, rows, strict=True)}
+        return found if there else {}
 
     def estimates(self) -> gtsam.Values:
         return self._smoother.calculateEstimate()
