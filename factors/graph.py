@@ -6,7 +6,8 @@ variables, and an exception in a callback leaves iSAM2 in an inconsistent state.
 """
 
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Protocol, runtime_checkable
 
@@ -45,6 +46,18 @@ class Stack(Protocol):
         """The loss of all."""
 
 
+class Alike(Factor, Protocol):
+    """A factor of which many are linearised by one call."""
+
+    @property
+    def alike(self) -> Hashable:
+        """What those have in common that are linearised together."""
+
+    @staticmethod
+    def linearize_all(factors: Sequence[Any], values: Sequence[Sequence[Array]]) -> tuple[Array, list[Array]]:
+        """Residuals (N, m) of N factors, and a Jacobian (N, m, d) for each of their variables."""
+
+
 @runtime_checkable
 class Stackable(Factor, Protocol):
     """A factor on one pose or on two that follow one another, and perhaps on one vector, many of which become a stack."""
@@ -65,13 +78,38 @@ def pose_array(pose: gtsam.Pose2) -> Array:
 
 def silenced(factor: Factor, rows: int, on_failure: Callable[[str], None]) -> Factor:
     """``factor`` with ``rows`` residuals; a residual or Jacobian that is not finite or has a wrong shape is replaced by zeros and
-    reported to ``on_failure``."""
-    return _Silenced(factor, rows, on_failure)
+    reported to ``on_failure``. One of :class:`Alike` ones is taken as it is."""
+    return factor if hasattr(factor, "alike") else _Silenced(factor, rows, on_failure)
 
 
 def jacobian_factor(factor: Factor, keys: Sequence[int], values: Sequence[Array]) -> gtsam.GaussianFactor:
     """``factor`` linearised at ``values``."""
-    residual, blocks = factor.linearize(values)
+    return _gaussian(keys, *factor.linearize(values))
+
+
+def jacobian_factors(
+    factors: Sequence[tuple[Factor, Sequence[int]]], values: Mapping[int, Array]
+) -> list[gtsam.GaussianFactor]:
+    """Factors, each with the keys of its variables, linearised at ``values``; those that are alike together."""
+    out: list[Any] = [None] * len(factors)
+    alike: defaultdict[Hashable, list[int]] = defaultdict(list)
+    for i, (factor, keys) in enumerate(factors):
+        if hasattr(factor, "alike"):
+            alike[factor.alike].append(i)
+        else:
+            out[i] = jacobian_factor(factor, keys, [values[key] for key in keys])
+    for numbers in alike.values():
+        some = [factors[i] for i in numbers]
+        first: Any = some[0][0]
+        residuals, blocks = first.linearize_all(
+            [f for f, _ in some], [[values[key] for key in keys] for _, keys in some]
+        )
+        for i, (_, keys), residual, *parts in zip(numbers, some, residuals, *blocks, strict=True):
+            out[i] = _gaussian(keys, residual, parts)
+    return out
+
+
+def _gaussian(keys: Sequence[int], residual: Array, blocks: Sequence[Array]) -> gtsam.GaussianFactor:
     unit = _unit(len(residual))
     if len(blocks) > MOST_TERMS:
         return gtsam.GaussianConditional(list(zip(keys, blocks, strict=True)), 1, -residual, unit)

@@ -265,10 +265,11 @@ class Incremental:
         while self._graph.keyframes[end].t < now - lag:
             end += 1
         leaving = self._graph.keyframes[count:end]
+        points = [key for mapper in self._graph.mappers for key in mapper.leave(now - lag)]
+        # of a start of the whole problem the covariance is not asked
+        asked = [] if self._is_whole else [*(k.key for k in leaving), *constants, *points]
+        spreads = self._solver.covariances(asked) if asked else {}
         try:
-            # of a start of the whole problem the covariance is not asked; a window with points takes long to eliminate
-            alone = self._is_whole or self._maps
-            spreads = {} if alone else self._solver.covariances([*(k.key for k in leaving), *constants])
             for k in leaving:
                 spread = self._filtered[k.index][1] if self._is_whole else spreads.get(k.key)
                 self._left.append(self._marginal(k.key, spread))
@@ -279,14 +280,13 @@ class Incremental:
         oldest = self._solver.oldest  # what is still in the solver is needed where that is rebuilt
         for key in [key for key in self._graph.values if is_of_keyframe(key) and index_of(key) < oldest]:
             del self._graph.values[key]
-        for mapper in self._graph.mappers:
-            self._forget(mapper.leave(now - lag))
+        self._forget(points, spreads)
 
-    def _forget(self, points: Iterable[int]) -> None:
-        """Keep the estimates of points that leave the window."""
+    def _forget(self, points: Iterable[int], spreads: Mapping[int, Array]) -> None:
+        """Keep the estimates of points that leave the window, and their covariances, of which some are known."""
         for key in points:
             try:
-                self._graph.departed[0][key], self._graph.departed[1][key] = self._marginal(key)
+                self._graph.departed[0][key], self._graph.departed[1][key] = self._marginal(key, spreads.get(key))
             except RuntimeError:
                 self._graph.departed[0][key], self._graph.departed[1][key] = (
                     self._graph.values[key],

@@ -15,7 +15,7 @@ from factorgraph_loc.fusion.chained import Chained
 from factorgraph_loc.fusion.least_squares import MAX_ITERATIONS, damped_step, optimum
 from factorgraph_loc.fusion.marginals import Covariances, covariances
 from factorgraph_loc.fusion.variables import Values, gather, retract
-from factors.graph import Factor, jacobian_factor
+from factors.graph import Factor, jacobian_factors
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class Problem:
     def linearize(self, values: Values) -> gtsam.GaussianFactorGraph:
         """All factors, linearised with their robust weights."""
         graph = gtsam.GaussianFactorGraph()
-        for factor, keys in self._factors:
-            graph.add(jacobian_factor(factor, keys, gather(values, keys)))
+        for factor in jacobian_factors(self._factors, values):
+            graph.add(factor)
         return graph
 
     def covariances(self, values: Values, keys: Iterable[int]) -> Covariances:

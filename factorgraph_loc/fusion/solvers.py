@@ -21,7 +21,6 @@ from factorgraph_loc.fusion.summary import MarginalSummary, oldest_pose
 from factorgraph_loc.fusion.variables import (
     Node,
     Values,
-    gather,
     gtsam_errors,
     is_constant,
     is_point,
@@ -29,7 +28,7 @@ from factorgraph_loc.fusion.variables import (
     read,
     to_gtsam,
 )
-from factors.graph import jacobian_factor, pose_array, silenced
+from factors.graph import Factor, jacobian_factors, pose_array, silenced
 from factors.positive_kernels import inverse
 from factors.se2 import Array
 
@@ -241,10 +240,19 @@ class _Ours:
             self._added.append(linear)
             for key in node.keys:
                 self._on[key][id(linear)] = linear
-        for linear in self._added:
+        for linear, linearized in zip(self._added, self._linearized(), strict=True):
             linear.slot = graph.size()
-            graph.add(linear.on(self.at, self._on_failure))
+            graph.add(gtsam.LinearContainerFactor(linearized))
         return graph, removed
+
+    def _linearized(self) -> list[gtsam.GaussianFactor]:
+        """What is to be added, linearised. It does without a point that it is linearised at: the solver never leaves that."""
+        factors: list[tuple[Factor, tuple[int, ...]]] = []
+        for node in (linear.node for linear in self._added):
+            assert node.factor is not None
+            told = self._on_failure
+            factors.append((node.factor if told is None else silenced(node.factor, node.rows, told), node.keys))
+        return jacobian_factors(factors, self.at)
 
     def place(self, slots: Sequence[int]) -> None:
         """Take where the solver has put what was added."""
@@ -293,14 +301,6 @@ class _Linear:
 
     def __init__(self, node: Node) -> None:
         self.node, self.slot = node, -1
-
-    def on(self, values: Values, on_failure: Callable[[str], None] | None) -> gtsam.LinearContainerFactor:
-        """The factor, linearised at ``values``. It does without a point that it is linearised at: the solver never leaves that."""
-        factor, keys = self.node.factor, self.node.keys
-        assert factor is not None
-        if on_failure is not None:
-            factor = silenced(factor, self.node.rows, on_failure)
-        return gtsam.LinearContainerFactor(jacobian_factor(factor, keys, gather(values, keys)))
 
 
 def _linear(isam: gtsam.ISAM2) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:

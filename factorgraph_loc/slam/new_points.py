@@ -14,14 +14,13 @@ import numpy as np
 
 from factors import chi_squared
 from factors.camera import model as reprojection
+from factors.camera import triangulation_kernels as kernels
 from factors.camera.model import CameraModel
+from factors.camera.triangulation_kernels import MIN_PARALLAX
 from factors.se2 import Array
 
 FEWEST, MAX_WAITING = 3, 10  # sightings of one point
-MIN_PARALLAX = 0.03  # rad, between the outermost rays
 MAX_SPREAD = 0.15  # standard deviation of an initial point, relative to its least depth
-NEAREST = 0.3  # m of depth
-ITERATIONS, SETTLED = 4, 1e-3  # m: step below which the solution has converged
 GATE = 0.999  # probability of the chi-square test of the residuals
 PATIENCE = 20  # keyframes after which a point not seen again is dropped
 ORIGIN, UNTURNED, UPRIGHT = np.zeros(3), np.eye(3), np.zeros(2)
@@ -178,28 +177,15 @@ def _triangulate(
     model: CameraModel, seen: Sequence[PointSighting], places: Sequence[KeyframeCamera], spread: float
 ) -> TriangulatedPoint | None:
     """As :func:`triangulate`, with infinite residuals where the rays do not intersect in front of the camera."""
-    centres, turns = np.array([p.centre for p in places]), np.array([p.rotation for p in places])
-    rays = (turns @ np.array([s.ray for s in seen])[:, :, None])[:, :, 0]
-    if (rays @ rays.T).min() > math.cos(MIN_PARALLAX):
-        return None
-    pixels, sigmas = np.array([s.pixel for s in seen]), np.array([math.hypot(model.sigma, p.slack) for p in places])
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    point = np.linalg.solve(across.sum(axis=0), (across @ centres[:, :, None]).sum(axis=0)[:, 0])
-    for i in range(ITERATIONS + 1):
-        local = ((point - centres)[:, None, :] @ turns)[:, 0]
-        if not local[:, 2].min() > NEAREST:
-            return TriangulatedPoint(point, UNTURNED, np.full(len(seen), np.inf))
-        # a point in the camera frame is like a world point seen by a camera at the origin
-        at, _, by_local = reprojection.linearize_in_space(model, ORIGIN, UNTURNED, local)
-        residual = (at - pixels) / sigmas[:, None]
-        jacobian = (by_local @ turns.transpose(0, 2, 1) / sigmas[:, None, None]).reshape(-1, 3)
-        covariance = np.linalg.inv(jacobian.T @ jacobian)
-        # the initial point may be less accurate
-        if np.linalg.eigvalsh(covariance)[-1] > ((2.0 if i == 0 else 1.0) * spread * local[:, 2].min()) ** 2:
-            return None
-        if i < ITERATIONS:
-            step = covariance @ (jacobian.T @ residual.ravel())
-            point = point - step
-            if np.abs(step).max() < SETTLED:
-                break
-    return TriangulatedPoint(point, covariance, np.asarray(np.einsum("mi,mi->m", residual, residual)))
+    ended, *found = kernels.triangulated(
+        reprojection.lens_of(model),
+        np.array([p.centre for p in places]),
+        np.array([p.rotation for p in places]),
+        np.array([s.ray for s in seen]),
+        np.array([s.pixel for s in seen]),
+        np.array([math.hypot(model.sigma, p.slack) for p in places]),
+        spread,
+    )
+    if ended == kernels.BEHIND:
+        return TriangulatedPoint(ORIGIN, UNTURNED, np.full(len(seen), np.inf))
+    return TriangulatedPoint(*found) if ended == kernels.FOUND else None

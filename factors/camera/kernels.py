@@ -5,9 +5,8 @@ import math
 import numpy as np
 
 from factors.compiled import compiled
-from factors.robust import huber_loss, huber_weight
+from factors.robust import huber_loss
 from factors.se2 import Array
-from factors.small_kernels import product
 
 NEAREST = 0.05  # m in front of the camera
 MOST_STEPS, ENOUGH = 50, 1e-14  # of Newton's method: maximum steps, and norm of the residual at convergence
@@ -172,64 +171,6 @@ def linearize(
         by_parameters[i, 0, 6] = u - k[2]
         by_parameters[i, 1, 6] = v - k[3]
     return pixels, by_pose, by_point, by_parameters
-
-
-@compiled(error_model="numpy")
-def seen_by_tilted(
-    k: Lens,
-    position: Array,
-    rotation: Array,
-    pose: Array,
-    tilt: Array,
-    point: Array,
-    pixel: Array,
-    sigma: float,
-    robust: float,
-    behind: float,
-) -> tuple[Array, Array, Array, Array, Array, float]:
-    """See :meth:`factors.camera.point.PointFactor.linearize`: residual (2,) and its Jacobians by pose, all parameters, tilt and
-    point, and the squared residual without weight. ``behind``: the residual of a point behind the camera."""
-    roll, pitch = tilt[0], tilt[1]
-    angle = math.sqrt(roll * roll + pitch * pitch)
-    a, b = (math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)) if angle > 1e-6 else (1.0, 0.5)
-    turn = np.empty((3, 3))
-    turn[0, 0], turn[1, 1], turn[2, 2] = 1.0 - b * pitch * pitch, 1.0 - b * roll * roll, 1.0 - b * angle * angle
-    turn[0, 1] = turn[1, 0] = b * roll * pitch
-    turn[0, 2], turn[2, 0], turn[1, 2], turn[2, 1] = a * pitch, -a * pitch, -a * roll, a * roll
-    mounted, turned = product(turn, position.reshape(3, 1)).reshape(3), product(turn, rotation)
-    pixels, by_pose, by_point, by_parameters = linearize(k, mounted, turned, pose, point.reshape(1, 3))
-    depth = turned[2, 2] * (point[2] - mounted[2])
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    dx, dy = point[0] - pose[0], point[1] - pose[1]
-    depth += turned[0, 2] * (c * dx + s * dy - mounted[0]) + turned[1, 2] * (c * dy - s * dx - mounted[1])
-    x, y, z = mounted[0], mounted[1], mounted[2]
-    residual, by_tilt, by_constants = np.empty(2), np.empty((2, 2)), np.empty((2, by_parameters.shape[2]))
-    for r in range(2):
-        residual[r] = (pixels[0, r] - pixel[r]) / sigma
-        g = by_parameters[0, r]
-        # a change of the tilt turns the robot about other axes than its own by half of the tilt
-        by_tilt[r, 0] = g[3] + g[2] * y - g[1] * z - 0.5 * pitch * by_pose[0, r, 2]
-        by_tilt[r, 1] = g[4] + g[0] * z - g[2] * x + 0.5 * roll * by_pose[0, r, 2]
-        for j in range(3):
-            by_constants[r, j] = g[0] * turn[0, j] + g[1] * turn[1, j] + g[2] * turn[2, j]
-            by_constants[r, 3 + j] = g[3] * turn[0, j] + g[4] * turn[1, j] + g[5] * turn[2, j]
-        by_constants[r, 6], by_constants[r, 7] = g[6], g[7]
-    squared = residual[0] * residual[0] + residual[1] * residual[1]
-    scale = math.sqrt(huber_weight(squared, robust)) / sigma
-    if depth < NEAREST:
-        squared, scale = 2.0 * behind * behind, 0.0
-        residual[:] = behind
-    weight = math.sqrt(huber_weight(squared, robust))
-    for r in range(2):
-        residual[r] *= weight
-        for j in range(3):
-            by_pose[0, r, j] *= scale
-            by_point[0, r, j] *= scale
-        for j in range(2):
-            by_tilt[r, j] *= scale
-        for j in range(by_constants.shape[1]):
-            by_constants[r, j] *= scale
-    return residual, by_pose[0], by_constants, by_tilt, by_point[0], squared
 
 
 @compiled(error_model="numpy")

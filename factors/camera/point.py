@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from factors.camera import kernels
+from factors.camera import point_kernels as kernels
 from factors.camera.kernels import Lens
 from factors.camera.model import PARAMETERS, CameraModel, lens_of, recalibrated
+from factors.camera.point_kernels import BEHIND, CONSTANTS, POINT, TILT
 from factors.robust import huber_loss
 from factors.se2 import Array
-
-BEHIND = 100.0  # residual of a point behind the camera, in standard deviations
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,33 +29,55 @@ class PointFactor:
     pixel: Array
     estimated: tuple[int, ...] = ()
 
+    @property
+    def alike(self) -> Hashable:
+        """The camera."""
+        return id(self.model)
+
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2,) and its Jacobian (2, d) by each value. A point behind the camera has a constant
         residual, as no gradient leads to its true position."""
-        residual, by_pose, by_constants, by_tilt, by_point, _ = self._seen(values)
-        if not self.estimated:
-            return residual, [by_pose, by_tilt, by_point]
-        turn = np.zeros(3)
-        for place, value in zip(self.estimated, values[1].tolist(), strict=True):
-            if place in (3, 4, 5):
-                turn[place - 3] = value
-        by_constants[:, 3:6] = by_constants[:, 3:6] @ gtsam.Rot3.ExpmapDerivative(-turn)
-        return residual, [by_pose, by_constants[:, list(self.estimated)], by_tilt, by_point]
+        residuals, blocks = self.linearize_all([self], [values])
+        return residuals[0], [block[0] for block in blocks]
+
+    @staticmethod
+    def linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, list[Array]]:
+        """:meth:`linearize` of N factors with the same camera and constants: residuals (N, 2) and Jacobians (N, 2, d)."""
+        estimated, constants = factors[0].estimated, values[0][1]
+        residual, jacobian, _ = _seen(factors, values)
+        blocks = [jacobian[..., :TILT], jacobian[..., TILT:POINT], jacobian[..., POINT:CONSTANTS]]
+        if estimated:
+            turn = np.zeros(3)
+            for place, value in zip(estimated, constants.tolist(), strict=True):
+                if place in (3, 4, 5):
+                    turn[place - 3] = value
+            by_constants = jacobian[..., CONSTANTS:]
+            by_constants[..., 3:6] = by_constants[..., 3:6] @ gtsam.Rot3.ExpmapDerivative(-turn)
+            blocks.insert(1, by_constants[..., list(estimated)])
+        return residual, blocks
 
     def cost(self, values: Sequence[Array]) -> float:
         """The robust loss."""
-        return float(huber_loss(self._seen(values)[-1], self.model.robust))
+        return float(huber_loss(_seen([self], [values])[2][0], self.model.robust))
 
     def is_astray(self, values: Sequence[Array]) -> bool:
         """Whether the point cannot be what the robot saw: it is behind the camera, or :data:`BEHIND` standard deviations away."""
-        return bool(self._seen(values)[-1] >= BEHIND**2)
+        return bool(_seen([self], [values])[2][0] >= BEHIND**2)
 
-    def _seen(self, values: Sequence[Array]) -> tuple[Array, Array, Array, Array, Array, float]:
-        model, lens, (pose, *constants, tilt, point) = self.model, self.lens, values
-        if constants:
-            changes = np.zeros(len(PARAMETERS))
-            changes[list(self.estimated)] = constants[0]
-            model = recalibrated(model, changes)
-            lens = lens_of(model)
-        camera = lens, model.position, model.rotation
-        return kernels.seen_by_tilted(*camera, pose, tilt, point, self.pixel, model.sigma, model.robust, BEHIND)
+
+def _seen(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array, Array]:
+    first = factors[0]
+    model, lens, (_, *constants, _, _) = first.model, first.lens, values[0]
+    if constants:
+        changes = np.zeros(len(PARAMETERS))
+        changes[list(first.estimated)] = constants[0]
+        model = recalibrated(model, changes)
+        lens = lens_of(model)
+    poses, tilts, points, pixels = (
+        np.array([v[0] for v in values], dtype=float),
+        np.array([v[-2] for v in values], dtype=float),
+        np.array([v[-1] for v in values], dtype=float),
+        np.array([f.pixel for f in factors], dtype=float),
+    )
+    camera = lens, model.position, model.rotation
+    return kernels.seen(*camera, poses, tilts, points, pixels, model.sigma, model.robust)

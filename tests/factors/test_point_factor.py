@@ -10,6 +10,7 @@ from mounted_camera import MODEL
 from factors import se2
 from factors.camera.model import camera_pose, lens_of, linearize_in_space
 from factors.camera.point import PointFactor
+from factors.graph import VectorPriorFactor, jacobian_factor, jacobian_factors
 from factors.robust import huber_loss
 
 POSE, TILT, POINT = np.array((0.1, 0.2, 0.3)), np.array((0.02, -0.03)), np.array((5.0, 2.5, 1.4))
@@ -55,6 +56,22 @@ def test_its_jacobians_are_the_numerical_ones(estimated):
                 ends.append(factor.cost(moved))
             slope = (ends[0] - ends[1]) / 2e-6
             assert residual @ block[:, column] == pytest.approx(slope, rel=1e-2, abs=1e-2)
+
+
+@pytest.mark.parametrize("estimated", [(), ESTIMATED])
+def test_many_are_linearised_as_each_by_itself(estimated):
+    rng = np.random.default_rng(0)
+    pixels = seen().pixel + rng.normal(0.0, 5.0, (4, 2))
+    factors = [PointFactor(MODEL, lens_of(MODEL), pixel, estimated) for pixel in pixels]
+    constants = {9: CHANGES} if estimated else {}
+    values = constants | {i: POSE + rng.normal(0.0, 0.01, 3) for i in range(4)}
+    values |= {10 + i: TILT + rng.normal(0.0, 0.01, 2) for i in range(4)} | {20: POINT, 21: POINT + 0.1}
+    keys = [(i, *constants, 10 + i, 20 + i % 2) for i in range(4)]
+    mixed = [*zip(factors, keys, strict=True), (VectorPriorFactor(POINT, np.ones(3)), (20,))]
+    for (factor, on), together in zip(mixed, jacobian_factors(mixed, values), strict=True):
+        alone = jacobian_factor(factor, on, [values[key] for key in on])
+        np.testing.assert_allclose(together.augmentedJacobian(), alone.augmentedJacobian(), rtol=1e-12)
+        assert together.keys() == alone.keys()
 
 
 def test_a_point_behind_the_camera_is_astray_and_pulls_at_nothing():

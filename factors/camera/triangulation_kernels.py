@@ -1,0 +1,94 @@
+"""Compiled triangulation of a point that is seen from several places."""
+
+import math
+
+import numpy as np
+
+from factors.camera.kernels import Lens, pixel
+from factors.compiled import compiled
+from factors.se2 import Array
+from factors.small_kernels import inverse, product, product_by_transpose, solved
+
+MIN_PARALLAX = 0.03  # rad, between the outermost rays
+NEAREST = 0.3  # m of depth
+ITERATIONS, SETTLED = 4, 1e-3  # m: step below which the solution has converged
+# how it ends: as a point, as none, or with rays that do not intersect in front of the camera
+FOUND, NONE, BEHIND = 0, 1, 2
+
+
+@compiled(error_model="numpy")
+def triangulated(
+    k: Lens, centres: Array, turns: Array, rays: Array, pixels: Array, sigmas: Array, spread: float
+) -> tuple[int, Array, Array, Array]:
+    """How it ends, a point (3,), its covariance (3, 3) and squared whitened residuals (M,), seen by cameras at ``centres`` (M, 3)
+    with rotations ``turns`` (M, 3, 3).
+
+    ``rays`` (M, 3): its directions in their frames; ``pixels`` (M, 2): where it is seen, with standard deviations ``sigmas`` (M,).
+    ``spread``: the largest standard deviation allowed, relative to the least depth.
+    """
+    ways = np.empty_like(rays)
+    for m in range(len(rays)):
+        ways[m] = product(turns[m], rays[m].reshape(3, 1)).reshape(3)
+    covariance, squared = np.zeros((3, 3)), np.full(len(rays), np.inf)
+    if product_by_transpose(ways, ways).min() > math.cos(MIN_PARALLAX):
+        return NONE, np.zeros(3), covariance, squared
+    point = _nearest(centres, ways)
+    for iteration in range(ITERATIONS + 1):
+        told, pull, depth = _told(k, centres, turns, pixels, sigmas, point, squared)
+        if not depth > NEAREST:
+            return BEHIND, point, covariance, squared
+        covariance = inverse(told)
+        # the initial point may be less accurate
+        if not _is_below(covariance, ((2.0 if iteration == 0 else 1.0) * spread * depth) ** 2):
+            return NONE, point, covariance, squared
+        if iteration < ITERATIONS:
+            step = product(covariance, pull).reshape(3)
+            point += step
+            if np.abs(step).max() < SETTLED:
+                break
+    return FOUND, point, covariance, squared
+
+
+@compiled(error_model="numpy")
+def _nearest(centres: Array, ways: Array) -> Array:
+    """The point nearest to rays from ``centres`` (M, 3) in the directions ``ways`` (M, 3)."""
+    left, right = np.zeros((3, 3)), np.zeros((3, 1))
+    for m in range(len(ways)):
+        for i in range(3):
+            for j in range(3):
+                across = (1.0 if i == j else 0.0) - ways[m, i] * ways[m, j]
+                left[i, j] += across
+                right[i, 0] += across * centres[m, j]
+    return solved(left, right)[0].reshape(3)
+
+
+@compiled(error_model="numpy")
+def _told(
+    k: Lens, centres: Array, turns: Array, pixels: Array, sigmas: Array, point: Array, squared: Array
+) -> tuple[Array, Array, float]:
+    """The information (3, 3) on a point and its gradient (3, 1), and the least depth; ``squared`` residuals (M,) in place."""
+    told, pull, depth, row = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3)
+    for m in range(len(centres)):
+        local = product((point - centres[m]).reshape(1, 3), turns[m])
+        depth = min(depth, local[0, 2])
+        u, v, by_u, by_v = pixel(k, local[0, 0], local[0, 1], local[0, 2])
+        error = (u - pixels[m, 0]) / sigmas[m], (v - pixels[m, 1]) / sigmas[m]
+        squared[m] = error[0] ** 2 + error[1] ** 2
+        for r in range(2):
+            d = by_u if r == 0 else by_v
+            for j in range(3):
+                row[j] = (turns[m, j, 0] * d[0] + turns[m, j, 1] * d[1] + turns[m, j, 2] * d[2]) / sigmas[m]
+            for i in range(3):
+                pull[i, 0] -= row[i] * error[r]
+                for j in range(3):
+                    told[i, j] += row[i] * row[j]
+    return told, pull, depth
+
+
+@compiled(error_model="numpy")
+def _is_below(covariance: Array, most: float) -> bool:
+    """Whether the largest eigenvalue of a covariance (3, 3) is less than ``most``: the difference is positive definite."""
+    a, b, c = most - covariance[0, 0], most - covariance[1, 1], most - covariance[2, 2]
+    d, e, f = covariance[0, 1], covariance[0, 2], covariance[1, 2]
+    two = a * b - d * d
+    return bool(a > 0.0 and two > 0.0 and c * two - a * f * f - b * e * e - 2.0 * d * e * f > 0.0)
