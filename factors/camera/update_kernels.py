@@ -170,6 +170,16 @@ def updated(
 
 
 @compiled(error_model="numpy")
+def steepness(seen: Seen, pose: Array, covariance: Array) -> float:
+    """The tilt [rad] of the robot, of a ``pose`` (3,) with this ``covariance`` (3, 3), that least squares find in an image."""
+    residual, jacobian = whitened(seen, pose)
+    prior = np.eye(WIDTH)
+    prior[:3, :3] = inverse(covariance)
+    delta, _, _ = _solved(prior, residual, jacobian, np.ones(len(residual)), np.zeros(WIDTH))
+    return seen.tilt * math.hypot(delta[3], delta[4])
+
+
+@compiled(error_model="numpy")
 def placed(position: Array, rotation: Array, tilt: float, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
     """Position (3,) and rotation (3, 3) in the world of a camera mounted at ``position`` with ``rotation`` on a robot at ``pose``
     (3,), and the covariance (6, 6) of its perturbation in its own frame, rotation first, from ``covariance`` (3, 3) of the pose

@@ -263,11 +263,8 @@ class KnownPoints:
         Constants that are estimated would explain it."""
         if here.estimated:
             return False
-        residual, blocks = here.whitened([predicted.pose])
-        jacobian, information = np.concatenate(blocks, axis=2).reshape(2 * len(residual), -1), np.eye(5)
-        information[:3, :3] = np.linalg.inv(predicted.covariance)
-        step = np.linalg.solve(information + jacobian.T @ jacobian, jacobian.T @ residual.ravel())
-        return here.model.tilt * math.hypot(*step[3:]) > STEEPEST
+        pose, covariance = (np.ascontiguousarray(part, dtype=float) for part in (predicted.pose, predicted.covariance))
+        return bool(pixel_kernels.steepness(here.packed(), pose, covariance) > STEEPEST)
 
     def _camera(self, here: ReprojectionFactor, predicted: Predicted) -> CameraPose:
         """The pose of the camera for an image, including the uncertainty of its constants."""
