@@ -7,7 +7,7 @@ too. A track whose pixels are outliers :data:`STRIKES` times in a row is separat
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -30,7 +30,9 @@ from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.spread import spread_out
 from factors import positive, se2
 from factors.camera import model as reprojection
+from factors.camera import update_kernels as pixel_kernels
 from factors.camera.factor import ReprojectionFactor
+from factors.camera.floor import Floor
 from factors.camera.kernels import NEAREST
 from factors.camera.model import CameraModel, recalibrated
 from factors.camera.point import PointFactor
@@ -84,6 +86,7 @@ class UnknownPoints:
     def __post_init__(self) -> None:
         self._new = NewPoints(self.model)
         self._lens = reprojection.lens_of(self.model)
+        self._floor = Floor(self.model.tilt)
 
     def take(
         self,
@@ -121,8 +124,8 @@ class UnknownPoints:
         points = [self._points[names[i]] for i in old]
         known = np.array([rows[i] in certain for i in old], dtype=bool)
         fewest = REVISITED if m.names is None else 2  # a name needs one other to confirm it
-        guess, tilt, right = self._placed(model, points, pixels[old], keyframe.t, guess, graph, known, fewest)
-        self._tilts(keyframe, tilt, graph, addition)
+        guess, tilt, sigma, right = self._placed(model, points, pixels[old], keyframe.t, guess, graph, known, fewest)
+        self._tilts(keyframe, tilt, sigma, graph, addition)
         if m.frame is not None:
             seen_from = lifted(model, *guess).position
             self._remember(
@@ -251,13 +254,13 @@ class UnknownPoints:
         positions, covariances = (np.array([part[key] for key in keys.values()]) for part in (values, spreads))
         return self._looks.map_of(tuple(keys), tuple(keys.values()), positions, covariances)
 
-    def _tilts(self, keyframe: Keyframe, tilt: Array, graph: GraphView, addition: Addition) -> None:
-        """Make a variable of the ``tilt`` of the robot at a new keyframe."""
+    def _tilts(self, keyframe: Keyframe, tilt: Array, sigma: float, graph: GraphView, addition: Addition) -> None:
+        """Make a variable of the ``tilt`` of the robot at a new keyframe, of a floor that is level to ``sigma`` [rad]."""
         key = tilt_key(keyframe.index)
         if key in graph.values:
             return
         addition.values[key] = graph.values[key] = tilt
-        sigmas = np.full(2, self.model.tilt)
+        sigmas = np.full(2, sigma)
         native = gtsam.PriorFactorVector(key, LEVEL, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
         prior = Node((key,), VectorPriorFactor(LEVEL, sigmas), 2, native)
         keyframe.nodes.append(prior)
@@ -273,14 +276,16 @@ class UnknownPoints:
         graph: GraphView,
         known: Truths,
         fewest: int,
-    ) -> tuple[Guess, Array, Truths]:
-        """The pose corrected by points of the graph, the tilt (2,) of the robot that they tell, and which of them are inliers.
+    ) -> tuple[Guess, Array, float, Truths]:
+        """The pose corrected by points of the graph, the tilt (2,) of the robot that they tell with its prior standard deviation,
+        and which of them are inliers.
 
         Points not seen for long need to agree with each other, at least ``fewest`` of them, but not with the rest, as the track has
         drifted since.
         """
+        sigma = self._floor.sigma
         if not points:
-            return guess, LEVEL, np.zeros(0, dtype=bool)
+            return guess, LEVEL, sigma, np.zeros(0, dtype=bool)
         positions = np.array([graph.current(point.key) for point in points])
         spreads = positive.inverse(np.array([point.information for point in points]))
         camera = lifted(model, *guess)
@@ -296,9 +301,11 @@ class UnknownPoints:
                 agrees[which] = agreeing(model, camera, positions[which], pixels[which], noise[which])
             if np.count_nonzero(agrees) >= enough and placed is guess:
                 factor = ReprojectionFactor(model, positions[agrees], pixels[agrees], point_covariances=spreads[agrees])
+                sigma = self._floor.learn(*pixel_kernels.leaning(factor.packed(), *guess), model.tilt)
+                factor = replace(factor, model=replace(model, tilt=sigma))
                 update = robust_update(factor, *guess, ITERATIONS, SETTLED)
                 placed = se2.compose(guess[0], se2.exp(update.delta)), guess[1]
-                tilt = model.tilt * factor.levelled([placed[0]])[1]
+                tilt = sigma * factor.levelled([placed[0]])[1]
             elif np.count_nonzero(agrees) < enough and placed is not guess:
                 seen_from = reprojection.camera_pose(model, placed[0], tilt)
                 error = reprojection.linearize_in_space(model, *seen_from, positions)[0] - pixels
@@ -306,7 +313,7 @@ class UnknownPoints:
             elif np.count_nonzero(agrees) < enough:
                 agrees &= which & recent
             right |= agrees
-        return placed, tilt, right
+        return placed, tilt, sigma, right
 
     def _again(
         self,
@@ -356,7 +363,8 @@ class UnknownPoints:
             last = [index for index in sorted(slacks)[-BUNDLE:] if graph.is_open(index)]
             poses = [pose if i == newest.index else graph.current(graph.keyframes[i].key) for i in last]
             some = [slacks[i] for i in last]
-            found = bundled(self.model, [graph.keyframes[i] for i in last], poses, some, self._new.waiting())
+            level = replace(self.model, tilt=self._floor.sigma)
+            found = bundled(level, [graph.keyframes[i] for i in last], poses, some, self._new.waiting())
             if found is not None:
                 cameras = {i: KeyframeCamera.of(self.model, p, SLACK, t) for i, (p, t) in zip(last, found, strict=True)}
                 return cameras, found[-1][0]

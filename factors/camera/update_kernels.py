@@ -170,13 +170,14 @@ def updated(
 
 
 @compiled(error_model="numpy")
-def steepness(seen: Seen, pose: Array, covariance: Array) -> float:
-    """The tilt [rad] of the robot, of a ``pose`` (3,) with this ``covariance`` (3, 3), that least squares find in an image."""
+def leaning(seen: Seen, pose: Array, covariance: Array) -> tuple[Array, Array]:
+    """Roll and pitch (2,) [rad] of a robot at a ``pose`` (3,) with this ``covariance`` (3, 3), as least squares find them in an
+    image, and their covariance (2, 2)."""
     residual, jacobian = whitened(seen, pose)
     prior = np.eye(WIDTH)
     prior[:3, :3] = inverse(covariance)
-    delta, _, _ = _solved(prior, residual, jacobian, np.ones(len(residual)), np.zeros(WIDTH))
-    return seen.tilt * math.hypot(delta[3], delta[4])
+    delta, after, _ = _solved(prior, residual, jacobian, np.ones(len(residual)), np.zeros(WIDTH))
+    return seen.tilt * delta[3:], seen.tilt**2 * after[3:, 3:]
 
 
 @compiled(error_model="numpy")

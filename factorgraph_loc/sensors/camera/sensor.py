@@ -27,6 +27,7 @@ from factors import se2
 from factors.camera import model as reprojection
 from factors.camera import update_kernels as pixel_kernels
 from factors.camera.factor import ReprojectionFactor
+from factors.camera.floor import Floor
 from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel
 from factors.motion import Increment, propagate
 from factors.se2 import Array
@@ -79,6 +80,7 @@ class KnownPoints:
         self.model: CameraModel | None = None if settings is None else replace(settings.model(), tempering=1.0)
         second = setup.rig.camera_right if used and "sightings_right" in setup.sensors else None
         self._second: CameraModel | None = None if second is None else replace(second.model(), tempering=1.0)
+        self._floor = None if self.model is None else Floor(self.model.tilt)
         self._tempering = 1.0 if settings is None else settings.tempering  # for matched points
         self.map = PointMap.of((), np.empty((0, 3)))
         if setup.world.points is not None and use != "unknown":
@@ -179,17 +181,17 @@ class KnownPoints:
             focal = math.sqrt(predicted.spread[place, place])
         if isinstance(m, CameraFrame):
             found = self._found(m, factor, here.model, camera, focal)
-            return None if found is None or self._is_steep(found, predicted) else found
+            return None if found is None else self._levelled(found, found, predicted)
         right = _agreeing(here, camera, focal)
         agreed = int(np.count_nonzero(right))
-        if agreed and self._is_steep(rows_of(here, right), predicted):
+        seen = self._levelled(rows_of(factor, right), rows_of(here, right), predicted) if agreed else None
+        if seen is None:
             right, agreed = np.zeros_like(right), 0
         self.missed = agreed < FEW_SHARE * len(right)
-        if agreed == len(right):
-            return factor
-        self._diagnostics.reject(DISAGREES, len(right) - agreed)
-        self.names = tuple(self.names[row] for row in np.flatnonzero(right).tolist())
-        return rows_of(factor, right) if agreed else None
+        if agreed < len(right):
+            self._diagnostics.reject(DISAGREES, len(right) - agreed)
+            self.names = tuple(self.names[row] for row in np.flatnonzero(right).tolist())
+        return seen
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
         """The pose of an image without a prediction, or None, and the number of points that it seemed to show."""
@@ -258,13 +260,22 @@ class KnownPoints:
         spreads = self.map.covariances[points] if self._map_matters else None
         return replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=spreads)
 
-    def _is_steep(self, here: ReprojectionFactor, predicted: Predicted) -> bool:
-        """Whether only a robot that tilts by more than :data:`STEEPEST` sees the points where they are, which is not believed.
-        Constants that are estimated would explain it."""
-        if here.estimated:
-            return False
+    def _levelled(
+        self, factor: ReprojectionFactor, here: ReprojectionFactor, predicted: Predicted
+    ) -> ReprojectionFactor | None:
+        """The factor with what is known of the tilt of the robot; ``here``: with the constants that are expected.
+
+        None if only a robot that tilts by more than :data:`STEEPEST` sees the points where they are, which is not believed.
+        """
+        if here.estimated:  # constants that nothing is known of would explain it
+            return factor
         pose, covariance = (np.ascontiguousarray(part, dtype=float) for part in (predicted.pose, predicted.covariance))
-        return bool(pixel_kernels.steepness(here.packed(), pose, covariance) > STEEPEST)
+        tilt, spread = pixel_kernels.leaning(here.packed(), pose, covariance)
+        if math.hypot(*tilt) > STEEPEST:
+            return None
+        assert self._floor is not None
+        sigma = self._floor.learn(tilt, spread, float(here.model.tilt))
+        return replace(factor, model=replace(factor.model, tilt=sigma))
 
     def _camera(self, here: ReprojectionFactor, predicted: Predicted) -> CameraPose:
         """The pose of the camera for an image, including the uncertainty of its constants."""
