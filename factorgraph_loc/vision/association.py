@@ -2,8 +2,9 @@
 
 With a prediction, a point is searched where it should be visible, if it was observed from a similar viewpoint before, which also
 excludes occluded points. The most similar feature in its gate is accepted if it passes the ratio test, and all matches must agree
-on one pose (:mod:`~factorgraph_loc.vision.consensus`). Without a prediction, the image is compared with the whole map
-(:mod:`~factorgraph_loc.vision.relocalization`). Ratio test: Lowe, IJCV 60, 2004, section 7.1, here among different points, as
+on one pose (:mod:`~factorgraph_loc.vision.consensus`). Without a prediction, the image is compared with a small map as a whole,
+with those keyframes of a large one that look most alike (:mod:`~factorgraph_loc.vision.relocalization`,
+:mod:`~factorgraph_loc.vision.places`). Ratio test: Lowe, IJCV 60, 2004, section 7.1, here among different points, as
 views of one point are similar.
 """
 
@@ -18,6 +19,7 @@ from factorgraph_loc.vision.consensus import CameraPose, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.keypoints import Descriptors, Integers
 from factorgraph_loc.vision.matching import distance_matrix
+from factorgraph_loc.vision.places import Places
 from factorgraph_loc.vision.relocalization import located
 from factors import chi_squared
 from factors.camera import model as reprojection
@@ -35,6 +37,7 @@ MARGIN = 20.0  # px around the image in which a predicted point is still searche
 SAME = 4.0  # px: closer points and features may be the same
 SAME_POINT = 0.15  # m: closer points may be the same
 CHANCE = 0.02  # fraction of pairs of different map points that are more similar than a match may be
+MANY = 5000  # views of a map, of which only those of the most similar keyframes are compared with an image
 # matches, and fraction of the visible points: fewer may be consistent with the prediction by chance. In an office unknown to the
 # map up to 2 % of the features are
 FEWEST, LEAST_SHARE = 3, 0.05
@@ -73,6 +76,7 @@ class Associator:
         self._starts = np.searchsorted(self._owners, np.arange(len(points) + 1)).astype(np.int64)
         self._seen_from = np.ascontiguousarray(points.seen_from[order], dtype=float)
         self._descriptors: Descriptors = np.ascontiguousarray(points.descriptors[order])
+        self._places: Places | None = None
         self._farthest_look = self._look_alike()
         corners = np.array(((-0.5, -0.5), (model.width, -0.5), (-0.5, model.height), (model.width, model.height)))
         # wide enough for an uncertain focal length
@@ -145,17 +149,20 @@ class Associator:
 
     def _alike(self, frame: CameraFrame) -> tuple[Integers, Integers]:
         """Points and features that are similar, and pass the ratio test against all other points."""
-        owners, first = np.unique(self._owners, return_index=True)
-        distances = distance_matrix(frame.descriptors, self._descriptors, binary=self._binary)
-        nearest = np.minimum.reduceat(distances, first, axis=1)
-        rows = np.arange(len(nearest))
-        few = min(8, nearest.shape[1])
-        candidates = np.argpartition(nearest, few - 1, axis=1)[:, :few]
-        candidates = np.take_along_axis(candidates, np.argsort(nearest[rows[:, None], candidates], axis=1), axis=1)
+        owners, descriptors = self._owners, self._descriptors
+        if len(owners) > MANY:
+            if self._places is None:
+                self._places = Places(self._descriptors, self._seen_from)
+            views = self._places.views(frame.descriptors)
+            owners, descriptors = owners[views], descriptors[views]
+        owners, first = np.unique(owners, return_index=True)
+        distances = distance_matrix(frame.descriptors, descriptors, binary=self._binary)
+        starts = np.append(first, len(descriptors))
+        candidates, nearest, rows = kernels.nearest_owners(distances, starts, min(8, len(owners)))
         best = candidates[:, 0]
         away = np.linalg.norm(self._positions[owners[candidates]] - self._positions[owners[best]][:, None], axis=2)
-        others = np.where(away > SAME_POINT, nearest[rows[:, None], candidates], np.inf).min(axis=1)
-        kept = (nearest[rows, best] < GLOBAL_RATIO * others) & (nearest[:, best].argmin(axis=0) == rows)
+        others = np.where(away > SAME_POINT, nearest, np.inf).min(axis=1)
+        kept = (nearest[:, 0] < GLOBAL_RATIO * others) & (rows[best] == np.arange(len(best)))
         return owners[best[kept]], np.flatnonzero(kept)
 
     def _costs(self, pairs: Integers, begins: Integers, views: Integers, seen: Descriptors) -> Array:

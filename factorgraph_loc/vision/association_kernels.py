@@ -187,3 +187,27 @@ def clear_pairs(
             out[n] = i
             n += 1
     return out[:n]
+
+
+@compiled(error_model="numpy")
+def nearest_owners(distances: NDArray[Any], starts: Integers, few: int) -> tuple[Integers, NDArray[Any], Integers]:
+    """Of K owners of the columns of ``distances`` (N, M), those of owner k from ``starts`` (K + 1,) k on: the ``few`` nearest
+    to each row, nearest first, with their distances (N, few); and the row (K,) that is nearest to each."""
+    n, count = len(distances), len(starts) - 1
+    owners, least = np.zeros((n, few), dtype=np.int64), np.full((n, few), np.inf, dtype=distances.dtype)
+    rows, best = np.zeros(count, dtype=np.int64), np.full(count, np.inf, dtype=distances.dtype)
+    for i in range(n):
+        for k in range(count):
+            distance = distances[i, starts[k]]
+            for j in range(starts[k] + 1, starts[k + 1]):
+                distance = min(distance, distances[i, j])
+            if distance < best[k]:
+                best[k], rows[k] = distance, i
+            if not distance < least[i, few - 1]:
+                continue
+            place = few - 1
+            while place > 0 and distance < least[i, place - 1]:
+                least[i, place], owners[i, place] = least[i, place - 1], owners[i, place - 1]
+                place -= 1
+            least[i, place], owners[i, place] = distance, k
+    return owners, least, rows

@@ -1,0 +1,65 @@
+"""The keyframes of a map by what they look like as a whole, to compare an image with those few that are most like it.
+
+A keyframe is described by how its descriptors differ from the words of a small vocabulary (VLAD: Jegou, Douze, Schmid, Perez, CVPR
+2010), each word normalised by itself (Arandjelovic, Zisserman, CVPR 2013).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph_loc.vision.keypoints import Descriptors, Integers
+from factors.se2 import Array
+
+WORDS, SAMPLE, ROUNDS = (
+    64,
+    4000,
+    6,
+)  # of the vocabulary, descriptors that it is learnt from, and rounds of Lloyd's algorithm
+NEAREST = 20  # keyframes that an image is compared with
+
+
+class Places:
+    """Keyframes that saw ``descriptors`` (M, D) from the positions ``seen_from`` (M, 3), one for each position."""
+
+    def __init__(self, descriptors: Descriptors, seen_from: Array) -> None:
+        _, self._of = np.unique(seen_from, axis=0, return_inverse=True)
+        self._of = self._of.ravel()
+        values = _values(descriptors)
+        sample = values[np.linspace(0, len(values) - 1, min(SAMPLE, len(values))).astype(np.int64)]
+        self._words = sample[np.linspace(0, len(sample) - 1, min(WORDS, len(sample))).astype(np.int64)]
+        for _ in range(ROUNDS):
+            nearest = self._nearest(sample)
+            sums, counts = np.zeros_like(self._words), np.bincount(nearest, minlength=len(self._words))
+            np.add.at(sums, nearest, sample)
+            self._words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], self._words)
+        self._looks = self._described(values, self._of)
+
+    def __len__(self) -> int:
+        return len(self._looks)
+
+    def views(self, descriptors: Descriptors) -> Integers:
+        """The rows of the map's descriptors that the keyframes see that are most like an image with ``descriptors`` (N, D)."""
+        (look,) = self._described(_values(descriptors), np.zeros(len(descriptors), dtype=np.int64))
+        alike = np.zeros(len(self), dtype=bool)
+        alike[np.argsort(-(self._looks @ look), kind="stable")[:NEAREST]] = True
+        return np.flatnonzero(alike[self._of])
+
+    def _nearest(self, values: Array) -> Integers:
+        return np.asarray((np.sum(self._words**2, axis=1) - 2.0 * values @ self._words.T).argmin(axis=1))
+
+    def _described(self, values: Array, of: Integers) -> Array:
+        """The descriptions (K, WORDS * D) of K images, from the values (M, D) in image ``of`` (M,)."""
+        nearest, count = self._nearest(values), len(self._words)
+        looks = np.zeros((int(of.max()) + 1, count, values.shape[1]))
+        np.add.at(looks, (of, nearest), values - self._words[nearest])
+        looks /= np.maximum(np.linalg.norm(looks, axis=2), 1e-9)[..., None]
+        flat = looks.reshape(len(looks), -1)
+        return np.asarray(flat / np.maximum(np.linalg.norm(flat, axis=1), 1e-9)[:, None])
+
+
+def _values(descriptors: Descriptors) -> Array:
+    """As real numbers; bits of binary ones by themselves."""
+    if descriptors.dtype == np.uint8:
+        descriptors = np.unpackbits(descriptors, axis=1)
+    return np.asarray(descriptors, dtype=float)
