@@ -32,7 +32,7 @@ from factors import positive, se2
 from factors.camera import model as reprojection
 from factors.camera import update_kernels as pixel_kernels
 from factors.camera.factor import ReprojectionFactor
-from factors.camera.floor import Floor
+from factors.camera.floor import TiltScale
 from factors.camera.kernels import NEAREST
 from factors.camera.model import CameraModel, recalibrated
 from factors.camera.point import PointFactor
@@ -86,7 +86,7 @@ class UnknownPoints:
     def __post_init__(self) -> None:
         self._new = NewPoints(self.model)
         self._lens = reprojection.lens_of(self.model)
-        self._floor = Floor(self.model.tilt)
+        self._floor = TiltScale(self.model.tilt)
 
     def take(
         self,

@@ -19,7 +19,7 @@ from factorgraph_loc.vision.consensus import CameraPose, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.keypoints import Descriptors, Integers
 from factorgraph_loc.vision.matching import distance_matrix
-from factorgraph_loc.vision.places import Places
+from factorgraph_loc.vision.places import KeyframeLooks
 from factorgraph_loc.vision.relocalization import located
 from factors import chi_squared
 from factors.camera import model as reprojection
@@ -76,7 +76,7 @@ class Associator:
         self._starts = np.searchsorted(self._owners, np.arange(len(points) + 1)).astype(np.int64)
         self._seen_from = np.ascontiguousarray(points.seen_from[order], dtype=float)
         self._descriptors: Descriptors = np.ascontiguousarray(points.descriptors[order])
-        self._places: Places | None = None
+        self._places: KeyframeLooks | None = None
         self._farthest_look = self._look_alike()
         corners = np.array(((-0.5, -0.5), (model.width, -0.5), (-0.5, model.height), (model.width, model.height)))
         # wide enough for an uncertain focal length
@@ -152,7 +152,7 @@ class Associator:
         owners, descriptors = self._owners, self._descriptors
         if len(owners) > MANY:
             if self._places is None:
-                self._places = Places(self._descriptors, self._seen_from)
+                self._places = KeyframeLooks(self._descriptors, self._seen_from)
             views = self._places.views(frame.descriptors)
             owners, descriptors = owners[views], descriptors[views]
         owners, first = np.unique(owners, return_index=True)

@@ -19,7 +19,7 @@ WORDS, SAMPLE, ROUNDS = (
 NEAREST = 20  # keyframes that an image is compared with
 
 
-class Places:
+class KeyframeLooks:
     """Keyframes that saw ``descriptors`` (M, D) from the positions ``seen_from`` (M, 3), one for each position."""
 
     def __init__(self, descriptors: Descriptors, seen_from: Array) -> None:

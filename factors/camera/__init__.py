@@ -1,3 +1,14 @@
 """Pixels of points in space: model, kernels, factors."""
 
-__all__ = ["factor", "inverse_depth", "kernels", "model", "point", "update_kernels", "visual_odometry"]
+__all__ = [
+    "bundle_kernels",
+    "factor",
+    "floor",
+    "inverse_depth",
+    "kernels",
+    "model",
+    "point",
+    "triangulation_kernels",
+    "update_kernels",
+    "visual_odometry",
+]

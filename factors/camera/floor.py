@@ -18,7 +18,7 @@ MEMORY = 60.0  # images that the scale is learnt from
 SILLS = 0.05  # share of images with another scale
 
 
-class Floor:
+class TiltScale:
     """``sigma``: the standard deviation [rad] of roll and pitch, at first a guess."""
 
     def __init__(self, sigma: float) -> None:
@@ -35,7 +35,7 @@ class Floor:
 
 @compiled(error_model="numpy")
 def _learnt(tilt: Array, covariance: Array, prior: float, prior_log: Array, told: Array) -> tuple[float, float]:
-    """See :meth:`Floor.learn`: what is to be expected later, and in this image; ``told`` in place."""
+    """See :meth:`TiltScale.learn`: what is to be expected later, and in this image; ``told`` in place."""
     determinant = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
     a, b, d = covariance[1, 1] / determinant, -covariance[0, 1] / determinant, covariance[0, 0] / determinant
     x, y = a * tilt[0] + b * tilt[1], b * tilt[0] + d * tilt[1]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factors.camera.floor import SCALES, Floor
+from factors.camera.floor import SCALES, TiltScale
 
 GUESS = 0.005
 PRIOR = GUESS  # of the tilt in an image
@@ -20,7 +20,7 @@ def seen(tilt, rng):
 def test_the_scale_of_the_tilt_is_learnt(scale):
     """Over 20 floors: a scale is known from 60 images to 1 / sqrt(240) = 6 %, and to more where noise hides it."""
     for seed in range(20):
-        rng, floor = np.random.default_rng(seed), Floor(GUESS)
+        rng, floor = np.random.default_rng(seed), TiltScale(GUESS)
         for _ in range(120):
             floor.learn(*seen(scale * rng.standard_normal(2), rng))
         assert floor.sigma == pytest.approx(scale, rel=0.4)
@@ -28,14 +28,14 @@ def test_the_scale_of_the_tilt_is_learnt(scale):
 
 def test_a_level_floor_is_found_to_be_level():
     for seed in range(20):
-        rng, floor = np.random.default_rng(seed), Floor(GUESS)
+        rng, floor = np.random.default_rng(seed), TiltScale(GUESS)
         for _ in range(120):
             floor.learn(*seen(np.zeros(2), rng))
         assert SCALES[0] < floor.sigma < 0.0015
 
 
 def test_what_tells_nothing_changes_nothing():
-    floor = Floor(GUESS)
+    floor = TiltScale(GUESS)
     for _ in range(100):
         here = floor.learn(np.zeros(2), PRIOR**2 * np.eye(2) * (1.0 - 1e-9), PRIOR)
         assert floor.sigma == pytest.approx(GUESS, rel=0.02)
@@ -43,7 +43,7 @@ def test_what_tells_nothing_changes_nothing():
 
 
 def test_a_sill_on_a_level_floor_is_a_tilt_of_that_image_alone():
-    rng, floor = np.random.default_rng(0), Floor(GUESS)
+    rng, floor = np.random.default_rng(0), TiltScale(GUESS)
     for _ in range(60):
         floor.learn(*seen(np.zeros(2), rng))
     assert floor.learn(*seen(np.array((0.03, -0.02)), rng)) > 0.015

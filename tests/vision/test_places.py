@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.vision import association_kernels as kernels
-from factorgraph_loc.vision.places import NEAREST, Places
+from factorgraph_loc.vision.places import NEAREST, KeyframeLooks
 
 KEYFRAMES, EACH, SIZE = 400, 60, 24
 
@@ -24,7 +24,7 @@ def drive(rng, binary):
 def test_the_keyframe_that_saw_the_same_is_among_the_most_alike(binary):
     rng = np.random.default_rng(0)
     descriptors, seen_from, by_keyframe = drive(rng, binary)
-    places = Places(descriptors, seen_from)
+    places = KeyframeLooks(descriptors, seen_from)
     assert len(places) == KEYFRAMES
     for k in range(5, KEYFRAMES, 20):
         image = by_keyframe[k][: EACH // 2].copy()
@@ -39,7 +39,7 @@ def test_the_keyframe_that_saw_the_same_is_among_the_most_alike(binary):
 def test_a_map_with_few_keyframes_is_taken_as_a_whole():
     descriptors, seen_from, _ = drive(np.random.default_rng(0), binary=False)
     few = seen_from[:, 0] < NEAREST
-    places = Places(descriptors[few], seen_from[few])
+    places = KeyframeLooks(descriptors[few], seen_from[few])
     np.testing.assert_array_equal(places.views(descriptors[:10]), np.arange(np.count_nonzero(few)))
 
 

@@ -27,7 +27,7 @@ from factors import se2
 from factors.camera import model as reprojection
 from factors.camera import update_kernels as pixel_kernels
 from factors.camera.factor import ReprojectionFactor
-from factors.camera.floor import Floor
+from factors.camera.floor import TiltScale
 from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel
 from factors.motion import Increment, propagate
 from factors.se2 import Array
@@ -80,7 +80,7 @@ class KnownPoints:
         self.model: CameraModel | None = None if settings is None else replace(settings.model(), tempering=1.0)
         second = setup.rig.camera_right if used and "sightings_right" in setup.sensors else None
         self._second: CameraModel | None = None if second is None else replace(second.model(), tempering=1.0)
-        self._floor = None if self.model is None else Floor(self.model.tilt)
+        self._floor = None if self.model is None else TiltScale(self.model.tilt)
         self._tempering = 1.0 if settings is None else settings.tempering  # for matched points
         self.map = PointMap.of((), np.empty((0, 3)))
         if setup.world.points is not None and use != "unknown":
