@@ -17,6 +17,7 @@ BAND, BANDS = 1.0, 50  # m of distance, and how many bands; the last one has no 
 FEWEST = 30.0  # predicted reads of a group that is told
 SHOWN = 4  # groups that are named
 DIFFERENT = 0.15  # share of the predicted reads by which a model that is doubted is off
+TINY = 1e-9  # reads: none of them has no logarithm
 WINDOW = 15.0  # s in which what was counted comes to count for 1 / e
 DOUBTED, TRUSTED = 1e-5, 1e-3  # probability of such counts with a right model at which doubts begin, and end
 KNOWN = BAND / 4.0  # m: standard deviation of the position up to which a scan tells of the model
@@ -37,11 +38,10 @@ class ReadGroups:
         """Add ``reads`` in ``rounds`` (K,) of ``antennas`` (K,); ``counts`` (K, C): which of them are counted."""
         _add(self.sums, antennas, rounds, reads.hits, reads.p, reads.distance, counts)
 
-    @property
-    def told(self) -> Integers:
-        """The groups that are predicted to have :data:`FEWEST` reads or more; antennas only if there are several."""
+    def told(self, fewest: float = FEWEST) -> Integers:
+        """The groups that are predicted to have so many reads or more; antennas only if there are several."""
         count = len(self.sums[1]) if len(self.antennas) > 1 else BANDS
-        return np.flatnonzero(self.sums[1, :count] >= FEWEST)
+        return np.flatnonzero(self.sums[1, :count] >= fewest)
 
     def names(self, groups: Integers) -> list[str]:
         """What groups are called."""
@@ -59,7 +59,8 @@ class ReadGroups:
 class ConsistencyMonitor:
     """Whether reads are as the detection models predict, in a window that forgets.
 
-    The bands of distance and the antennas have a chi-square each, where ``together`` rounds tell as much as one. The model is
+    The bands of distance and the antennas have a chi-square each, where ``together`` rounds tell as much as one; groups of
+    which few reads are predicted are merged, far bands with nearer ones: there are the reads if a range is too short. The model is
     doubted while one of them is beyond chance, and more than :data:`DIFFERENT` of the predicted reads are missing or too many.
     """
 
@@ -86,17 +87,19 @@ class ConsistencyMonitor:
 
     def _chance(self, groups: slice, together: float) -> float:
         """The probability of counts that are so far off with a right model; 1 if they are not off by much."""
-        observed, predicted, variance = self._groups.sums[:, groups]
-        told = predicted >= FEWEST
-        off = np.abs(observed - predicted)[told]
-        if np.sum(off) <= DIFFERENT * np.sum(predicted[told]):
+        observed, predicted, variance = _merged(self._groups.sums[:, groups], FEWEST)
+        off = observed - predicted
+        if np.sum(np.abs(off)) <= DIFFERENT * np.sum(predicted):
             return 1.0
-        return float(chi_squared.survival(np.sum(off**2 / variance[told]) / together, len(off)))
+        # the deviance, whose tail is right for few reads too (McCullagh and Nelder, 1989, section 2.3)
+        deviance = 2.0 * (observed * np.log(np.maximum(observed, TINY) / predicted) - off) * predicted / variance
+        return float(chi_squared.survival(np.sum(deviance) / together, len(off)))
 
     @property
     def shares(self) -> str:
         """Reads over predicted reads of the groups that are off most."""
-        return self._groups.shares(self._groups.told)
+        told = self._groups.told()
+        return self._groups.shares(told if len(told) else self._groups.told(1.0))
 
     def clear(self) -> None:
         """Forget everything: the track was wrong."""
@@ -123,3 +126,22 @@ def _add(
                     sums[0, group] += hits[k, c]
                     sums[1, group] += expected
                     sums[2, group] += expected * (1.0 - p[k, c])
+
+
+@compiled
+def _merged(sums: Array, least: float) -> Array:
+    """Sums (3, G) of groups, each merged with those before it until ``least`` reads are predicted of it; what is left of the first
+    ones goes with the last that was made."""
+    out, count, open_ = np.zeros(sums.shape), 0, 0.0
+    for g in range(sums.shape[1] - 1, -1, -1):
+        if open_ == 0.0 and sums[1, g] == 0.0:
+            continue
+        open_ += sums[1, g]
+        for i in range(3):
+            out[i, count] += sums[i, g]
+        if open_ >= least:
+            count, open_ = count + 1, 0.0
+    if open_ > 0.0 and count > 0:
+        for i in range(3):
+            out[i, count - 1] += out[i, count]
+    return out[:, :count]

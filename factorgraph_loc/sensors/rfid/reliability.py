@@ -118,7 +118,7 @@ def _told(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Rel
     one = np.ones(len(looks.p), dtype=np.int64)
     reads = ExpectedReads(looks.tag, looks.hit.astype(np.int64)[:, None], looks.p[:, None], looks.distance[:, None])
     groups.add(looks.antenna, one, reads, one[:, None] > 0)
-    together, told = _together(looks, (looks.distance // BAND).astype(np.int64)), groups.told
+    together, told = _together(looks, (looks.distance // BAND).astype(np.int64)), groups.told()
     if not len(told):
         return None
     observed, predicted, variance = groups.sums[:, told]
