@@ -1,18 +1,20 @@
-"""The factor graph of a camera in space: all its poses, from measured motion and points of a known map.
+"""The factor graph of a camera in space: all its poses, from its motion and points of a known map.
 
-One ``gtsam.Pose3`` per stamp; between-factors of the measured motion (``twist``), or of a random walk without it; and for each
-image the points that the monoSLAM filter matched, with Huber loss. That filter runs along and provides initial values. Points that
-the map lacks are not used.
+One ``gtsam.Pose3`` per stamp; its motion as measured (``twist``), or with a velocity that changes at random (:mod:`.space_going`);
+and for each image the points that the monoSLAM filter matched, with Huber loss. That filter runs along and provides initial values.
+Points that the map lacks are not used.
 
 Point factors are linearised here, as in :mod:`~factorgraph_loc.fusion.problem`, and GTSAM solves.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.fusion.least_squares import damped_step, optimum
@@ -24,39 +26,18 @@ from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.camera.sensor import Pixels
 from factorgraph_loc.sensors.twist.measurement import in_space, twist_settings
-from factorgraph_loc.sensors.twist.settings import TwistSettings
 from factorgraph_loc.slam.monoslam import Monoslam, MonoslamSettings
 from factorgraph_loc.slam.monoslam_sighting import Match
 from factorgraph_loc.slam.monoslam_state import Eye, SlamState, squared
-from factorgraph_loc.slam.space_motion import Displacement, RobotState, TwistChain
+from factorgraph_loc.slam.space_going import AT_ONCE, Going, KnownState, Measured, Steady, pose_of, robot_of
+from factorgraph_loc.slam.space_motion import ROBOT, TwistChain
 from factors import positive
 from factors.robust import huber_loss, huber_weight
 from factors.se2 import Array
 
-RANDOM_WALK = (1.0, 1.0, 1.0)  # m and rad per sqrt(s), without measured motion
-
 
 class SpaceGraphSettings(MonoslamSettings):
     """Settings of the filter that provides initial values; ``landmarks`` must be ``known``, and ``planar`` off."""
-
-
-@dataclass(frozen=True)
-class KnownPose:
-    """What is known of the pose at ``t``: its mean, and the covariance (6, 6) of a perturbation."""
-
-    t: float
-    pose: gtsam.Pose3
-    covariance: Array
-
-    def moved(self, by: Displacement, t: float) -> KnownPose:
-        """The pose at ``t``, after that motion."""
-        step = gtsam.Pose3(gtsam.Rot3(by.rotation), by.shift)
-        adjoint = step.inverse().AdjointMap()
-        return KnownPose(t, self.pose.compose(step), adjoint @ self.covariance @ adjoint.T + by.covariance)
-
-    def factor(self, key: int) -> gtsam.NonlinearFactor:
-        """The prior that says so of a variable."""
-        return gtsam.PriorFactorPose3(key, self.pose, gtsam.noiseModel.Gaussian.Covariance(self.covariance))
 
 
 @dataclass(frozen=True)
@@ -80,12 +61,12 @@ class SeenPoints:
 
     def cost(self, pose: gtsam.Pose3) -> float:
         """The robust loss, tempered."""
-        sights = self.eye.known(_robot(pose), self.points, self.spreads)
+        sights = self.eye.known(robot_of(pose), self.points, self.spreads)
         losses = huber_loss(squared(sights.pixels - self.pixels, sights.noise), self.eye.model.robust)
         return self.tempering * float(np.sum(losses))
 
     def _whitened(self, pose: gtsam.Pose3) -> tuple[Array, Array, Array]:
-        sights = self.eye.known(_robot(pose), self.points, self.spreads)
+        sights = self.eye.known(robot_of(pose), self.points, self.spreads)
         whitener = positive.whitener(sights.noise)
         return np.einsum("kij,kj->ki", whitener, sights.pixels - self.pixels), whitener, sights.by_pose
 
@@ -104,9 +85,12 @@ class SpaceGraph(Monoslam):
             )
         super().__init__(setup, settings.model_copy(update={"planar": False}))
         twist = twist_settings(setup)
-        self._chain = TwistChain(twist or TwistSettings(shift=RANDOM_WALK, turn=RANDOM_WALK))
+        self._chain = None if twist is None else TwistChain(twist)
+        self._going: Going = Steady(settings.acceleration, settings.angular_acceleration)
+        if self._chain is not None:
+            self._going = Measured(self._chain)
         self._images: dict[tuple[float, bool], SeenPoints] = {}
-        self._first: KnownPose | None = None  # the start
+        self._first: KnownState | None = None  # the start
         self._conclusion: tuple[Trajectory3, Diagnostics] | None = None  # the result, until the next measurement
 
     def initialize(self, prior: PosePrior) -> None:
@@ -115,16 +99,14 @@ class SpaceGraph(Monoslam):
             raise InputError(
                 f"{self.name}: the start is a pose on a floor, expected one in space: a log with such a reference, or unknown"
             )
-        start = prior.space
-        pose = gtsam.Pose3(gtsam.Rot3(start.rotation), start.position)
-        self._first = KnownPose(prior.t, pose, start.covariance)
         super().initialize(prior)
+        self._first = self._begun(prior.t, self._state)
 
     def process(self, measurement: Measurement) -> None:
         """Process one measurement, in order or late by at most ``max_delay``."""
         self._conclusion = None
         twist = in_space(measurement)
-        if twist is not None:
+        if twist is not None and self._chain is not None:
             self._chain.add(twist.t, twist.v, twist.w)
         super().process(measurement)
 
@@ -151,14 +133,15 @@ class SpaceGraph(Monoslam):
         if not past:  # nothing told where an unknown start was
             return Trajectory3(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 6, 6)))
         t = np.array(sorted(past))
+        t = t[np.append(True, np.diff(t) > AT_ONCE)]
         values = gtsam.Values()
         for i, stamp in enumerate(t.tolist()):
             values.insert(i, pose_of(past[stamp]))
-        images = [(int(np.searchsorted(t, image.t)), image) for image in self._images.values()]
-        motion = self._motion_graph(t)
+        images = [(int(_at(t, image.t)), image) for image in self._images.values()]
+        motion = self._motion_factors(t)
         values, linear = _solved(motion, images, values)
         ticks = np.unique(np.array(self._ticks))
-        rows = np.searchsorted(t, ticks).tolist()
+        rows = _at(t, ticks).tolist()
         spreads = self._covariances(linear, rows, t, diagnostics)
         poses = [values.atPose3(i) for i in rows]
         return Trajectory3(
@@ -170,8 +153,12 @@ class SpaceGraph(Monoslam):
 
     def _seek(self, m: Pixels) -> SlamState | None:
         state = super()._seek(m)
-        self._first = None if state is None else KnownPose(m.t, pose_of(state.robot), state.covariance[:6, :6])
+        self._first = None if state is None else self._begun(m.t, state)
         return state
+
+    def _begun(self, t: float, state: SlamState) -> KnownState:
+        """What is known at the start."""
+        return KnownState(t, state.robot, state.covariance[:ROBOT, :ROBOT])
 
     def _matched(self, m: Pixels, match: Match, eye: Eye) -> None:
         key = (m.t, m.right)
@@ -179,18 +166,19 @@ class SpaceGraph(Monoslam):
         if len(match.pixels):
             self._images[key] = SeenPoints(m.t, eye, match.pixels, match.points, match.spreads, match.tempering)
 
-    def _motion_graph(self, t: Array) -> gtsam.NonlinearFactorGraph:
-        first = self._first
-        assert first is not None
-        graph = gtsam.NonlinearFactorGraph()
-        graph.add(self._later(first, float(t[0])).factor(0))
-        for i in range(len(t) - 1):
-            graph.add(between(i, i + 1, self._chain.between(float(t[i]), float(t[i + 1]))))
-        return graph
+    def _motion_factors(self, t: Array) -> list[gtsam.NonlinearFactor]:
+        """The factors of the start and of the motion between the stamps."""
+        assert self._first is not None
+        start = self._later(self._first, float(t[0]))
+        times, factors = t.tolist(), [start.prior(0)]
+        for i in range(1, len(times)):
+            part = slice(max(0, i - 2), i + 1)
+            factors.append(self._going.factor(range(len(times))[part], times[part], start))
+        return factors
 
-    def _later(self, known: KnownPose, t: float) -> KnownPose:
-        """What is known at ``t``, by the measured motion."""
-        return known.moved(self._chain.between(known.t, t), t) if t > known.t else known
+    def _later(self, known: KnownState, t: float) -> KnownState:
+        """What is known at ``t``."""
+        return known.moved(self._going.step(known.robot, known.t, t), t) if t > known.t else known
 
     def _covariances(
         self, linear: gtsam.GaussianFactorGraph, rows: list[int], t: Array, diagnostics: Diagnostics
@@ -206,24 +194,26 @@ class SpaceGraph(Monoslam):
         return found.by_key
 
 
-def between(key: int, later: int, by: Displacement) -> gtsam.NonlinearFactor:
-    """The factor of a measured motion from one pose to the next."""
-    step = gtsam.Pose3(gtsam.Rot3(by.rotation), by.shift)
-    return gtsam.BetweenFactorPose3(key, later, step, gtsam.noiseModel.Gaussian.Covariance(by.covariance))
+def _at(t: Array, stamps: Array | float) -> NDArray[np.intp]:
+    """The poses at ``stamps``, of poses at times ``t``."""
+    return np.asarray(np.searchsorted(t, np.asarray(stamps) + AT_ONCE, side="right") - 1)
 
 
 def _solved(
-    motion: gtsam.NonlinearFactorGraph, images: list[tuple[int, SeenPoints]], values: gtsam.Values
+    motion: Sequence[gtsam.NonlinearFactor], images: list[tuple[int, SeenPoints]], values: gtsam.Values
 ) -> tuple[gtsam.Values, gtsam.GaussianFactorGraph]:
     """The optimum, and the problem linearised there."""
     units = {2 * len(image.pixels): gtsam.noiseModel.Unit.Create(2 * len(image.pixels)) for _, image in images}
     sizes = dict.fromkeys(range(values.size()), 6)
 
     def cost(at: gtsam.Values) -> float:
-        return float(motion.error(at)) + sum(image.cost(at.atPose3(key)) for key, image in images)
+        moved = sum(factor.error(_only(factor, at)) for factor in motion)
+        return moved + sum(image.cost(at.atPose3(key)) for key, image in images)
 
     def linearized(at: gtsam.Values) -> gtsam.GaussianFactorGraph:
-        graph = motion.linearize(at)
+        graph = gtsam.GaussianFactorGraph()
+        for factor in motion:
+            graph.push_back(factor.linearize(_only(factor, at)))
         for key, image in images:
             residual, jacobian = image.linearize(at.atPose3(key))
             graph.add(gtsam.JacobianFactor(key, jacobian, -residual, units[len(residual)]))
@@ -237,10 +227,9 @@ def _solved(
     return found, linearized(found)
 
 
-def _robot(pose: gtsam.Pose3) -> RobotState:
-    return RobotState(np.asarray(pose.translation()), np.asarray(pose.rotation().matrix()), np.zeros(3), np.zeros(3))
-
-
-def pose_of(robot: RobotState) -> gtsam.Pose3:
-    """The pose of the filter's robot."""
-    return gtsam.Pose3(gtsam.Rot3(robot.rotation), robot.position)
+def _only(factor: gtsam.NonlinearFactor, at: gtsam.Values) -> gtsam.Values:
+    """The poses of a factor: GTSAM copies all that it is given for each call of a factor of ours."""
+    values = gtsam.Values()
+    for key in factor.keys():  # noqa: SIM118
+        values.insert(key, at.atPose3(key))
+    return values

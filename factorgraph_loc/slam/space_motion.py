@@ -23,6 +23,7 @@ from factors.se2 import Array
 
 ROBOT = 12  # values of the error state
 TURN, SHIFT, VELOCITY, RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+POSES, VELOCITIES = slice(0, 6), slice(6, 12)
 PLANAR = [3, 4, 2]  # indices in the pose's error: x, y and heading of a level robot
 UPRIGHT = [0, 1, 5]  # the components held by the floor: roll, pitch, height
 NO_VELOCITY = [8, 9, 10]  # their velocities

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import gtsam
-import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import RunFailedError
@@ -23,15 +22,13 @@ from factorgraph_loc.model.trajectory3 import planar_estimate
 from factorgraph_loc.sensors.camera.sensor import Pixels
 from factorgraph_loc.slam.monoslam_past import UpdateRecord
 from factorgraph_loc.slam.monoslam_state import SlamState
+from factorgraph_loc.slam.space_going import AT_ONCE, Going, KnownState, pose_of
 from factorgraph_loc.slam.space_graph import (
-    KnownPose,
     SeenPoints,
     SpaceGraph,
     SpaceGraphSettings,
-    between,
-    pose_of,
 )
-from factorgraph_loc.slam.space_motion import Displacement
+from factorgraph_loc.slam.space_motion import POSES
 from factors.se2 import Array
 
 THRESHOLD = 0.01  # m, rad: how far a pose moves before its factors are linearised again
@@ -48,7 +45,7 @@ class SpaceSmootherSettings(SpaceGraphSettings):
 class _WindowRecord(UpdateRecord):
     """``known``: what the window knew then."""
 
-    known: KnownPose | None = None
+    known: KnownState | None = None
 
 
 class SpaceSmoother(SpaceGraph):
@@ -62,7 +59,7 @@ class SpaceSmoother(SpaceGraph):
         self._window: _Window | None = (
             None  # begun anew from what is known, after the start and after a late measurement
         )
-        self._known: KnownPose | None = None
+        self._known: KnownState | None = None
 
     def initialize(self, prior: PosePrior) -> None:
         """Start from a pose in space. Raises InputError for a planar pose."""
@@ -76,19 +73,20 @@ class SpaceSmoother(SpaceGraph):
 
     def _see(self, m: Pixels) -> None:
         super()._see(m)
+        if self._anew:  # the filter found its place, whatever was before
+            self._known, self._window = self._begun(m.t, self._state), None
         known, image = self._known, self._images.get((m.t, m.right))
-        if image is None or known is None:
+        if image is None or known is None or self._anew or self._vague(self._state):
             return
         if self._window is None:
-            self._window = _Window(known, self._lag)
-        moved = self._chain.between(known.t, m.t) if m.t > known.t else None
-        self._known = self._window.add(image, moved, pose_of(self._state.robot))
+            self._window = _Window(known, self._going, self._lag)
+        self._known = self._window.add(image, pose_of(self._state.robot))
 
     def _estimate(self) -> PoseEstimate:
         assert self._known is not None
         now = self._later(self._known, self._t)
-        position, rotation = np.asarray(now.pose.translation()), np.asarray(now.pose.rotation().matrix())
-        return planar_estimate(self._t, SpacePose(position, rotation, now.covariance + self._mounting))
+        spread = now.covariance[POSES, POSES] + self._mounting
+        return planar_estimate(self._t, SpacePose(now.robot.position, now.robot.rotation, spread))
 
     def _record(self) -> UpdateRecord:
         return _WindowRecord(**vars(super()._record()), known=self._known)
@@ -103,35 +101,39 @@ class SpaceSmoother(SpaceGraph):
 class _Window:
     """The poses of the images of the last ``lag`` seconds; older ones are marginalised out."""
 
-    def __init__(self, start: KnownPose, lag: float) -> None:
+    def __init__(self, start: KnownState, going: Going, lag: float) -> None:
         parameters = gtsam.ISAM2Params()
         parameters.setRelinearizeThreshold(THRESHOLD)
         parameters.relinearizeSkip = 1
         self._solver = gtsam.IncrementalFixedLagSmoother(lag, parameters)
-        self._key, self._t = 0, start.t
-        self._update([start.factor(0)], start.pose)
+        self._start, self._going = start, going
+        self._keys, self._times = [0], [start.t]  # of the newest poses
+        self._update([start.prior(0)], pose_of(start.robot))
 
-    def add(self, image: SeenPoints, moved: Displacement | None, guess: gtsam.Pose3) -> KnownPose:
-        """Add an image, of the newest pose or of one after the motion ``moved``, and return what is known of its pose then."""
-        if moved is None:
-            self._update([_factor(image, self._key)])
+    def add(self, image: SeenPoints, guess: gtsam.Pose3) -> KnownState:
+        """Add an image, of the newest pose or of a later one, and return what is known of the robot then."""
+        if image.t > self._times[-1] + AT_ONCE:
+            self._keys, self._times = [*self._keys[-2:], self._keys[-1] + 1], [*self._times[-2:], image.t]
+            motion = self._going.factor(self._keys, self._times, self._start)
+            self._update([motion, _factor(image, self._keys[-1])], guess)
         else:
-            self._key, self._t = self._key + 1, image.t
-            self._update([between(self._key - 1, self._key, moved), _factor(image, self._key)], guess)
-        covariance = np.asarray(self._solver.marginalCovariance(self._key))
-        return KnownPose(self._t, self._solver.calculateEstimatePose3(self._key), covariance)
+            self._update([_factor(image, self._keys[-1])])
+        keys, times = self._keys[-2:], self._times[-2:]
+        poses = [self._solver.calculateEstimatePose3(key) for key in keys]
+        spread = self._solver.getISAM2().jointMarginalCovariance(keys).fullMatrix()
+        return self._going.state(poses, spread, times, self._start)
 
     def _update(self, factors: list[gtsam.NonlinearFactor], guess: gtsam.Pose3 | None = None) -> None:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for factor in factors:
             graph.push_back(factor)
         if guess is not None:
-            values.insert(self._key, guess)
+            values.insert(self._keys[-1], guess)
         try:
-            self._solver.update(graph, values, {self._key: self._t})
+            self._solver.update(graph, values, dict.fromkeys(self._keys[-2:], self._times[-1]))
         except RuntimeError as error:
             raise RunFailedError(
-                f"space_smoother: the measurements do not determine the pose at {self._t:.3f} s"
+                f"space_smoother: the measurements do not determine the pose at {self._times[-1]:.3f} s"
             ) from error
 
 

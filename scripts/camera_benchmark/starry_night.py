@@ -29,9 +29,10 @@ CONFIGS = {
     "monoslam, both eyes, constant velocity": RunConfig("monoslam", sensors=(LEFT, RIGHT)),
     "space_smoother, motion and both eyes": RunConfig("space_smoother", sensors=STEREO),
     "space_smoother, motion and left eye": RunConfig("space_smoother", sensors=(TWIST, LEFT)),
+    "space_smoother, both eyes, constant velocity": RunConfig("space_smoother", sensors=(LEFT, RIGHT)),
     "space_batch, motion and both eyes": RunConfig("space_batch", sensors=STEREO),
     "space_batch, motion and left eye": RunConfig("space_batch", sensors=(TWIST, LEFT)),
-    "space_batch, both eyes, random walk": RunConfig("space_batch", sensors=(LEFT, RIGHT)),
+    "space_batch, both eyes, constant velocity": RunConfig("space_batch", sensors=(LEFT, RIGHT)),
 }
 DRAWN = ("monoslam, motion and both eyes", "space_batch, motion and both eyes")
 HEADS = (

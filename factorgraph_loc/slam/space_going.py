@@ -1,0 +1,164 @@
+"""Motion in space as factors of a graph: measured, or with a velocity that changes at random.
+
+A velocity is no variable: between two poses it is their difference over the time between them, as in the filter that predicts by it
+(:func:`~factorgraph_loc.slam.space_motion.constant_velocity`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import gtsam
+import numpy as np
+
+from factorgraph_loc.slam.space_motion import (
+    POSES,
+    ROBOT,
+    SHIFT,
+    TURN,
+    VELOCITIES,
+    RobotState,
+    Step,
+    TwistChain,
+    constant_velocity,
+    log,
+    measured,
+)
+from factors import positive
+from factors.se2 import Array
+
+AT_ONCE = 1e-3  # s between stamps of one pose: from less no velocity can be computed
+
+
+@dataclass(frozen=True)
+class KnownState:
+    """What is known of the robot at ``t``: its mean, and the covariance (12, 12) of the error."""
+
+    t: float
+    robot: RobotState
+    covariance: Array
+
+    def moved(self, step: Step, t: float) -> KnownState:
+        """What is known at ``t``, after that step."""
+        return KnownState(t, step.robot, step.transition @ self.covariance @ step.transition.T + step.noise)
+
+    def prior(self, key: int) -> gtsam.NonlinearFactor:
+        """The factor that says so of a pose."""
+        noise = gtsam.noiseModel.Gaussian.Covariance(self.covariance[POSES, POSES])
+        return gtsam.PriorFactorPose3(key, pose_of(self.robot), noise)
+
+    def by_pose(self) -> tuple[Array, Array]:
+        """How the expected velocities depend on the error of the pose (6, 6), and their covariance (6, 6) if that is known."""
+        gain = positive.solve(self.covariance[POSES, POSES], self.covariance[POSES, VELOCITIES]).T
+        return gain, self.covariance[VELOCITIES, VELOCITIES] - gain @ self.covariance[POSES, VELOCITIES]
+
+
+class Going(Protocol):
+    """How the robot moves."""
+
+    def step(self, robot: RobotState, start: float, end: float) -> Step:
+        """Where it is at ``end``."""
+
+    def factor(self, keys: Sequence[int], times: Sequence[float], start: KnownState) -> gtsam.NonlinearFactor:
+        """The factor on the last of the poses ``keys`` and one or two before; ``start``: what is known of the first of all."""
+
+    def state(
+        self, poses: Sequence[gtsam.Pose3], spread: Array, times: Sequence[float], start: KnownState
+    ) -> KnownState:
+        """What is known at the last of one or two poses with the joint covariance ``spread``."""
+
+
+class Measured:
+    """As a ``twist`` tells."""
+
+    def __init__(self, chain: TwistChain) -> None:
+        self._chain = chain
+
+    def step(self, robot: RobotState, start: float, end: float) -> Step:
+        return measured(robot, self._chain.between(start, end), end - start)
+
+    def factor(self, keys: Sequence[int], times: Sequence[float], start: KnownState) -> gtsam.NonlinearFactor:
+        by = self._chain.between(times[-2], times[-1])
+        moved = gtsam.Pose3(gtsam.Rot3(by.rotation), by.shift)
+        return gtsam.BetweenFactorPose3(keys[-2], keys[-1], moved, gtsam.noiseModel.Gaussian.Covariance(by.covariance))
+
+    def state(
+        self, poses: Sequence[gtsam.Pose3], spread: Array, times: Sequence[float], start: KnownState
+    ) -> KnownState:
+        covariance = np.zeros((ROBOT, ROBOT))
+        covariance[POSES, POSES] = spread[-6:, -6:]
+        return KnownState(times[-1], robot_of(poses[-1]), covariance)
+
+
+class Steady:
+    """At a velocity and a turn rate that change by an impulse at each step: ``acceleration`` [m/s^2], ``angular`` [rad/s^2]."""
+
+    def __init__(self, acceleration: float, angular: float) -> None:
+        self._sigmas = np.repeat((acceleration, angular), 3)
+
+    def step(self, robot: RobotState, start: float, end: float) -> Step:
+        impulse = self._sigmas * (end - start)
+        return constant_velocity(robot, end - start, impulse[:3], impulse[3:])
+
+    def factor(self, keys: Sequence[int], times: Sequence[float], start: KnownState) -> gtsam.NonlinearFactor:
+        spans = np.diff(times)
+        impulse = np.diag(np.square(self._sigmas * spans[-1]))
+        gain, rest = start.by_pose()
+        noise = gtsam.noiseModel.Gaussian.Covariance(impulse if len(keys) > 2 else rest + impulse)
+
+        def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+            poses = [values.atPose3(key) for key in keys]
+            found, *by = velocities(poses[-2], poses[-1], spans[-1])
+            if len(keys) > 2:
+                before, by_first, by_second = velocities(poses[0], poses[1], spans[0])
+                by = [-by_first, by[0] - by_second, by[1]]
+            else:
+                off = start.robot
+                before = np.concatenate((off.velocity, off.rate)) + gain @ robot_of(poses[0]).minus(off)[POSES]
+                by[0] = by[0] - gain
+            if jacobians is not None:
+                for i, jacobian in enumerate(by):
+                    jacobians[i] = jacobian
+            return found - before
+
+        return gtsam.CustomFactor(noise, list(keys), error)
+
+    def state(
+        self, poses: Sequence[gtsam.Pose3], spread: Array, times: Sequence[float], start: KnownState
+    ) -> KnownState:
+        robot, covariance = robot_of(poses[-1]), np.zeros((ROBOT, ROBOT))
+        if len(poses) > 1:
+            found, by_first, by_second = velocities(poses[0], poses[1], times[-1] - times[-2])
+            lift = np.block([[np.zeros((6, 6)), np.eye(6)], [by_first, by_second]])
+        else:
+            gain, rest = start.by_pose()
+            found = np.concatenate((start.robot.velocity, start.robot.rate)) + gain @ robot.minus(start.robot)[POSES]
+            lift = np.vstack((np.eye(6), gain))
+            covariance[VELOCITIES, VELOCITIES] = rest
+        moving = RobotState(robot.position, robot.rotation, found[:3], found[3:])
+        return KnownState(times[-1], moving, lift @ spread @ lift.T + covariance)
+
+
+def velocities(first: gtsam.Pose3, second: gtsam.Pose3, dt: float) -> tuple[Array, Array, Array]:
+    """Velocity in the world and turn rate in the robot's frame (6,) between two poses, and their derivatives (6, 6) by the
+    perturbation of each."""
+    here, there = robot_of(first), robot_of(second)
+    turned = here.rotation.T @ there.rotation
+    angle = log(turned)
+    by_turn = np.asarray(gtsam.Rot3.LogmapDerivative(angle))
+    by_first, by_second = np.zeros((6, 6)), np.zeros((6, 6))
+    by_first[:3, SHIFT], by_second[:3, SHIFT] = -here.rotation, there.rotation
+    by_first[3:, TURN], by_second[3:, TURN] = -by_turn @ turned.T, by_turn
+    return np.concatenate((there.position - here.position, angle)) / dt, by_first / dt, by_second / dt
+
+
+def robot_of(pose: gtsam.Pose3) -> RobotState:
+    """A robot at rest at a pose."""
+    return RobotState(np.asarray(pose.translation()), np.asarray(pose.rotation().matrix()), np.zeros(3), np.zeros(3))
+
+
+def pose_of(robot: RobotState) -> gtsam.Pose3:
+    """The pose of a robot."""
+    return gtsam.Pose3(gtsam.Rot3(robot.rotation), robot.position)
