@@ -206,11 +206,11 @@ class Incremental:
         """RuntimeError if points that are estimated took the newest pose where it cannot be."""
         if not self._maps:
             return
-        pose, spread = guess
+        (pose, spread), estimates = guess, self._solver.estimates()
         off = se2.log(se2.between(pose, self._solver.value(newest.key)))
         if not positive.squared(off, spread) < JUMPED:
             raise RuntimeError("the estimate jumped")
-        self._last = self._solver.estimates()
+        self._last = estimates
 
     def _read(self, newest: Keyframe, touched: Iterable[int]) -> None:
         """Bring the newest pose with its covariance up to date, and those constants and landmarks that an update touched.

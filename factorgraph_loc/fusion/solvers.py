@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, Protocol, cast
 
 import gtsam
@@ -26,6 +26,7 @@ from factorgraph_loc.fusion.variables import (
     is_point,
     is_pose,
     read,
+    retract,
     to_gtsam,
 )
 from factors.graph import Factor, jacobian_factors, pose_array, silenced
@@ -74,15 +75,21 @@ class Solver(Protocol):
 
 class FullHistory:
     """Everything stays in the graph. ``threshold``: how far iSAM2 lets a variable move from where it is linearised, in m, rad or
-    the units of constants."""
+    the units of constants.
+
+    Constants are in all branches of iSAM2's tree, and in each update: to read an estimate it solves the whole tree for its
+    variables. What the last update touched is at the root, and is solved for by itself.
+    """
 
     def __init__(self, parameters: gtsam.ISAM2Params, threshold: float) -> None:
         parameters.setRelinearizeThreshold(threshold)
         self._isam = gtsam.ISAM2(parameters)
         self._ours = _Ours(threshold, parameters.relinearizeSkip, None)
+        self._touched: Collection[int] = ()  # by the last update
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
         self.begin((), nodes, values, {})
+        self._touched = {key for node in nodes for key in node.keys}
 
     def begin(
         self,
@@ -94,6 +101,7 @@ class FullHistory:
         with gtsam_errors():
             graph, removed = self._ours.added(self._isam, factors, nodes, values)
             self._ours.place(self._isam.update(graph, to_gtsam(values), removed).getNewFactorsIndices())
+        self._touched = ()
 
     @property
     def oldest(self) -> int:
@@ -104,13 +112,17 @@ class FullHistory:
 
     def value(self, key: int) -> Array:
         with gtsam_errors():
-            return read(self._isam, key)
+            if key not in self._touched:
+                return read(self._isam, key)
+            step = np.linalg.solve(*self._isam.marginalFactor(key).jacobian())
+            return retract(key, self._ours.at[key], np.asarray(step, dtype=float))
 
     def covariance(self, key: int) -> Array:
         with gtsam_errors():
             return np.asarray(self._isam.marginalCovariance(key))
 
     def estimates(self) -> gtsam.Values:
+        self._touched = ()  # the whole tree is solved
         return self._isam.calculateEstimate()
 
     def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:

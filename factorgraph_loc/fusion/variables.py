@@ -13,7 +13,7 @@ from types import TracebackType
 import gtsam
 import numpy as np
 
-from factors import se2
+from factors import se2_kernels
 from factors.graph import Factor, pose_array
 from factors.se2 import Array
 
@@ -108,7 +108,7 @@ class gtsam_errors:  # noqa: N801 - used as a function
 
 def retract(key: int, value: Array, step: Array) -> Array:
     """A variable moved by a step of its tangent space."""
-    return se2.compose(value, se2.exp(step)) if is_pose(key) else value + step
+    return se2_kernels.moved(value, step) if is_pose(key) else value + step
 
 
 def to_gtsam(values: Values) -> gtsam.Values:

@@ -11,7 +11,7 @@ from landmark_world import simulate
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.solvers import MARGIN, FullHistory, Window, read_all
 from factorgraph_loc.fusion.summary import MarginalSummary
-from factorgraph_loc.fusion.variables import index_of, is_pose, pose_key
+from factorgraph_loc.fusion.variables import index_of, is_pose, pose_key, read
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factors import se2
 
@@ -85,6 +85,18 @@ def test_covariances_of_poses_at_once_are_those_of_each(log):
 
     run(log, RunConfig("smoother", {"lag": 6.0}, prior=START), watch=watch)
     assert compared == [True, True, True]
+
+
+def test_what_is_solved_for_by_itself_is_the_estimate(log):
+    compared = []
+
+    def watch(_, estimator):
+        solver = estimator._backend._solver
+        compared.extend(np.allclose(solver.value(key), read(solver._isam, key), atol=1e-9) for key in solver._touched)
+
+    run(log, RunConfig("smoother", {"lag": "all"}, prior=START), watch=watch)
+    assert len(compared) > 100
+    assert all(compared)
 
 
 def test_poses_leave_a_window_several_at_a_time(log):
