@@ -32,6 +32,7 @@ ESTIMATORS: dict[str, tuple[dict[str, Any], ...]] = {
     "batch": ({}, {"landmarks": "unknown"}),
     "monoslam": ({}, {"landmarks": "unknown"}, {"planar": False}),
     "space_batch": ({}, {"planar": False}),
+    "space_smoother": ({}, {"lag": 0.5}),
 }
 CHOSEN = ("ekf", "particle_filter", "smoother", *ESTIMATORS)
 LOCALIZERS = tuple(ESTIMATORS)

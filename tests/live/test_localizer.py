@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+import space_world
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import (
@@ -355,6 +356,19 @@ def test_a_long_pause_holds_no_ticks(log):
     expected = run(replace(log, streams={"odometry": odometry}), RunConfig("ekf", prior="0,0,0", sensors=("odometry",)))
     assert localizer.trajectory().t.tolist() == expected.final.t.tolist()[:-1]
     assert np.diff(expected.final.t).max() > 2800.0
+
+
+@pytest.mark.parametrize("name", ["monoslam", "space_smoother"])
+def test_a_camera_in_space_begins_where_an_image_tells(name):
+    log = space_world.carried(1)
+    localizer = fgloc.Localizer(log.rig, log.world, estimator=name)
+    localizer.initialize()
+    for measurement in log.measurements(log.rig.sensors):
+        localizer.push(measurement)
+    found, sigmas = localizer.estimate(), np.sqrt(np.diag(localizer.estimate().space.covariance))[3:]
+    off = log.reference3.rotations[-1].T @ (found.space.position - log.reference3.positions[-1])
+    assert found.status == "localized"
+    np.testing.assert_array_less(np.abs(off) / sigmas, 4.0)
 
 
 def test_an_estimator_in_space_begins_on_no_floor():
