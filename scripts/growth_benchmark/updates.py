@@ -1,7 +1,7 @@
 """What an update costs, over the length of a log, the rate, the size of the map, and the particles.
 
-Each case has a process of its own, and all times are processor time. What an axis leaves alone is as in :data:`BASE`. Tags and
-points fill a larger building as densely; further landmarks are out of sight.
+Each case has a process of its own, and all times are processor time. What an axis leaves alone is as in :data:`BASE`. Points fill a
+larger building as densely; further landmarks, and copies of the hall with its tags, are out of sight.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from factorgraph_loc.simulation import preset, simulate
 WARM_UP = 20.0  # s of the log, run before anything is timed
 AREA = {"tags": 12.0, "points": 0.6}  # m^2 of the building for each of them
 FAR = 1000.0  # m: where landmarks are that no robot of the building sees
+HALL, APART = 100, 20.0  # tags of a hall, and m between it and its copies
 STREAMS = {"landmarks": "bearing_range", "points": "sightings", "tags": "rfid"}
 RUNS: Mapping[str, RunConfig] = {
     "EKF": RunConfig("ekf"),
@@ -83,8 +84,9 @@ def log_of(axis: str, size: int) -> Log:
     wanted = {**BASE, axis.split(",", maxsplit=1)[0]: size}
     world: dict[str, Any] = {"tags": 1, "landmarks": int(BASE["landmarks"])}
     if kind in AREA:
-        depth = math.sqrt(0.6 * AREA[kind] * size)
-        world = {"plan": "warehouse", "width": depth / 0.6, "depth": depth, "tags": 1, kind: int(size)}
+        count = HALL if kind == "tags" else size
+        depth = math.sqrt(0.6 * AREA[kind] * count)
+        world = {"plan": "warehouse", "width": depth / 0.6, "depth": depth, "tags": 1, kind: count}
     settings: dict[str, Any] = {"world": world, "drive": {"duration": 60.0 * wanted["minutes"]}}
     if kind == "landmarks":
         settings |= {"rig": RIG, "sightings": {**SIGHTINGS, "rate": wanted["rate"]}}
@@ -92,12 +94,19 @@ def log_of(axis: str, size: int) -> Log:
         settings |= {"pixels": {"rate": wanted["rate"]}}
     log = simulate(preset("office", settings), SEED)
     sensors = ("odometry", STREAMS[kind])
+    copies = int(size) // HALL if kind == "tags" else 1
+    steps = [np.array(divmod(i, math.isqrt(copies))) * (world.get("width", 0.0) + APART) for i in range(copies)]
+    tags = {
+        f"{name}-{i}" if i else name: tag.model_copy(update={"x": tag.x + step[0], "y": tag.y + step[1]})
+        for i, step in enumerate(steps)
+        for name, tag in log.world.tags.items()
+    }
     others = {f"far{i}": Landmark(x=FAR + i, y=FAR) for i in range(int(wanted["landmarks"]) - len(log.world.landmarks))}
     return replace(
         log,
         streams={s: log.streams[s] for s in sensors},
         rig=log.rig.model_copy(update={"sensors": sensors}),
-        world=log.world.model_copy(update={"landmarks": {**log.world.landmarks, **others}}),
+        world=log.world.model_copy(update={"landmarks": {**log.world.landmarks, **others}, "tags": tags}),
     )
 
 
