@@ -77,6 +77,13 @@ def moved(pose: Array, twist: Array) -> Array:
 
 
 @compiled
+def twist_to(pose: Array, other: Array) -> Array:
+    """The twist (3,) in the frame of a pose (3,) that leads from it to another: the inverse of :func:`moved`."""
+    x, y, turned = related(pose[0], pose[1], pose[2], other[0], other[1], other[2])
+    return np.array(log(x, y, turned))
+
+
+@compiled
 def body_to_world(pose: Array, covariance: Array) -> Array:
     """:func:`factors.se2.body_to_world` of one pose (3,), and of the first three components of a covariance (S, S), of which the
     upper triangle is read: the result is symmetric to the last bit."""

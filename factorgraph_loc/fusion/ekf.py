@@ -208,7 +208,7 @@ class Ekf(Filter):
     def _smoothed(self, here: _State, step: _Step, after: _State) -> _State:
         """The state ``here`` given what came later: ``step`` led from it to where ``after`` is the smoothed state."""
         after = after.first(len(here.covariance))
-        change = np.concatenate((se2.log(se2.between(step.pose, after.pose)), after.rest - here.rest))
+        change = np.concatenate((se2_kernels.twist_to(step.pose, after.pose), after.rest - here.rest))
         try:
             found = rts_kernels.smoothed(here.covariance, step.transition, step.noise, change, after.covariance)
         except np.linalg.LinAlgError:

@@ -19,7 +19,7 @@ from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.sensors.known_position import KnownPosition
-from factors import se2
+from factors import se2_kernels
 from factors.graph import Factor
 from factors.marginal import Marginalized
 from factors.motion import ChainState, Increment
@@ -369,7 +369,7 @@ class ResidualObservation:
         size = max((3, *(columns[name].stop for name in self.blocks)))
 
         def linearize(delta: Array) -> tuple[Array, Array]:
-            at = se2.compose(pose, se2.exp(delta[:3]))
+            at = se2_kernels.moved(pose, delta)
             parts = []
             for term, factor in zip(self.terms, self.factors, strict=True):
                 moved = [values[name] + delta[columns[name]] for name in term.blocks]

@@ -31,6 +31,7 @@ def test_twists_lead_back_to_the_poses(heading):
     same_poses(se2.compose(pose, se2.exp(twists)), POSES)
     turned = np.abs(se2.wrap(POSES[:, 2] - heading)) < 3.1  # of half a turn either way is right
     np.testing.assert_allclose(twists[turned], se2.log(se2.between(pose, POSES))[turned], atol=1e-10)
+    same_poses(np.array([se2_kernels.moved(pose, se2_kernels.twist_to(pose, other)) for other in POSES]), POSES)
 
 
 def test_moments():
