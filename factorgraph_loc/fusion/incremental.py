@@ -190,7 +190,7 @@ class Incremental:
         if isinstance(self._solver, Stalled) and newest.t < self._solver.until:
             self._graph.pose, self._graph.covariance = guess  # the next try takes in what keyframes and constants hold
             return
-        self._leave(newest.t, [k for k in self._graph.values if k not in values and is_constant(k)])
+        self._leave(newest.t, values)
         try:
             with gtsam_errors():
                 self._solver.update(nodes, values, newest.t)
@@ -248,11 +248,9 @@ class Incremental:
             covariance = found.by_key[key]
         return value, positive.sound(covariance)
 
-    def _leave(self, now: float, constants: Sequence[int]) -> None:
-        """Keep the estimates of the keyframes older than the lag, before the next update marginalises the oldest out.
-
-        ``constants``: those that are in the solver by now, which are brought up to date.
-        """
+    def _leave(self, now: float, new: Collection[int]) -> None:
+        """Keep the estimates of the keyframes older than the lag, before updates marginalise them out, and of the constants that
+        are in the solver by now, which are all but the ``new`` ones."""
         if not isinstance(self._solver, Window) or self._lag is None:
             return
         lag, count = self._lag, len(self._left)
@@ -261,10 +259,8 @@ class Incremental:
             self._solver.lag = now - first + ROUNDING
         if first >= now - lag - self._margin:
             return
-        end = count
-        while self._graph.keyframes[end].t < now - lag:
-            end += 1
-        leaving = self._graph.keyframes[count:end]
+        leaving = self._graph.keyframes[count : bisect.bisect_left(self._graph.times, now - lag, count)]
+        constants = [key for key in self._graph.values if key not in new and is_constant(key)]
         points = [key for mapper in self._graph.mappers for key in mapper.leave(now - lag)]
         # of a start of the whole problem the covariance is not asked
         asked = [] if self._is_whole else [*(k.key for k in leaving), *constants, *points]
@@ -286,12 +282,10 @@ class Incremental:
         """Keep the estimates of points that leave the window, and their covariances, of which some are known."""
         for key in points:
             try:
-                self._graph.departed[0][key], self._graph.departed[1][key] = self._marginal(key, spreads.get(key))
+                found = self._marginal(key, spreads.get(key))
             except RuntimeError:
-                self._graph.departed[0][key], self._graph.departed[1][key] = (
-                    self._graph.values[key],
-                    self._graph.spreads[key],
-                )
+                found = self._graph.values[key], self._graph.spreads[key]
+            self._graph.departed[0][key], self._graph.departed[1][key] = found
             del self._graph.values[key], self._graph.spreads[key]
 
     def _rebuild(self, newest: Keyframe, guess: Guess) -> None:

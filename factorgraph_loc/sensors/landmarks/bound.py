@@ -110,7 +110,7 @@ class LandmarkObservation(ResidualObservation):
             here = factor.fixed(shared, None if own is None else values[own])
             fixed.append(here if own is None else replace(here, point_covariances=spreads[own][None]))
         factor = together(fixed)
-        return replace(self, terms=(Term(factor, (), 2 * len(factor.points)),))
+        return type(self)(self.t, (Term(factor, (), 2 * len(factor.points)),), self.surveyed)
 
 
 class LandmarkSensor(Sensor):
