@@ -65,6 +65,8 @@ VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s at the start
 LATELY = 5.0  # s: a point in the state that was not seen since may be hidden
 LOST_AFTER = 5  # consecutive images without a match, after which the filter is lost
 SCALE = "scale_distance"  # the constant of the odometry
+UNSCALED = 1.0  # standard deviation of the scale of a world that one camera alone tells, relative to it
+NO_SCALE = "camera: one camera without a map and without measured motion tells no distances: their scale is unknown"
 VAGUE = 0.5  # m, rad: standard deviations beyond which the pose is unknown
 
 
@@ -197,7 +199,10 @@ class Monoslam(Filter):
             free = PLANAR if self._planar else list(range(6))
             spread = np.zeros((6, 6))
             spread[np.ix_(free, free)] = covariance[np.ix_(free, free)]
-            self._origin = Origin(robot, spread)
+            scaled = not self._by_velocity or self._looker.two_eyes
+            self._origin = Origin(robot, spread, 0.0 if scaled else UNSCALED)
+            if not scaled:
+                self.diagnostics.events.append((prior.t, NO_SCALE))
             covariance[free] = covariance[:, free] = 0.0
         return SlamState(robot, np.zeros(len(constants.names)), covariance)
 

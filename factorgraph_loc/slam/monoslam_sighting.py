@@ -64,6 +64,11 @@ class FeatureMatcher:
             worst = float(np.trace(self._map.covariances, axis1=1, axis2=2).max())
             self._spreads_matter = worst > (EXACT * self._left_eye.model.sigma / self._left_eye.model.fx) ** 2
 
+    @property
+    def two_eyes(self) -> bool:
+        """Whether two cameras see, whose distance is known."""
+        return self._left_eye is not None and self._right_eye is not None
+
     def eye(self, m: Pixels) -> Eye | None:
         """The camera of an image."""
         return self._right_eye if m.right else self._left_eye

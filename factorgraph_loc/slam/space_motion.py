@@ -89,10 +89,12 @@ class Displacement:
 
 @dataclass(frozen=True)
 class Origin:
-    """The start of a run without a map: ``robot`` then, and the covariance (6, 6) of its pose, common to all later poses."""
+    """The start of a run without a map: ``robot`` then, the covariance (6, 6) of its pose, common to all later poses, and the
+    standard deviation of the ``scale`` of all distances from it, relative to 1."""
 
     robot: RobotState
     covariance: Array
+    scale: float = 0.0
 
     def of_pose(self, robot: RobotState) -> Array:
         """Its contribution to the covariance (6, 6) of a later pose."""
@@ -101,13 +103,16 @@ class Origin:
         adjoint = np.zeros((6, 6))
         adjoint[TURN, TURN] = adjoint[SHIFT, SHIFT] = turn
         adjoint[SHIFT, TURN] = cross(back) @ turn
-        return adjoint @ self.covariance @ adjoint.T
+        spread = adjoint @ self.covariance @ adjoint.T
+        spread[SHIFT, SHIFT] += self.scale**2 * np.outer(back, back)
+        return spread
 
     def of_point(self, point: Array) -> Array:
         """Its contribution to the covariance (3, 3) of a ``point`` (3,)."""
         rotation = self.robot.rotation
         jacobian = rotation @ np.column_stack((-cross(rotation.T @ (point - self.robot.position)), np.eye(3)))
-        return np.asarray(jacobian @ self.covariance @ jacobian.T)
+        away = point - self.robot.position
+        return np.asarray(jacobian @ self.covariance @ jacobian.T + self.scale**2 * np.outer(away, away))
 
 
 def standstill(robot: RobotState) -> Step:

@@ -161,6 +161,27 @@ def test_what_is_not_known_of_the_mounting_is_in_the_covariances():
     assert low < sum(final) < high
 
 
+@pytest.mark.parametrize(
+    ("sensors", "told"),
+    [
+        (("sightings",), False),
+        (("twist", "sightings"), True),
+        (("sightings", "sightings_right"), True),
+    ],
+    ids=["one eye", "motion", "two eyes"],
+)
+def test_who_cannot_know_the_scale_says_so(sensors, told):
+    """NEES of the last position of 8 runs without a map: below what a right covariance exceeds once in 10,000."""
+    found = []
+    for seed in range(8):
+        log = carried(seed)
+        result = run(log, RunConfig("monoslam", {"landmarks": "unknown"}, sensors))
+        assert any("scale is unknown" in text for _, text in result.diagnostics.events) is not told
+        errors = space.pose_errors(result.final_space, log.reference3.at(result.final_space.t))[-1, 3:]
+        found.append(errors @ np.linalg.solve(result.final_space.covariances[-1, 3:, 3:], errors))
+    assert sum(found) < chi2.ppf(1.0 - 1e-4, 3 * 8)
+
+
 def test_figures_in_space():
     log = carried(2)
     figures = score(estimated(log, "monoslam"), log)

@@ -121,3 +121,12 @@ def test_the_start_spreads_over_later_poses_and_points():
     assert np.trace(origin.of_point(later.position)) == pytest.approx(0.5**2 + 2 * 0.2**2)
     across = np.array((-0.8, 0.6, 0.0))
     assert across @ origin.of_point(later.position) @ across == pytest.approx(0.5**2 + 0.2**2)
+
+
+def test_an_unknown_scale_spreads_along_the_way_from_the_start():
+    origin = Origin(LEVEL, np.zeros((6, 6)), 0.5)
+    turn = exp(np.array((0.0, 0.0, -1.0)))
+    later = RobotState(LEVEL.position + np.array((3.0, 4.0, 0.0)), turn, NOTHING, NOTHING)
+    along = np.outer((1.5, 2.0, 0.0), (1.5, 2.0, 0.0))
+    np.testing.assert_allclose(origin.of_point(later.position), along)
+    np.testing.assert_allclose(turn @ origin.of_pose(later)[3:, 3:] @ turn.T, along, atol=1e-12)
