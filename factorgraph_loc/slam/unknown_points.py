@@ -86,7 +86,7 @@ class UnknownPoints:
     def __post_init__(self) -> None:
         self._new = NewPoints(self.model)
         self._lens = reprojection.lens_of(self.model)
-        self._floor = TiltScale(self.model.tilt)
+        self._floor = TiltScale.guessed(self.model.tilt)
 
     def take(
         self,
@@ -301,7 +301,8 @@ class UnknownPoints:
                 agrees[which] = agreeing(model, camera, positions[which], pixels[which], noise[which])
             if np.count_nonzero(agrees) >= enough and placed is guess:
                 factor = ReprojectionFactor(model, positions[agrees], pixels[agrees], point_covariances=spreads[agrees])
-                sigma = self._floor.learn(*pixel_kernels.leaning(factor.packed(), *guess), model.tilt)
+                leaning = pixel_kernels.leaning(factor.packed(), *guess)
+                self._floor, sigma = self._floor.learnt(*leaning, model.tilt)
                 factor = replace(factor, model=replace(model, tilt=sigma))
                 update = robust_update(factor, *guess, ITERATIONS, SETTLED)
                 placed = se2.compose(guess[0], se2.exp(update.delta)), guess[1]

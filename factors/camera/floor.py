@@ -6,6 +6,7 @@ In most images the tilt of a robot is that of the floor; in some, as on a sill, 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,24 +19,31 @@ MEMORY = 60.0  # images that the scale is learnt from
 SILLS = 0.05  # share of images with another scale
 
 
+@dataclass(frozen=True)
 class TiltScale:
-    """``sigma``: the standard deviation [rad] of roll and pitch, at first a guess."""
+    """``sigma``: the standard deviation [rad] of roll and pitch. ``guess``, ``told``: logarithms of what is guessed of each of the
+    :data:`SCALES`, and of what images told."""
 
-    def __init__(self, sigma: float) -> None:
-        self.sigma = sigma
-        self._prior = -0.5 * (np.log(SCALES / sigma) / VAGUE) ** 2
-        self._told = np.zeros(len(SCALES))  # logarithm of what images tell of each scale
+    sigma: float
+    guess: Array
+    told: Array
 
-    def learn(self, tilt: Array, covariance: Array, prior: float) -> float:
-        """Take in the ``tilt`` (2,) of an image with its ``covariance`` (2, 2), found with the standard deviation ``prior``; the
-        standard deviation to be expected in this image."""
-        self.sigma, here = _learnt(tilt, covariance, prior, self._prior, self._told)
-        return here
+    @staticmethod
+    def guessed(sigma: float) -> TiltScale:
+        """A guess, which is rough."""
+        return TiltScale(sigma, -0.5 * (np.log(SCALES / sigma) / VAGUE) ** 2, np.zeros(len(SCALES)))
+
+    def learnt(self, tilt: Array, covariance: Array, prior: float) -> tuple[TiltScale, float]:
+        """What is known after the ``tilt`` (2,) of an image with its ``covariance`` (2, 2), found with the standard deviation
+        ``prior``; and the standard deviation to be expected in this image."""
+        told = self.told.copy()
+        sigma, here = _learnt(tilt, covariance, prior, self.guess, told)
+        return TiltScale(sigma, self.guess, told), here
 
 
 @compiled(error_model="numpy")
 def _learnt(tilt: Array, covariance: Array, prior: float, prior_log: Array, told: Array) -> tuple[float, float]:
-    """See :meth:`TiltScale.learn`: what is to be expected later, and in this image; ``told`` in place."""
+    """See :meth:`TiltScale.learnt`: what is to be expected later, and in this image; ``told`` in place."""
     determinant = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
     a, b, d = covariance[1, 1] / determinant, -covariance[0, 1] / determinant, covariance[0, 0] / determinant
     x, y = a * tilt[0] + b * tilt[1], b * tilt[0] + d * tilt[1]

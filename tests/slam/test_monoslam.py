@@ -24,6 +24,7 @@ from factorgraph_loc.simulation import preset, simulate
 from factorgraph_loc.slam.monoslam_state import Innovation
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera import model as reprojection
+from factors.camera.floor import TiltScale
 from factors.camera.model import CameraModel
 
 SENSORS = ("odometry", "sightings")
@@ -55,7 +56,10 @@ def estimated(log, name="monoslam", **settings):
 
 
 @pytest.mark.parametrize("self_calibration", [False, True])
-def test_in_a_known_map_it_is_the_planar_filter(drive, self_calibration):
+def test_in_a_known_map_it_is_the_planar_filter(drive, self_calibration, monkeypatch):
+    monkeypatch.setattr(
+        TiltScale, "learnt", lambda floor, *_: (floor, floor.sigma)
+    )  # as monoslam's, which is a setting
     log = drive(1)
     ours = estimated(log, **ALIKE_FLOOR, iterations=8, self_calibration=self_calibration)
     planar = estimated(log, "ekf", self_calibration=self_calibration)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
@@ -10,7 +10,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from factorgraph_loc.model.settings import NOTHING, Estimated
-from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
+from factorgraph_loc.sensors.base import GOING_BACK, Binding, NewVariable, ResidualObservation, Sensor, Term, View
 from factorgraph_loc.sensors.camera.finder import MISSED, PixelFinder
 from factorgraph_loc.sensors.camera.sensor import (
     CAMERAS,
@@ -23,6 +23,7 @@ from factorgraph_loc.sensors.camera.sensor import (
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factors.camera import model as reprojection
 from factors.camera.factor import ReprojectionFactor
+from factors.camera.floor import TiltScale
 from factors.camera.model import TIME_OFFSET
 from factors.se2 import Array
 from factors.update import Correction, image_update, robust_update
@@ -120,6 +121,7 @@ class CameraSensor(Sensor):
         self.points = KnownPoints(setup, diagnostics, constants, use, motion)
         # times [s] of recent looks at what was surveyed with an error and is not estimated
         self._looks: dict[str, list[float]] = defaultdict(list)
+        self._before: deque[tuple[float, TiltScale | None]] = deque()  # what was known of the floor before an image
         self._shared = (self.modality,) if constants.names else ()
         if self.points.known:
             self.finder = PixelFinder(self.points, motion)
@@ -148,6 +150,9 @@ class CameraSensor(Sensor):
                 spread = view.spread(block)
                 blocks.update(dict.fromkeys(points, block))
             displaced.update(dict.fromkeys(points, (by, len(points) * spread)))
+        self._before.append((m.t, self.points.floor))
+        while self._before[0][0] < m.t - GOING_BACK:
+            self._before.popleft()
         factor = self.points.factor(m, predicted, view.offset, twist, displaced)
         if factor is None:
             return
@@ -167,6 +172,8 @@ class CameraSensor(Sensor):
     def rewind(self, t: float) -> None:
         for name, looks in self._looks.items():
             self._looks[name] = [one for one in looks if one <= t]
+        while self._before and self._before[-1][0] > t:
+            _, self.points.floor = self._before.pop()
 
     def restart(self, t: float) -> None:
         self._looks.clear()

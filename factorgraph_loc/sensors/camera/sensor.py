@@ -80,7 +80,7 @@ class KnownPoints:
         self.model: CameraModel | None = None if settings is None else replace(settings.model(), tempering=1.0)
         second = setup.rig.camera_right if used and "sightings_right" in setup.sensors else None
         self._second: CameraModel | None = None if second is None else replace(second.model(), tempering=1.0)
-        self._floor = None if self.model is None else TiltScale(self.model.tilt)
+        self.floor = None if self.model is None else TiltScale.guessed(self.model.tilt)
         self._tempering = 1.0 if settings is None else settings.tempering  # for matched points
         self.map = PointMap.of((), np.empty((0, 3)))
         if setup.world.points is not None and use != "unknown":
@@ -273,8 +273,8 @@ class KnownPoints:
         tilt, spread = pixel_kernels.leaning(here.packed(), pose, covariance)
         if math.hypot(*tilt) > STEEPEST:
             return None
-        assert self._floor is not None
-        sigma = self._floor.learn(tilt, spread, float(here.model.tilt))
+        assert self.floor is not None
+        self.floor, sigma = self.floor.learnt(tilt, spread, float(here.model.tilt))
         return replace(factor, model=replace(factor.model, tilt=sigma))
 
     def _camera(self, here: ReprojectionFactor, predicted: Predicted) -> CameraPose:

@@ -13,7 +13,7 @@ from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.settings import Estimated
-from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
+from factorgraph_loc.sensors.base import GOING_BACK, Binding, NewVariable, ResidualObservation, Sensor, Term, View
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.landmarks.finder import Hypothesis, Relocalizer, TrackMonitor
 from factorgraph_loc.sensors.landmarks.located import NewLandmarks
@@ -27,7 +27,6 @@ from factors.motion import ChainState
 from factors.se2 import Array
 from factors.update import Correction, landmark_update
 
-GOING_BACK = 5.0  # s that an estimator may go back in time
 SURVEYED_ITERATIONS = 4
 WORK = 8  # of a landmark, for one of many poses that are weighed by a compiled call
 SMALL = 40  # size of error states whose matrices are inverted by compiled code

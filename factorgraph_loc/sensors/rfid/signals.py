@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.sensors.base import GOING_BACK
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factors.rfid.factor import RfidFactor
@@ -17,7 +18,6 @@ from factors.se2 import Array
 
 M = TypeVar("M", RssiModel, PhaseModel)
 Row = tuple[float, int, int, float, float]  # time of the read, antenna, tag, phase, frequency
-GOING_BACK = 5.0  # s that an estimator may go back in time
 
 
 class TagSignals:
