@@ -123,8 +123,10 @@ class UnknownPoints:
         old = [old[i] for i in few]
         points = [self._points[names[i]] for i in old]
         known = np.array([rows[i] in certain for i in old], dtype=bool)
-        fewest = REVISITED if m.names is None else 2  # a name needs one other to confirm it
-        guess, tilt, sigma, right = self._placed(model, points, pixels[old], keyframe.t, guess, graph, known, fewest)
+        named = m.names is not None
+        guess, tilt, sigma, right = self._placed(
+            model, points, pixels[old], keyframe.t, guess, graph, known, named=named
+        )
         self._tilts(keyframe, tilt, sigma, graph, addition)
         if m.frame is not None:
             seen_from = lifted(model, *guess).position
@@ -275,13 +277,14 @@ class UnknownPoints:
         guess: Guess,
         graph: GraphView,
         known: Truths,
-        fewest: int,
+        *,
+        named: bool,
     ) -> tuple[Guess, Array, float, Truths]:
         """The pose corrected by points of the graph, the tilt (2,) of the robot that they tell with its prior standard deviation,
         and which of them are inliers.
 
-        Points not seen for long need to agree with each other, at least ``fewest`` of them, but not with the rest, as the track has
-        drifted since.
+        Points not seen for long need to agree with each other, but not with the rest, as the track has drifted since. So few points
+        that they cannot confirm each other are used only if they have names: where the pose is uncertain a wrong one agrees, too.
         """
         sigma = self._floor.sigma
         if not points:
@@ -294,6 +297,7 @@ class UnknownPoints:
         recent = np.array([t - point.last < RECENT for point in points])
         right = known.copy()
         placed, tilt = guess, LEVEL
+        fewest = 2 if named else REVISITED  # a name needs one other to confirm it
         revisited = max(fewest, math.ceil(AGREED * np.count_nonzero(~recent & ~known)))
         for which, enough in ((recent, FEWEST), (~recent & ~known, revisited)):
             agrees = np.zeros(len(points), dtype=bool)
@@ -312,7 +316,7 @@ class UnknownPoints:
                 error = reprojection.linearize_in_space(model, *seen_from, positions)[0] - pixels
                 agrees &= positive.squared(error, noise) < GATE
             elif np.count_nonzero(agrees) < enough:
-                agrees &= which & recent
+                agrees &= recent & named
             right |= agrees
         return placed, tilt, sigma, right
 
