@@ -187,7 +187,7 @@ SCENARIOS: Mapping[str, Scenario | ActiveScenario] = {
     "features-slam": Scenario(logs.followed_frames, ("smoother", "batch", "monoslam"), settings=UNKNOWN),
     "features-visual-odometry": Scenario(logs.frames_without_map, GRAPHS, settings={"visual_odometry": True}),
     "space": Scenario(logs.space, IN_SPACE),
-    "space-one-camera": Scenario(logs.space, IN_SPACE, ("twist", "sightings")),
+    "space-one-camera": Scenario(logs.space, ("monoslam", "space_batch"), ("twist", "sightings")),
     "space-without-twist": Scenario(logs.space, IN_SPACE, ("sightings", "sightings_right")),
     "space-late": Scenario(logs.space_late, IN_SPACE),
     "space-features": Scenario(logs.space_features, IN_SPACE),
