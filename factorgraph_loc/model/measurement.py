@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from factors.motion import ChainState, Increment
 
 
+GOING_BACK = 5.0  # s that an estimator goes back in time, at most, for one that is late
 SEEN = 2  # rank of exteroceptive streams; motion has lower ranks
 
 

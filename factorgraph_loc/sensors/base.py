@@ -313,7 +313,6 @@ class Sensor:
         """Start a new track at ``t``; later measurements will be processed again."""
 
 
-GOING_BACK = 5.0  # s that an estimator may go back in time
 WORK = 20  # for a residual: its robust loss takes as long as so many tags
 
 

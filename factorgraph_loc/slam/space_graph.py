@@ -26,7 +26,8 @@ from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.camera.sensor import Pixels
 from factorgraph_loc.sensors.twist.measurement import in_space, twist_settings
-from factorgraph_loc.slam.monoslam import Monoslam, MonoslamSettings
+from factorgraph_loc.slam.monoslam import MonoslamSettings
+from factorgraph_loc.slam.monoslam_past import UpdateRecord
 from factorgraph_loc.slam.monoslam_sighting import Match
 from factorgraph_loc.slam.monoslam_state import Eye, SlamState, squared
 from factorgraph_loc.slam.space_going import AT_ONCE, Going, KnownState, Measured, Steady, pose_of, robot_of
@@ -38,6 +39,27 @@ from factors.se2 import Array
 
 class SpaceGraphSettings(MonoslamSettings):
     """Settings of the filter that provides initial values; ``landmarks`` must be ``known``, and ``planar`` off."""
+
+
+def of_space(name: str, settings: SpaceGraphSettings) -> SpaceGraphSettings:
+    """The settings of an estimator for a robot in space; InputError for others."""
+    if settings.landmarks != "known" or settings.planar:
+        raise InputError(f"{name}: works with points of a known map and a robot in space, expected planar = false")
+    return settings.model_copy(update={"planar": False})
+
+
+def start_in_space(name: str, prior: PosePrior) -> PosePrior:
+    """The start of an estimator for a robot in space; InputError for one on a floor."""
+    if prior.space is None:
+        raise InputError(
+            f"{name}: the start is a pose on a floor, expected one in space: a log with such a reference, or unknown"
+        )
+    return prior
+
+
+def known_start(t: float, state: SlamState) -> KnownState:
+    """What is known when a filter begins."""
+    return KnownState(t, state.robot, state.covariance[:ROBOT, :ROBOT])
 
 
 @dataclass(frozen=True)
@@ -71,65 +93,53 @@ class SeenPoints:
         return np.einsum("kij,kj->ki", whitener, sights.pixels - self.pixels), whitener, sights.by_pose
 
 
-class SpaceGraph(Monoslam):
-    """Estimates in space of which the final ones are the robust optimum over the whole log. See the module."""
+class SpaceProblem:
+    """The graph of the estimator ``name``, and its robust optimum over the whole log. ``first``: what is known of the start;
+    ``going``: how the robot moves; ``images``: what was seen, by time and whether with the right camera."""
 
-    name: str  # of the estimator, in messages
-    estimates_points = False
-    starts_in_space = True
-
-    def __init__(self, setup: Setup, settings: SpaceGraphSettings) -> None:
-        if settings.landmarks != "known" or settings.planar:
-            raise InputError(
-                f"{self.name}: works with points of a known map and a robot in space, expected planar = false"
-            )
-        super().__init__(setup, settings.model_copy(update={"planar": False}))
+    def __init__(self, name: str, setup: Setup, settings: MonoslamSettings) -> None:
+        self._name = name
         twist = twist_settings(setup)
         self._chain = None if twist is None else TwistChain(twist)
-        self._going: Going = Steady(settings.acceleration, settings.angular_acceleration)
+        self.going: Going = Steady(settings.acceleration, settings.angular_acceleration)
         if self._chain is not None:
-            self._going = Measured(self._chain)
-        self._images: dict[tuple[float, bool], SeenPoints] = {}
-        self._first: KnownState | None = None  # the start
+            self.going = Measured(self._chain)
+        self.images: dict[tuple[float, bool], SeenPoints] = {}
+        self.first: KnownState | None = None
         self._conclusion: tuple[Trajectory3, Diagnostics] | None = None  # the result, until the next measurement
 
-    def initialize(self, prior: PosePrior) -> None:
-        """Start from a pose in space. Raises InputError for a planar pose."""
-        if prior.space is None:
-            raise InputError(
-                f"{self.name}: the start is a pose on a floor, expected one in space: a log with such a reference, or unknown"
-            )
-        super().initialize(prior)
-        self._first = self._begun(prior.t, self._state)
-
-    def process(self, measurement: Measurement) -> None:
-        """Process one measurement, in order or late by at most ``max_delay``."""
+    def take(self, measurement: Measurement) -> None:
+        """Take in the motion, if a measurement tells it; what was concluded holds no more."""
         self._conclusion = None
         twist = in_space(measurement)
         if twist is not None and self._chain is not None:
             self._chain.add(twist.t, twist.v, twist.w)
-        super().process(measurement)
 
-    def forget(self, before: float) -> None:
-        """Forget nothing: the problem is that of the whole log."""
+    def see(self, m: Pixels, match: Match, eye: Eye) -> None:
+        """Take in what was matched in an image."""
+        key = (m.t, m.right)
+        self.images.pop(key, None)  # it may have been matched before a late measurement
+        if len(match.pixels):
+            self.images[key] = SeenPoints(m.t, eye, match.pixels, match.points, match.spreads, match.tempering)
 
-    def space_trajectory(self) -> Trajectory3:
-        """The optimum over the whole log, at the ticks."""
-        return self._concluded()[0]
+    def later(self, known: KnownState, t: float) -> KnownState:
+        """What is known at ``t``."""
+        return known.moved(self.going.step(known.robot, known.t, t), t) if t > known.t else known
 
-    def final_diagnostics(self) -> Diagnostics:
-        """The diagnostics, including those of the final trajectory."""
-        return self._concluded()[1]
-
-    def _concluded(self) -> tuple[Trajectory3, Diagnostics]:
-        """The final trajectory, and the diagnostics including it."""
+    def concluded(
+        self, past: Sequence[UpdateRecord], ticks: Sequence[float], mounting: Array, diagnostics: Diagnostics
+    ) -> tuple[Trajectory3, Diagnostics]:
+        """The optimum at the ``ticks``, and the diagnostics with those of it. ``past``: the filter's, to begin with; ``mounting``:
+        the covariance (6, 6) that is added, of the camera's place on the robot. Raises RunFailedError if it is not determined."""
         if self._conclusion is None:
-            diagnostics = self.diagnostics.copy()
-            self._conclusion = self._solution(diagnostics), diagnostics
+            diagnostics = diagnostics.copy()
+            self._conclusion = self._solution(past, np.unique(np.array(ticks)), mounting, diagnostics), diagnostics
         return self._conclusion
 
-    def _solution(self, diagnostics: Diagnostics) -> Trajectory3:
-        past = {record.t: record.robot for record in self._past()}
+    def _solution(
+        self, records: Sequence[UpdateRecord], ticks: Array, mounting: Array, diagnostics: Diagnostics
+    ) -> Trajectory3:
+        past = {record.t: record.robot for record in records}
         if not past:  # nothing told where an unknown start was
             return Trajectory3(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 6, 6)))
         t = np.array(sorted(past))
@@ -137,10 +147,8 @@ class SpaceGraph(Monoslam):
         values = gtsam.Values()
         for i, stamp in enumerate(t.tolist()):
             values.insert(i, pose_of(past[stamp]))
-        images = [(int(_at(t, image.t)), image) for image in self._images.values()]
-        motion = self._motion_factors(t)
-        values, linear = _solved(motion, images, values)
-        ticks = np.unique(np.array(self._ticks))
+        images = [(int(_at(t, image.t)), image) for image in self.images.values()]
+        values, linear = _solved(self._motion_factors(t), images, values)
         rows = _at(t, ticks).tolist()
         spreads = self._covariances(linear, rows, t, diagnostics)
         poses = [values.atPose3(i) for i in rows]
@@ -148,37 +156,18 @@ class SpaceGraph(Monoslam):
             ticks,
             np.array([pose.translation() for pose in poses]).reshape(-1, 3),
             np.array([pose.rotation().matrix() for pose in poses]).reshape(-1, 3, 3),
-            np.array([spreads[i] + self._mounting for i in rows]).reshape(-1, 6, 6),
+            np.array([spreads[i] + mounting for i in rows]).reshape(-1, 6, 6),
         )
-
-    def _seek(self, m: Pixels) -> SlamState | None:
-        state = super()._seek(m)
-        self._first = None if state is None else self._begun(m.t, state)
-        return state
-
-    def _begun(self, t: float, state: SlamState) -> KnownState:
-        """What is known at the start."""
-        return KnownState(t, state.robot, state.covariance[:ROBOT, :ROBOT])
-
-    def _matched(self, m: Pixels, match: Match, eye: Eye) -> None:
-        key = (m.t, m.right)
-        self._images.pop(key, None)  # it may have been matched before a late measurement
-        if len(match.pixels):
-            self._images[key] = SeenPoints(m.t, eye, match.pixels, match.points, match.spreads, match.tempering)
 
     def _motion_factors(self, t: Array) -> list[gtsam.NonlinearFactor]:
         """The factors of the start and of the motion between the stamps."""
-        assert self._first is not None
-        start = self._later(self._first, float(t[0]))
+        assert self.first is not None
+        start = self.later(self.first, float(t[0]))
         times, factors = t.tolist(), [start.prior(0)]
         for i in range(1, len(times)):
             part = slice(max(0, i - 2), i + 1)
-            factors.append(self._going.factor(range(len(times))[part], times[part], start))
+            factors.append(self.going.factor(range(len(times))[part], times[part], start))
         return factors
-
-    def _later(self, known: KnownState, t: float) -> KnownState:
-        """What is known at ``t``."""
-        return known.moved(self._going.step(known.robot, known.t, t), t) if t > known.t else known
 
     def _covariances(
         self, linear: gtsam.GaussianFactorGraph, rows: list[int], t: Array, diagnostics: Diagnostics
@@ -188,7 +177,7 @@ class SpaceGraph(Monoslam):
             found = covariances(linear, dict.fromkeys(range(len(t)), 6), rows)
         except IndeterminateError as error:
             what = "all poses" if error.key is None else f"the pose at {t[error.key]:.3f} s"
-            raise RunFailedError(f"{self.name}: the measurements do not determine {what}") from error
+            raise RunFailedError(f"{self._name}: the measurements do not determine {what}") from error
         if found.damping:
             diagnostics.events.append((float(t[-1]), damped(found.damping)))
         return found.by_key

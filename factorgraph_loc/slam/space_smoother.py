@@ -17,20 +17,28 @@ from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion.timeline import Taken
 from factorgraph_loc.model.belief import PoseEstimate, PosePrior, SpacePose
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.model.trajectory3 import planar_estimate
+from factorgraph_loc.model.trajectory3 import Trajectory3, planar_estimate
 from factorgraph_loc.sensors.camera.sensor import Pixels
+from factorgraph_loc.slam.monoslam import Monoslam
 from factorgraph_loc.slam.monoslam_past import UpdateRecord
-from factorgraph_loc.slam.monoslam_state import SlamState
+from factorgraph_loc.slam.monoslam_sighting import Match
+from factorgraph_loc.slam.monoslam_state import Eye, SlamState
 from factorgraph_loc.slam.space_going import AT_ONCE, Going, KnownState, pose_of
 from factorgraph_loc.slam.space_graph import (
     SeenPoints,
-    SpaceGraph,
     SpaceGraphSettings,
+    SpaceProblem,
+    known_start,
+    of_space,
+    start_in_space,
 )
 from factorgraph_loc.slam.space_motion import POSES
 from factors.se2 import Array
 
+NAME = "space_smoother"
 THRESHOLD = 0.01  # m, rad: how far a pose moves before its factors are linearised again
 
 
@@ -48,43 +56,65 @@ class _WindowRecord(UpdateRecord):
     known: KnownState | None = None
 
 
-class SpaceSmoother(SpaceGraph):
+class SpaceSmoother(Monoslam):
     """Incremental factor graph (iSAM2) in space: a window, and the whole problem at the end. See the module."""
 
-    name = "space_smoother"
+    estimates_points = False
+    starts_in_space = True
 
     def __init__(self, setup: Setup, settings: SpaceSmootherSettings) -> None:
-        super().__init__(setup, settings)
+        super().__init__(setup, of_space(NAME, settings))
+        self._problem = SpaceProblem(NAME, setup, settings)
         self._lag = settings.lag
-        self._window: _Window | None = (
-            None  # begun anew from what is known, after the start and after a late measurement
-        )
+        # begun anew from what is known, after the start and after a late measurement
+        self._window: _Window | None = None
         self._known: KnownState | None = None
 
     def initialize(self, prior: PosePrior) -> None:
         """Start from a pose in space. Raises InputError for a planar pose."""
-        super().initialize(prior)
-        self._known, self._window = self._first, None
+        super().initialize(start_in_space(NAME, prior))
+        self._known = self._problem.first = known_start(prior.t, self._state)
+        self._window = None
+
+    def process(self, measurement: Measurement) -> None:
+        """Process one measurement, in order or late by at most ``max_delay``."""
+        self._problem.take(measurement)
+        super().process(measurement)
+
+    def forget(self, before: float) -> None:
+        """Forget nothing: the problem is that of the whole log."""
+
+    def space_trajectory(self) -> Trajectory3:
+        """The optimum over the whole log, at the ticks."""
+        return self._problem.concluded(self._past(), self._ticks, self._mounting, self.diagnostics)[0]
+
+    def final_diagnostics(self) -> Diagnostics:
+        """The diagnostics, including those of the final trajectory."""
+        return self._problem.concluded(self._past(), self._ticks, self._mounting, self.diagnostics)[1]
 
     def _seek(self, m: Pixels) -> SlamState | None:
         state = super()._seek(m)
-        self._known, self._window = self._first, None
+        self._known = self._problem.first = None if state is None else known_start(m.t, state)
+        self._window = None
         return state
+
+    def _matched(self, m: Pixels, match: Match, eye: Eye) -> None:
+        self._problem.see(m, match, eye)
 
     def _see(self, m: Pixels) -> None:
         super()._see(m)
         if self._anew:  # the filter found its place, whatever was before
-            self._known, self._window = self._begun(m.t, self._state), None
-        known, image = self._known, self._images.get((m.t, m.right))
+            self._known, self._window = known_start(m.t, self._state), None
+        known, image = self._known, self._problem.images.get((m.t, m.right))
         if image is None or known is None or self._anew or self._vague(self._state):
             return
         if self._window is None:
-            self._window = _Window(known, self._going, self._lag)
+            self._window = _Window(known, self._problem.going, self._lag)
         self._known = self._window.add(image, pose_of(self._state.robot))
 
     def _estimate(self) -> PoseEstimate:
         assert self._known is not None
-        now = self._later(self._known, self._t)
+        now = self._problem.later(self._known, self._t)
         spread = now.covariance[POSES, POSES] + self._mounting
         return planar_estimate(self._t, SpacePose(now.robot.position, now.robot.rotation, spread))
 
@@ -93,7 +123,7 @@ class SpaceSmoother(SpaceGraph):
 
     def _go_back(self, taken: Taken) -> None:
         super()._go_back(taken)
-        known = self._records[-1].known if self._records else self._first
+        known = self._records[-1].known if self._records else self._problem.first
         if known is not self._known:
             self._known, self._window = known, None
 
@@ -133,7 +163,7 @@ class _Window:
             self._solver.update(graph, values, dict.fromkeys(self._keys[-2:], self._times[-1]))
         except RuntimeError as error:
             raise RunFailedError(
-                f"space_smoother: the measurements do not determine the pose at {self._times[-1]:.3f} s"
+                f"{NAME}: the measurements do not determine the pose at {self._times[-1]:.3f} s"
             ) from error
 
 

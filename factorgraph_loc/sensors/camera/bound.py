@@ -9,8 +9,9 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from factorgraph_loc.model.measurement import GOING_BACK
 from factorgraph_loc.model.settings import NOTHING, Estimated
-from factorgraph_loc.sensors.base import GOING_BACK, Binding, NewVariable, ResidualObservation, Sensor, Term, View
+from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
 from factorgraph_loc.sensors.camera.finder import MISSED, PixelFinder
 from factorgraph_loc.sensors.camera.sensor import (
     CAMERAS,

@@ -11,9 +11,9 @@ import numpy as np
 
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import Motion
+from factorgraph_loc.model.measurement import GOING_BACK, Motion
 from factorgraph_loc.model.settings import Estimated
-from factorgraph_loc.sensors.base import GOING_BACK, Binding, NewVariable, ResidualObservation, Sensor, Term, View
+from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.landmarks.finder import Hypothesis, Relocalizer, TrackMonitor
 from factorgraph_loc.sensors.landmarks.located import NewLandmarks

@@ -7,8 +7,8 @@ from typing import TypeVar
 import numpy as np
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.model.measurement import GOING_BACK
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.base import GOING_BACK
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factors.rfid.factor import RfidFactor
