@@ -51,11 +51,11 @@ class SpaceBatch(Monoslam):
 
     def space_trajectory(self) -> Trajectory3:
         """The optimum over the whole log, at the ticks."""
-        return self._problem.concluded(self._past(), self._ticks, self._mounting, self.diagnostics)[0]
+        return self._problem.concluded(self._past, self._ticks, self._mounting, self.diagnostics)[0]
 
     def final_diagnostics(self) -> Diagnostics:
         """The diagnostics, including those of the final trajectory."""
-        return self._problem.concluded(self._past(), self._ticks, self._mounting, self.diagnostics)[1]
+        return self._problem.concluded(self._past, self._ticks, self._mounting, self.diagnostics)[1]
 
     def _seek(self, m: Pixels) -> SlamState | None:
         state = super()._seek(m)

@@ -1,15 +1,15 @@
 """The factor graph of a camera in space: all its poses, from its motion and points of a known map.
 
-One ``gtsam.Pose3`` per stamp; its motion as measured (``twist``), or with a velocity that changes at random (:mod:`.space_going`);
-and for each image the points that the monoSLAM filter matched, with Huber loss. That filter runs along and provides initial values.
-Points that the map lacks are not used.
+One ``gtsam.Pose3`` per stamp; its motion as measured (``twist``), or with a velocity that changes at random
+(:mod:`.space_motion_models`); and for each image the points that the monoSLAM filter matched, with Huber loss. That filter runs
+along and provides initial values. Points that the map lacks are not used.
 
 Point factors are linearised here, as in :mod:`~factorgraph_loc.fusion.problem`, and GTSAM solves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -30,8 +30,16 @@ from factorgraph_loc.slam.monoslam import MonoslamSettings
 from factorgraph_loc.slam.monoslam_past import UpdateRecord
 from factorgraph_loc.slam.monoslam_sighting import Match
 from factorgraph_loc.slam.monoslam_state import Eye, SlamState, squared
-from factorgraph_loc.slam.space_going import AT_ONCE, Going, KnownState, Measured, Steady, pose_of, robot_of
 from factorgraph_loc.slam.space_motion import ROBOT, TwistChain
+from factorgraph_loc.slam.space_motion_models import (
+    AT_ONCE,
+    ConstantVelocity,
+    KnownState,
+    MeasuredMotion,
+    SpaceMotion,
+    pose_of,
+    robot_of,
+)
 from factors import positive
 from factors.robust import huber_loss, huber_weight
 from factors.se2 import Array
@@ -95,15 +103,15 @@ class SeenPoints:
 
 class SpaceProblem:
     """The graph of the estimator ``name``, and its robust optimum over the whole log. ``first``: what is known of the start;
-    ``going``: how the robot moves; ``images``: what was seen, by time and whether with the right camera."""
+    ``motion``: how the robot moves; ``images``: what was seen, by time and whether with the right camera."""
 
     def __init__(self, name: str, setup: Setup, settings: MonoslamSettings) -> None:
         self._name = name
         twist = twist_settings(setup)
         self._chain = None if twist is None else TwistChain(twist)
-        self.going: Going = Steady(settings.acceleration, settings.angular_acceleration)
+        self.motion: SpaceMotion = ConstantVelocity(settings.acceleration, settings.angular_acceleration)
         if self._chain is not None:
-            self.going = Measured(self._chain)
+            self.motion = MeasuredMotion(self._chain)
         self.images: dict[tuple[float, bool], SeenPoints] = {}
         self.first: KnownState | None = None
         self._conclusion: tuple[Trajectory3, Diagnostics] | None = None  # the result, until the next measurement
@@ -124,16 +132,23 @@ class SpaceProblem:
 
     def later(self, known: KnownState, t: float) -> KnownState:
         """What is known at ``t``."""
-        return known.moved(self.going.step(known.robot, known.t, t), t) if t > known.t else known
+        return known.moved(self.motion.step(known.robot, known.t, t), t) if t > known.t else known
 
     def concluded(
-        self, past: Sequence[UpdateRecord], ticks: Sequence[float], mounting: Array, diagnostics: Diagnostics
+        self,
+        past: Callable[[], Sequence[UpdateRecord]],
+        ticks: Sequence[float],
+        mounting: Array,
+        diagnostics: Diagnostics,
     ) -> tuple[Trajectory3, Diagnostics]:
-        """The optimum at the ``ticks``, and the diagnostics with those of it. ``past``: the filter's, to begin with; ``mounting``:
-        the covariance (6, 6) that is added, of the camera's place on the robot. Raises RunFailedError if it is not determined."""
+        """The optimum at the ``ticks``, and the diagnostics with those of it. Raises RunFailedError if it is not determined.
+
+        ``past`` gives the records of the filter, to begin with; ``mounting``: the covariance (6, 6) that is added, of the camera's
+        place on the robot.
+        """
         if self._conclusion is None:
             diagnostics = diagnostics.copy()
-            self._conclusion = self._solution(past, np.unique(np.array(ticks)), mounting, diagnostics), diagnostics
+            self._conclusion = self._solution(past(), np.unique(np.array(ticks)), mounting, diagnostics), diagnostics
         return self._conclusion
 
     def _solution(
@@ -166,7 +181,7 @@ class SpaceProblem:
         times, factors = t.tolist(), [start.prior(0)]
         for i in range(1, len(times)):
             part = slice(max(0, i - 2), i + 1)
-            factors.append(self.going.factor(range(len(times))[part], times[part], start))
+            factors.append(self.motion.factor(range(len(times))[part], times[part], start))
         return factors
 
     def _covariances(

@@ -26,7 +26,6 @@ from factorgraph_loc.slam.monoslam import Monoslam
 from factorgraph_loc.slam.monoslam_past import UpdateRecord
 from factorgraph_loc.slam.monoslam_sighting import Match
 from factorgraph_loc.slam.monoslam_state import Eye, SlamState
-from factorgraph_loc.slam.space_going import AT_ONCE, Going, KnownState, pose_of
 from factorgraph_loc.slam.space_graph import (
     SeenPoints,
     SpaceGraphSettings,
@@ -36,6 +35,7 @@ from factorgraph_loc.slam.space_graph import (
     start_in_space,
 )
 from factorgraph_loc.slam.space_motion import POSES
+from factorgraph_loc.slam.space_motion_models import AT_ONCE, KnownState, SpaceMotion, pose_of
 from factors.se2 import Array
 
 NAME = "space_smoother"
@@ -86,11 +86,11 @@ class SpaceSmoother(Monoslam):
 
     def space_trajectory(self) -> Trajectory3:
         """The optimum over the whole log, at the ticks."""
-        return self._problem.concluded(self._past(), self._ticks, self._mounting, self.diagnostics)[0]
+        return self._problem.concluded(self._past, self._ticks, self._mounting, self.diagnostics)[0]
 
     def final_diagnostics(self) -> Diagnostics:
         """The diagnostics, including those of the final trajectory."""
-        return self._problem.concluded(self._past(), self._ticks, self._mounting, self.diagnostics)[1]
+        return self._problem.concluded(self._past, self._ticks, self._mounting, self.diagnostics)[1]
 
     def _seek(self, m: Pixels) -> SlamState | None:
         state = super()._seek(m)
@@ -109,7 +109,7 @@ class SpaceSmoother(Monoslam):
         if image is None or known is None or self._anew or self._vague(self._state):
             return
         if self._window is None:
-            self._window = _Window(known, self._problem.going, self._lag)
+            self._window = _Window(known, self._problem.motion, self._lag)
         self._known = self._window.add(image, pose_of(self._state.robot))
 
     def _estimate(self) -> PoseEstimate:
@@ -131,12 +131,12 @@ class SpaceSmoother(Monoslam):
 class _Window:
     """The poses of the images of the last ``lag`` seconds; older ones are marginalised out."""
 
-    def __init__(self, start: KnownState, going: Going, lag: float) -> None:
+    def __init__(self, start: KnownState, motion: SpaceMotion, lag: float) -> None:
         parameters = gtsam.ISAM2Params()
         parameters.setRelinearizeThreshold(THRESHOLD)
         parameters.relinearizeSkip = 1
         self._solver = gtsam.IncrementalFixedLagSmoother(lag, parameters)
-        self._start, self._going = start, going
+        self._start, self._motion_model = start, motion
         self._keys, self._times = [0], [start.t]  # of the newest poses
         self._update([start.prior(0)], pose_of(start.robot))
 
@@ -144,14 +144,14 @@ class _Window:
         """Add an image, of the newest pose or of a later one, and return what is known of the robot then."""
         if image.t > self._times[-1] + AT_ONCE:
             self._keys, self._times = [*self._keys[-2:], self._keys[-1] + 1], [*self._times[-2:], image.t]
-            motion = self._going.factor(self._keys, self._times, self._start)
+            motion = self._motion_model.factor(self._keys, self._times, self._start)
             self._update([motion, _factor(image, self._keys[-1])], guess)
         else:
             self._update([_factor(image, self._keys[-1])])
         keys, times = self._keys[-2:], self._times[-2:]
         poses = [self._solver.calculateEstimatePose3(key) for key in keys]
         spread = self._solver.getISAM2().jointMarginalCovariance(keys).fullMatrix()
-        return self._going.state(poses, spread, times, self._start)
+        return self._motion_model.state(poses, spread, times, self._start)
 
     def _update(self, factors: list[gtsam.NonlinearFactor], guess: gtsam.Pose3 | None = None) -> None:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()

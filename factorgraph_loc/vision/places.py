@@ -11,11 +11,8 @@ import numpy as np
 from factorgraph_loc.vision.keypoints import Descriptors, Integers
 from factors.se2 import Array
 
-WORDS, SAMPLE, ROUNDS = (
-    64,
-    4000,
-    6,
-)  # of the vocabulary, descriptors that it is learnt from, and rounds of Lloyd's algorithm
+WORDS = 64  # of the vocabulary
+SAMPLE, ROUNDS = 4000, 6  # descriptors that it is learnt from, and rounds of Lloyd's algorithm
 NEAREST = 20  # keyframes that an image is compared with
 
 

@@ -35,7 +35,6 @@ ESTIMATORS: dict[str, tuple[dict[str, Any], ...]] = {
     "space_smoother": ({}, {"lag": 0.5}),
 }
 CHOSEN = ("ekf", "particle_filter", "smoother", *ESTIMATORS)
-LOCALIZERS = tuple(ESTIMATORS)
 SENSORS = ("odometry", "imu", "rfid", "bearing_range", "sightings", "rssi", "phase", "camera")
 ABSURD: tuple[Any, ...] = (
     *(

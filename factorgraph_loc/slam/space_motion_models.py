@@ -34,7 +34,7 @@ AT_ONCE = 1e-3  # s between stamps of one pose: from less no velocity can be com
 
 @dataclass(frozen=True)
 class KnownState:
-    """What is known of the robot at ``t``: its mean, and the covariance (12, 12) of the error."""
+    """What is known of the robot at ``t`` [s]: its mean, and the covariance (12, 12) of the error state of the filter."""
 
     t: float
     robot: RobotState
@@ -45,7 +45,7 @@ class KnownState:
         return KnownState(t, step.robot, step.transition @ self.covariance @ step.transition.T + step.noise)
 
     def prior(self, key: int) -> gtsam.NonlinearFactor:
-        """The factor that says so of a pose."""
+        """The prior factor on the variable ``key``, a pose."""
         noise = gtsam.noiseModel.Gaussian.Covariance(self.covariance[POSES, POSES])
         return gtsam.PriorFactorPose3(key, pose_of(self.robot), noise)
 
@@ -55,8 +55,8 @@ class KnownState:
         return gain, self.covariance[VELOCITIES, VELOCITIES] - gain @ self.covariance[POSES, VELOCITIES]
 
 
-class Going(Protocol):
-    """How the robot moves."""
+class SpaceMotion(Protocol):
+    """A model of how the robot moves."""
 
     def step(self, robot: RobotState, start: float, end: float) -> Step:
         """Where it is at ``end``."""
@@ -70,8 +70,8 @@ class Going(Protocol):
         """What is known at the last of one or two poses with the joint covariance ``spread``."""
 
 
-class Measured:
-    """As a ``twist`` tells."""
+class MeasuredMotion:
+    """Motion as a ``twist`` measures it."""
 
     def __init__(self, chain: TwistChain) -> None:
         self._chain = chain
@@ -92,8 +92,12 @@ class Measured:
         return KnownState(times[-1], robot_of(poses[-1]), covariance)
 
 
-class Steady:
-    """At a velocity and a turn rate that change by an impulse at each step: ``acceleration`` [m/s^2], ``angular`` [rad/s^2]."""
+class ConstantVelocity:
+    """A velocity and a turn rate that are constant but for an impulse at each step, as in the filter.
+
+    ``acceleration`` [m/s^2], ``angular`` [rad/s^2]: standard deviations of what acts over a step (Davison et al., 2007, section
+    III.D).
+    """
 
     def __init__(self, acceleration: float, angular: float) -> None:
         self._sigmas = np.repeat((acceleration, angular), 3)
@@ -105,8 +109,8 @@ class Steady:
     def factor(self, keys: Sequence[int], times: Sequence[float], start: KnownState) -> gtsam.NonlinearFactor:
         spans = np.diff(times)
         impulse = np.diag(np.square(self._sigmas * spans[-1]))
-        gain, rest = start.by_pose()
-        noise = gtsam.noiseModel.Gaussian.Covariance(impulse if len(keys) > 2 else rest + impulse)
+        gain, rest = start.by_pose() if len(keys) == 2 else (np.empty(0), np.zeros((6, 6)))
+        noise = gtsam.noiseModel.Gaussian.Covariance(rest + impulse)
 
         def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
             poses = [values.atPose3(key) for key in keys]

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
 
-from factorgraph_loc.slam.space_going import KnownState, Steady, pose_of, robot_of, velocities
 from factorgraph_loc.slam.space_motion import POSES, ROBOT, VELOCITIES, RobotState, exp
+from factorgraph_loc.slam.space_motion_models import ConstantVelocity, KnownState, pose_of, robot_of, velocities
 
 TIMES = (2.0, 2.1, 2.35)
 
@@ -31,7 +31,7 @@ def test_velocities_are_those_of_the_step():
     """A step at a velocity and turn rate gives these back."""
     rng = np.random.default_rng(5)
     known = start(poses(1, rng)[0], rng)
-    there = Steady(1.0, 1.0).step(known.robot, 0.0, 0.4).robot
+    there = ConstantVelocity(1.0, 1.0).step(known.robot, 0.0, 0.4).robot
     found = velocities(pose_of(known.robot), pose_of(there), 0.4)[0]
     np.testing.assert_allclose(found, np.concatenate((known.robot.velocity, known.robot.rate)), atol=1e-9)
 
@@ -52,7 +52,7 @@ def test_derivatives_of_the_factor(count):
     known = start(at[0], rng)  # where the first pose is: its error enters to first order
     for key, pose in enumerate(at):
         values.insert(key, pose)
-    factor = Steady(0.7, 0.9).factor(range(count), TIMES[:count], known)
+    factor = ConstantVelocity(0.7, 0.9).factor(range(count), TIMES[:count], known)
     jacobian, _ = factor.linearize(values).jacobian()
 
     def error(d):
@@ -73,7 +73,7 @@ def test_what_is_known_of_pose_and_velocity(count):
     rng = np.random.default_rng(5)
     at = poses(count, rng)
     known, root = start(at[0], rng), 0.01 * rng.standard_normal((6 * count, 6 * count))
-    found = Steady(0.7, 0.9).state(at, root @ root.T, TIMES[:count], known)
+    found = ConstantVelocity(0.7, 0.9).state(at, root @ root.T, TIMES[:count], known)
     drawn, gain, rest = [], *known.by_pose()
     still = np.linalg.cholesky(rest)
     for d in (root @ rng.standard_normal((6 * count, 20000))).T:
