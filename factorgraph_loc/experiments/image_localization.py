@@ -110,7 +110,7 @@ def evaluate_images(
         made = map_points(
             log.rig.of(CameraSettings).model(),
             posed[np.array(mapped, dtype=np.int64)],
-            PointSettings(distance=0.0, angle=0.0),
+            PointSettings(distance=0.0, angle=0.0, lens=True),
             told,
         )
         maps[feature] = made.report
@@ -128,8 +128,8 @@ def evaluate_images(
             done += 1
             both = localizer.all(frames, t, ones, told)
             done += 1
-            alone, together = ([bends.in_reference(place) for place in places] for places in (ones, both))
-            together = [bends.better(*pair) for pair in zip(alone, together, strict=True)]
+            together = [bends.combined(*pair) for pair in zip(ones, both, strict=True)]
+            alone, together = ([bends.in_reference(place) for place in places] for places in (ones, together))
             for method, places in zip(METHODS, (alone, together), strict=True):
                 outcomes.append(_outcome(feature, query, method, numbers, places, truth))
     return ImageResults(outcomes, maps, posed.cameras.positions, tuple(doubts))

@@ -21,7 +21,6 @@ from factors.se2 import Array
 ARM = 0.8  # m that a turn of 1 rad counts as
 NOTHING_KNOWN = 0.1  # weight of no bend, where that of a camera at the place is 1
 NARROWEST = 0.01  # m, the least reach
-NEAR = 2.0  # times the reach: where bends are known
 ASTRAY = 0.1  # m or rad: images that are farther off were located wrongly
 
 
@@ -68,22 +67,38 @@ class Bends:
             place,
             position=place.position - place.rotation @ bend[3:],
             rotation=place.rotation @ Rotation.from_rotvec(-bend[:3]).as_matrix(),
-            covariance=place.covariance + max(float(apart.min()), self.reach) * self.growth,
+            covariance=place.covariance + self._spread(place),
         )
 
-    def better(self, alone: Located | None, together: Located | None) -> Located | None:
-        """Where an image is: located ``alone``, or ``together`` with others, both in the reference.
+    def combined(self, alone: Located | None, together: Located | None) -> Located | None:
+        """Where an image is in the map: located ``alone``, or ``together`` with others.
 
-        Near the cameras the map is bent as the reference is there, which an image alone follows, but no rigid motion from image to
-        image. Elsewhere that keeps together what is hardly determined, and anywhere it refutes what is far off.
+        The map is bent as the reference is, which an image alone follows, but not the rigid motion from image to image, so that all
+        images have the same error. So what is not known of the bends is the uncertainty of the latter, and both are averaged
+        accordingly. Where they contradict each other, one is wrong: that with which fewer points of the map agree.
         """
         if alone is None or together is None:
             return together or alone
+        apart = _error(together.position, together.rotation, alone)
+        if np.abs(apart).max() > ASTRAY:
+            return max(together, alone, key=lambda place: len(place.points))
+        spread = self._spread(alone)
+        gain = spread @ np.linalg.inv(spread + alone.covariance)
+        rest = np.eye(6) - gain
+        step = gain @ apart
+        return replace(
+            together,
+            position=together.position + alone.rotation @ step[3:],
+            rotation=together.rotation @ Rotation.from_rotvec(step[:3]).as_matrix(),
+            covariance=rest @ together.covariance @ rest.T + gain @ alone.covariance @ gain.T,
+        )
+
+    def _spread(self, place: Located) -> Array:
+        """The covariance (6, 6) of what the bends of a place differ by from those of the nearest camera."""
         if not len(self.cameras):
-            return together
-        near = self._distances(alone.position, alone.rotation).min() < NEAR * self.reach
-        agree = np.abs(_error(alone.position, alone.rotation, together)).max() < ASTRAY
-        return alone if near and agree else together
+            return np.zeros((6, 6))
+        nearest = float(self._distances(place.position, place.rotation).min())
+        return max(nearest, self.reach) * self.growth
 
     def _interpolated(self, apart: Array) -> Array:
         """The errors (N, 6) at distances (N, F) from the cameras."""

@@ -27,7 +27,9 @@ LOOSE, OUTLIER = (
 )  # standard deviations of a pixel beyond which an observation is an outlier, in the first round and later
 ITERATIONS = 20
 RELATIVE, ABSOLUTE = 1e-4, 1e-4  # decrease of the cost at which to stop
-FOCAL_SIGMA = 0.1  # standard deviation of an unknown focal length, relative
+FOCAL_SIGMA, ASPECT_SIGMA = 0.1, 0.005  # standard deviations of an unknown focal length and of fx / fy, relative
+CENTRE_SIGMA = 0.01  # standard deviation of an unknown principal point, relative to the focal length
+LENS_SIGMA = (0.1, 0.1, 0.003, 0.003)  # standard deviations of an unknown distortion
 FIXED = 1e-5  # standard deviation of the known calibration constants
 SOMEWHERE = 1000.0  # m, standard deviation of a point without a prior
 CHUNK = 500  # points whose covariances are computed at once
@@ -35,12 +37,12 @@ CHUNK = 500  # points whose covariances are computed at once
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Result of :func:`adjust`: ``model`` (with the adjusted focal length, if that was a variable), ``cameras``, and ``points``
+    """Result of :func:`adjust`: ``model`` (with the adjusted constants, if they were variables), ``cameras``, and ``points``
     (T, 3) [m] of ``tracks`` without outliers; ``old`` (T,): indices of the points in the input. ``errors`` (N, 2) [px]: of the
     observations.
 
     ``camera_covariances`` (F, 6, 6): of perturbations in the cameras' own frames, rotation first; ``point_covariances`` (T, 3,
-    3) [m^2]: marginals, including the uncertainty of the cameras but not of the focal length.
+    3) [m^2]: marginals, including the uncertainty of the cameras but not of the constants.
     """
 
     model: CameraModel
@@ -84,12 +86,14 @@ def adjust(
     known: Known | None = None,
     motion: MotionPrior | None = None,
     focal: bool = False,
+    lens: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Bundle:
     """Adjust ``points`` (T, 3) and ``cameras``, whose prior poses have ``covariances`` (F, 6, 6), see :class:`Bundle`.
 
     ``known``: priors of some of the points; ``motion``: a motion model, which the covariances of the result do not include.
-    ``focal``: whether to estimate the focal lengths. Raises RuntimeError if the graph cannot be solved.
+    ``focal``: whether to estimate the focal lengths; ``lens``: and the principal point and the distortion. Raises RuntimeError
+    if the graph cannot be solved.
     """
     known = known or Known(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
     old = np.arange(len(points))
@@ -99,8 +103,11 @@ def adjust(
         fixed.add(gtsam.PriorFactorPose3(X(i), pose3(cameras.positions[i], cameras.rotations[i]), noise))
     if motion is not None:
         motion.add_to(fixed)
+    if focal or lens:
+        noise = gtsam.noiseModel.Gaussian.Covariance(_unknown_constants(model, lens=lens))
+        fixed.add(gtsam.PriorFactorCal3DS2(K(0), model.calibration(), noise))
     for i in range(ROUNDS):
-        model, cameras, points = _optimized(model, fixed, known, cameras, tracks, points, focal=focal)
+        model, cameras, points = _optimized(model, fixed, known, cameras, tracks, points, constants=focal or lens)
         least = np.full(len(points), 2)
         least[known.points] = 1
         right = agreeing(model, cameras, tracks, points, LOOSE if i == 0 else OUTLIER, least)
@@ -172,6 +179,17 @@ def robust_noise(model: CameraModel) -> Any:
     return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, model.sigma))
 
 
+def _unknown_constants(model: CameraModel, *, lens: bool) -> Array:
+    """The covariance (9, 9) of (fx, fy, skew, cx, cy, k1, k2, p1, p2) if a data sheet is all that is known of them."""
+    spread = FIXED**2 * np.eye(9)
+    focal = np.array((model.fx, model.fy))
+    spread[:2, :2] += FOCAL_SIGMA**2 * np.outer(focal, focal) + ASPECT_SIGMA**2 * np.diag(focal**2)
+    if lens:
+        centre = CENTRE_SIGMA * focal
+        spread[range(3, 9), range(3, 9)] = np.square((*centre, *LENS_SIGMA))
+    return spread
+
+
 def _optimized(
     model: CameraModel,
     fixed: gtsam.NonlinearFactorGraph,
@@ -180,7 +198,7 @@ def _optimized(
     tracks: Tracks,
     points: Array,
     *,
-    focal: bool,
+    constants: bool,
 ) -> tuple[CameraModel, Cameras, Array]:
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.push_back(fixed)
@@ -193,9 +211,7 @@ def _optimized(
         graph.add(gtsam.PriorFactorPoint3(L(k), position, gtsam.noiseModel.Gaussian.Covariance(covariance)))
     noise = robust_noise(model)
     rows = zip(tracks.frame.tolist(), tracks.track.tolist(), tracks.pixels, strict=True)
-    if focal:
-        sigmas = np.array([FOCAL_SIGMA * model.fx, FOCAL_SIGMA * model.fy, *[FIXED] * 7])
-        graph.add(gtsam.PriorFactorCal3DS2(K(0), calibration, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+    if constants:
         values.insert(K(0), calibration)
         for i, k, pixel in rows:
             graph.add(gtsam.GeneralSFMFactor2Cal3DS2(pixel, noise, X(i), L(k), K(0)))
@@ -207,9 +223,9 @@ def _optimized(
     parameters.setRelativeErrorTol(RELATIVE)
     parameters.setAbsoluteErrorTol(ABSOLUTE)
     found = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    if focal:
-        fx, fy = found.atCal3DS2(K(0)).vector()[:2].tolist()
-        model = replace(model, fx=fx, fy=fy)
+    if constants:
+        fx, fy, _, cx, cy, *distortion = found.atCal3DS2(K(0)).vector().tolist()
+        model = replace(model, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
     poses = [found.atPose3(X(i)) for i in range(len(cameras))]
     adjusted = Cameras(np.array([p.translation() for p in poses]), np.array([p.rotation().matrix() for p in poses]))
     return model, adjusted, np.array([found.atPoint3(L(k)) for k in range(len(points))]).reshape(-1, 3)

@@ -161,6 +161,10 @@ class ImageLocalizer:
         """The optimised graph of all images."""
         model = self._model
         of_map, shown, new = _divided(tracks, frames, seen)
+        # a wrong track would pull all images that nothing else holds in the map, however far
+        once, limit = np.ones(len(shown), dtype=np.int64), EPIPOLAR / model.sigma
+        of_map, left = of_map.kept(bundle.agreeing(model, cameras, of_map, self._points.positions[shown], limit, once))
+        shown = shown[left]
         found = triangulate(model, cameras, new)
         good = found.good(new, replace(model, sigma=2.0 * model.sigma))
         new, old = new.kept(good[new.track])

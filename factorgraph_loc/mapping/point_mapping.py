@@ -40,6 +40,8 @@ class PointSettings(FileModel):
     """angle between keyframes; 0 for all frames"""
     focal: bool = False
     """whether to adjust the focal length"""
+    lens: bool = False
+    """whether to adjust focal length, principal point and distortion"""
     observations: Annotated[int, Field(ge=2, le=1000)] = 3
     """number of keyframes that a point must be seen in"""
     parallax: Annotated[float, Field(ge=1e-4, le=3.0), InUnit("rad")] = PARALLAX
@@ -119,6 +121,7 @@ def map_points(
             seen,
             found.positions[old],
             focal=settings.focal,
+            lens=settings.lens,
             progress=lambda share: progress(0.7 + 0.3 * share),
         )
     except RuntimeError as error:  # raised by GTSAM for an underdetermined system

@@ -1,5 +1,7 @@
 """Bends of a reference against the map made with it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -68,17 +70,34 @@ def test_far_from_the_cameras_bends_are_not_known():
     assert np.all((spread > 0.2 * BEND**2) & (spread < 5.0 * BEND**2))
 
 
-def test_near_the_cameras_an_image_alone_is_better():
+def test_images_together_have_an_error_in_common_that_an_image_alone_has_not():
+    """The graph is off by what is not known of the bends, each image alone by noise of its own."""
     rng = np.random.default_rng(2)
     true, reference = a_walk(rng)
-    alone, together = (places(rng, true) for _ in range(2))
-    bends = Bends.of(reference[:100], alone[:100])
-    alone, together = ([bends.in_reference(place) for place in found] for found in (alone, together))
-    assert bends.better(alone[50], together[50]) is alone[50]
-    assert bends.better(alone[150], together[150]) is together[150]
-    assert bends.better(alone[50], together[90]) is together[90]  # it is far off
-    assert bends.better(None, together[50]) is together[50]
-    assert bends.better(alone[50], None) is alone[50]
+    bends = Bends.of(reference[:100], places(rng, true[:100]))
+    common = 0.5 * BEND * np.sqrt(true.positions[150, 0] - true.positions[99, 0])
+    slid = [replace(place, position=place.position + common) for place in places(rng, true)]
+    for noise, limit in ((2e-4, 0.1), (0.05, 1.05)):  # of its own, and what remains of the common error
+        covariance = noise**2 * np.eye(6)
+        found = [
+            bends.combined(replace(one, position=p + noise * rng.standard_normal(3), covariance=covariance), both)
+            for p, one, both in zip(true.positions[145:155], slid[145:155], slid[145:155], strict=True)
+        ]
+        errors = np.array([place.position for place in found]) - true.positions[145:155]
+        assert np.sqrt(np.mean(errors**2)) < limit * common
+        assert all(np.linalg.eigvalsh(covariance - place.covariance)[0] > -1e-9 for place in found)
+
+
+def test_of_two_places_that_contradict_each_other_the_map_tells_which_is_right():
+    rng = np.random.default_rng(2)
+    true, reference = a_walk(rng)
+    found = places(rng, true)
+    bends = Bends.of(reference[:100], found[:100])
+    seen = replace(found[50], points=np.arange(20), features=np.arange(20))
+    assert bends.combined(seen, found[90]) is seen
+    assert bends.combined(found[90], seen) is seen
+    assert bends.combined(None, found[50]) is found[50]
+    assert bends.combined(found[50], None) is found[50]
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -1,5 +1,7 @@
 """Bundle adjustment: wrong poses are mended, outliers left out, covariances are those of GTSAM and right."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from scipy.stats import chi2
 
 from factorgraph_loc.mapping.bundle import Known, adjust, marginals, pose3
 from factorgraph_loc.mapping.triangulation import Tracks, triangulate
-from factors.camera.model import recalibrated
+from factors.camera.model import project, recalibrated
 
 
 def prior(count, turn, shift):
@@ -101,6 +103,21 @@ def test_the_focal_length_can_be_found(look):
     assert made.model.fx == pytest.approx(sight.model.fx, rel=0.01)
     assert made.model.fy == pytest.approx(sight.model.fy, rel=0.02)  # the cameras are side by side
     assert made.model.cx == pytest.approx(sight.model.cx, abs=0.1)
+
+
+def test_the_lens_can_be_found(look):
+    """Of a nominal camera: without it, cameras that agree with all pixels are bent away from their poses."""
+    rng = np.random.default_rng(5)
+    sight = look(rng, noise=0.3)
+    tracks, _ = sight.tracks()
+    nominal = replace(sight.model, fx=540.0, fy=540.0, cx=316.0, cy=243.0, distortion=(0.0, 0.0, 0.0, 0.0))
+    start = triangulate(nominal, sight.cameras, tracks).positions
+    given = (nominal, sight.cameras, prior(len(sight.cameras), 0.002, 0.004), tracks, start)
+    bent, made = adjust(*given), adjust(*given, lens=True)
+    seen = np.array([(x, y, 1.0) for x in (-0.4, 0.0, 0.4) for y in (-0.3, 0.0, 0.3)])
+    apart = np.abs(project(made.model, seen) - project(sight.model, seen))
+    assert apart.max() < 0.25 * np.abs(project(nominal, seen) - project(sight.model, seen)).max()
+    assert np.median(np.abs(offsets(sight, made.cameras))) < 0.4 * np.median(np.abs(offsets(sight, bent.cameras)))
 
 
 def test_known_points_place_cameras_that_nothing_else_does(look):

@@ -6,9 +6,13 @@ import gtsam
 import numpy as np
 import pytest
 
-from factorgraph_loc.mapping.image_localization import ImageLocalizer, smooth_start
+from factorgraph_loc.mapping import bundle
+from factorgraph_loc.mapping.feature_tracks import chained
+from factorgraph_loc.mapping.image_localization import EPIPOLAR, ImageLocalizer, smooth_start
 from factorgraph_loc.mapping.steady_motion import SteadyMotion, change_of_velocity
+from factorgraph_loc.mapping.triangulation import Tracks, reproject
 from factorgraph_loc.maps.points import PointMap
+from factors.camera.model import project
 
 pytestmark = pytest.mark.kernels
 
@@ -85,6 +89,55 @@ def test_the_graph_reaches_beyond_the_map(look):
     assert ones[8:] == [None] * 4
     places = localizer.all(frames, T, ones)
     assert errors(sight, places).max() < 0.03
+
+
+def test_wrong_tracks_do_not_pull_images_that_see_nothing_of_the_map(look, monkeypatch):
+    """Features of the last images, of other points, are in tracks of points of the map as well."""
+    rng = np.random.default_rng(3)
+    sight = look(rng, noise=0.5)
+    known = np.arange(0, 150, 2)
+    frames = []
+    for i, (frame, shown) in enumerate(zip(sight.frames, sight.shown, strict=True)):
+        keep = ~np.isin(shown, known) if i >= 8 else np.ones(len(shown), dtype=bool)
+        frames.append(
+            replace(frame, pixels=frame.pixels[keep], sizes=frame.sizes[keep], descriptors=frame.descriptors[keep])
+        )
+    localizer = ImageLocalizer(a_map(sight, rng, known), sight.model)
+    ones = [localizer.one(frame) for frame in frames]
+    of_map = ones[0].features
+
+    def with_wrong_ones(*given):
+        right = chained(*given)
+        wrong = []
+        for k, feature in enumerate(of_map):  # what is 150 px beside the point, in all these images
+            for i in range(8, 12):
+                local = (sight.points[sight.shown[0][feature]] - sight.cameras.positions[i]) @ sight.cameras.rotations[
+                    i
+                ]
+                aside = np.linalg.norm(frames[i].pixels - project(sight.model, local[None]) - (150.0, 0.0), axis=1)
+                wrong.append((k, i, int(aside.argmin())))
+        track, frame, feature = np.concatenate((np.array([(k, 0, f) for k, f in enumerate(of_map)]), wrong)).T
+        pixels = np.array([frames[i].pixels[f] for i, f in zip(frame, feature, strict=True)])
+        both = (
+            (right.track, right.count + track),
+            (right.frame, frame),
+            (right.feature, feature),
+            (right.pixels, pixels),
+        )
+        return Tracks(*(np.concatenate(part) for part in both))
+
+    monkeypatch.setattr("factorgraph_loc.mapping.image_localization.chained", with_wrong_ones)
+    adjust, amiss = bundle.adjust, []
+
+    def watched(model, cameras, covariances, tracks, points, *, known=None, **others):
+        if known is not None:
+            off = np.linalg.norm(reproject(model, cameras, points, tracks)[0], axis=1)
+            amiss.append(np.count_nonzero(off[np.isin(tracks.track, known.points)] > EPIPOLAR))
+        return adjust(model, cameras, covariances, tracks, points, known=known, **others)
+
+    monkeypatch.setattr("factorgraph_loc.mapping.bundle.adjust", watched)
+    assert errors(sight, localizer.all(frames, T, ones)).max() < 0.03
+    assert amiss == [0, 0]
 
 
 def test_a_start_for_all_images(look):
