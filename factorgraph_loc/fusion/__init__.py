@@ -4,6 +4,7 @@ __all__ = [
     "base",
     "batch",
     "cloud",
+    "cloud_view",
     "dead_reckoning",
     "ekf",
     "graph_parts",

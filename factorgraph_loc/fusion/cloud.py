@@ -69,6 +69,19 @@ class Cloud:
         parts = {**self.parts, name: slice(first, first + len(mean))}
         return replace(self, constants=np.concatenate((self.constants, drawn), axis=1), parts=parts)
 
+    def weighed(self, likelihood: Array, share: float) -> tuple[Cloud, float]:
+        """The particles after a share of a log-likelihood (N,), and the log of its mean."""
+        weighed = self.log_weights + share * likelihood
+        log_weights = normalised(weighed)
+        heaviest = int(np.argmax(weighed))
+        return replace(self, log_weights=log_weights), float(weighed[heaviest] - log_weights[heaviest])
+
+    def thinned(self, count: int) -> Cloud:
+        """About so many of the particles, as far apart in their order as there is room."""
+        some = slice(None, None, max(1, len(self.poses) // count))
+        weights = normalised(self.log_weights[some])
+        return replace(self, poses=self.poses[some], constants=self.constants[some], log_weights=weights)
+
     def density(self) -> tuple[Cloud, Array]:
         """The cloud as a density with the moments of what it was drawn from: poses shrunk towards their mean, each with a Gaussian
         kernel (Liu, West, in "Sequential Monte Carlo Methods in Practice", 2001, eq. 10.3.8) as wide as befits their number
@@ -114,6 +127,12 @@ class Cloud:
             log_weights=np.full(len(rows), -np.log(len(rows))),
         )
 
+    def around(self, middle: Array) -> NDArray[np.bool_]:
+        """Which particles (N,) are of a mode with this ``middle`` (3,)."""
+        difference = np.abs(self.poses - middle)
+        difference[:, 2] = np.abs(se2.wrap(difference[:, 2]))
+        return np.asarray(np.all(difference < REACH, axis=1))
+
     def modes(self) -> tuple[Mode, ...]:
         """The places where the weight is, the heaviest first: each with the moments of the particles around it."""
         weights = self.weights
@@ -124,9 +143,7 @@ class Cloud:
             heaviest = free & (which == np.argmax(np.bincount(which, weights * free)))
             middle, _ = _normalised_moments(self.poses[heaviest], weights[heaviest])
             for _ in range(2):
-                difference = np.abs(self.poses - middle)
-                difference[:, 2] = np.abs(se2.wrap(difference[:, 2]))
-                near = free & np.all(difference < REACH, axis=1)
+                near = free & self.around(middle)
                 middle, covariance = _normalised_moments(self.poses[near], weights[near])
             found.append(Mode(float(weights[near].sum()), middle, covariance))
             free &= ~near

@@ -222,7 +222,7 @@ class GraphEstimator(ABC):
                 self._drop_late(m)
                 return
         graph.t = max(graph.t, m.t)
-        told = self._search.advance() if isinstance(m, Tick) else self._search.look(m, self._motion.state(m.t))
+        told = self._search.advance(m.t) if isinstance(m, Tick) else self._search.look(m, self._motion.state(m.t))
         if not told and self._search.newest is None and not self._search.waits and start is None:
             return  # the run begins with the first measurement that tells something
         self._remember(m)

@@ -32,7 +32,7 @@ class HeadingSearch:
         self._kept.append(m)
         while self._kept[0].t < m.t - START_KEPT:
             self._kept.popleft()
-        told = self._search.advance() if isinstance(m, Tick) else self._search.look(m, self._motion.state(m.t))
+        told = self._search.advance(m.t) if isinstance(m, Tick) else self._search.look(m, self._motion.state(m.t))
         if not told:
             return None
         found = self._search.best

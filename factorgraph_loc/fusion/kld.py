@@ -30,10 +30,12 @@ def prefix(poses: Array, rng: np.random.Generator, least: int, cell: Array = CEL
     return np.asarray(order[: int(np.argmax(reached)) + 1] if reached.any() else order)
 
 
-def jittered(poses: Array, rows: NDArray[np.int64], rng: np.random.Generator) -> Array:
+def jittered(poses: Array, rows: NDArray[np.int64], rng: np.random.Generator, room: Array | float = 0.0) -> Array:
     """Particles (K, 3) drawn from kernels on the particles ``rows`` (K,) of ``poses`` (N, 3), as wide as befits how densely those,
-    each of them once, lie in the cells. Of several modes each keeps its width."""
+    each of them once, lie in the cells; or, where they are farther apart, the ``room`` (K,), in cells, that each had for itself.
+    Of several modes each keeps its width."""
     chosen = poses[rows]
     cells = len(np.unique(cell_numbers(chosen, CELL)))
-    width = KERNEL * CELL * (cells / len(np.unique(rows))) ** (1.0 / 3.0)
-    return se2.compose(chosen, se2.exp(rng.standard_normal(chosen.shape) * width))
+    width = KERNEL * np.cbrt(np.maximum(room, cells / len(np.unique(rows))))
+    noise = rng.standard_normal(chosen.shape) * CELL * np.reshape(width, (-1, 1))
+    return se2.compose(chosen, se2.exp(noise))

@@ -16,10 +16,9 @@ seen tells of it (:mod:`~factorgraph_loc.fusion.search`). A start with an unknow
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -27,7 +26,8 @@ from pydantic import Field
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.changes import Change, is_known
-from factorgraph_loc.fusion.cloud import Cloud, largest_share, normalised, systematic, vector_moments, weighable
+from factorgraph_loc.fusion.cloud import Cloud, largest_share, systematic, vector_moments, weighable
+from factorgraph_loc.fusion.cloud_view import CloudView
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.search import Search, Tracked
@@ -37,12 +37,14 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation
+from factorgraph_loc.sensors.base import Link, NewVariable, Observation
 from factorgraph_loc.sensors.binding import bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import positive, se2, se2_kernels
 from factors.motion import Increment
 from factors.se2 import Array
+
+FEW, HEAVY = 500, 2_000_000  # particles, and work of weighing all, above which some are weighed first
 
 
 class ParticleFilterSettings(FilterSettings):
@@ -63,53 +65,6 @@ class ParticleFilterSettings(FilterSettings):
     self_calibration: bool = True
     """whether constants to which the rig gives an uncertainty travel with each particle; not time offsets, and not those of
     a camera, which widen its noise"""
-
-
-class CloudView:
-    """What sensors see of the filter, at its time."""
-
-    offset = None
-    newest = True
-
-    def __init__(self, owner: Filter) -> None:
-        self._filter: Any = owner
-        self.t = owner._t
-
-    @property
-    def localized(self) -> bool:
-        return bool(self._filter._state.localized)
-
-    @property
-    def pose(self) -> Array:
-        return np.asarray(self._filter._moments()[0], dtype=float)
-
-    @property
-    def covariance(self) -> Array:
-        return se2.world_to_body(*self._filter._moments())
-
-    def value(self, name: str) -> Array | None:
-        cloud, part = self._filter._state, self._filter._state.parts.get(name)
-        return None if part is None else np.asarray(cloud.weights @ cloud.constants[:, part])
-
-    def spread(self, name: str) -> Array:
-        cloud, part = self._filter._state, self._filter._state.parts[name]
-        return vector_moments(cloud.constants[:, part], cloud.weights)[1]
-
-    def joint(self) -> tuple[Array, Mapping[str, slice]]:
-        return self.covariance, {}
-
-    def poses_at(self, times: Array) -> Array:
-        constants = self.value(MOTION)
-        owner = self._filter
-        values = np.zeros(0) if constants is None else constants
-        return np.asarray(owner._motion.poses_at(owner._odometry, times, values))
-
-    def earlier(self, t: float) -> EarlierPose | None:
-        return None
-
-    def values(self, names: Sequence[str]) -> dict[str, Array]:
-        """The means of blocks that travel with the particles."""
-        return {name: value for name in names if (value := self.value(name)) is not None}
 
 
 class ParticleFilter(Filter):
@@ -206,7 +161,7 @@ class ParticleFilter(Filter):
 
     def _begin(self, m: Measurement) -> None:
         super()._begin(m)
-        if isinstance(m, Tick) and self._search.advance():
+        if isinstance(m, Tick) and self._search.advance(m.t):
             self._t, self._odometry, self._moves = m.t, self._motion.state(m.t), True
             found = self._found(m.t)
             if found is not None:
@@ -218,25 +173,31 @@ class ParticleFilter(Filter):
 
     def _found(self, since: float) -> Cloud | None:
         """Particles drawn from what the search tells, None where it tells nothing; once that is one place a track begins, with what
-        was seen ``since`` then."""
-        poses = self._search.sample(self._drawn_by, self._settings.particles, self._odometry)
-        if not len(poses):
+        was seen ``since`` then. Their constants are those of a track before, if there was one."""
+        clouds = (r.cloud for r in reversed(self._records) if r.cloud is not None and r.t < since)
+        before = next((cloud for cloud in clouds if cloud.localized), None)
+        told = self._search.sample(self._drawn_by, self._settings.particles, self._odometry)
+        if told is None:
             return None
-        if self._search.best is None:
-            return replace(self._cloud(poses), localized=False)
-        self._search.begin_track(found=True)
-        for sensor in self._sensors.values():
-            sensor.restart(since)
-        self.diagnostics.event(self._t, "recovered" if self._lost else "localized")
-        return self._cloud(poses)
+        cloud = replace(self._cloud(told[0], before), odometry=told[1], localized=self._search.best is not None)
+        if cloud.localized:
+            self._search.begin_track(found=True)
+            for sensor in self._sensors.values():
+                sensor.restart(since)
+            self.diagnostics.event(self._t, "recovered" if self._lost else "localized")
+        return cloud
 
-    def _cloud(self, poses: Array) -> Cloud:
-        """Particles at poses (N, 3), whose constants are those of the prior."""
+    def _cloud(self, poses: Array, before: Cloud | None = None) -> Cloud:
+        """Particles at poses (N, 3), whose constants are those of others ``before``, or of the prior."""
         count = len(poses)
         poses[:, 2] = se2.wrap(poses[:, 2])
+        log_weights = np.full(count, -np.log(count))
+        if before is not None:
+            rows = self._drawn_by.permutation(systematic(before.weights, self._drawn_by, count))
+            return replace(before, poses=poses, constants=before.constants[rows], log_weights=log_weights)
         sigmas = np.concatenate([constants.sigmas for _, constants in self._blocks])
         constants = self._drawn_by.standard_normal((count, len(sigmas))) * sigmas
-        return Cloud(poses, constants, np.full(count, -np.log(count)), parts=self._parts, odometry=self._odometry)
+        return Cloud(poses, constants, log_weights, parts=self._parts, odometry=self._odometry)
 
     def _anchor(self) -> None:
         super()._anchor()
@@ -319,7 +280,7 @@ class ParticleFilter(Filter):
             self._doubt(tick)
             return
         self._state = self._moved_on(self._drawn_by)
-        if self._search.advance():
+        if self._search.advance(tick.t):
             self._state = self._found(self._t) or self._state
 
     def _doubt(self, m: Measurement) -> None:
@@ -344,30 +305,37 @@ class ParticleFilter(Filter):
 
     def _weigh(self, observation: Observation) -> float:
         """Weigh the particles by an observation, by a share of it at a time if it leaves too few effective ones: they are resampled
-        in between (progressive correction: Musso, Oudjane, Le Gland, 2001, section 12.4). Returns the log of the mean of its
-        likelihood. RunFailedError if that is not finite for any of them."""
-        mean, left = 0.0, 1.0
+        in between (progressive correction: Musso, Oudjane, Le Gland, 2001, section 12.4). Where that is much work, a few of them
+        are, until they can take all that is left; by that all are weighed, which are drawn from them. Returns the log of the mean
+        of the likelihood. RunFailedError if that is not finite for any of them."""
+        evidence, left, enough, whole = 0.0, 1.0, self._settings.resample_below, self._state
+        count = self._settings.particles
+        few = observation.work * count > HEAVY
+        if few:
+            self._state = whole.thinned(FEW)
+            count = FEW if self._search.doubts else count  # a track in doubt is not worth more
         while True:
             cloud = self._state
             values = {name: cloud.constants[:, cloud.parts[name]] for name in observation.blocks}
             likelihood = weighable(observation.log_likelihood(cloud.poses, values), cloud.log_weights, self._t)
-            share = largest_share(cloud.log_weights, likelihood, left, self._settings.resample_below * len(cloud.poses))
-            weighed = cloud.log_weights + share * likelihood
-            log_weights = normalised(weighed)
-            heaviest = int(np.argmax(weighed))
-            mean += float(weighed[heaviest] - log_weights[heaviest])
-            self._state = replace(cloud, log_weights=log_weights)
+            share = largest_share(cloud.log_weights, likelihood, left, enough * len(cloud.poses))
+            if few and share >= left and count > FEW:
+                few, enough = False, 0.5 * enough
+                self._state = self._resampled(cloud, count) if left < 1.0 else whole
+                continue
+            self._state, mean = cloud.weighed(likelihood, share)
+            evidence += mean
             left -= share
             if left <= 0.0:
-                return mean
-            self._resample()
+                return evidence
+            self._state = self._resampled(self._state, FEW if few else count)
 
-    def _resample(self) -> None:
-        chosen = systematic(self._state.weights, self._drawn_by, self._settings.particles)
+    def _resampled(self, cloud: Cloud, count: int) -> Cloud:
+        chosen = systematic(cloud.weights, self._drawn_by, count)
         if self._settings.kld:
-            chosen = chosen[kld.prefix(self._state.poses[chosen], self._drawn_by, self._settings.min_particles)]
-        cloud, kernel = self._state.density()
-        self._state = cloud.drawn(chosen, kernel, self._drawn_by)
+            chosen = chosen[kld.prefix(cloud.poses[chosen], self._drawn_by, self._settings.min_particles)]
+        density, kernel = cloud.density()
+        return density.drawn(chosen, kernel, self._drawn_by)
 
     def _estimate(self) -> PoseEstimate:
         if self._state.localized:

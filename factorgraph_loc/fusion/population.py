@@ -3,9 +3,9 @@
 A particle filter over pose: evenly over the map's bounds at first, or with any heading where the start's position
 is known. Each observation is weighed a share at a time, with resampling from a kernel density in between (progressive correction:
 Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4), so that few particles find
-narrow places. Their number follows the size of the places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). At each
-resampling some are drawn anywhere once more,
-with hardly any weight: they bring back a place that was given up for tags that were silent or misplaced.
+narrow places; in a large map the kernels are as wide as the first particles are far apart. Their number follows the size of the
+places that are left (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). At each resampling some are drawn anywhere once more, and some
+beside others, with hardly any weight: they bring back a place that was given up for tags that were silent or misplaced.
 
 All this is done in slices, whose size is counted in work and not in seconds: what was seen waits until it is its turn, and
 until then the population stands where it was. So a search over a large hall goes on beside whatever else is to be done.
@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorgraph_loc.fusion import kld
-from factorgraph_loc.fusion.cloud import Cloud, effective_size, largest_share, normalised, systematic, weighable
+from factorgraph_loc.fusion.cloud import Cloud, effective_size, largest_share, systematic, weighable
 from factorgraph_loc.model.belief import Mode, PosePrior
 from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.sensors.base import Observation
@@ -35,7 +35,8 @@ DENSITY = 25.0  # particles per m^2 and rad at first
 FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 40_000, 4000
 GROWTH = 4  # times as many particles, at most, after a resampling
 RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # effective size, as a share: when to resample; what a share of a likelihood leaves
-FRESH, ELSEWHERE = 2000, 1e-3  # particles that are drawn anywhere at a resampling, and their weight together
+FRESH, ELSEWHERE = 2000, 1e-3  # particles that are drawn anew at a resampling, and their weight together
+ASTRAY, BESIDE = 500, np.array((0.7, 0.7, 0.3))  # of those, how many beside others, and how far: m, m, rad
 # Variance of the odometry, times this: the constants of the odometry, which are not estimated here, err as well.
 NOISE = 2.0
 
@@ -48,7 +49,7 @@ CLEAR_OBSERVATIONS, CLEAR_THINGS = 3, 2  # of something, and of different things
 REACH = 5.0  # standard deviations, within which weight counts for a place that is denied
 
 # Work: of one tag that one particle looks at it is 1, some nanoseconds.
-CHUNK = 1_000_000  # of what is done at once
+CHUNK = 500_000  # of what is done at once
 PARTICLE = 25  # of a particle that is weighed, besides what it looks at
 RESAMPLED = 60  # of a particle in each half of a resampling
 BEGUN = 80  # of a particle at first, with what the sensors make for the search
@@ -75,6 +76,7 @@ class Population:
     ) -> None:
         self._motion, self._bounds, self._rng, self._start = motion, bounds, rng, start
         self._cloud: Cloud | None = None
+        self._room = np.empty(0)  # of each particle for itself, in cells, when it was drawn
         self._odometry: ChainState | None = None
         self._begun: ChainState | None = None  # at the last observation whose turn has come
         self._hypotheses: tuple[Mode, ...] | None = ()
@@ -149,8 +151,8 @@ class Population:
         """Take an observation, telling the work of each part of it."""
         odometry, observation = new.odometry, new.observation
         if self._cloud is None or self._odometry is None:
-            area = float(np.prod(self._bounds[1] - self._bounds[0]))
-            count = int(np.clip(DENSITY * area * 2.0 * math.pi, FEWEST_AT_FIRST, MOST))
+            count = int(np.clip(DENSITY * self._everywhere, FEWEST_AT_FIRST, MOST))
+            self._room = self._room_of(count)
             cloud = _cloud(self._anywhere(count, odometry), np.full(count, -math.log(count)))
             yield float(BEGUN * count)
         else:
@@ -176,10 +178,12 @@ class Population:
         return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Poses (N, 3) at the last observation, drawn from all hypotheses; none before the first observation."""
+        """Poses (N, 3) at the last observation, drawn from all hypotheses, or the one that is clear; none before the first
+        observation."""
         if self._cloud is None:
             return np.empty((0, 3))
-        rows = systematic(self._cloud.weights, rng, count)
+        best, weights = self.best, self._cloud.weights
+        rows = systematic(weights if best is None else weights * self._cloud.around(best.pose), rng, count)
         return kld.jittered(self._cloud.poses, rows, rng)
 
     def _weight_of_best(self) -> float:
@@ -216,10 +220,8 @@ class Population:
             likelihood = yield from _likelihood(cloud, new.observation)
             likelihood = weighable(likelihood, cloud.log_weights, new.odometry.t)
             share = largest_share(cloud.log_weights, likelihood, left, ENOUGH * effective_size(cloud.log_weights))
-            weighed = cloud.log_weights + share * likelihood
-            highest = float(weighed.max())
-            evidence += highest + math.log(float(np.sum(np.exp(weighed - highest))))
-            cloud = replace(cloud, log_weights=normalised(weighed))
+            cloud, mean = cloud.weighed(likelihood, share)
+            evidence += mean
             left -= share
             if effective_size(cloud.log_weights) < RESAMPLE_BELOW * len(cloud.poses):
                 cloud = yield from self._resampled(cloud, new.odometry)
@@ -229,11 +231,24 @@ class Population:
         rows = systematic(cloud.weights, self._rng, min(MOST, GROWTH * len(cloud.poses)))
         rows = rows[kld.prefix(cloud.poses[rows], self._rng, FEWEST)]
         yield RESAMPLED * len(cloud.poses)
-        poses = np.concatenate((kld.jittered(cloud.poses, rows, self._rng), self._anywhere(FRESH, now)))
+        room = self._room[rows]
+        drawn = kld.jittered(cloud.poses, rows, self._rng, room)
+        beside = se2.compose(drawn[:ASTRAY], se2.exp(BESIDE * self._rng.standard_normal((ASTRAY, 3))))
+        poses = np.concatenate((drawn, beside, self._anywhere(FRESH - ASTRAY, now)))
+        self._room = np.concatenate((room / np.bincount(rows)[rows], np.zeros(ASTRAY), self._room_of(FRESH - ASTRAY)))
         log_weights = np.full(len(poses), math.log((1.0 - ELSEWHERE) / len(rows)))
         log_weights[len(rows) :] = math.log(ELSEWHERE / FRESH)
         yield RESAMPLED * len(poses)
         return _cloud(poses, log_weights)
+
+    @property
+    def _everywhere(self) -> float:
+        """How large the space of poses is [m^2 rad]."""
+        return float(np.prod(self._bounds[1] - self._bounds[0])) * 2.0 * math.pi
+
+    def _room_of(self, count: int) -> Array:
+        """What room (N,) each of so many particles has that are drawn anywhere; none in the small place of a start."""
+        return np.full(count, self._everywhere / float(np.prod(kld.CELL)) / count if self._start is None else 0.0)
 
     def _anywhere(self, count: int, now: ChainState) -> Array:
         """Poses (N, 3) where the robot may have come to by ``now``, as far as its start tells it: else evenly over the bounds and

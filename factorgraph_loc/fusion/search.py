@@ -31,7 +31,8 @@ DURATION = 60.0  # s of observations that are kept
 REFUTING = 8.0  # log of the odds that a track must lose by: kidnappings are rare
 BEFORE = 2.0  # s before a suspicion, or before what speaks for a change, in which it may lie
 UNSURE = 5.0  # a change may be at a time for which the log of its likelihood is so much below the highest
-SLICE = 5_000_000  # of work (:mod:`.population`) that is done at a measurement or a tick
+SLICE = 2_500_000  # of work (:mod:`.population`) that is done at a measurement or a tick
+PAUSE = 0.05  # s between two slices, at least: a measurement and a tick often come at once
 APART = 16.0  # squared Mahalanobis distance to the track, beyond which it is another place
 
 
@@ -73,6 +74,7 @@ class Search:
         self._last: dict[str, float] = {}  # when a sensor last told something new of a place
         self._newest: ChainState | None = None
         self._since = -math.inf
+        self._advanced = -math.inf  # when a slice of work was done last
         self._horizon = motion.horizon
         self.start: KnownPosition | None = None
 
@@ -107,11 +109,14 @@ class Search:
             seen = sensor.evidence(m)
             if seen is not None:
                 self._population.add(odometry, seen)
-        return self.advance() or told
+        return self.advance(odometry.t) or told
 
-    def advance(self) -> bool:
-        """Go on with what waits, for one slice of work; whether that told something of a place."""
-        if self._population is None or not self._population.advance(SLICE):
+    def advance(self, t: float) -> bool:
+        """Go on at ``t`` with what waits, for one slice of work; whether that told something of a place."""
+        if self._population is None or t < self._advanced + PAUSE:
+            return False
+        self._advanced = t
+        if not self._population.advance(SLICE):
             return False
         reached = self._population.odometry
         if reached is not None and (self._newest is None or reached.t > self._newest.t):
@@ -162,8 +167,8 @@ class Search:
         poses, weights = self._population.particles
         return se2.compose(poses, self._motion.relative(reached, self._motion.state(t)).delta), weights
 
-    def sample(self, rng: np.random.Generator, count: int, now: ChainState) -> Array:
-        """Poses (N, 3) when the odometry is at ``now``, drawn from what is known; none where nothing was seen."""
+    def sample(self, rng: np.random.Generator, count: int, now: ChainState) -> tuple[Array, ChainState] | None:
+        """Poses (N, 3) drawn from what is known, and the odometry there, not later than ``now``; None where nothing was seen."""
         leading = self._at_once()
         if leading is None and self._population is not None and self._population.odometry is not None:
             poses, reached = self._population.sample(rng, count), self._population.odometry
@@ -171,13 +176,9 @@ class Search:
             if leading is None:
                 leading = next((f for f in self._finders.values() if f.newest is not None), None)
             if leading is None:
-                return np.empty((0, 3))
+                return None
             poses, reached = leading.sample(rng, count), leading.newest
-        if reached is None or reached.t >= now.t:
-            return poses
-        since = self._motion.relative(reached, now)
-        noise = positive.draws(since.covariance, len(poses), rng)
-        return np.asarray(se2.compose(se2.compose(poses, since.delta), se2.exp(noise)))
+        return poses, now if reached is None or reached.t >= now.t else reached
 
     @property
     def doubts(self) -> bool:
@@ -234,7 +235,7 @@ class Search:
             for row in self._kept:
                 if row.odometry.t >= self._since:
                     self._population.add(*row)
-        best = self._population.best if self.advance() else None
+        best = self._population.best if self.advance(odometry.t) else None
         if best is None:
             return None
         best = self._brought(best, odometry)

@@ -25,7 +25,7 @@ from scipy.special import logsumexp
 
 from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.cloud import Cloud, effective_size, largest_share, normalised, systematic, weighable
-from factorgraph_loc.fusion.particle_filter import CloudView
+from factorgraph_loc.fusion.cloud_view import CloudView
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks
 from factorgraph_loc.maps.free_space import CELL, FreeSpace
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, Status

@@ -25,6 +25,16 @@ MOST = 1 << 25  # numbers in the tables; more have none
 NO_MATTER = 1e-3  # of a log-likelihood: a silence that tells less is taken for one out of reach
 
 
+class Antennas(NamedTuple):
+    """A model and its tables. ``logs`` (M, Z, 2): log q and log(1 - q) for the logits of the tables, of each detection model as it
+    is adjusted; ``reach`` [m], from the robot's middle."""
+
+    packed: Packed
+    tables: Tables
+    logs: NDArray[np.float32]
+    reach: float
+
+
 class PlaceTables(NamedTuple):
     """Of H heights: ``gain`` (A, H, S, S), log q - log(1 - q) of each antenna for a tag at a place in the robot's frame, and
     ``missed`` (A, H, S, S), log(1 - q) above that out of reach; ``level`` (T,): height of each tag; ``reach`` [m], from the
@@ -36,6 +46,19 @@ class PlaceTables(NamedTuple):
     reach: float
     none: Array
     walls: Walls | None
+
+
+class Heights(NamedTuple):
+    """Of the tags of a map: ``columns`` (H, A), tables of all antennas for each height, and ``level`` (T,): height of each tag."""
+
+    columns: Integers
+    level: Integers
+
+
+def heights_of(tables: Tables) -> Heights:
+    """The heights that the tables of antennas tell apart."""
+    columns, level = np.unique(tables.level.T, axis=0, return_inverse=True)
+    return Heights(columns, level.reshape(-1).astype(np.int64))
 
 
 class TagSilence(NamedTuple):
@@ -62,23 +85,22 @@ class Listed(NamedTuple):
     far: Array
 
 
-def place_tables(model: RfidModel, packed: Packed, tables: Tables, logs: NDArray[np.float32]) -> PlaceTables | None:
+def place_tables(model: RfidModel, antennas: Antennas, heights: Heights) -> PlaceTables | None:
     """The tables of places, from those of the antennas; None where facings matter, for models that have none, and where they would
-    be too large. ``packed``: the model as it is adjusted; ``logs`` (M, Z, 2): those of ``tables`` for each detection model."""
+    be too large."""
+    packed, tables, logs, reach = antennas
     used = [packed.kinds[a.model] for a in model.antennas]
     if not tables.level.size or LOGISTIC in used or tables.facings.max() > 1:
         return None
-    columns, level = np.unique(tables.level.T, axis=0, return_inverse=True)
-    reach = float(np.max(packed.reach[packed.which] + np.hypot(packed.antennas[:, 0], packed.antennas[:, 1])))
     half = math.ceil(reach / CELL)
-    shape = (len(used), len(columns), 2 * half + 1, 2 * half + 1)
+    shape = (len(used), len(heights.columns), 2 * half + 1, 2 * half + 1)
     if math.prod(shape) > MOST:
         return None
     gain, missed = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
     q = packed.false_read + packed.span * tables.sigmoids[0]
     none = np.log(np.array((q, 1.0 - q)))
-    _fill(packed, tables, logs, columns, half, none, gain, missed)
-    return PlaceTables(gain, missed, level.reshape(-1).astype(np.int64), reach, none, packed.walls)
+    _fill(packed, tables, logs, heights.columns, half, none, gain, missed)
+    return PlaceTables(gain, missed, heights.level, reach, none, packed.walls)
 
 
 def silence(tables: PlaceTables, antennas: Integers, rounds: Integers, odds: float, tempering: float) -> TagSilence:

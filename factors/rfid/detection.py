@@ -18,13 +18,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.rfid import adjustment, near, weighing
+from factors.rfid import adjustment, anywhere, near, weighing
 from factors.rfid import kernels as rfid_kernels
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.index import tag_index
 from factors.rfid.model import Packed, RfidModel
 from factors.rfid.near import MapTags
-from factors.rfid.places import Places, in_reach
+from factors.rfid.places import Places, in_reach, is_wide, reach_of
 from factors.rfid.tables import Tables, make_tables
 from factors.se2 import Array, Integers
 from factors.walls import NO_WALLS, walls_around
@@ -149,7 +149,7 @@ class RfidLikelihood:
         ``parameters`` (N, 2 M): of the detection models at each pose, by default its own.
         """
         poses = np.ascontiguousarray(poses, dtype=float)
-        if parameters is None and not looks.offsets.any() and self._places.is_wide(poses):
+        if parameters is None and not looks.offsets.any() and is_wide(poses, reach_of(self.packed)):
             return self._places.log_likelihood(poses, looks, self.model.tempering)
         parameters = self.parameters[None] if parameters is None else np.ascontiguousarray(parameters)
         return weighing.log_likelihood(*self._tabled, looks.seen, poses, float(self.model.tempering), parameters)
@@ -174,9 +174,11 @@ class RfidLikelihood:
     @cached_property
     def reached(self) -> float:
         """How many tags are in reach of a pose among them, on average."""
-        packed = self._unadjusted.packed
-        reach = np.max(packed.reach[packed.which] + np.hypot(*packed.antennas[:, :2].T), initial=0.0)
-        return in_reach(self.tags.points[:, :2], float(reach))
+        return in_reach(self.tags.points[:, :2], reach_of(self._unadjusted.packed))
+
+    @cached_property
+    def _heights(self) -> anywhere.Heights:
+        return anywhere.heights_of(self._tables)
 
     @property
     def _places(self) -> Places:
@@ -188,7 +190,8 @@ class RfidLikelihood:
             if len(kept) >= KEPT:
                 del kept[next(k for k in kept if any(k))]
             packed = adjustment.adjusted(self._unadjusted.packed, steps * rounded)
-            kept[key] = Places.of(self.model, packed, self._unadjusted._tables, self.tags.points, self.tags.normals)
+            first = self._unadjusted
+            kept[key] = Places.of(self.model, packed, first._tables, first._map, first._heights)
         return kept[key]
 
     def by_tag(self, pose: Array, looks: TagReadCounts) -> tuple[Array, Array, Array]:

@@ -9,17 +9,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.rfid import anywhere, scattered
-from factors.rfid.anywhere import Listed, PlaceTables, TagSilence
+from factors.rfid.anywhere import Antennas, Heights, Listed, PlaceTables, TagSilence
 from factors.rfid.counts import TagReadCounts
-from factors.rfid.index import TagIndex, tag_index
+from factors.rfid.index import TagIndex
 from factors.rfid.model import Packed, RfidModel
-from factors.rfid.scattered import Antennas, Looked
+from factors.rfid.near import MapTags
+from factors.rfid.scattered import Looked
 from factors.rfid.tables import Tables, logs_of
 from factors.se2 import Array, Integers
 
 WIDE = 2.0  # times the square that an antenna reaches: poses that touch more are looked at one by one
 PLACED = 25  # work of a pose, besides what it looks at
 BY_ANTENNA = 7  # work of a tag that is looked at by one antenna alone, where there are no tables of places
+
+
+def reach_of(packed: Packed) -> float:
+    """How far [m] an antenna of a model, as it is adjusted, reaches from the robot's middle."""
+    levers = np.hypot(packed.antennas[:, 0], packed.antennas[:, 1])
+    return float(np.max(packed.reach[packed.which] + levers, initial=0.0))
+
+
+def is_wide(poses: Array, reach: float) -> bool:
+    """Whether poses (N, 3) are so far apart that most tags are within ``reach`` [m] of few of them."""
+    reached = np.ptp(poses[:, :2], axis=0) + 2.0 * reach
+    return bool(np.prod(reached) > WIDE * (2.0 * reach) ** 2)
 
 
 def in_reach(points: Array, reach: float) -> float:
@@ -44,31 +57,19 @@ class Places:
     _last: dict[tuple[object, ...], TagSilence] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, model: RfidModel, packed: Packed, tables: Tables, points: Array, normals: Array) -> Places:
-        """For tags at ``points`` (T, 3) with ``normals`` (T, 2), from the ``tables`` of the antennas. ``packed``: the model as it
-        is adjusted."""
+    def of(cls, model: RfidModel, packed: Packed, tables: Tables, of_map: MapTags, heights: Heights) -> Places:
+        """For the tags of a map with their ``heights``, from the ``tables`` of the antennas. ``packed``: the model as it is
+        adjusted."""
         logs = logs_of(packed)
-        index = tag_index(points)
-        reach = np.max(packed.reach[packed.which] + np.hypot(packed.antennas[:, 0], packed.antennas[:, 1]), initial=0.0)
-        order = index.order
-        of_tags = np.ascontiguousarray(points[order]), np.ascontiguousarray(normals[order])
-        found = anywhere.place_tables(model, packed, tables, logs)
-        antennas = Antennas(packed, tables, logs, float(reach))
-        return cls(antennas, found, index, *of_tags, np.ascontiguousarray(tables.level[:, order]))
-
-    @property
-    def reach(self) -> float:
-        """How far [m] an antenna reaches from the robot's middle."""
-        return self.antennas.reach
-
-    def is_wide(self, poses: Array) -> bool:
-        """Whether poses (N, 3) are so far apart that most tags are in reach of few of them."""
-        reached = np.ptp(poses[:, :2], axis=0) + 2.0 * self.reach
-        return bool(np.prod(reached) > WIDE * (2.0 * self.reach) ** 2)
+        order = of_map.cells.order
+        of_tags = np.ascontiguousarray(of_map.points[order]), np.ascontiguousarray(of_map.normals[order])
+        antennas = Antennas(packed, tables, logs, reach_of(packed))
+        found = anywhere.place_tables(model, antennas, heights)
+        return cls(antennas, found, of_map.cells, *of_tags, np.ascontiguousarray(tables.level[:, order]))
 
     def work(self, looks: TagReadCounts) -> int:
         """How many tags are looked at for one pose, on average; one that was read counts as four."""
-        near = in_reach(self.points[:, :2], self.reach)
+        near = in_reach(self.points[:, :2], self.antennas.reach)
         if self.tables is None:
             return PLACED + round(BY_ANTENNA * len(looks.antennas) * near)
         return PLACED + round(near) + 4 * int(np.count_nonzero(looks.hits.any(axis=0)))

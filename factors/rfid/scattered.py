@@ -13,23 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid.anywhere import mixed
+from factors.rfid.anywhere import Antennas, mixed
 from factors.rfid.index import TagIndex, cells
 from factors.rfid.kernels import FAST
-from factors.rfid.model import Packed
-from factors.rfid.tables import Tables, row_of
+from factors.rfid.tables import row_of
 from factors.se2 import Array, Integers
 from factors.walls import farther
-
-
-class Antennas(NamedTuple):
-    """A model and its tables. ``logs`` (M, Z, 2): log q and log(1 - q) for the logits of the tables, of each detection model as it
-    is adjusted; ``reach`` [m], from the robot's middle."""
-
-    packed: Packed
-    tables: Tables
-    logs: NDArray[np.float32]
-    reach: float
 
 
 class Looked(NamedTuple):

@@ -27,6 +27,7 @@ from factors.se2 import Array
 Array32 = NDArray[np.float32]
 
 CELL = 0.05  # m
+COARSE = 8  # cells along each side of a block
 FACINGS = 9  # knots of the facing's cosine
 NEGLIGIBLE = 15.0  # log of the ratio of two likelihoods of which the smaller one does not count
 STEP, LEVEL = 0.01, 0.04  # of the logit, in the tables; m of height within which tags share a table
@@ -37,7 +38,9 @@ _LOGITS = np.arange(round(-2.0 * NEGLIGIBLE_LOGIT / STEP) + 1) * STEP + NEGLIGIB
 class Tables(NamedTuple):
     """``rows``: places in ``sigmoids`` of all tables, each (F, NX, NX), and ``chances``: the sigmoids there; ``start`` (L,): first
     index of each table; ``half`` (L,): knots from its middle to its edge; ``facings`` (L,); ``level`` (A, T): table of each
-    antenna and tag; ``sigmoids`` (Z,): of logits :data:`STEP` apart, from :data:`NEGLIGIBLE_LOGIT` to its negative."""
+    antenna and tag; ``sigmoids`` (Z,): of logits :data:`STEP` apart, from :data:`NEGLIGIBLE_LOGIT` to its negative. ``most``: the
+    largest chance, of all facings, in each block of :data:`COARSE` by :data:`COARSE` cells, of all tables; ``first`` (L,): where
+    those of each begin."""
 
     rows: NDArray[np.uint16]
     chances: Array32
@@ -46,6 +49,8 @@ class Tables(NamedTuple):
     facings: NDArray[np.int64]
     level: NDArray[np.int64]
     sigmoids: Array
+    most: Array32
+    first: NDArray[np.int64]
 
 
 _last: dict[tuple[bytes, ...], Tables] = {}
@@ -101,15 +106,27 @@ def _made(model: RfidModel, packed: Packed, heights: Array) -> Tables:
         level[i] = found[which]
     sizes = np.array([t.size for t in tables], dtype=np.int64)
     rows = np.concatenate([t.ravel() for t in tables]) if tables else np.empty(0, np.uint16)
+    blocks = [_blocks(t) for t in tables]
+    most = np.concatenate([b.ravel() for b in blocks]) if tables else np.empty(0, np.uint16)
+    small = sigmoids.astype(np.float32)
     return Tables(
         rows,
-        sigmoids.astype(np.float32)[rows],
+        small[rows],
         np.concatenate((np.zeros(1, np.int64), np.cumsum(sizes)))[: len(tables)],
         np.array(halves, dtype=np.int64),
         np.array([len(t) for t in tables], dtype=np.int64),
         level,
         sigmoids,
+        small[most],
+        np.cumsum([0, *(b.size for b in blocks)])[: len(tables)].astype(np.int64),
     )
+
+
+def _blocks(table: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """The largest row, of all facings, in each block of a table (F, NX, NX)."""
+    begins = np.arange(0, table.shape[1], COARSE)
+    highest = np.maximum.reduceat(table.max(axis=0), begins, axis=0)
+    return np.asarray(np.maximum.reduceat(highest, begins, axis=1))
 
 
 @compiled

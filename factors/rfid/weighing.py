@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from factors.compiled import compiled
 from factors.rfid.adjustment import MOST_CERTAIN, adjusted
+from factors.rfid.anywhere import mixed as of_states
 from factors.rfid.kernels import FAST
 from factors.rfid.model import LOGISTIC, NEGLIGIBLE_LOGIT, Packed
 from factors.rfid.near import MapTags, NearTags, Seen, near_tags, reach_of
 from factors.rfid.tables import CELL, Tables, row_of
+from factors.rfid.telling import Looks, Tags, telling
 from factors.se2 import Array, Integers
 from factors.walls import Walls, around, crosses
 
@@ -27,8 +29,6 @@ SHIFT = 0.05  # of the logit of a model's peak, to which it is rounded, as in ta
 MIXED = 500  # factors up to two, of which a product is no overflow
 _WHERE_IT_IS = np.zeros((1, 2))
 
-_Looks = tuple[Array, Integers, Integers]  # offsets, antennas and rounds of read counts
-_Tags = tuple[Array, Array, Integers, Integers]  # points, normals, tables (A, T) and hits (K, T)
 _MANTISSA, _HALF = 0x000FFFFFFFFFFFFF, 0x3FE0000000000000  # bits of a number, and of 0.5
 
 
@@ -48,9 +48,16 @@ def log_likelihood(
     reach = _reach(packed, looks, parameters)
     near = near_tags(of_map, seen, poses, reach)
     tags, odds, elsewhere = _tabled(tables, near), near.odds, near.elsewhere
-    matters = np.empty(len(odds), np.bool_)
-    _near(poses, tags, reach, matters)
-    out = np.full(len(poses), tempering * len(of_map.points) * _silence(packed, looks[2]))
+    near_enough = np.empty(len(odds), np.bool_)
+    _near(poses, tags, reach, near_enough)
+    matters = telling(packed, tables, poses, looks, parameters, tags, near_enough, tempering)
+    base = tempering * len(of_map.points) * _silence(packed, looks[2])
+    none = packed.false_read + packed.span / (1.0 + math.exp(-NEGLIGIBLE_LOGIT))
+    for t in range(len(odds)):
+        hits = near.hits[:, t].sum()
+        if hits > 0 and not near_enough[t]:  # all poses are as likely
+            base += of_states(tempering * hits * (math.log(none) - math.log1p(-none)), odds[t], elsewhere[t])
+    out = np.full(len(poses), base)
     size = min(BLOCK, len(poses))
     at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
     own, product, room, mixed = np.empty(size), np.empty(size), np.empty(size), np.ones(size)
@@ -62,9 +69,9 @@ def log_likelihood(
         _place(packed, poses[first : first + count], looks, own_parameters, at, models)
         factors = 0
         for t in range(len(odds)):
-            if not matters[t]:
+            if not near_enough[t]:
                 continue
-            _of_tag(packed, tables, at, models, count, looks, tags, t, where_it_is, own, product, room)
+            _of_tag(packed, tables, at, models, count, looks, tags, t, matters[:, t], where_it_is, own, product, room)
             if odds[t] == -np.inf or elsewhere[t] == -np.inf:
                 for n in range(count):
                     found[n] += tempering * own[n]
@@ -107,7 +114,7 @@ def displaced(
     kept = np.empty(len(heard), np.bool_)
     _near(poses, tags, reach, kept)
     for u in range(len(heard)):
-        kept[u] &= odds[near.tags[u]] > -np.inf
+        kept[u] = (kept[u] or heard[u]) and odds[near.tags[u]] > -np.inf
     found = np.flatnonzero(kept)
     out = np.empty((len(found), len(shifts)))
     each = len(poses)
@@ -120,8 +127,9 @@ def displaced(
     at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
     own, product, room = np.empty(size), np.empty(size), np.empty(size)
     _place(packed, moved, looks, parameters.reshape(1, -1), at, models)
+    matters = np.ones(len(looks[1]), np.bool_)
     for u in range(len(found)):
-        _of_tag(packed, tables, at, models, size, looks, tags, found[u], shifts, own, product, room)
+        _of_tag(packed, tables, at, models, size, looks, tags, found[u], matters, shifts, own, product, room)
         for i in range(len(shifts)):
             most = own[i * each]
             for n in range(i * each + 1, (i + 1) * each):
@@ -140,7 +148,7 @@ def displaced(
 
 
 @compiled
-def _tabled(tables: Tables, near: NearTags) -> _Tags:
+def _tabled(tables: Tables, near: NearTags) -> Tags:
     """What tables are needed of tags."""
     levels = np.empty((len(tables.level), len(near.tags)), np.int64)
     for a in range(len(levels)):
@@ -150,7 +158,7 @@ def _tabled(tables: Tables, near: NearTags) -> _Tags:
 
 
 @compiled
-def _reach(packed: Packed, looks: _Looks, parameters: Array) -> float:
+def _reach(packed: Packed, looks: Looks, parameters: Array) -> float:
     """How far [m] the antennas of ``looks`` reach at most, with any of the ``parameters`` (N or 1, 2 M), from the pose."""
     offsets, antennas, _ = looks
     reach = 0.0
@@ -163,9 +171,9 @@ def _reach(packed: Packed, looks: _Looks, parameters: Array) -> float:
 
 
 @compiled
-def _near(poses: Array, tags: _Tags, reach: float, out: NDArray[np.bool_]) -> None:
-    """Which tags (T,) are read, or within ``reach`` [m] of the box that holds the poses (N, 3)."""
-    points, hits = tags[0], tags[3]
+def _near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) -> None:
+    """Which tags (T,) are within ``reach`` [m] of the box that holds the poses (N, 3)."""
+    points = tags[0]
     low_x = high_x = poses[0, 0]
     low_y = high_y = poses[0, 1]
     for n in range(1, len(poses)):
@@ -175,12 +183,10 @@ def _near(poses: Array, tags: _Tags, reach: float, out: NDArray[np.bool_]) -> No
         x, y = points[t, 0], points[t, 1]
         dx, dy = max(low_x - x, 0.0, x - high_x), max(low_y - y, 0.0, y - high_y)
         out[t] = dx * dx + dy * dy < reach * reach
-        for k in range(len(hits)):
-            out[t] |= hits[k, t] > 0
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def _place(packed: Packed, poses: Array, looks: _Looks, parameters: Array, at: Array, models: Array) -> None:
+def _place(packed: Packed, poses: Array, looks: Looks, parameters: Array, at: Array, models: Array) -> None:
     """For each look ``at`` (K, 4, N): place of the antenna, cosine and sine of its heading; and for each of ``models`` (M, 2, N):
     one over the scale of the range, and rate of the probabilities, at poses (N, 3) with ``parameters`` (N or 1, 2 M)."""
     offsets, antennas, _ = looks
@@ -220,22 +226,25 @@ def _of_tag(
     at: Array,
     models: Array,
     count: int,
-    looks: _Looks,
-    tags: _Tags,
+    looks: Looks,
+    tags: Tags,
     t: int,
+    matters: NDArray[np.bool_],
     shifts: Array,
     own: Array,
     product: Array,
     room: Array,
 ) -> None:
-    """The log-likelihood ``own`` (N,) of one tag above that of a silence out of reach. ``shifts`` (S, 2): how much tag and antenna
-    have been moved to where the walls are, N / S poses each."""
+    """The log-likelihood ``own`` (N,) of one tag above that of a silence out of reach, by those looks that matter (K,). ``shifts``
+    (S, 2): how much tag and antenna have been moved to where the walls are, N / S poses each."""
     points, normals, levels, hits = tags
     _, antennas, rounds = looks
-    silent, factors = -_silence(packed, rounds), 0
+    silent, factors = -_silence(packed, rounds[matters]), 0
     for n in range(count):
         own[n], product[n] = silent, 1.0
     for k in range(len(antennas)):
+        if not matters[k]:
+            continue
         level = levels[antennas[k], t]
         model = models[packed.which[antennas[k]]]
         unit, rate = _attenuated(packed.walls, at[k], points[t], shifts, model[0], count), model[1]

@@ -14,7 +14,7 @@ from benchmarking.trials import BEFORE, HOLD, JUMP, POSITION, is_right
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.base import Estimator
-from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import SimulationSettings
@@ -76,7 +76,11 @@ def run_simulated_trials(job: SimulatedTrialJob) -> list[SimulatedTrial]:
 
 def start_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     """The beginning of a drive, from an unknown start, long enough to hold a correct estimate at three deadlines."""
-    log = simulate(lasting(job.simulation, 3.0 * job.deadline + HOLD + 1.0), seed)
+    return started(simulate(lasting(job.simulation, 3.0 * job.deadline + HOLD + 1.0), seed), job, seed)
+
+
+def started(log: Log, job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
+    """The trial on the log of such a drive."""
     clock = Clock()
     result = run(log, RunConfig(job.estimator, job.settings, job.sensors, prior="unknown", seed=seed), watch=clock)
     first = float(log.streams["rfid"].t[0])

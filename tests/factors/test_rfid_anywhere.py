@@ -7,6 +7,7 @@ from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.index import tag_index, within
 from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel, bake
+from factors.rfid.places import is_wide
 
 BEAM = BeamModel()
 ANTENNAS = tuple(Antenna(0.2, 0.1 * k, 1.2, 1.5 * k) for k in range(4))
@@ -93,8 +94,8 @@ def test_what_is_out_of_reach_tells_what_silence_and_false_reads_tell():
 def test_only_tags_in_reach_are_counted_as_work():
     likelihood, looks, near, anywhere = scene((1.2,))
     assert likelihood.work(looks) < len(likelihood.tags.points)
-    assert likelihood._places.is_wide(anywhere)
-    assert not likelihood._places.is_wide(near)
+    assert is_wide(anywhere, likelihood._places.antennas.reach)
+    assert not is_wide(near, likelihood._places.antennas.reach)
 
 
 @pytest.mark.parametrize("size", [(30.0, 10.0), (0.0, 0.0), (1e6, 3.0)])

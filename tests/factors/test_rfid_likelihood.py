@@ -113,6 +113,35 @@ def test_tables_are_near_the_likelihood(name: str) -> None:
     assert np.abs(found - exact).mean() < 0.05 * np.abs(exact).mean()
 
 
+@pytest.mark.parametrize("tempering", [0.3, 1.0])
+def test_what_is_left_out_of_many_tags_does_not_matter(tempering: float) -> None:
+    """Looks at tags that cannot have been read, and reads from out of reach, of a dense map: tables are as wrong by their cells."""
+    rng = np.random.default_rng(3)
+    antennas = tuple(Antenna(0.2 * math.cos(a), 0.2 * math.sin(a), 1.0, a) for a in np.arange(8) * math.pi / 4.0)
+    model = RfidModel(antennas, (BeamModel(),), 1e-3, 0.0, tempering)
+    points = np.column_stack((rng.uniform(0.0, 40.0, (1500, 2)), np.full(1500, 1.1)))
+    likelihood = RfidLikelihood(model, TagArray(points, np.full(1500, np.nan)))
+    truth = np.array((20.0, 20.0, 0.3))
+    chance = np.stack([likelihood.probabilities(truth[None], k)[0] for k in range(8)])
+    assert (chance[:, np.hypot(*(points[:, :2] - truth[:2]).T) > 10.0] < 0.002).all()
+    hits = (rng.random(chance.shape) < chance).astype(np.int64)
+    looks = TagReadCounts(np.zeros((8, 3)), np.arange(8), np.ones(8, dtype=np.int64), hits, np.full(1500, -2.8))
+    poses = truth + rng.normal(size=(300, 3)) * (0.3, 0.3, 0.1)
+    parameters = rng.normal(size=(300, 2)) * (0.02, 0.1)
+    found = likelihood.log_likelihood(poses, looks, parameters)
+    exact = np.array(
+        [-likelihood.joint_score(pose, own, looks).nll[0] for pose, own in zip(poses, parameters, strict=True)]
+    )
+    assert np.std(found - exact) < 0.1 * np.std(exact)
+    assert np.abs(found - exact).mean() < 0.01 * np.abs(exact).mean()
+
+
+def test_no_tables_of_places_are_made_for_a_single_pose() -> None:
+    likelihood, looks = scene(BeamModel())
+    likelihood.adjusted(np.array((0.1, 0.3))).log_likelihood(POSE[None], looks.moved(np.zeros(3)))
+    assert not likelihood._of_parameters
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_many_looks_at_many_tags_add_up(name: str) -> None:
     """Tables multiply the likelihoods of looks and of tags before they take logarithms: of 600 poses, 100 rounds and 1,500 tags."""

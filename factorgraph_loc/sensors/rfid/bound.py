@@ -28,6 +28,7 @@ from factors.rfid.factor import RfidFactor
 from factors.se2 import Array
 from factors.update import Correction
 
+PLACED = 5.0  # m: standard deviation of the position, above which a scan tells nothing of single tags
 SCAN = 50  # work of a scan, besides that of the tags in reach
 NO_RESIDUAL = np.empty((0, 1))
 
@@ -149,9 +150,10 @@ class TagSensor(Sensor):
             estimated = self._estimated(view)
             if view.newest and self.suspicious_since is None and self._settled.add(m.t, estimated):
                 self._for_search = likelihood.adjusted(self._settled.values)
-            told = self.tags.told(here, view.pose, view.covariance, estimated)
-            looks = self.tags.with_states(looks, told)
-            here = looks if view.offset is None else looks.moved(view.offset.delta)
+            if np.trace(view.covariance[:2, :2]) < PLACED**2:
+                told = self.tags.told(here, view.pose, view.covariance, estimated)
+                looks = self.tags.with_states(looks, told)
+                here = looks if view.offset is None else looks.moved(view.offset.delta)
         yield replace(self._detection(m, here, looks), told=told, settled=self._for_search)
         if self._silence.lasts and view.newest:
             return
@@ -232,7 +234,8 @@ class TagSensor(Sensor):
 
     @property
     def suspicious_since(self) -> float | None:
-        return self._monitor.suspicious_since
+        since = self._monitor.suspicious_since, self._consistency.suspicious_since
+        return min((t for t in since if t is not None), default=None)
 
     @property
     def silent(self) -> bool:
@@ -244,6 +247,7 @@ class TagSensor(Sensor):
 
     def accept(self) -> None:
         self._monitor.accept()
+        self._consistency.accept()
 
     def gathered(self, observations: Sequence[TagObservation]) -> list[Term]:
         """Merge all reads and misses into one factor."""

@@ -62,6 +62,8 @@ class ConsistencyMonitor:
     The bands of distance and the antennas have a chi-square each, where ``together`` rounds tell as much as one; groups of
     which few reads are predicted are merged, far bands with nearer ones: there are the reads if a range is too short. The model is
     doubted while one of them is beyond chance, and more than :data:`DIFFERENT` of the predicted reads are missing or too many.
+    That may come of a wrong pose: ``suspicious_since`` is the time [s] since which they were not as by chance; None without doubts,
+    and once the pose is accepted.
     """
 
     EVENT = "reads are not as the detection models predict"
@@ -69,7 +71,9 @@ class ConsistencyMonitor:
     def __init__(self, antennas: Sequence[str]) -> None:
         self._groups = ReadGroups(antennas)
         self._last = -math.inf
+        self._odd_since: float | None = None
         self.doubted = False
+        self.suspicious_since: float | None = None
 
     def add(
         self, t: float, looks: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_], together: float
@@ -83,7 +87,13 @@ class ConsistencyMonitor:
         self._groups.sums[2] *= forgotten**2
         self._groups.add(looks.antennas, looks.rounds, reads, counts)
         chance = min((self._chance(one, together) for one in (slice(0, BANDS), slice(BANDS, None))), default=1.0)
-        self.doubted = chance < (TRUSTED if self.doubted else DOUBTED)
+        if chance >= TRUSTED:
+            self._odd_since = None
+        elif self._odd_since is None:
+            self._odd_since = t
+        before, self.doubted = self.doubted, chance < (TRUSTED if self.doubted else DOUBTED)
+        if self.doubted != before:
+            self.suspicious_since = self._odd_since if self.doubted else None
 
     def _chance(self, groups: slice, together: float) -> float:
         """The probability of counts that are so far off with a right model; 1 if they are not off by much."""
@@ -101,10 +111,15 @@ class ConsistencyMonitor:
         told = self._groups.told()
         return self._groups.shares(told if len(told) else self._groups.told(1.0))
 
+    def accept(self) -> None:
+        """Accept the pose: the model is wrong instead."""
+        self.suspicious_since = None
+
     def clear(self) -> None:
         """Forget everything: the track was wrong."""
         self._groups.sums[:] = 0.0
-        self.doubted = False
+        self.doubted, self._odd_since = False, None
+        self.accept()
 
 
 @compiled
