@@ -183,7 +183,7 @@ class TagSensor(Sensor):
             return False
         if view.newest:
             self._monitor.add(t, correction.excess_nll, correction.variance)
-        if observation.told is not None and self.suspicious_since is None:
+        if observation.told is not None and self._monitor.suspicious_since is None:
             self.tags.learn(t, observation.told)
             if view.newest:
                 self._count(observation, view)
