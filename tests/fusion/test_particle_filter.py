@@ -207,10 +207,12 @@ class Likely:
 
     blocks = ()
 
-    def __init__(self, log_likelihood):
-        self._log_likelihood = log_likelihood
+    def __init__(self, log_likelihood, work=1):
+        self._log_likelihood, self.work = log_likelihood, work
+        self.weighed = 0
 
     def log_likelihood(self, poses, values):
+        self.weighed += len(poses)
         return self._log_likelihood(poses)
 
 
@@ -228,6 +230,26 @@ def test_a_likelihood_that_is_no_number_comes_to_an_end(log, nowhere):
         RunFailedError, match=r"^at 2.500 s the likelihood of a measurement is a finite number for none"
     ):
         filter._weigh(Likely(lambda poses: np.full(len(poses), nowhere)))
+
+
+def test_what_is_much_work_is_weighed_by_a_few_particles_first(log):
+    """A narrow place, for a quarter of the work: of 200 other seeds the largest error of its middle was 0.32 of its standard deviation,
+    that of these 0.13 of them, and that of the log of the evidence, -12.1, 3.8."""
+    found = []
+    for work in (1, 1000):
+        setup = Setup(log.rig, log.world, ("odometry", "bearing_range"), np.random.default_rng(1))
+        filter = ParticleFilter(setup, ParticleFilterSettings(self_calibration=False))
+        filter.initialize(PosePrior(2.5, np.zeros(3), np.eye(3)))
+        place = Likely(lambda poses: -0.5 * np.sum(((poses - 0.5) / 0.02) ** 2, axis=1), work)
+        evidence = filter._weigh(place)
+        found.append((evidence, *filter._state.moments, place.weighed))
+    assert found[1][3] < 0.4 * found[0][3]
+    assert len(filter._state.poses) == 5000
+    expected = -1.5 * np.log(1.0 + 1.0 / 0.02**2) - 0.5 * 3 * 0.5**2 / (1.0 + 0.02**2)
+    for evidence, mean, covariance, _ in found:
+        assert evidence == pytest.approx(expected, abs=5.0)
+        np.testing.assert_allclose(mean, 0.5, atol=0.5 * 0.02)
+        np.testing.assert_allclose(np.sqrt(np.diag(covariance)), 0.02, rtol=0.2)
 
 
 def test_what_no_particle_explains_is_taken_in_few_shares():
