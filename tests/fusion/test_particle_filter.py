@@ -233,8 +233,8 @@ def test_a_likelihood_that_is_no_number_comes_to_an_end(log, nowhere):
 
 
 def test_what_is_much_work_is_weighed_by_a_few_particles_first(log):
-    """A narrow place, for a quarter of the work: of 200 other seeds the largest error of its middle was 0.32 of its standard deviation,
-    that of these 0.13 of them, and that of the log of the evidence, -12.1, 3.8."""
+    """A narrow place, for a quarter of the work: of 200 other seeds the largest error of its middle was 0.32 of its standard
+    deviation, that of these 0.13 of them, and that of the log of the evidence, which is -12.1, was 3.8."""
     found = []
     for work in (1, 1000):
         setup = Setup(log.rig, log.world, ("odometry", "bearing_range"), np.random.default_rng(1))
