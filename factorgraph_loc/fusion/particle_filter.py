@@ -310,7 +310,7 @@ class ParticleFilter(Filter):
         of the likelihood. RunFailedError if that is not finite for any of them."""
         evidence, left, enough, whole = 0.0, 1.0, self._settings.resample_below, self._state
         count = self._settings.particles
-        few = observation.work * count > HEAVY
+        few = count > FEW and observation.work * count > HEAVY
         if few:
             self._state = whole.thinned(FEW)
             count = FEW if self._search.doubts else count  # a track in doubt is not worth more
