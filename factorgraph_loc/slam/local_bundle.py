@@ -1,8 +1,9 @@
 """Local bundle adjustment of the last keyframes and the points waiting there, where no points of the graph determine the
 rotation.
 
-Odometry alone may be wrong by more pixels than the parallax to be triangulated. Points seen from several keyframes determine the
-rotation better. The result serves as a linearization point only: the sightings enter the graph unchanged.
+Odometry alone may be wrong by more pixels than the parallax to be triangulated, and far more where wheels slip. Points seen from
+several keyframes determine the rotation better, before anything is known of their distances. The result serves as a linearization
+point only: the sightings enter the graph unchanged.
 """
 
 from collections.abc import Hashable, Mapping, Sequence
@@ -10,58 +11,108 @@ from collections.abc import Hashable, Mapping, Sequence
 import numpy as np
 
 from factorgraph_loc.fusion.graph_parts import Keyframe
-from factorgraph_loc.slam.new_points import FEWEST, KeyframeCamera, PointSighting, agreed, apart
-from factors import positive
+from factorgraph_loc.slam.new_points import FEWEST, PointSighting
+from factorgraph_loc.vision.consensus import Truths
+from factors import positive, se2
 from factors.camera import bundle_kernels as kernels
-from factors.camera.model import CameraModel, lens_of
+from factors.camera.model import CameraModel, camera_pose, lens_of
 from factors.se2 import Array
 
-ROUGH = 0.5  # standard deviation of an initial point, relative to its depth
-ENOUGH = 8  # points
-ITERATIONS = 12
+DISTANCE = 3.0  # m: first guess of how far points are away
+FEW, ENOUGH = 5, 8  # points that a keyframe shares with the one before: a third of what it sees, within these bounds
+ITERATIONS = 30
+FITS, MOST = 3.0, 0.5  # standard deviations, and the share of a keyframe's sightings that must fit
+SLIPPED = 0.1  # rad: what points that move with the image for their nearness cannot explain
 
 
 def bundled(
     model: CameraModel,
     keyframes: Sequence[Keyframe],
     poses: Sequence[Array],
-    slacks: Sequence[float],
     waiting: Mapping[Hashable, Sequence[PointSighting]],
 ) -> list[tuple[Array, Array]] | None:
-    """Adjusted poses (3,) and tilts (2,) of consecutive ``keyframes``, the first pose held, from the initial
-    ``poses``, which displace points by ``slacks`` [px]; None with fewer than :data:`ENOUGH` points.
+    """Adjusted poses (3,) and tilts (2,) of the last of consecutive ``keyframes``, as far as each shares points with the one
+    before; the first pose held, from the initial ``poses``.
+
+    None with fewer than :data:`ENOUGH` points, or where most of what a keyframe sees does not fit.
     """
-    first = keyframes[0].index
-    places = [KeyframeCamera.of(model, pose, slack) for pose, slack in zip(poses, slacks, strict=True)]
-    often = [seen for w in waiting.values() if len(seen := [s for s in w if s.keyframe >= first]) >= FEWEST]
-    ends = [(seen[i], places[seen[i].keyframe - first]) for seen in often for i in (0, -1)]
-    often = [s for s, a, b in zip(often, ends[::2], ends[1::2], strict=True) if apart(model, *a, *b, ROUGH)]
+    often = _seen_often(keyframes[0].index, waiting)
+    shared, sees = np.zeros(len(keyframes)), np.zeros(len(keyframes))
+    for seen in often:
+        rows = np.array([s.keyframe for s in seen]) - keyframes[0].index
+        sees[rows] += 1
+        shared[rows[1:]] += np.diff(rows) == 1
+    begin = int(np.flatnonzero(shared < np.clip(sees / 3.0, FEW, ENOUGH))[-1])
+    keyframes, poses, first = keyframes[begin:], poses[begin:], keyframes[begin].index
+    often = _seen_often(first, waiting)
     if len(often) < ENOUGH:
         return None
-    points: list[Array] = []
-    sightings: list[PointSighting] = []
-    starts = [0]
-    for seen in often:
-        found = agreed(model, seen, [places[s.keyframe - first] for s in seen], ROUGH)
-        if found is not None:
-            points.append(found[0].position)
-            sightings += found[1]
-            starts.append(len(sightings))
-    if len(points) < ENOUGH:
+    starts = _turned(model, poses, first, often)
+    adjusted, tilts, fits = _adjusted(model, keyframes, starts, often)
+    frames = np.array([s.keyframe - first for seen in often for s in seen])
+    if np.any(np.bincount(frames, fits) < MOST * np.bincount(frames)):
         return None
+    fitting = iter(fits.tolist())
+    often = [fitted for seen in often if len(fitted := [s for s in seen if next(fitting)]) >= FEWEST]
+    if len(often) < ENOUGH:
+        return None
+    adjusted, tilts, _ = _adjusted(model, keyframes, adjusted, often)
+    return list(zip(adjusted, tilts, strict=True))
+
+
+def _adjusted(
+    model: CameraModel, keyframes: Sequence[Keyframe], poses: Sequence[Array], often: Sequence[Sequence[PointSighting]]
+) -> tuple[Sequence[Array], Array, Truths]:
+    """Adjusted poses (3,) and tilts (N, 2) of N keyframes, and which of the M sightings fit; no sighting fits where the points
+    cannot be determined."""
+    first = keyframes[0].index
+    places = [camera_pose(model, pose) for pose in poses]
+    points = []
+    for seen in often:
+        middle = seen[len(seen) // 2]
+        centre, rotation = places[middle.keyframe - first]
+        points.append(centre + DISTANCE * (rotation @ middle.ray))
     steps = [k.from_previous for k in keyframes[1:] if k.from_previous is not None]
-    adjusted = kernels.adjusted(
-        lens_of(model),
-        model.position,
-        model.rotation,
-        np.array(poses, dtype=float),
-        np.array(points),
-        np.array([s.keyframe - first for s in sightings]),
-        np.array(starts),
-        np.array([s.pixel for s in sightings]),
-        np.array((model.sigma, model.robust, model.tilt)),
-        np.array([step.delta for step in steps]),
-        positive.whitener(np.array([step.covariance for step in steps])),
-        ITERATIONS,
-    )
-    return list(zip(*adjusted, strict=True))
+    frames = np.array([s.keyframe - first for seen in often for s in seen])
+    try:
+        adjusted, tilts, residuals = kernels.adjusted(
+            lens_of(model),
+            model.position,
+            model.rotation,
+            np.array(poses),
+            np.array(points),
+            frames,
+            np.cumsum([0, *map(len, often)]),
+            np.array([s.pixel for seen in often for s in seen]),
+            np.array((model.sigma, model.robust, model.tilt)),
+            np.array([step.delta for step in steps]),
+            positive.whitener(np.array([step.covariance for step in steps])),
+            ITERATIONS,
+        )
+    except np.linalg.LinAlgError:
+        return poses, np.zeros((len(poses), 2)), np.zeros(len(frames), dtype=bool)
+    return list(adjusted), tilts, np.einsum("mi,mi->m", residuals, residuals) < FITS**2
+
+
+def _seen_often(first: int, waiting: Mapping[Hashable, Sequence[PointSighting]]) -> list[list[PointSighting]]:
+    """The sightings from keyframe number ``first`` on of each point that was seen from :data:`FEWEST` of these."""
+    return [seen for w in waiting.values() if len(seen := [s for s in w if s.keyframe >= first]) >= FEWEST]
+
+
+def _turned(
+    model: CameraModel, poses: Sequence[Array], first: int, often: Sequence[Sequence[PointSighting]]
+) -> list[Array]:
+    """The ``poses`` (3,) of keyframes from number ``first`` on, turned as points turn between them where these contradict."""
+    sides: list[dict[int, float]] = [{} for _ in poses]
+    for i, seen in enumerate(often):
+        for s in seen:
+            x, y, _ = model.rotation @ s.ray
+            sides[s.keyframe - first][i] = float(np.arctan2(y, x))
+    turned = [poses[0]]
+    for before, here, at, then in zip(poses, poses[1:], sides, sides[1:], strict=False):
+        step = se2.between(before, here)
+        turns = [at[i] - then[i] for i in at.keys() & then.keys()]
+        if len(turns) >= ENOUGH and abs(turn := float(np.median(turns)) - step[2]) > SLIPPED:
+            step = np.array((step[0], step[1], step[2] + turn))
+        turned.append(se2.compose(turned[-1], step))
+    return turned

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 
+import numpy as np
+
 from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe
 from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.fusion.variables import Node, Values, gather
@@ -21,6 +23,7 @@ from factors.camera.point import PointFactor
 from factors.se2 import Array
 
 KEYFRAME_INTERVAL = 0.5  # s between images that become keyframes for points that are estimated
+LEAST_COMMON = 0.3  # share of an image's features that the last keyframe has: with less there is a new one at once
 
 
 class PointMapper:
@@ -39,6 +42,7 @@ class PointMapper:
             self._unknown = UnknownPoints(model, diagnostics, camera.constants)
         self._pairs = FramePairs(model) if settings.visual_odometry else None
         self._taken = -math.inf
+        self._tracks = np.empty(0, dtype=np.int64)  # of the last keyframe
 
     @property
     def estimates(self) -> bool:
@@ -47,7 +51,16 @@ class PointMapper:
 
     def is_due(self, m: Pixels) -> bool:
         # estimated points need keyframes of their own
-        return self._unknown is not None and self._maps(m) and m.t - self._taken >= self._interval
+        if self._unknown is None or not self._maps(m):
+            return False
+        return m.t - self._taken >= self._interval or self._loses(m)
+
+    def _loses(self, m: Pixels) -> bool:
+        """Whether an image has little in common with that of the last keyframe."""
+        if m.frame is None or not len(self._tracks):
+            return False
+        common = np.count_nonzero(np.isin(m.frame.tracks, self._tracks))
+        return bool(common < LEAST_COMMON * len(m.frame.tracks))
 
     def take(
         self, m: Pixels, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition, *, is_new: bool
@@ -62,6 +75,8 @@ class PointMapper:
             names, used = m.frame.tracks.tolist(), set(points.used.tolist())
         if self._unknown is not None:
             self._taken = m.t
+            if m.frame is not None:
+                self._tracks = m.frame.tracks
             rows = [i for i in range(len(names)) if i not in used]
             guess = self._unknown.take(m, rows, keyframe, guess, graph, addition)
         if self._pairs is not None and is_new:

@@ -105,7 +105,8 @@ class UnknownPoints:
         model = self.model
         if graph.constants is not None:
             model = recalibrated(model, self.estimated.full(graph.constants, len(reprojection.PARAMETERS)))
-        rows = list(rows)
+        # those that have been followed for longest come first
+        rows = list(rows) if m.frame is None else sorted(rows, key=m.frame.tracks.__getitem__)
         if keyframe.from_previous is not None:
             self._distance_travelled += float(np.hypot(*keyframe.from_previous.delta[:2]))
         names = self._named(m, rows, lifted(model, *guess), graph)
@@ -367,12 +368,11 @@ class UnknownPoints:
         if not self._anchored[newest.index]:
             last = [index for index in sorted(slacks)[-BUNDLE:] if graph.is_open(index)]
             poses = [pose if i == newest.index else graph.current(graph.keyframes[i].key) for i in last]
-            some = [slacks[i] for i in last]
             level = replace(self.model, tilt=self._floor.sigma)
-            found = bundled(level, [graph.keyframes[i] for i in last], poses, some, self._new.waiting())
+            found = bundled(level, [graph.keyframes[i] for i in last], poses, self._new.waiting())
             if found is not None:
-                cameras = {i: KeyframeCamera.of(self.model, p, SLACK, t) for i, (p, t) in zip(last, found, strict=True)}
-                return cameras, found[-1][0]
+                placed = zip(last[-len(found) :], found, strict=True)
+                return {i: KeyframeCamera.of(self.model, p, SLACK, t) for i, (p, t) in placed}, found[-1][0]
         tilt = graph.values[tilt_key(newest.index)]
         places = {newest.index: KeyframeCamera.of(self.model, pose, slacks[newest.index], tilt)}
         for i in {s.keyframe for name in names for s in self._new.waiting()[name]}:

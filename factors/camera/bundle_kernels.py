@@ -32,8 +32,9 @@ def adjusted(
     deltas: Array,
     whiteners: Array,
     iterations: int,
-) -> tuple[Array, Array]:
-    """Poses (N, 3), of which the first is held, and tilts (N, 2) that fit best to what is seen of points (P, 3).
+) -> tuple[Array, Array, Array]:
+    """Poses (N, 3), of which the first is held, and tilts (N, 2) that fit best to what is seen of points (P, 3); and the whitened,
+    robustly weighted residuals (M, 2).
 
     ``frames`` (M,): the pose that each of the ``pixels`` (M, 2) was seen from; those of point p are from ``starts`` (P + 1,) p on.
     ``noise``: of a pixel, the scale of its robust loss, and of the tilt [rad]. ``deltas`` (N - 1, 3): from each pose to the next,
@@ -66,7 +67,7 @@ def adjusted(
         residual, jacobian, other, others = other, others, residual, jacobian
         if gained < GAIN * cost:
             break
-    return poses, tilts
+    return poses, tilts, residual
 
 
 @compiled(error_model="numpy")
