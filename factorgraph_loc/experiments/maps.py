@@ -33,7 +33,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.frontend import with_features
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.landmarks import mapping as landmarks_mapping
-from factorgraph_loc.sensors.registry import functions, sensors
+from factorgraph_loc.sensors.registry import functions
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.text import quoted
@@ -304,14 +304,13 @@ def _in_words(start: PosePrior, source: str) -> str:
 
 
 def _smoothed(log: Log, prior: str | None, stages: Stages) -> tuple[Log, str, tuple[str, ...]]:
-    """The log with the smoother's final trajectory, from all sensors but the camera, as its reference; and warnings.
+    """The log with the smoother's final trajectory as its reference, from all sensors and points that its map lacks; and warnings.
 
     It has covariances, so that images of revisited places can still correct it.
     """
-    eyes = {channel.name for channel in sensors()[_mappable(log)["points"]].channels}
-    others = tuple(name for name in log.rig.sensors if name in log.streams and name not in eyes)
+    used = tuple(name for name in log.rig.sensors if name in log.streams)
     started, frame = _started_exactly(log, prior)
-    blind = replace(started, streams={name: s for name, s in log.streams.items() if name not in eyes})
+    config = RunConfig("smoother", {"landmarks": "extended"}, used, prior="log")
     with stages("smoother") as report:
-        result = run(blind, RunConfig("smoother", sensors=others, prior="log"), lambda share: report(share, 1.0))
+        result = run(started, config, lambda share: report(share, 1.0))
     return replace(log, reference=result.final, reference3=None), f"that of the start: {frame}", result.warnings

@@ -1,5 +1,6 @@
 """`fgloc map` of points, from images to files and back to a run's map; `fgloc images`."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -186,3 +187,15 @@ def test_settings_of_points(fgloc, gallery_on_disk, tmp_path):
     result = fgloc("export", log, "-o", tmp_path / "a.ply")
     assert result.exit_code == 2
     assert "has no points to write" in result.stderr
+
+
+def test_images_correct_the_odometry_that_a_map_is_made_with(fgloc, gallery, gallery_on_disk, tmp_path):
+    """Wheels that report a turn of 0.1 rad where there is none; the map has little left to correct."""
+    wheels = gallery.streams["odometry"]
+    bent = dataclasses.replace(wheels, dtheta=wheels.dtheta + np.where(np.arange(len(wheels.t)) == 5, 0.1, 0.0))
+    out = tmp_path / "hall.world.toml"
+    where = gallery_on_disk(streams={**gallery.streams, "odometry": bent})
+    result = fgloc("map", where, "-o", out, "--poses", "odometry", "--json")
+    assert result.exit_code == 0, result.output
+    assert np.median(np.abs(read_world(out).points.positions[:, 0] - WALL)) < 0.05
+    assert json.loads(result.stdout)["turned"] < 0.01  # rad
