@@ -116,7 +116,7 @@ class NewPoints:
             seen = [(s, place) for s in waiting if (place := known[s.keyframe]) is not None]
             if len(seen) < FEWEST or not apart(self._model, *seen[0], *seen[-1]):
                 continue
-            result = agreed(self._model, [s for s, _ in seen], [p for _, p in seen], MAX_SPREAD)
+            result = agreed(self._model, [s for s, _ in seen], [p for _, p in seen])
             if result is not None:
                 del self._waiting[name]
                 found.append((name, *result))
@@ -129,28 +129,27 @@ def apart(
     here: KeyframeCamera,
     last: PointSighting,
     there: KeyframeCamera,
-    spread: float = MAX_SPREAD,
 ) -> bool:
-    """Cheap test whether two rays alone nearly determine the point to ``spread`` times its depth."""
+    """Cheap test whether two rays alone nearly determine the point."""
     sigma = math.hypot(model.sigma, max(here.slack, there.slack)) / model.fx
-    angle = max(MIN_PARALLAX, min(sigma / spread, 0.5))
+    angle = max(MIN_PARALLAX, min(sigma / MAX_SPREAD, 0.5))
     return float((here.rotation @ first.ray) @ (there.rotation @ last.ray)) < math.cos(angle)
 
 
 def agreed(
-    model: CameraModel, seen: Sequence[PointSighting], places: Sequence[KeyframeCamera], spread: float
+    model: CameraModel, seen: Sequence[PointSighting], places: Sequence[KeyframeCamera]
 ) -> tuple[TriangulatedPoint, list[PointSighting]] | None:
-    """The point ``seen`` from ``places``, and its consistent sightings; None if they do not determine it to ``spread`` times its
-    depth. Of contradicting sightings the one without which the others agree best is removed.
+    """The point ``seen`` from ``places``, and its consistent sightings; None if they do not determine it. Of contradicting
+    sightings the one without which the others agree best is removed.
     """
     seen, places = list(seen), list(places)
-    found = _triangulate(model, seen, places, spread)
+    found = _triangulate(model, seen, places, MAX_SPREAD)
     while found is not None and not found.squared.sum() < chi_squared.quantile(GATE, 2 * len(seen) - 3):
         if len(seen) <= FEWEST:
             return None
         best: tuple[float, int, TriangulatedPoint] | None = None
         for i in range(len(seen)):
-            others = _triangulate(model, seen[:i] + seen[i + 1 :], places[:i] + places[i + 1 :], spread)
+            others = _triangulate(model, seen[:i] + seen[i + 1 :], places[:i] + places[i + 1 :], MAX_SPREAD)
             if others is not None and (best is None or others.squared.sum() < best[0]):
                 best = float(others.squared.sum()), i, others
         if best is None:
