@@ -130,7 +130,17 @@ def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Int
     track = np.repeat(np.arange(len(chains)), [len(chain) for chain in chains]).astype(np.int64)
     frame = frame_of[nodes]
     pixels = np.concatenate([frame.pixels for frame in frames])[nodes] if len(nodes) else np.empty((0, 2))
-    return Tracks(track, frame, nodes - starts[frame], pixels)
+    feature = nodes - starts[frame]
+    return Tracks(track, frame, feature, pixels, depths_of(frames, frame, feature))
+
+
+def depths_of(frames: Sequence[CameraFrame], frame: Integers, feature: Integers) -> Array | None:
+    """The depths (N,) [m] of the features ``feature`` (N,) of the frames ``frame`` (N,); None if no frame has any."""
+    if all(one.depths is None for one in frames):
+        return None
+    depths = [np.full(len(one.pixels), np.nan) if one.depths is None else one.depths for one in frames]
+    starts = np.cumsum([0, *(len(one) for one in depths)])
+    return np.asarray(np.concatenate(depths)[starts[frame] + feature])
 
 
 def _angles(rotations: Array, other: Array) -> Array:

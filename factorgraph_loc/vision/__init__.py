@@ -3,6 +3,7 @@
 __all__ = [
     "association",
     "consensus",
+    "depth",
     "feature_cache",
     "features",
     "fiducials",

@@ -2,6 +2,7 @@
 
 __all__ = [
     "bundle_kernels",
+    "depth",
     "factor",
     "floor",
     "inverse_depth",

@@ -124,6 +124,19 @@ def test_tum_poses_are_those_of_the_camera(tum_rgbd, one):
     np.testing.assert_allclose(in_camera(log, ahead[None]), ((0.0, 0.0, 3.0),), atol=1e-9)
 
 
+def test_tum_depths_belong_to_the_nearest_image(tum_rgbd, one):
+    assert one(tum_rgbd, reader="tum_rgbd").streams["camera"].depth == [None, None]
+    for name in ("1305031102.160407", "1305031102.260000"):
+        image(tum_rgbd / "depth" / f"{name}.png")
+    (tum_rgbd / "depth.txt").write_text(
+        "# depth maps\n1305031102.160407 depth/1305031102.160407.png\n1305031102.260000 depth/1305031102.260000.png\n"
+    )
+    log = one(tum_rgbd, reader="tum_rgbd")
+    assert log.streams["camera"].depth == [tum_rgbd / "depth" / "1305031102.160407.png", None]  # the next is 49 ms away
+    assert log.rig.camera.depth.unit == 1.0 / 5000.0
+    assert "not read" not in log.metadata
+
+
 def test_what_a_fixed_format_has_beside_what_is_read_is_told(euroc, tum_rgbd, kitti_odometry, one):
     assert "not read" not in one(euroc, reader="euroc").metadata
     (euroc / "mav0" / "imu0").mkdir()
@@ -134,8 +147,8 @@ def test_what_a_fixed_format_has_beside_what_is_read_is_told(euroc, tum_rgbd, ki
     assert one(truth).metadata["not read"] == "data.csv: v_RS_R_x [m s^-1]"
     truth.write_text("\n".join(f"{row},0.1" for row in rows))
     assert one(truth).metadata["not read"] == "data.csv: column 9"
-    (tum_rgbd / "depth.txt").touch()
-    assert one(tum_rgbd, reader="tum_rgbd").metadata["not read"] == "depth.txt"
+    (tum_rgbd / "accelerometer.txt").touch()
+    assert one(tum_rgbd, reader="tum_rgbd").metadata["not read"] == "accelerometer.txt"
     image(kitti_odometry / "sequences" / "03" / "image_0" / "000000.png")
     log = one(kitti_odometry, reader="kitti_odometry", options={"sequence": 3, "camera": 2})
     assert log.metadata["not read"] == "image_0"

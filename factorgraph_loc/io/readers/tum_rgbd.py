@@ -1,8 +1,12 @@
 """TUM RGB-D: colour images of a hand-held camera, listed in ``rgb.txt``, with ground-truth poses in ``groundtruth.txt`` (Sturm et
-al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012). Depth images and the accelerometer are not read."""
+al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012). A depth image, listed in ``depth.txt``, belongs to the
+colour image nearest in time. The accelerometer is not read."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, inside
@@ -11,7 +15,8 @@ from factorgraph_loc.io.readers.pose_file import TUM, later, read_image_list, re
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.settings import CameraSettings, DepthSettings
+from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.sensors.camera.tables import make_images
 
 # the robot frame is the camera frame; the lens is the nominal one of the benchmark
@@ -19,9 +24,18 @@ RIG = Rig(
     name="kinect-tum",
     sensors=("camera",),
     camera=CameraSettings(
-        width=640, height=480, fx=525, fy=525, cx=319.5, cy=239.5, pitch=-math.pi / 2, yaw=math.pi / 2
+        width=640,
+        height=480,
+        fx=525,
+        fy=525,
+        cx=319.5,
+        cy=239.5,
+        pitch=-math.pi / 2,
+        yaw=math.pi / 2,
+        depth=DepthSettings(unit=1.0 / 5000.0),
     ),
 )
+APART = 0.02  # s between a colour image and its depth image, as in the benchmark's own tool
 
 
 class Options(FileModel):
@@ -41,9 +55,25 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
         name=name,
         rig=RIG,
         world=World(name=name),
-        streams={"camera": make_images(table, t0_ns, warnings, path)},
+        streams={"camera": _with_depth(make_images(table, t0_ns, warnings, path), path, t0_ns)},
         reference3=later(poses, t_ns, t0_ns),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
-        metadata=not_read(beside(path, ("rgb", "rgb.txt", "groundtruth.txt"))),
+        metadata=not_read(beside(path, ("rgb", "rgb.txt", "depth", "depth.txt", "groundtruth.txt"))),
     )
+
+
+def _with_depth(images: ImageStream, path: Path, t0_ns: int) -> ImageStream:
+    """The images with the depth image of each, nearest in time and at most :data:`APART` from it."""
+    if not (path / "depth.txt").is_file():
+        return images
+    warnings: list[str] = []
+    depths = make_images(
+        read_image_list(inside(path, "depth.txt", path), unit="s", separator=" "), t0_ns, warnings, path
+    )
+    near = [int(np.abs(depths.t - t).argmin()) if len(depths.t) else -1 for t in images.t]
+    files = [
+        depths.file[i] if i >= 0 and abs(depths.t[i] - t) <= APART else None
+        for i, t in zip(near, images.t, strict=True)
+    ]
+    return replace(images, depth=files)

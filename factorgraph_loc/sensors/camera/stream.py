@@ -38,9 +38,15 @@ class RightSightingStream(SightingStream):
 
 @dataclass(frozen=True)
 class ImageStream(Stream):
-    """Image files (N,). :mod:`factorgraph_loc.sensors.camera.frontend` turns them into features."""
+    """Image files (N,), and the depth image (N,) of each, or None; by default all None.
+    :mod:`factorgraph_loc.sensors.camera.frontend` turns them into features."""
 
     file: Sequence[Path]
+    depth: Sequence[Path | None] = ()
+
+    def __post_init__(self) -> None:
+        if not self.depth:
+            object.__setattr__(self, "depth", [None] * len(self.file))
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         raise InputError("images have no measurements before feature detection")

@@ -1,9 +1,11 @@
-"""Images in the native format: ``camera.csv`` and the folder ``camera``.
+"""Images in the native format: ``camera.csv`` and the folder ``camera``; depth images have their names in the folder ``depth``.
 
 Images are decoded and checked later, by :mod:`factorgraph_loc.sensors.camera.frontend`.
 """
 
+import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from factorgraph_loc.errors import InputError
@@ -15,7 +17,7 @@ from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.sensors.tables import Columns, Reading, Writing
 
-FOLDER = "camera"
+FOLDER, DEPTH = "camera", "depth"
 
 
 def make_images(table: TableRows, t0_ns: int, warnings: list[str], folder: Path | None = None) -> ImageStream:
@@ -39,14 +41,22 @@ def make_images(table: TableRows, t0_ns: int, warnings: list[str], folder: Path 
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> ImageStream:
-    """The images in a log's folder."""
-    return make_images(rows["camera"], reading.t0_ns, reading.warnings)
+    """The images in a log's folder, with the depth images that have their names."""
+    table = rows["camera"]
+    images = make_images(table, reading.t0_ns, reading.warnings)
+    folder = inside(table.path.parent, DEPTH, table.path)
+    if not folder.is_dir():
+        return images
+    within = inside(table.path.parent, FOLDER, table.path)
+    names = [Path(os.path.relpath(file, within)).with_suffix(".png") for file in images.file]
+    return replace(images, depth=[_image(folder, str(table.path), str(name)) for name in names])
 
 
 def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
     """The rows of images, which are copied to the folder; InputError for features, which cannot be written."""
     if not isinstance(stream, ImageStream):
         raise InputError(f"{writing.log}: camera holds features, expected the images they were computed from")
+    _copy_depths(stream.depth, writing.folder)
     return {
         "camera": {"t_ns": checks.absolute(stream.t, writing.t0_ns), "file": write_images(stream.file, writing.folder)}
     }
@@ -59,11 +69,24 @@ def write_images(files: Sequence[Path], folder: Path) -> list[str]:
     target.mkdir()
     names = [f"{i:06d}{file.suffix}" for i, file in enumerate(files)]
     for file, name in zip(files, names, strict=True):
-        try:
-            copy_file(file, target / name)
-        except OSError as error:
-            raise InputError(f"{file}: cannot be copied into {target}: {error.strerror}") from error
+        _copy(file, target / name)
     return names
+
+
+def _copy_depths(files: Sequence[Path | None], folder: Path) -> None:
+    """Copy depth images into the new folder ``depth``, with the names of their images; InputError if one is missing."""
+    there = [(i, file) for i, file in enumerate(files) if file is not None]
+    if there:
+        (folder / DEPTH).mkdir()
+    for i, file in there:
+        _copy(file, folder / DEPTH / f"{i:06d}.png")
+
+
+def _copy(file: Path, target: Path) -> None:
+    try:
+        copy_file(file, target)
+    except OSError as error:
+        raise InputError(f"{file}: cannot be copied into {target.parent}: {error.strerror}") from error
 
 
 def _image(folder: Path, source: str, name: str) -> Path | None:

@@ -1,0 +1,28 @@
+"""Depths of features, from the depth image that belongs to an image."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.bounded import IMAGE, read_bytes
+from factorgraph_loc.vision.images import decoded
+from factors.se2 import Array
+
+EDGE = 0.05  # relative difference of the depths around a pixel, beyond which it may show either side of an edge
+AROUND = np.ones((3, 3), dtype=np.uint8)
+
+
+def depths_at(path: Path, pixels: Array, size: tuple[int, int], unit: float) -> Array:
+    """The depths (K,) [m] at ``pixels`` (K, 2) in the 16-bit image ``path`` of ``size`` (width, height), NaN where there is none
+    and at edges; a value of 1 is ``unit`` [m]. InputError if it is missing, cannot be decoded, or is no such image."""
+    image = decoded(read_bytes(path, IMAGE), path, cv2.IMREAD_UNCHANGED)
+    if image.dtype != np.uint16 or image.shape != size[::-1]:
+        channels = f", {image.shape[2]} channels" if image.ndim == 3 else ""
+        given = f"{image.shape[1]} x {image.shape[0]} px of {image.dtype}{channels}"
+        raise InputError(f"{path}: has {given}, expected {size[0]} x {size[1]} px of uint16")
+    column, row = np.clip(np.rint(pixels).astype(np.int64), 0, np.array(size) - 1).T
+    least, most = (found[row, column].astype(float) for found in (cv2.erode(image, AROUND), cv2.dilate(image, AROUND)))
+    value = image[row, column]
+    return np.where((least > 0) & (most - least <= EDGE * value), value * unit, np.nan)
