@@ -115,6 +115,7 @@ class Monoslam(Filter):
         camera = setup.rig.find(CameraSettings) if any(name in setup.sensors for name in CAMERAS) else None
         constants = self._motion.constants.names
         self._scale = constants.index(SCALE) if SCALE in constants else None
+        self._depths = camera is not None and camera.depth is not None
         self._mounting = np.zeros((6, 6)) if camera is None else _of_mounting(camera)
         self._step: Step | None = None
         self._predicted, self._anew = np.empty((0, 0)), False
@@ -201,7 +202,7 @@ class Monoslam(Filter):
             spread[np.ix_(free, free)] = covariance[np.ix_(free, free)]
             scaled = not self._by_velocity or self._looker.two_eyes
             self._origin = Origin(robot, spread, 0.0 if scaled else UNSCALED)
-            if not scaled:
+            if not scaled and not self._depths:
                 self.diagnostics.events.append((prior.t, NO_SCALE))
             covariance[free] = covariance[:, free] = 0.0
         return SlamState(robot, np.zeros(len(constants.names)), covariance)
@@ -248,6 +249,8 @@ class Monoslam(Filter):
         if eye is None:
             self.diagnostics.ignore("camera", len(m.pixels))
             return
+        if self._origin is not None and m.frame is not None and m.frame.depths is not None:
+            self._origin = replace(self._origin, scale=0.0)
         match = self._looker.match(m, self._state, eye)
         self._matched(m, match, eye)
         state, self._anew = self._relocated(m, self._state, eye, match)
@@ -337,7 +340,8 @@ class Monoslam(Filter):
         for row in self._looker.new(m, state, eye, match, state.tracks)[:room]:
             name = f"met{state.met}" if m.names is None else m.names[row]
             descriptor = None if frame is None else frame.descriptors[row]
-            grown = with_point(state, MapPoint(name, True, descriptor, m.t), eye, m.pixels[row])
+            depth = math.nan if frame is None or frame.depths is None else float(frame.depths[row])
+            grown = with_point(state, MapPoint(name, True, descriptor, m.t), eye, m.pixels[row], depth)
             state = replace(grown, met=state.met + 1)
         state, failed = pruned(state, self._settings.max_points)
         if failed:

@@ -51,11 +51,13 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     t0_ns = int(table.t_ns.min())
     t_ns, poses = read_poses(inside(path, "groundtruth.txt", path), TUM, unit="s", separator=" ", warnings=warnings)
     name = path.resolve().name
+    images = _with_depth(make_images(table, t0_ns, warnings, path), path, t0_ns)
+    deep = any(file is not None for file in images.depth)
     return Log(
         name=name,
-        rig=RIG,
+        rig=RIG if deep else RIG.model_copy(update={"camera": RIG.camera.model_copy(update={"depth": None})}),
         world=World(name=name),
-        streams={"camera": _with_depth(make_images(table, t0_ns, warnings, path), path, t0_ns)},
+        streams={"camera": images},
         reference3=later(poses, t_ns, t0_ns),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
