@@ -12,6 +12,9 @@ where ``elsewhere`` is the log-likelihood of the same reads and misses if the ta
 weighed by what is known before the scan, at the pose that was predicted. It is no function of the pose, which bounds what a tag
 costs a pose. As E is tempered, so is the evidence on the state. The odds in a likelihood are those before its scan, so that no
 scan is used twice.
+
+How many tags have moved is learnt as well: the more of those that were read are found to have moved, the likelier it is of the next
+one. The share has a beta prior with the mean that the rig tells.
 """
 
 import math
@@ -28,6 +31,7 @@ KEPT = 200.0  # s of evidence that can be taken back
 BELIEVED = 0.5  # probability above which a tag is believed to be dead, or moved
 LIMIT = math.log(BELIEVED / (1.0 - BELIEVED))
 PITCH, FARTHEST = 0.5, 1.5  # m: of the grid of displacements, and the largest of them
+WORTH = 10.0  # tags that were read: what the prior of the share of moved ones is worth
 DEAD = 1  # column of the weights: as surveyed, dead, and moved to each place
 
 
@@ -54,6 +58,7 @@ class TagStates:
         each = _log(moved / len(moves))
         prior = np.array((math.log(1.0 - dead - moved), _log(dead), *(each for _ in moves)))
         self._weights = np.tile(prior, (count, 1))  # logarithms, not normalised
+        self._dead, self._moved, self._surveyed, self._raised = dead, moved, prior[0], 0.0
         self.prior = float(_log(dead + moved) - prior[0])
         self._odds = np.full(count, self.prior)
         self._doubtful: Integers | None = None  # not known
@@ -126,6 +131,17 @@ class TagStates:
         """Which tags are doubtful has changed, or not."""
         if doubtful:
             self._doubtful = None
+            if self._moved > 0.0:
+                self._expect_moved()
+
+    def _expect_moved(self) -> None:
+        """Take all tags to have moved as often as those that were read."""
+        read, found = self._weights[:, DEAD] == -np.inf, self.were_read(self.doubtful)
+        share = (WORTH * self._moved + np.sum(found)) / (WORTH + np.sum(read))
+        raised = math.log(max(share / self._moved, 1.0))
+        self._weights[:, DEAD + 1 :] += raised - self._raised
+        self._odds, self._raised, self._doubtful = _all_odds(self._weights), raised, None
+        self.prior = float(np.logaddexp(_log(self._dead), _log(self._moved) + raised) - self._surveyed)
 
 
 @compiled
@@ -187,6 +203,11 @@ def _learn(weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32
         odds[tags[u]] = _odds(of_tag)
         changed |= (before > LIMIT) != (odds[tags[u]] > LIMIT)
     return changed
+
+
+@compiled
+def _all_odds(weights: Array) -> Array:
+    return np.array([_odds(of_tag) for of_tag in weights])
 
 
 @compiled

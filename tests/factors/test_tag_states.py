@@ -94,3 +94,21 @@ def test_memory_is_bounded() -> None:
     states.forget(-np.inf)
     # what is older than is kept is not taken back
     assert states.odds[0] == pytest.approx(np.log(0.1 / 0.9) + 0.1 * (10_000 - 2000), abs=1.0)
+
+
+def test_the_more_tags_have_moved_the_likelier_it_is_of_others() -> None:
+    """Three of ten tags that were read are found to have moved: by a beta prior that is worth ten tags the share is 0.165. What was
+    learnt is taken back, and the share with it."""
+    states = TagStates(30, 0.02, 0.03)
+    before = states.prior
+    states.hear(1.0, np.arange(10))
+    after = states.odds.copy()
+    for tag in range(3):
+        states.learn(2.0, np.array((tag,)), told(-20.0, 5.0))
+    share = (10.0 * 0.03 + 3.0) / 20.0
+    assert states.odds[5] == pytest.approx(np.log(share / 0.95))
+    assert states.odds[-1] == pytest.approx(np.log((0.02 + share) / 0.95))
+    assert states.prior == pytest.approx(states.odds[-1])
+    states.forget(2.0)
+    assert states.odds == pytest.approx(after)
+    assert states.prior == pytest.approx(before)
