@@ -307,10 +307,8 @@ class Ekf(Filter):
         self._step = _Step(self._state.pose, np.zeros((3, len(covariance))), body)
 
     def _estimate(self) -> PoseEstimate:
-        status: Status = "localized"
-        for sensor in self._sensors.values():
-            if sensor.silent or sensor.inconsistent:
-                status = "ambiguous"
+        doubted = self._search.unsure or any(s.silent or s.inconsistent for s in self._sensors.values())
+        status: Status = "ambiguous" if doubted else "localized"
         return world_estimate(self._t, self._state.pose, self._state.covariance, status)
 
     def _record(self) -> _Record:

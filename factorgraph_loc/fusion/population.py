@@ -44,7 +44,7 @@ NEGLIGIBLE, WIDENED = 1e-4, np.diag((0.1, 0.1, 0.05)) ** 2  # weight of a place 
 
 # A place is clear once the robot has been within so much of it, m and rad, with one of these probabilities for its time, s.
 NEAR_POSITION, NEAR_HEADING = 0.5, math.radians(15.0)
-CLEAR = ((0.98, 1.0), (0.9, 4.0))
+CLEAR = ((0.95, 1.0), (0.85, 3.0))
 CLEAR_OBSERVATIONS, CLEAR_THINGS = 3, 2  # of something, and of different things
 REACH = 5.0  # standard deviations, within which weight counts for a place that is denied
 

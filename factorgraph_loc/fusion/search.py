@@ -33,6 +33,7 @@ BEFORE = 2.0  # s before a suspicion, or before what speaks for a change, in whi
 UNSURE = 5.0  # a change may be at a time for which the log of its likelihood is so much below the highest
 SLICE = 2_500_000  # of work (:mod:`.population`) that is done at a measurement or a tick
 PAUSE = 0.05  # s between two slices, at least: a measurement and a tick often come at once
+NEAR, SURE = 0.5, 0.9  # m: a place that was found is known once it is so near with so much probability
 APART = 16.0  # squared Mahalanobis distance to the track, beyond which it is another place
 
 
@@ -76,6 +77,7 @@ class Search:
         self._since = -math.inf
         self._advanced = -math.inf  # when a slice of work was done last
         self._horizon = motion.horizon
+        self.unsure = False  # whether a track that was found is not yet known to half a metre
         self.start: KnownPosition | None = None
 
     @property
@@ -182,8 +184,10 @@ class Search:
 
     @property
     def doubts(self) -> bool:
-        """Whether a track, or a sensor, is under suspicion."""
-        return any(s.suspicious_since is not None or s.silent or s.inconsistent for s in self._sensors.values())
+        """Whether a track, or a sensor, is under suspicion, or a track that was found is :attr:`unsure`."""
+        return self.unsure or any(
+            s.suspicious_since is not None or s.silent or s.inconsistent for s in self._sensors.values()
+        )
 
     def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
         """An observation is about to be applied to a track."""
@@ -214,6 +218,7 @@ class Search:
         if isinstance(m, Tick) and not self.waits:
             return None
         odometry, pose, covariance = track()
+        self.unsure = self.unsure and beyond(covariance, NEAR) > 1.0 - SURE
         finder = None if isinstance(m, Tick) else self._finders.get(m.modality)
         if finder is not None:
             since = finder.refuted_since(m, odometry, pose, covariance)
@@ -277,6 +282,7 @@ class Search:
     def begin_track(self, *, found: bool) -> None:
         """A track begins: where the search ``found`` it, with what was seen again that led there, or where it was said to."""
         self.begin(None)
+        self.unsure = found
         if found:
             self._kept.clear()
             self._last.clear()
@@ -312,6 +318,15 @@ def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:
     error = se2.log(se2.between(pose, best.pose))
     spread = covariance + se2.world_to_body(best.pose, best.covariance)
     return float(error @ positive.solve(spread, error[:, None])[:, 0]) > APART
+
+
+def beyond(covariance: Array, distance: float) -> float:
+    """The probability that a Gaussian of this ``covariance`` (3, 3) is farther from its mean position than ``distance`` [m]."""
+    angle = math.pi * np.arange(180) / 180.0
+    direction = np.column_stack((np.cos(angle), np.sin(angle)))
+    curvature = np.einsum("ni,ij,nj->n", direction, np.linalg.inv(covariance[:2, :2]), direction)
+    shares = np.exp(-0.5 * distance**2 * curvature) / curvature
+    return float(shares.mean() / np.mean(1.0 / curvature))
 
 
 def laplace_evidence(observation: Observation, pose: Array, covariance: Array, correction: Correction) -> float:

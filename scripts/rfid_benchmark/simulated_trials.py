@@ -14,11 +14,11 @@ from benchmarking.trials import BEFORE, HOLD, JUMP, POSITION, is_right
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.base import Estimator
+from factorgraph_loc.fusion.search import beyond
 from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import SimulationSettings
-from factors.se2 import Array
 
 AWAY = 3.0  # m, least displacement of a kidnapping
 APART = 60.0  # s between the parts of a log that a kidnapping joins
@@ -115,15 +115,6 @@ def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     late = not seconds <= job.deadline
     false = late and bool(localized[at_deadline]) and not bool(good[at_deadline])
     return SimulatedTrial(seed, seconds, held(result, good & localized, first), false)
-
-
-def beyond(covariance: Array, distance: float) -> float:
-    """The probability that a Gaussian of this ``covariance`` (3, 3) is farther from its mean position than ``distance`` [m]."""
-    angle = math.pi * np.arange(180) / 180.0
-    direction = np.column_stack((np.cos(angle), np.sin(angle)))
-    curvature = np.einsum("ni,ij,nj->n", direction, np.linalg.inv(covariance[:2, :2]), direction)
-    shares = np.exp(-0.5 * distance**2 * curvature) / curvature
-    return float(shares.mean() / np.mean(1.0 / curvature))
 
 
 def held(result: RunResult, good: np.typing.NDArray[np.bool_], first: float) -> float:

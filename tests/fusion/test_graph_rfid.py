@@ -13,6 +13,7 @@ from factorgraph_loc.evaluation.metrics import errors as evaluated
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
+from factorgraph_loc.fusion.search import SURE, beyond
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.measurement import Tick
@@ -127,6 +128,19 @@ def test_unknown_start() -> None:
     assert result.t[first] - result.t[0] < 20.0
     assert errors(log, result)[first:].max() < 0.6
     assert set(result.status[:first]) <= {"ambiguous", "unlocalized"}
+
+
+@pytest.mark.parametrize(("estimator", "seed"), [("smoother", 2017), ("smoother", 2110), ("particle_filter", 2008)])
+def test_a_place_that_was_found_is_claimed_when_its_covariance_says_so(estimator: str, seed: int) -> None:
+    """Among few tags one place is clear seconds before it is known to half a metre."""
+    result = run(
+        simulate(preset("sparse", {"drive": {"duration": 17.0}}), seed),
+        RunConfig(estimator, prior="unknown", seed=seed),
+    )
+    found = next(t for t, what in result.diagnostics.events if what == "localized")
+    first = result.status.index("localized")
+    assert result.t[first] > found + 0.4
+    assert beyond(result.covariances[first], 0.5) <= 1.0 - SURE
 
 
 @pytest.mark.parametrize("estimator", ["smoother", "batch"])
