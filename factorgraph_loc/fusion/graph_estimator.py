@@ -152,7 +152,8 @@ class GraphEstimator(ABC):
                 return PoseEstimate(at, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
             return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
         pose, _, covariance = graph.moved(at)
-        status: Status = "ambiguous" if self._search.doubts or self._behind else "localized"
+        doubted = self._behind or self._search.doubts or self._search.is_unsure(covariance)
+        status: Status = "ambiguous" if doubted else "localized"
         return PoseEstimate(at, pose, covariance, status)
 
     def belief(self, t: float | None = None) -> Belief:

@@ -339,8 +339,10 @@ class ParticleFilter(Filter):
 
     def _estimate(self) -> PoseEstimate:
         if self._state.localized:
-            status: Status = "ambiguous" if self._search.doubts else "localized"
-            return PoseEstimate(self._t, *self._moments(), status)
+            pose, covariance = self._moments()
+            doubted = self._search.doubts or self._search.is_unsure(covariance)
+            status: Status = "ambiguous" if doubted else "localized"
+            return PoseEstimate(self._t, pose, covariance, status)
         mode = self._moved_on(twin(self._drawn_by)).modes()[0]
         return PoseEstimate(self._t, mode.pose, mode.covariance, "ambiguous")
 

@@ -77,7 +77,7 @@ class Search:
         self._since = -math.inf
         self._advanced = -math.inf  # when a slice of work was done last
         self._horizon = motion.horizon
-        self.unsure = False  # whether a track that was found is not yet known to half a metre
+        self._unsure = False  # whether a track that was found has not yet been known to half a metre
         self.start: KnownPosition | None = None
 
     @property
@@ -182,12 +182,14 @@ class Search:
             poses, reached = leading.sample(rng, count), leading.newest
         return poses, now if reached is None or reached.t >= now.t else reached
 
+    def is_unsure(self, covariance: Array) -> bool:
+        """Whether a track that was found has not yet been near the robot (:data:`NEAR`), with the ``covariance`` (3, 3) of now."""
+        return self._unsure and beyond(covariance, NEAR) > 1.0 - SURE
+
     @property
     def doubts(self) -> bool:
-        """Whether a track, or a sensor, is under suspicion, or a track that was found is :attr:`unsure`."""
-        return self.unsure or any(
-            s.suspicious_since is not None or s.silent or s.inconsistent for s in self._sensors.values()
-        )
+        """Whether a track, or a sensor, is under suspicion."""
+        return any(s.suspicious_since is not None or s.silent or s.inconsistent for s in self._sensors.values())
 
     def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
         """An observation is about to be applied to a track."""
@@ -218,7 +220,7 @@ class Search:
         if isinstance(m, Tick) and not self.waits:
             return None
         odometry, pose, covariance = track()
-        self.unsure = self.unsure and beyond(covariance, NEAR) > 1.0 - SURE
+        self._unsure = self.is_unsure(covariance)
         finder = None if isinstance(m, Tick) else self._finders.get(m.modality)
         if finder is not None:
             since = finder.refuted_since(m, odometry, pose, covariance)
@@ -282,7 +284,7 @@ class Search:
     def begin_track(self, *, found: bool) -> None:
         """A track begins: where the search ``found`` it, with what was seen again that led there, or where it was said to."""
         self.begin(None)
-        self.unsure = found
+        self._unsure = found
         if found:
             self._kept.clear()
             self._last.clear()
