@@ -313,4 +313,14 @@ def _smoothed(log: Log, prior: str | None, stages: Stages) -> tuple[Log, str, tu
     config = RunConfig("smoother", {"landmarks": "extended"}, used, prior="log")
     with stages("smoother") as report:
         result = run(started, config, lambda share: report(share, 1.0))
-    return replace(log, reference=result.final, reference3=None), f"that of the start: {frame}", result.warnings
+    assert result.final.covariances is not None
+    sigma = float(np.sqrt(np.linalg.eigvalsh(result.final.covariances[:, :2, :2])[:, -1].max()))
+    common = (
+        f"{log.name}: mapped without a reference: points near each other have an error in common, of up to {sigma:.2g} m (standard "
+        "deviation), which a robot that is localized in the map repeats, and which is in no covariance"
+    )
+    return (
+        replace(log, reference=result.final, reference3=None),
+        f"that of the start: {frame}",
+        (*result.warnings, common),
+    )

@@ -38,6 +38,7 @@ def test_points_lie_on_the_wall(fgloc, gallery_on_disk, tmp_path, poses):
         assert picture.width == 1600
     frame = "that of the reference" if poses == "reference" else "that of the start"
     assert report["frame"].startswith(frame)
+    assert ("an error in common" in result.stderr) == (poses == "odometry")
 
 
 def test_points_are_mapped_where_nothing_else_is_asked_for(fgloc, gallery_on_disk, tmp_path):
