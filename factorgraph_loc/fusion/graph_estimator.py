@@ -35,8 +35,9 @@ from factors import se2
 from factors.motion import Increment
 from factors.se2 import Array
 
-# m, m, rad: nothing is known of a start, or of where a robot is carried; the sightings that told the place come in as factors
-UNKNOWN = np.diag((10.0, 10.0, math.pi)) ** 2
+# m, m, rad: of a place that the search told. What told it comes in as factors, so it is to count for next to nothing, but to keep
+# what the first scan alone tells from leading elsewhere.
+FOUND = np.diag((1.0, 1.0, 0.5)) ** 2
 
 
 REPLAYED, TICK = 300, 2  # work of which so much is done at once, and that of a tick; see `Sensor.work`
@@ -233,7 +234,7 @@ class GraphEstimator(ABC):
         replay = self._take_back(-math.inf)
         self.diagnostics.events.append((m.t, "localized"))
         t = replay[0].t
-        prior = PosePrior(t, self._placed(t, best), UNKNOWN)
+        prior = PosePrior(t, self._placed(t, best), FOUND)
         if start is not None and graph.t <= start.t + START_KEPT:
             prior = start.facing(float(self._placed(start.t, best)[2]))
         self.initialize(prior)
@@ -246,7 +247,7 @@ class GraphEstimator(ABC):
             return Tracked(self._motion.state(m.t), *self._graph.moved(m.t)[:2])
 
         def back(t: float, here: Array) -> Array:
-            return self._placed(t, PosePrior(m.t, here, UNKNOWN))
+            return self._placed(t, PosePrior(m.t, here, FOUND))
 
         refuted = self._search.refuted(m, track, back)
         best = None if refuted is None else self._search.best
@@ -266,12 +267,12 @@ class GraphEstimator(ABC):
         del graph.keyframes[index:], graph.times[index:]
         graph.ticks = [tick for tick in graph.ticks if tick.keyframe < index and tick.t < t]
         pose = self._placed(t, best)
-        jump = Increment(se2.between(self._backend.guess_of(index - 1)[0], pose), UNKNOWN, t - graph.newest.t)
+        jump = Increment(se2.between(self._backend.guess_of(index - 1)[0], pose), FOUND, t - graph.newest.t)
         keyframe = Keyframe(index, t, self._motion.state(t), jump, is_elsewhere=True)
         graph.append(keyframe)
         earlier = [change for change in graph.changes if change[0] < t]
         graph.changes = (*earlier, (min(refuted.change[0], t), max(refuted.change[1], t)))
-        graph.pose, graph.covariance = pose, UNKNOWN
+        graph.pose, graph.covariance = pose, FOUND
         self._builder.clear()
         for sensor in graph.sensors.values():
             sensor.restart(t)

@@ -31,7 +31,7 @@ KEPT = 200.0  # s of evidence that can be taken back
 BELIEVED = 0.5  # probability above which a tag is believed to be dead, or moved
 LIMIT = math.log(BELIEVED / (1.0 - BELIEVED))
 PITCH, FARTHEST = 0.5, 1.5  # m: of the grid of displacements, and the largest of them
-WORTH = 10.0  # tags that were read: what the prior of the share of moved ones is worth
+WORTH = 20.0  # tags that were read: what the prior of the share of moved ones is worth
 DEAD = 1  # column of the weights: as surveyed, dead, and moved to each place
 
 

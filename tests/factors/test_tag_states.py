@@ -97,7 +97,7 @@ def test_memory_is_bounded() -> None:
 
 
 def test_the_more_tags_have_moved_the_likelier_it_is_of_others() -> None:
-    """Three of ten tags that were read are found to have moved: by a beta prior that is worth ten tags the share is 0.165. What was
+    """Three of ten tags that were read are found to have moved: by a beta prior that is worth twenty the share is 0.12. What was
     learnt is taken back, and the share with it."""
     states = TagStates(30, 0.02, 0.03)
     before = states.prior
@@ -105,7 +105,7 @@ def test_the_more_tags_have_moved_the_likelier_it_is_of_others() -> None:
     after = states.odds.copy()
     for tag in range(3):
         states.learn(2.0, np.array((tag,)), told(-20.0, 5.0))
-    share = (10.0 * 0.03 + 3.0) / 20.0
+    share = (20.0 * 0.03 + 3.0) / 30.0
     assert states.odds[5] == pytest.approx(np.log(share / 0.95))
     assert states.odds[-1] == pytest.approx(np.log((0.02 + share) / 0.95))
     assert states.prior == pytest.approx(states.odds[-1])
