@@ -135,6 +135,10 @@ def test_tum_depths_belong_to_the_nearest_image(tum_rgbd, one):
     assert log.streams["camera"].depth == [tum_rgbd / "depth" / "1305031102.160407.png", None]  # the next is 49 ms away
     assert log.rig.camera.depth.unit == 1.0 / 5000.0
     assert "not read" not in log.metadata
+    assert not any("depth.txt" in warning for warning in log.warnings)
+    (tum_rgbd / "depth" / "1305031102.260000.png").unlink()
+    (said,) = (w for w in one(tum_rgbd, reader="tum_rgbd").warnings if "depth.txt" in w)
+    assert "1 of 2 images are missing and skipped" in said
 
 
 def test_what_a_fixed_format_has_beside_what_is_read_is_told(euroc, tum_rgbd, kitti_odometry, one):

@@ -51,7 +51,7 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     t0_ns = int(table.t_ns.min())
     t_ns, poses = read_poses(inside(path, "groundtruth.txt", path), TUM, unit="s", separator=" ", warnings=warnings)
     name = path.resolve().name
-    images = _with_depth(make_images(table, t0_ns, warnings, path), path, t0_ns)
+    images = _with_depth(make_images(table, t0_ns, warnings, path), path, t0_ns, warnings)
     deep = any(file is not None for file in images.depth)
     return Log(
         name=name,
@@ -65,11 +65,10 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     )
 
 
-def _with_depth(images: ImageStream, path: Path, t0_ns: int) -> ImageStream:
+def _with_depth(images: ImageStream, path: Path, t0_ns: int, warnings: list[str]) -> ImageStream:
     """The images with the depth image of each, nearest in time and at most :data:`APART` from it."""
     if not (path / "depth.txt").is_file():
         return images
-    warnings: list[str] = []
     depths = make_images(
         read_image_list(inside(path, "depth.txt", path), unit="s", separator=" "), t0_ns, warnings, path
     )
