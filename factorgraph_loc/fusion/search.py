@@ -183,7 +183,8 @@ class Search:
         return poses, now if reached is None or reached.t >= now.t else reached
 
     def is_unsure(self, covariance: Array) -> bool:
-        """Whether a track that was found has not yet been near the robot (:data:`NEAR`), with the ``covariance`` (3, 3) of now."""
+        """Whether a track that was found has not yet been known to :data:`NEAR` with probability :data:`SURE`, nor is by its
+        ``covariance`` (3, 3) now."""
         return self._unsure and beyond(covariance, NEAR) > 1.0 - SURE
 
     @property

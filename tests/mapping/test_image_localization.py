@@ -73,17 +73,23 @@ def test_the_graph_is_better_than_single_images(look):
     assert np.mean(errors(sight, both)) < 0.7 * np.mean(errors(sight, one))
 
 
-def test_the_graph_reaches_beyond_the_map(look):
-    """The last images see nothing of the map, but points that the images before them see too."""
-    rng = np.random.default_rng(3)
-    sight = look(rng, noise=0.5)
-    known = np.arange(0, 150, 2)
+def reaching_beyond(sight, known):
+    """The frames of a sight, of which those from the ninth on show none of the ``known`` points."""
     frames = []
     for i, (frame, shown) in enumerate(zip(sight.frames, sight.shown, strict=True)):
         keep = ~np.isin(shown, known) if i >= 8 else np.ones(len(shown), dtype=bool)
         frames.append(
             replace(frame, pixels=frame.pixels[keep], sizes=frame.sizes[keep], descriptors=frame.descriptors[keep])
         )
+    return frames
+
+
+def test_the_graph_reaches_beyond_the_map(look):
+    """The last images see nothing of the map, but points that the images before them see too."""
+    rng = np.random.default_rng(3)
+    sight = look(rng, noise=0.5)
+    known = np.arange(0, 150, 2)
+    frames = reaching_beyond(sight, known)
     localizer = ImageLocalizer(a_map(sight, rng, known), sight.model)
     ones = [localizer.one(frame) for frame in frames]
     assert ones[8:] == [None] * 4
@@ -96,12 +102,7 @@ def test_wrong_tracks_do_not_pull_images_that_see_nothing_of_the_map(look, monke
     rng = np.random.default_rng(3)
     sight = look(rng, noise=0.5)
     known = np.arange(0, 150, 2)
-    frames = []
-    for i, (frame, shown) in enumerate(zip(sight.frames, sight.shown, strict=True)):
-        keep = ~np.isin(shown, known) if i >= 8 else np.ones(len(shown), dtype=bool)
-        frames.append(
-            replace(frame, pixels=frame.pixels[keep], sizes=frame.sizes[keep], descriptors=frame.descriptors[keep])
-        )
+    frames = reaching_beyond(sight, known)
     localizer = ImageLocalizer(a_map(sight, rng, known), sight.model)
     ones = [localizer.one(frame) for frame in frames]
     of_map = ones[0].features
