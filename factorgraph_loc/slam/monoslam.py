@@ -33,7 +33,15 @@ from factorgraph_loc.slam.monoslam_invariance import carried
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
 from factorgraph_loc.slam.monoslam_past import UpdateRecord, smoothed
 from factorgraph_loc.slam.monoslam_sighting import FeatureMatcher, Match
-from factorgraph_loc.slam.monoslam_state import Eye, Innovation, MapPoint, SlamState, squared, widening
+from factorgraph_loc.slam.monoslam_state import (
+    Eye,
+    Innovation,
+    MapPoint,
+    SlamState,
+    each_squared,
+    weighted,
+    widened,
+)
 from factorgraph_loc.slam.space_motion import (
     PLANAR,
     ROBOT,
@@ -115,7 +123,7 @@ class Monoslam(Filter):
         camera = setup.rig.find(CameraSettings) if any(name in setup.sensors for name in CAMERAS) else None
         constants = self._motion.constants.names
         self._scale = constants.index(SCALE) if SCALE in constants else None
-        self._depths = camera is not None and camera.depth is not None
+        self._told = False  # whether it was said that the scale is unknown
         self._mounting = np.zeros((6, 6)) if camera is None else _of_mounting(camera)
         self._step: Step | None = None
         self._predicted, self._anew = np.empty((0, 0)), False
@@ -202,8 +210,6 @@ class Monoslam(Filter):
             spread[np.ix_(free, free)] = covariance[np.ix_(free, free)]
             scaled = not self._by_velocity or self._looker.two_eyes
             self._origin = Origin(robot, spread, 0.0 if scaled else UNSCALED)
-            if not scaled and not self._depths:
-                self.diagnostics.events.append((prior.t, NO_SCALE))
             covariance[free] = covariance[:, free] = 0.0
         return SlamState(robot, np.zeros(len(constants.names)), covariance)
 
@@ -265,24 +271,24 @@ class Monoslam(Filter):
 
     def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
         """The iterated Kalman update; beyond the gate the noise of a pixel is widened, and Huber weights are applied."""
-        points, spreads = match.points, match.spreads
+        known = match.mapped, match.points, match.spreads, match.depths
         zero = np.zeros(len(prior.covariance))
-        sights = eye.all(prior, match.mapped, points, spreads)
+        sights = eye.all(prior, *known)
         innovation = Innovation.of(sights, prior.covariance)
-        residual = match.pixels - sights.pixels
-        noise = sights.noise * widening(residual, innovation, sights.noise)[:, None, None]
-        self._report(m, residual, innovation, sights.noise)
+        residual = match.measured - sights.pixels
+        noise = widened(sights.noise, residual, innovation)
+        self._report(m, match, residual, innovation, sights.noise)
         tempering = np.ones(len(residual))
         tempering[len(match.mapped) :] = match.tempering
         delta, root, spread = zero, np.empty(0), np.empty(0)
         for i in range(self._settings.iterations if self._settings.landmarks == "known" else 1):
             if i:
                 moved = prior.plus(delta, prior.covariance)
-                sights = eye.all(moved, match.mapped, points, spreads)
+                sights = eye.all(moved, *known)
                 innovation = Innovation.of(sights, prior.covariance)
-                residual = match.pixels - sights.pixels
-                weight = huber_weight(squared(residual, sights.noise), eye.model.robust)
-                noise = sights.noise / weight[:, None, None]
+                residual = match.measured - sights.pixels
+                weight = huber_weight(each_squared(residual, sights.noise), eye.model.robust)
+                noise = weighted(sights.noise, 1.0 / weight)
             root, spread = innovation.gain(noise / tempering[:, None, None])
             whitened = np.linalg.solve(root, residual.ravel() + innovation.jacobian @ delta[innovation.columns])
             before, delta = delta, spread.T @ whitened
@@ -293,10 +299,11 @@ class Monoslam(Filter):
             return after
         return replace(after, covariance=carried(prior, after, self._scale))
 
-    def _report(self, m: Pixels, residual: Array, innovation: Innovation, noise: Array) -> None:
+    def _report(self, m: Pixels, match: Match, residual: Array, innovation: Innovation, noise: Array) -> None:
         sensor = "camera_right" if m.right else "camera"
         whitened = np.linalg.solve(innovation.root(noise), residual.ravel())
-        self.diagnostics.innovation(sensor, m.t, float(whitened @ whitened), len(whitened))
+        missing = 0 if match.depths is None else int(np.count_nonzero(np.isnan(match.depths)))
+        self.diagnostics.innovation(sensor, m.t, float(whitened @ whitened), len(whitened) - missing)
         for i, name in enumerate("uv"):
             self.diagnostics.add_residuals(f"{sensor}.{name}", residual[:, i].tolist())
 
@@ -341,6 +348,9 @@ class Monoslam(Filter):
             name = f"met{state.met}" if m.names is None else m.names[row]
             descriptor = None if frame is None else frame.descriptors[row]
             depth = math.nan if frame is None or frame.depths is None else float(frame.depths[row])
+            if self._origin is not None and self._origin.scale and not self._told:
+                self.diagnostics.events.append((m.t, NO_SCALE))
+                self._told = True
             grown = with_point(state, MapPoint(name, True, descriptor, m.t), eye, m.pixels[row], depth)
             state = replace(grown, met=state.met + 1)
         state, failed = pruned(state, self._settings.max_points)

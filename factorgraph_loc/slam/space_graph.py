@@ -29,7 +29,7 @@ from factorgraph_loc.sensors.twist.measurement import in_space, twist_settings
 from factorgraph_loc.slam.monoslam import MonoslamSettings
 from factorgraph_loc.slam.monoslam_past import UpdateRecord
 from factorgraph_loc.slam.monoslam_sighting import Match
-from factorgraph_loc.slam.monoslam_state import Eye, SlamState, squared
+from factorgraph_loc.slam.monoslam_state import Eye, Sights, SlamState, each_squared
 from factorgraph_loc.slam.space_motion import ROBOT, TwistChain
 from factorgraph_loc.slam.space_motion_models import (
     AT_ONCE,
@@ -41,6 +41,7 @@ from factorgraph_loc.slam.space_motion_models import (
     robot_of,
 )
 from factors import positive
+from factors.camera.depth import with_inverse
 from factors.robust import huber_loss, huber_weight
 from factors.se2 import Array
 
@@ -73,7 +74,7 @@ def known_start(t: float, state: SlamState) -> KnownState:
 @dataclass(frozen=True)
 class SeenPoints:
     """The image of a camera at ``t``: ``pixels`` (K, 2) of ``points`` (K, 3) with covariances ``spreads`` (K, 3, 3);
-    ``tempering``: exponent of the likelihood.
+    ``tempering``: exponent of the likelihood; ``depths`` (K,) [m], NaN where none was measured, or None.
     """
 
     t: float
@@ -82,23 +83,32 @@ class SeenPoints:
     points: Array
     spreads: Array | None
     tempering: float
+    depths: Array | None = None
+
+    @property
+    def size(self) -> int:
+        """The number of values of the residual: two of each pixel, with depths three."""
+        return self.pixels.size if self.depths is None else self.pixels.size + len(self.depths)
 
     def linearize(self, pose: gtsam.Pose3) -> tuple[Array, Array]:
-        """Whitened, robustly weighted residual (2K,) and Jacobian (2K, 6) with respect to the pose."""
-        error, whitener, jacobian = self._whitened(pose)
-        weight = np.sqrt(self.tempering * huber_weight(np.sum(error**2, axis=1), self.eye.model.robust))
-        return (weight[:, None] * error).ravel(), (weight[:, None, None] * (whitener @ jacobian)).reshape(-1, 6)
+        """Whitened, robustly weighted residual (``size``,) and Jacobian (``size``, 6) with respect to the pose."""
+        sights, residual = self._seen(pose)
+        whitener = positive.whitener(sights.noise)
+        error = np.einsum("kij,kj->ki", whitener, residual)
+        trust = huber_weight(each_squared(residual, sights.noise), self.eye.model.robust)
+        weight = np.sqrt(self.tempering * trust)
+        return (weight * error).ravel(), (weight[:, :, None] * (whitener @ sights.by_pose)).reshape(-1, 6)
 
     def cost(self, pose: gtsam.Pose3) -> float:
         """The robust loss, tempered."""
-        sights = self.eye.known(robot_of(pose), self.points, self.spreads)
-        losses = huber_loss(squared(sights.pixels - self.pixels, sights.noise), self.eye.model.robust)
-        return self.tempering * float(np.sum(losses))
+        sights, residual = self._seen(pose)
+        squares = each_squared(residual, sights.noise)[:, 1:]  # of the pixel once, and perhaps of the depth
+        return self.tempering * float(np.sum(huber_loss(squares, self.eye.model.robust)))
 
-    def _whitened(self, pose: gtsam.Pose3) -> tuple[Array, Array, Array]:
-        sights = self.eye.known(robot_of(pose), self.points, self.spreads)
-        whitener = positive.whitener(sights.noise)
-        return np.einsum("kij,kj->ki", whitener, sights.pixels - self.pixels), whitener, sights.by_pose
+    def _seen(self, pose: gtsam.Pose3) -> tuple[Sights, Array]:
+        """What is predicted, and the residual (K, 2 or 3), predicted minus measured."""
+        sights = self.eye.known(robot_of(pose), self.points, self.spreads, self.depths)
+        return sights, sights.pixels - with_inverse(self.pixels, self.depths)
 
 
 class SpaceProblem:
@@ -128,7 +138,8 @@ class SpaceProblem:
         key = (m.t, m.right)
         self.images.pop(key, None)  # it may have been matched before a late measurement
         if len(match.pixels):
-            self.images[key] = SeenPoints(m.t, eye, match.pixels, match.points, match.spreads, match.tempering)
+            seen = match.pixels, match.points, match.spreads, match.tempering, match.depths
+            self.images[key] = SeenPoints(m.t, eye, *seen)
 
     def later(self, known: KnownState, t: float) -> KnownState:
         """What is known at ``t``."""
@@ -207,7 +218,7 @@ def _solved(
     motion: Sequence[gtsam.NonlinearFactor], images: list[tuple[int, SeenPoints]], values: gtsam.Values
 ) -> tuple[gtsam.Values, gtsam.GaussianFactorGraph]:
     """The optimum, and the problem linearised there."""
-    units = {2 * len(image.pixels): gtsam.noiseModel.Unit.Create(2 * len(image.pixels)) for _, image in images}
+    units = {image.size: gtsam.noiseModel.Unit.Create(image.size) for _, image in images}
     sizes = dict.fromkeys(range(values.size()), 6)
 
     def cost(at: gtsam.Values) -> float:

@@ -176,4 +176,4 @@ def _factor(image: SeenPoints, key: int) -> gtsam.NonlinearFactor:
             jacobians[0] = jacobian
         return residual
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(2 * len(image.pixels)), [key], error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(image.size), [key], error)

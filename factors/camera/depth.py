@@ -8,8 +8,9 @@ A structured-light or stereo camera measures a disparity, so the noise of the in
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factors.camera.model import CameraModel, undistorted
+from factors.camera.model import CameraModel, linearize_in_space, undistorted
 from factors.se2 import Array
 
 LEAST = 1e-3  # m: points nearer than this, or behind the camera, have no inverse depth
@@ -25,6 +26,27 @@ def linearize_inverse_depth(rotations: Array, local: Array) -> tuple[Array, Arra
     by_camera[:, 0], by_camera[:, 1] = local[:, 1] * squared, -local[:, 0] * squared
     by_camera[:, 5] = squared
     return inverse, by_camera, -squared[:, None] * rotations[:, :, 2]
+
+
+def linearize_with_depth(
+    model: CameraModel, position: Array, rotation: Array, points: Array, measured: NDArray[np.bool_]
+) -> tuple[Array, Array, Array]:
+    """Pixels and inverse depths (K, 3) of ``points`` (K, 3), and the Jacobians (K, 3, 6) and (K, 3, 3), as in
+    :func:`~factors.camera.model.linearize_in_space`; the third rows are zero where no depth was ``measured`` (K,)."""
+    pixels, by_camera, by_point = linearize_in_space(model, position, rotation, points)
+    rotations = np.broadcast_to(rotation, (len(points), 3, 3))
+    deep = linearize_inverse_depth(rotations, (points - position) @ rotation)
+    inverse, camera_by_depth, point_by_depth = (np.where(measured, part.T, 0.0).T[:, None] for part in deep)
+    return (
+        np.hstack((pixels, inverse)),
+        np.concatenate((by_camera, camera_by_depth), axis=1),
+        np.concatenate((by_point, point_by_depth), axis=1),
+    )
+
+
+def with_inverse(pixels: Array, depths: Array | None) -> Array:
+    """``pixels`` (K, 2) with the inverse of ``depths`` (K,) [m] as a third value, 0 where that is NaN; as they are without any."""
+    return pixels if depths is None else np.column_stack((pixels, np.nan_to_num(1.0 / depths)))
 
 
 def lifted(model: CameraModel, pixels: Array, depths: Array) -> Array:
