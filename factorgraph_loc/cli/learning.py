@@ -99,7 +99,7 @@ def map_(
         str | None,
         typer.Option(
             metavar="SOURCE",
-            help="For tags and points: reference, or odometry to estimate the poses too; by default the reference if there is one.",
+            help="For tags: reference, or odometry to estimate the poses too; by default the reference if there is one.",
         ),
     ] = None,
     tag_height: Annotated[

@@ -85,7 +85,7 @@ def run(
     """Run one estimator on one log; write trajectories, estimates, scores and plots."""
     from factorgraph_loc.experiments import run as experiment
     from factorgraph_loc.experiments.learning import run_and_learn
-    from factorgraph_loc.experiments.output import check_free, write_plots, write_run
+    from factorgraph_loc.experiments.output import MAP, check_free, write_plots, write_run
     from factorgraph_loc.fusion.registry import check_names, for_final_only
 
     check_names([estimator])
@@ -123,6 +123,8 @@ def run(
     _print_effort(scores)
     show.line()
     show.line(f"results are in {out}")
+    if (out / MAP).exists():
+        show.line(f"a map of the {len(result.learnt.points or ())} points that were found is in {out / MAP}")
 
 
 @takes_log_options

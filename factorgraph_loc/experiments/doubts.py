@@ -6,6 +6,7 @@ import numpy as np
 
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
 from factorgraph_loc.evaluation.pairing import pairs
+from factorgraph_loc.fusion.map_frame import MapFrame
 from factorgraph_loc.model.belief import Status
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
@@ -31,6 +32,18 @@ def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[str, ...
         return ()
     return (
         f"{log.name}: scored over {end - begin:.1f} s of {whole:.1f} s: the reference is there from {begin:.1f} s to {end:.1f} s",
+    )
+
+
+def in_bent_map(log: Log, frame: MapFrame, final: Trajectory) -> tuple[str, ...]:
+    """What a map that was made without a reference may be wrong by itself, where the robot was."""
+    if frame.error is None or not len(final):
+        return ()
+    worst = np.linalg.eigvalsh(frame.error(final.poses)[:, :2, :2])[:, -1]
+    median, most = np.sqrt((np.median(worst), worst.max()))
+    return (
+        f"{log.name}: the map was made without a reference: it may be wrong by {median:.2g} m here, {most:.2g} m at most (standard "
+        "deviations), which the covariances contain",
     )
 
 

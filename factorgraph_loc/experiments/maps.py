@@ -49,6 +49,7 @@ START_SIGMA = 1e-3  # m and rad; without a map the start defines the frame
 TURN_SIGMA, SHIFT_SIGMA = 0.01, 0.02  # rad, m: of a reference without covariances, for points
 HEIGHTS = (-10.0, 20.0)  # m
 OF_REFERENCE = "that of the reference"
+BY_RUN = "fgloc run -e smoother --set smoother.landmarks=unknown makes a map of points without one"
 SOURCES = {"log": "the log's start", "reference": "its reference"}
 
 Stages = Callable[[str], AbstractContextManager[Callable[[float, float], None]]]
@@ -67,9 +68,9 @@ class MapOptions:
     ``of``: landmarks, tags or points; None: points if the log has images, landmarks if it has sightings of them, else tags.
     ``estimator`` and ``settings``: for landmarks; ``points``: settings of points, fields of
     :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`. ``extend``: keep the log's map, and add what it lacks.
-    ``poses``: of the robot, for tags and points: reference, or odometry, with estimation of the poses; None: the reference if
-    there is one. ``tag_height`` [m]: of tags that the log's map lacks; None: that of the antennas. ``drop_dead``: write the log's
-    map without the tags that are believed dead, and map nothing. ``prior``: see
+    ``poses``: of the robot, for tags: reference, or odometry, with estimation of the poses; None: the reference if there is one.
+    ``tag_height`` [m]: of tags that the log's map lacks; None: that of the antennas. ``drop_dead``: write the log's map without the
+    tags that are believed dead, and map nothing. ``prior``: see
     :func:`~factorgraph_loc.experiments.preparation.resolve_prior`. ``colmap``: folder of a model of COLMAP (text) of the log's
     images, whose points are taken instead of mapping.
     """
@@ -241,14 +242,12 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
         raise InputError(f"{log.name}: has no images (camera), so that there are no points to map")
     if options.extend and log.world.points is None:
         raise InputError(f"{log.name}: has no map of points that could be extended; leave --extend out")
+    if options.poses not in (None, "reference"):
+        raise InputError(f"--poses is {quoted(options.poses)}, expected reference for points: {BY_RUN}")
     settings = parse_model(PointSettings, options.points, "--set points")
-    warnings: tuple[str, ...] = ()
-    frame = OF_REFERENCE
     model = None if options.colmap is None else read_colmap(options.colmap)
-    if model is not None:
-        frame = "that of the model"
-    elif not _along_reference(options, there=log.reference is not None or log.reference3 is not None):
-        log, frame, warnings = _smoothed(log, options.prior, stages)
+    if model is None and log.reference is None and log.reference3 is None:
+        raise InputError(f"{log.name}: has no reference that says where its images were taken: {BY_RUN}")
     with stages("features") as report:
         seen, doubts = with_features(log, camera.frontend, lambda share: report(share, 1.0))
     with stages("points") as report:
@@ -265,7 +264,8 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     world = log.world.model_copy(update={"name": f"{log.name}-map", "points": points})
     draw = partial(map_figure.point_figure, log.name, points, made.cameras.positions, world.walls)
     details = replace(made.report, points=len(points), fused=fused)
-    return MadeMap(world, frame, details, (*(warnings or log.warnings), *doubts), draw)
+    frame = OF_REFERENCE if model is None else "that of the model"
+    return MadeMap(world, frame, details, (*log.warnings, *doubts), draw)
 
 
 def _along_reference(options: MapOptions, *, there: bool) -> bool:
@@ -301,26 +301,3 @@ def _in_words(start: PosePrior, source: str) -> str:
     chosen = "" if start.has_heading else ", which has no heading"
     source = SOURCES.get(source, "--prior")
     return f"the robot starts at ({x:.3f} m, {y:.3f} m, {heading:.3f} rad), from {source}{chosen}"
-
-
-def _smoothed(log: Log, prior: str | None, stages: Stages) -> tuple[Log, str, tuple[str, ...]]:
-    """The log with the smoother's final trajectory as its reference, from all sensors and points that its map lacks; and warnings.
-
-    It has covariances, so that images of revisited places can still correct it.
-    """
-    used = tuple(name for name in log.rig.sensors if name in log.streams)
-    started, frame = _started_exactly(log, prior)
-    config = RunConfig("smoother", {"landmarks": "extended"}, used, prior="log")
-    with stages("smoother") as report:
-        result = run(started, config, lambda share: report(share, 1.0))
-    assert result.final.covariances is not None
-    sigma = float(np.sqrt(np.linalg.eigvalsh(result.final.covariances[:, :2, :2])[:, -1].max()))
-    common = (
-        f"{log.name}: mapped without a reference: points near each other have an error in common, of up to {sigma:.2g} m (standard "
-        "deviation), which a robot that is localized in the map repeats, and which is in no covariance"
-    )
-    return (
-        replace(log, reference=result.final, reference3=None),
-        f"that of the start: {frame}",
-        (*result.warnings, common),
-    )

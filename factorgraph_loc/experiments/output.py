@@ -25,14 +25,19 @@ from factorgraph_loc.evaluation.plots import plot_run, remove_plots
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
 from factorgraph_loc.files.models import file_name, write_text, write_toml
 from factorgraph_loc.files.temporary import of_system, require_free, sweep, temporary_folder, writing
+from factorgraph_loc.io.native.world_file import write_world
 from factorgraph_loc.io.results import FILES, trajectory_of
+from factorgraph_loc.mapping.point_maps import merged
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import Alignment
 from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory
+from factorgraph_loc.model.world import World
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
+
+MAP = "map.world.toml"
 
 
 def write_run(
@@ -48,6 +53,7 @@ def write_run(
     estimates from the first localized one on; of a robot in space both TUM files have height and rotation. ``learnt.json``:
     ``constants`` by name with ``value`` and ``sigma``, ``landmarks`` by name with ``x``, ``y`` [m] and ``covariance`` (xx, xy,
     yy) [m^2] in the world frame. ``events.csv``: ``t_ns`` (absolute), ``t`` [s from the log's start] and the event.
+    ``map.world.toml``, with its points beside it: the map with the points that were found, if any were; see :func:`map_of`.
 
     Everything is written to a temporary folder first; other files in ``out`` are not changed. Raises InputError if ``out``
     contains results and ``overwrite`` is off.
@@ -60,10 +66,12 @@ def write_run(
             content = stack.enter_context(temporary_folder(out)) / "run"  # with the permissions of any new folder
             content.mkdir()
         write_files(result, log, scores, content)
+        if (found := map_of(result, log)) is not None:
+            write_world(found, content / MAP)
         if out.exists():
             remove_run(out)
-            for name in FILES:
-                (content / name).replace(out / name)
+            for path in sorted(content.iterdir(), key=lambda path: path.name == FILES[-1]):
+                path.replace(out / path.name)
         else:
             content.replace(out)
     return scores
@@ -81,6 +89,16 @@ def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: 
     write_text(folder / "learnt.json", _json(learnt_tables(result.learnt)))
     write_text(folder / "events.csv", events(result, log).write_csv())
     write_text(folder / "metrics.json", _json(scores))
+
+
+def map_of(result: RunResult, log: Log) -> World | None:
+    """The log's map with the points that a run found in place of its own, or beside them if these were used; None without any."""
+    points, known = result.learnt.points, log.world.points
+    if points is None or not len(points):
+        return None
+    if known is not None and result.config["settings"].get("landmarks") == "extended":
+        points, _ = merged(known, points)
+    return log.world.model_copy(update={"name": f"{log.name}-map", "points": points})
 
 
 def write_plots(result: RunResult, log: Log, out: Path) -> None:
@@ -113,7 +131,7 @@ def check_free(out: Path, *, overwrite: bool) -> None:
 
 def remove_run(out: Path) -> None:
     """Remove the files of a previous run, the mark of completeness first, and nothing else."""
-    for name in reversed(FILES):
+    for name in (*reversed(FILES), *(path.name for path in out.glob(f"{MAP.partition('.')[0]}.*"))):
         (out / name).unlink(missing_ok=True)
 
 

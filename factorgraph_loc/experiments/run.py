@@ -19,7 +19,7 @@ import numpy as np
 
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.experiments.causal_estimates import CausalEstimates
-from factorgraph_loc.experiments.doubts import findable, never_localized, partly_scored, with_pauses
+from factorgraph_loc.experiments.doubts import findable, in_bent_map, never_localized, partly_scored, with_pauses
 from factorgraph_loc.experiments.garbage import only_new_searched
 from factorgraph_loc.experiments.preparation import (
     KNOWN,
@@ -34,6 +34,7 @@ from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, SpaceEstimator, finds_heading
 from factorgraph_loc.fusion.guarded import Guard, sound, sound_space, sound_trajectory
+from factorgraph_loc.fusion.map_frame import MapFrame
 from factorgraph_loc.io.checks import require_bounds, require_one_span
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PosePrior
@@ -128,6 +129,7 @@ def run(
     report = progress or (lambda _: None)
     prepared = prepare(use, lambda share: report(0.5 * share))
     before = 0.5 if prepared.images else 0.0
+    frame = MapFrame.of(setup, use.modalities, getattr(settings, "landmarks", "known"))
     _rehearse(config, setup, settings, prepared.log, prior)
     ticks = Ticks(_begin(log, sensors, prior), config.tick_gap)
     loop = _CausalRun(
@@ -137,6 +139,7 @@ def run(
         sensors,
         prior,
         ticks,
+        frame,
         lambda share: report(before + (1.0 - before) * share),
         watch,
     )
@@ -145,10 +148,10 @@ def run(
     started = perf_counter()
     in_space = None
     with guard.telling("the final trajectory"):
-        final = sound_trajectory(estimator.trajectory())
+        final = frame.trajectory(sound_trajectory(estimator.trajectory()))
         final_seconds = perf_counter() - started
         if isinstance(estimator, SpaceEstimator):
-            in_space = sound_space(estimator.space_trajectory())
+            in_space = frame.in_space(sound_space(estimator.space_trajectory()))
         diagnostics, learnt = estimator.diagnostics, estimator.learnt()
         if isinstance(estimator, ConcludingEstimator):
             diagnostics = estimator.final_diagnostics()
@@ -188,6 +191,7 @@ def run(
             *(line for one in reliability.values() for line in one.doubts),
             *never_localized(log, sensors, loop.told.status, final),
             *partly_scored(log, final, config.max_gap),
+            *in_bent_map(log, frame, final),
             *with_pauses(log, ticks.skipped, config.tick_gap),
         ),
         causal_space=loop.told.in_space(),
@@ -215,14 +219,14 @@ def _rehearse(
     with suppress(FglocError), guard, guard.quiet():
         estimator = registry.create(config.estimator, replace(setup, rng=np.random.default_rng(config.seed)), settings)
         ticks = Ticks(begin, config.tick_gap)
-        _CausalRun(guard, estimator, log, setup.sensors, prior, ticks, end=first + _REHEARSAL).run()
+        _CausalRun(guard, estimator, log, setup.sensors, prior, ticks, MapFrame(), end=first + _REHEARSAL).run()
         with guard.telling("the final trajectory"):
             estimator.trajectory()
 
 
 @dataclass
 class _CausalRun:
-    """The causal part of a run, up to ``end``."""
+    """The causal part of a run, up to ``end``, in a map with this ``frame``."""
 
     guard: Guard
     estimator: Estimator
@@ -230,6 +234,7 @@ class _CausalRun:
     sensors: tuple[str, ...]
     prior: PosePrior | None
     ticks: Ticks
+    frame: MapFrame
     progress: Callable[[float], None] = lambda _: None
     watch: Callable[[float, Estimator], None] | None = None
     end: float = math.inf
@@ -308,7 +313,7 @@ class _CausalRun:
         assert self.prior is not None
         self._initialized = True
         with self.guard.telling("the start", self.prior.t):
-            self.estimator.initialize(self.prior)
+            self.estimator.initialize(self.frame.prior(self.prior))
 
     def _update(self, t: float, measurements: Iterator[Measurement]) -> None:
         started = perf_counter()
@@ -321,7 +326,7 @@ class _CausalRun:
 
     def _tick(self, t: float) -> None:
         with self.guard.telling("the estimate", t):
-            e = sound(self.estimator.estimate(t))
+            e = self.frame.estimate(sound(self.estimator.estimate(t)))
         self.guard.process(self.estimator, Tick(t))
         self.told.add(t, e)
         if self.watch is not None:

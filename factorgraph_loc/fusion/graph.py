@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -177,8 +177,9 @@ class Graph:
             keyframe.factor = make(increment)
         return keyframe.factor, keys
 
-    def learnt(self) -> Learnt:
-        """The constants and landmarks that are estimated."""
+    def learnt(self, poses: Iterable[Array] = (), covariances: Iterable[Array] = ()) -> Learnt:
+        """The constants and landmarks that are estimated; points at final ``poses`` of all keyframes, with their body-frame
+        ``covariances``."""
         values: dict[str, tuple[float, float]] = {}
         blocks = [(name, self.values[key], self.spreads[key]) for name, key in self.keys.items() if is_landmark(key)]
         landmarks = learnt_landmarks(blocks)
@@ -189,8 +190,9 @@ class Graph:
             sigmas = np.sqrt(np.diag(self.spreads[key]))
             for label, value, sigma in zip(self._constants[name].names, self.values[key], sigmas, strict=True):
                 values[prefix + label] = (float(value), float(sigma))
+        at, spreads = ({k.key: v for k, v in zip(self.keyframes, part)} for part in (poses, covariances))  # noqa: B905
         for mapper in self.mappers:
-            found = mapper.learnt(self.departed[0] | self.values, self.departed[1] | self.spreads)
+            found = mapper.learnt(self.departed[0] | self.values | at, self.departed[1] | self.spreads | spreads)
             if found is not None:
                 return Learnt(values, landmarks, found)
         return Learnt(values, landmarks)

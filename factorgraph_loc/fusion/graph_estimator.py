@@ -168,7 +168,10 @@ class GraphEstimator(ABC):
 
     def learnt(self) -> Learnt:
         """The constants and landmarks that are estimated, as the final trajectory has them."""
-        return self._graph.learnt() if self._graph.prior is None else self._concluded().graph.learnt()
+        if self._graph.prior is None:
+            return self._graph.learnt()
+        end = self._concluded()
+        return end.graph.learnt(end.poses, end.covariances)
 
     def trajectory(self) -> Trajectory:
         """The best estimate of the whole past at the stamps of the ticks, from the start on; empty if there was none."""

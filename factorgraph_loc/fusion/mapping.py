@@ -63,4 +63,5 @@ class Mapper(Protocol):
         """Give up all points but those with these ``keys``."""
 
     def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
-        """All points that ever were in the graph."""
+        """All points that ever were in the graph, of which, and of the poses of keyframes, these are the ``values`` with their
+        ``spreads``."""

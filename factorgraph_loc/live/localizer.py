@@ -17,6 +17,7 @@ from factorgraph_loc.files.values import seconds_of
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import Estimator, ForgettingEstimator, finds_heading
 from factorgraph_loc.fusion.guarded import Guard, sound, sound_belief, sound_trajectory
+from factorgraph_loc.fusion.map_frame import MapFrame
 from factorgraph_loc.live.start import prior_of, require_options, usable_sensors
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior
@@ -74,6 +75,9 @@ class Localizer:
         default = {"lag": LAG} if estimator == "smoother" else {}
         self._settings = registry.settings_of(estimator, default | dict(settings or {}))
         self._sensors = usable_sensors(rig, sensors)
+        setup = model_setup.Setup(rig, self._world, self._sensors, np.random.default_rng(seed))
+        modalities = getattr(registry.estimator_type(estimator), "modalities", ())
+        self._frame = MapFrame.of(setup, modalities, getattr(self._settings, "landmarks", "known"))
         self._offsets = {name: rig.time_offset(name) for name in self._sensors}  # s
         self._history, self._seed = history, seed
         self._lock = threading.Lock()
@@ -109,7 +113,7 @@ class Localizer:
             raise InputError(f"{self._name} cannot find an unknown heading with this rig and map, expected a heading")
         if start is not None and not math.isnan(start.t):
             with guard.telling("the start", start.t):
-                new.initialize(start)
+                new.initialize(self._frame.prior(start))
         with self._lock:
             self._begin_anew(new, start, guard)
 
@@ -171,7 +175,7 @@ class Localizer:
             if self._estimator is None or not self._is_under_way(self._newest):
                 return Belief(())
             with self._guard.telling("the belief", self._newest):
-                return copy.deepcopy(sound_belief(self._estimator.belief(self._newest)))
+                return copy.deepcopy(self._frame.belief(sound_belief(self._estimator.belief(self._newest))))
 
     def trajectory(self) -> Trajectory:
         """The smoothed past at 10 Hz, at least the last ``history`` seconds before the newest timestamp."""
@@ -180,7 +184,7 @@ class Localizer:
             if self._estimator is None or self._ticks is None or not self._ticks.count:
                 return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
             with self._guard.telling("the trajectory"):
-                return copy.deepcopy(sound_trajectory(self._estimator.trajectory()))
+                return copy.deepcopy(self._frame.trajectory(sound_trajectory(self._estimator.trajectory())))
 
     def learnt(self) -> Learnt:
         """Estimates besides the pose: constants of sensors, landmarks, points. Smoothed, like :meth:`trajectory`."""
@@ -248,7 +252,7 @@ class Localizer:
             if self._prior is not None:
                 self._prior = replace(self._prior, t=m.t)
                 with self._guard.telling("the start", m.t):
-                    estimator.initialize(self._prior)
+                    estimator.initialize(self._frame.prior(self._prior))
         # as in a run of a log: a tick follows all measurements up to its time
         for t in self._ticks.before(m.t):
             self._guard.process(estimator, Tick(t))
@@ -282,7 +286,7 @@ class Localizer:
                 f"t is {at:.3f} s, {at - self._newest:.0f} s ahead of all measurements, expected the same clock"
             )
         with self._guard.telling("the estimate", at):
-            found = sound(self._estimator.estimate(at))
+            found = self._frame.estimate(sound(self._estimator.estimate(at)))
         # copied, because the estimator may reuse its arrays
         self._last = _copied(found, at)
         return _copied(found, at)

@@ -82,6 +82,7 @@ def chosen(points: PointMap, which: Integers) -> PointMap:
         points.descriptors[views],
         points.seen_from[views],
         points.sizes[views],
+        None if points.common is None else points.common[views],
     )
 
 
@@ -107,6 +108,20 @@ def _joined(first: PointMap, second: PointMap, others: Integers, owners: Integer
         np.concatenate([points.descriptors for points in parts]),
         np.concatenate((first.seen_from, second.seen_from)),
         np.concatenate((first.sizes, second.sizes)),
+        _common(first, second),
+    )
+
+
+def _common(first: PointMap, second: PointMap) -> Array | None:
+    """What the views of both maps know of their frames; a map that was made with a reference knows its own."""
+    if first.common is None and second.common is None:
+        return None
+    nothing = [np.zeros((len(points.owners), 3, 3)) for points in (first, second)]
+    return np.concatenate(
+        [
+            none if points.common is None else points.common
+            for none, points in zip(nothing, (first, second), strict=True)
+        ]
     )
 
 

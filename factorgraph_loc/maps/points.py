@@ -22,6 +22,7 @@ POINTS_SUFFIX = ".points.parquet"
 COLUMNS = ("point", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz")
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 VIEW = ("from_x", "from_y", "from_z", "size")
+COMMON = ("cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh")
 Feature = Literal["colour", "sift", "orb"]
 KINDS: tuple[str, ...] = get_args(Feature)
 LARGEST_VALUE = 1e6  # largest absolute value of a descriptor
@@ -34,7 +35,9 @@ class PointMap:
 
     ``names``: P, unique; ``positions`` (P, 3) [m] in the world frame; ``covariances`` (P, 3, 3) [m^2]. ``feature``: the kind of
     the views' ``descriptors`` (V, D), empty where points are identified by name only (V = 0). ``owners`` (V,): the point of
-    each view; ``seen_from`` (V, 3) [m]: the camera's position; ``sizes`` (V,) [px]: size of the feature in the image.
+    each view; ``seen_from`` (V, 3) [m]: the camera's position; ``sizes`` (V,) [px]: size of the feature in the image. ``common``
+    (V, 3, 3): of a map that was made without a reference, the covariance of (x, y, heading) of the frame there, about the camera:
+    the part of the points' errors that all points seen from there have in common; see :mod:`.common_error`.
     """
 
     names: tuple[str, ...]
@@ -45,6 +48,7 @@ class PointMap:
     descriptors: NDArray[Any]
     seen_from: Array
     sizes: Array
+    common: Array | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -107,6 +111,9 @@ def write_points(points: PointMap, path: Path) -> None:
         for axis, name in enumerate(VIEW[:3]):
             columns[name] = np.where(shown, points.seen_from[views, axis], np.nan)
         columns["size"] = np.where(shown, points.sizes[views], np.nan)
+        if points.common is not None:
+            entries = zip(COMMON, UPPER, strict=True)
+            columns |= {name: np.where(shown, points.common[views, i, j], np.nan) for name, (i, j) in entries}
         columns["descriptor"] = [points.descriptors[v].tobytes() if v >= 0 else b"" for v in views.tolist()]
     write_parquet(pl.DataFrame(columns), path)
 
@@ -135,10 +142,8 @@ def read_points(path: Path) -> PointMap:
             stated = f"{float(expected[i])!r} as in row {first[owner[i]] + 1} of point {labels[i]}"
             raise bad_field(path, name, float(values[i]), stated, row=i + 1)
     positions = np.column_stack([numbers[axis] for axis in "xyz"])
-    covariances = np.empty((len(rows), 3, 3))
-    for name, (i, j) in zip(COLUMNS[4:], UPPER, strict=True):
-        covariances[:, i, j] = covariances[:, j, i] = numbers[name][first]
-    _check_covariances(covariances, tuple(rows), first, path)
+    covariances = _symmetric([numbers[name][first] for name in COLUMNS[4:]])
+    _check_covariances(covariances, COLUMNS[4:], tuple(rows), first, path)
     features = text_column(table, "feature", path)
     kinds = sorted({name for name in features if name})
     if unknown := [name for name in kinds if name not in KINDS]:
@@ -149,6 +154,10 @@ def read_points(path: Path) -> PointMap:
         return PointMap.of(tuple(rows), positions[first], covariances)
     shown = np.flatnonzero([bool(name) for name in features])
     columns = [_numbers(table, name, shown, path) for name in VIEW]
+    common = None
+    if any(name in table.columns for name in COMMON):
+        common = _symmetric([_numbers(table, name, shown, path) for name in COMMON])
+        _check_covariances(common, COMMON, [labels[i] for i in shown.tolist()], shown, path)
     return PointMap(
         tuple(rows),
         positions[first],
@@ -158,7 +167,16 @@ def read_points(path: Path) -> PointMap:
         _descriptors(table, shown, kinds[0], path),
         np.column_stack(columns[:3]),
         columns[3],
+        common,
     )
+
+
+def _symmetric(upper: Sequence[Array]) -> Array:
+    """The matrices (N, 3, 3) with these entries (N,) on and above their diagonals."""
+    full = np.empty((len(upper[0]), 3, 3))
+    for values, (i, j) in zip(upper, UPPER, strict=True):
+        full[:, i, j] = full[:, j, i] = values
+    return full
 
 
 def _numbers(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path) -> Array:
@@ -170,17 +188,20 @@ def _numbers(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path
     return values
 
 
-def _check_covariances(covariances: Array, names: Sequence[str], first: NDArray[np.int64], path: Path) -> None:
+def _check_covariances(
+    covariances: Array, columns: Sequence[str], names: Sequence[str], rows: NDArray[np.int64], path: Path
+) -> None:
+    """InputError for the first of ``covariances`` (N, 3, 3), of points ``names`` (N) in ``rows`` (N,), that is none."""
     least, _, most = np.linalg.eigvalsh(covariances).T
     if len(bad := np.flatnonzero(least < -ROUNDING * np.abs(most))):
         i = int(bad[0])
         given = tuple(float(covariances[i][place]) for place in UPPER)
         raise bad_field(
             path,
-            f"covariance ({', '.join(COLUMNS[4:])}) of point {names[i]}",
+            f"covariance ({', '.join(columns)}) of point {names[i]}",
             given,
             "a positive semi-definite matrix",
-            row=int(first[i]) + 1,
+            row=int(rows[i]) + 1,
         )
 
 

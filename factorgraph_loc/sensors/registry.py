@@ -65,7 +65,9 @@ class SensorType:
     :class:`~factorgraph_loc.sensors.interfaces.Marks`, for plots and viewers.
 
     For estimators: ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor`, or None if a run does not use it;
-    ``predict``: ``(rig, sensors, diagnostics, self_calibration) ->`` :class:`~factorgraph_loc.model.measurement.Motion`.
+    ``predict``: ``(rig, sensors, diagnostics, self_calibration) ->`` :class:`~factorgraph_loc.model.measurement.Motion`;
+    ``frame_error``: ``(setup, modalities, landmarks)``, what is not known of the frame of the map, see
+    :class:`~factorgraph_loc.fusion.map_frame.MapFrame`, or None.
 
     For runs (:class:`~factorgraph_loc.sensors.interfaces.Use`): ``check``: ``(use)``, raises InputError if log and settings do not
     fit; ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.interfaces.PreparedLog`; ``doubts``: ``(use,
@@ -90,6 +92,7 @@ class SensorType:
     simulation: Mapping[str, Section] = field(default_factory=dict)
     bind: Place = ""
     predict: Place = ""
+    frame_error: Place = ""
     summarize: Place = ""
     draw: Place = ""
     check: Place = ""

@@ -6,6 +6,7 @@ from itertools import compress
 
 import numpy as np
 
+from factorgraph_loc.maps.common_error import without_common
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import MapUse, Setup
@@ -62,7 +63,8 @@ class FeatureMatcher:
         self._right_eye = Eye.of(right.model()) if right else None
         self._grows = use != "known"
         nothing = PointMap.of((), np.empty((0, 3)))
-        self._map = nothing if use == "unknown" or setup.world.points is None else setup.world.points
+        known = nothing if use == "unknown" or setup.world.points is None else setup.world.points
+        self._map = without_common(known)
         self._associator: Associator | None = None
         if self._left_eye is not None and "camera" in sensors and len(self._map.owners):
             self._associator = Associator(self._map, self._left_eye.model)

@@ -75,7 +75,6 @@ class UnknownPoints:
     _points: dict[Hashable, _Point] = field(default_factory=dict)
     _astray: list[_Point] = field(default_factory=list)  # in the graph, but no longer seen under their name
     _names: dict[int, str] = field(default_factory=dict)  # by key, of all points that ever were in the graph
-    _looks: PointLooks = field(default_factory=PointLooks)
     _loops: LoopClosure = field(default_factory=LoopClosure)
     _distance_travelled: float = 0.0  # m
     _again_as: dict[Hashable, Hashable] = field(
@@ -84,7 +83,7 @@ class UnknownPoints:
     _anchored: dict[int, bool] = field(default_factory=dict)  # keyframes with sightings
 
     def __post_init__(self) -> None:
-        self._new = NewPoints(self.model)
+        self._new, self._looks = NewPoints(self.model), PointLooks(self.model)
         self._lens = reprojection.lens_of(self.model)
         self._floor = TiltScale.guessed(self.model.tilt)
 
@@ -130,10 +129,8 @@ class UnknownPoints:
         )
         self._tilts(keyframe, tilt, sigma, graph, addition)
         if m.frame is not None:
-            seen_from = lifted(model, *guess).position
-            self._remember(
-                m.frame, [(rows[i], names[i], bool(agrees)) for i, agrees in zip(old, right, strict=True)], seen_from
-            )
+            known_rows = [(rows[i], names[i], bool(agrees)) for i, agrees in zip(old, right, strict=True)]
+            self._remember(m.frame, known_rows, keyframe.key, guess)
         for i, agrees in zip(old, right.tolist(), strict=True):
             self._again(names[i], pixels[i], bool(agrees), keyframe, guess[0], model, graph, addition)
         self._anchored[keyframe.index] = int(np.count_nonzero(right)) >= ANCHORED
@@ -148,9 +145,8 @@ class UnknownPoints:
             self._names[key] = f"track{name}" if m.names is None else str(name)
             self._points[name] = _Point(key, keyframe.t, positive.inverse(found.covariance))
             if m.frame is not None:
-                self._looks.keep(
-                    key, m.frame, rows[names.index(name)], lifted(model, *guess).position, self._distance_travelled
-                )
+                row = rows[names.index(name)]
+                self._looks.keep(key, m.frame, row, self._distance_travelled, keyframe.key, guess)
             addition.values[key] = found.position
             graph.values[key], graph.spreads[key] = found.position, found.covariance
             native = gtsam.PriorFactorVector(key, found.position, gtsam.noiseModel.Diagonal.Sigmas(OPEN))
@@ -221,12 +217,13 @@ class UnknownPoints:
                 self._follow(int(image.frame.tracks[row]), old[which])
         return certain
 
-    def _remember(self, m: CameraFrame, seen: Sequence[tuple[int, Hashable, bool]], seen_from: Array) -> None:
-        """Store the current views of points; a track that was wrongly assigned to one is separated."""
+    def _remember(self, m: CameraFrame, seen: Sequence[tuple[int, Hashable, bool]], key: int, guess: Guess) -> None:
+        """Store the views of points from the keyframe ``key``; a track that was wrongly assigned to one is separated."""
         for row, name, agrees in seen:
             track = int(m.tracks[row])
             if agrees:
-                self._looks.keep(self._points[name].key, m, row, seen_from, self._distance_travelled)
+                point = self._points[name].key
+                self._looks.keep(point, m, row, self._distance_travelled, key, guess)
             elif self._again_as.pop(track, None) is not None:
                 self._points[name].strikes -= 1  # not the fault of the point
 
@@ -247,7 +244,8 @@ class UnknownPoints:
         self._new, self._loops = NewPoints(self.model), LoopClosure()
 
     def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
-        """All points that were ever in the graph, under the first of their keys; features with their last view."""
+        """All points that were ever in the graph, under the first of their keys; features with their last view. ``values`` and
+        ``spreads`` are of keyframes too."""
         keys: dict[str, int] = {}
         for key, name in self._names.items():
             if key in values:
@@ -255,7 +253,8 @@ class UnknownPoints:
         if not keys:
             return None
         positions, covariances = (np.array([part[key] for key in keys.values()]) for part in (values, spreads))
-        return self._looks.map_of(tuple(keys), tuple(keys.values()), positions, covariances)
+        found = self._looks.map_of(tuple(keys), tuple(keys.values()), positions, covariances)
+        return self._looks.settled(found, tuple(keys.values()), values, spreads)
 
     def _tilts(self, keyframe: Keyframe, tilt: Array, sigma: float, graph: GraphView, addition: Addition) -> None:
         """Make a variable of the ``tilt`` of the robot at a new keyframe, of a floor that is level to ``sigma`` [rad]."""

@@ -33,7 +33,8 @@ DURATION = 180.0  # s
 RECORD = Path(__file__).parents[1] / "record_physics"
 MONDAY, TUESDAY = "monday", "tuesday"
 DRAWN_RIG, RIG = "cart.rig.toml", "learnt.rig.toml"
-MAP, OWN_MAP = "monday.world.toml", "own.world.toml"
+MAP, OWN = "monday.world.toml", "own"
+OWN_MAP = f"{OWN}/map.world.toml"
 WHEELS, NO_MAP = ("odometry",), {"landmarks": "unknown"}
 HEADS = (
     "map",
@@ -113,9 +114,10 @@ def learn(folder: Path) -> None:
     monday = str(folder / f"{MONDAY}.toml")
     if not (folder / RIG).exists():
         fgloc.calibrate([monday], folder / RIG)
-    for name, poses in ((MAP, "reference"), (OWN_MAP, "odometry")):
-        if not (folder / name).exists():
-            fgloc.build_map(monday, folder / name, rig=folder / RIG, poses=poses)
+    if not (folder / MAP).exists():
+        fgloc.build_map(monday, folder / MAP, rig=folder / RIG)
+    if not (folder / OWN_MAP).exists():
+        fgloc.run(monday, "smoother", settings=NO_MAP, rig=folder / RIG, out=folder / OWN, overwrite=True)
 
 
 def attempt(job: Job) -> RunResult:

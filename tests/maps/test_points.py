@@ -7,11 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.maps.points import PointMap, read_points, write_points
+from factorgraph_loc.maps.points import COMMON, PointMap, read_points, write_points
 
 
-def a_map(count, views, feature="sift", seed=0):
-    """A map of ``count`` points of which those in ``views`` are seen, once for each time they stand there."""
+def a_map(count, views, feature="sift", seed=0, *, common=False):
+    """A map of ``count`` points of which those in ``views`` are seen, once for each time they stand there; with an error that they
+    have in ``common`` or not."""
     rng = np.random.default_rng(seed)
     root = rng.standard_normal((count, 3, 3))
     bits = feature == "orb"
@@ -29,6 +30,7 @@ def a_map(count, views, feature="sift", seed=0):
         descriptors,
         rng.standard_normal((len(views), 3)),
         rng.uniform(1.0, 9.0, len(views)),
+        root[views] @ root[views].transpose(0, 2, 1) if common else None,
     )
 
 
@@ -39,18 +41,30 @@ def assert_same(found, points):
     for name in ("positions", "owners", "descriptors", "seen_from", "sizes"):
         np.testing.assert_array_equal(getattr(found, name), getattr(points, name))
     np.testing.assert_allclose(found.covariances, points.covariances, rtol=1e-14)
+    assert (found.common is None) == (points.common is None)
+    if points.common is not None:
+        np.testing.assert_allclose(found.common, points.common, rtol=1e-14)
     assert found.descriptors.dtype == points.descriptors.dtype
 
 
 @given(
     st.integers(1, 6).flatmap(lambda n: st.tuples(st.just(n), st.lists(st.integers(0, n - 1), min_size=1, max_size=9))),
     st.sampled_from(["sift", "orb", "colour"]),
+    st.booleans(),
 )
-def test_what_is_written_comes_back(tmp_path_factory, counts, feature):
-    points = a_map(*counts, feature)
+def test_what_is_written_comes_back(tmp_path_factory, counts, feature, common):
+    points = a_map(*counts, feature, common=common)
     path = tmp_path_factory.mktemp("maps") / "a.points.parquet"
     write_points(points, path)
     assert_same(read_points(path), points)
+
+
+def test_a_map_without_what_its_points_have_in_common_is_read(tmp_path):
+    path = tmp_path / "a.points.parquet"
+    write_points(a_map(3, [0, 1, 1], common=True), path)
+    assert [name for name in pl.read_parquet(path).columns if name.startswith("cov_")] == list(COMMON)
+    pl.read_parquet(path).drop(COMMON).write_parquet(path)
+    assert read_points(path).common is None
 
 
 def test_points_known_by_name_alone(tmp_path):
@@ -75,7 +89,7 @@ def written(tmp_path):
 
     def write(change):
         path = tmp_path / "a.points.parquet"
-        write_points(a_map(3, [0, 1, 1]), path)
+        write_points(a_map(3, [0, 1, 1], common=True), path)
         change(pl.read_parquet(path)).write_parquet(path)
         return path
 
@@ -113,6 +127,11 @@ def test_a_flat_covariance_is_one(written):
         (lambda t: in_row(t, 1, size=0.0), ":2: size is 0.0, expected a finite number of px in 0.001"),
         (lambda t: in_row(t, 0, from_x=float("inf")), ":1: from_x is inf, expected a finite number"),
         (lambda t: in_row(t, 2, from_z=None), ":3: from_z is nan, expected a finite number"),
+        (lambda t: t.drop("cov_xh"), "has no column cov_xh of numbers"),
+        (
+            lambda t: in_row(t, 1, cov_hh=-1.0),
+            ":2: covariance (cov_xx, cov_xy, cov_xh, cov_yy, cov_yh, cov_hh) of point p1",
+        ),
         (lambda t: t.with_columns(feature=pl.lit("surf")), ":1: feature is 'surf', expected colour or sift or orb"),
         (lambda t: t.with_columns(feature=pl.Series(["sift", "orb", "orb", "orb"])), "kinds orb, sift"),
         (lambda t: t.with_columns(descriptor=pl.Series([b"1234", b"12345678", b"1234", b"1234"])), "differ in their"),

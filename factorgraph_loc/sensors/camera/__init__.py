@@ -61,6 +61,7 @@ SENSOR = SensorType(
         "camera_right": Section("factorgraph_loc.sensors.camera.settings:CameraSettings"),
     },
     bind="factorgraph_loc.sensors.camera.bound:bind",
+    frame_error="factorgraph_loc.sensors.camera.describe:frame_error",
     summarize="factorgraph_loc.sensors.camera.summary:summarize",
     prepare="factorgraph_loc.sensors.camera.prepare:prepare",
     doubts="factorgraph_loc.sensors.camera.describe:doubts",

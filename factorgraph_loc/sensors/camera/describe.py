@@ -1,12 +1,17 @@
 """Descriptions of what a run can do with a camera."""
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Container, Iterator, Sequence
+from functools import partial
 
+from factorgraph_loc.maps.common_error import CommonError
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.interfaces import Use
+from factors.se2 import Array
 
 NAMES = ("camera", "sightings")
 
@@ -21,6 +26,17 @@ def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:
 def mappable(log: Log) -> str | None:
     """The map layer that can be made from a log's images, or None if there are none or the camera is unknown."""
     return "points" if "camera" in log.streams and log.rig.find(CameraSettings) is not None else None
+
+
+def frame_error(setup: Setup, modalities: Container[str], landmarks: MapUse) -> Callable[[Array], Array] | None:
+    """The covariances (N, 3, 3) at poses (N, 3) of what all points of the map that are seen from there have in common; None if it
+    was made with a reference, or is not used."""
+    points, camera = setup.world.points, setup.rig.find(CameraSettings)
+    used = "camera" in setup.sensors and "camera" in modalities and landmarks != "unknown"
+    if points is None or camera is None or not used:
+        return None
+    error, ahead = CommonError.of(points), camera.model().rotation[:, 2]
+    return None if error is None else partial(error.at, looking=math.atan2(ahead[1], ahead[0]))
 
 
 def doubts(use: Use, _diagnostics: Diagnostics, _learnt: Learnt) -> Iterator[str]:

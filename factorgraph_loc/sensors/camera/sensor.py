@@ -10,6 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from factorgraph_loc.maps.common_error import without_common
 from factorgraph_loc.maps.markers import marker_of
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -84,7 +85,7 @@ class KnownPoints:
         self._tempering = 1.0 if settings is None else settings.tempering  # for matched points
         self.map = PointMap.of((), np.empty((0, 3)))
         if setup.world.points is not None and use != "unknown":
-            self.map = setup.world.points
+            self.map = without_common(setup.world.points)
         self._others_matter = use != "known"
         self.used = np.empty(0, dtype=np.int64)  # features of the last image that match points of the map
         self.names: tuple[str, ...] = ()  # of the points of the last factor, where they are named

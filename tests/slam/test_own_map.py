@@ -1,0 +1,89 @@
+"""A run without a map makes one, in which another drive finds its place and knows how well."""
+
+from dataclasses import replace
+
+import camera_world
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import factorgraph_loc as fgloc
+from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.experiments.output import map_of
+from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.mapping.point_maps import chosen
+from factorgraph_loc.maps.common_error import CommonError
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.stream import FeatureStream
+
+SECONDS, EVERY = 24.0, 0.4  # s
+SEEDS = range(21, 25)
+UNKNOWN = RunConfig("smoother", {"landmarks": "unknown"})
+
+
+def filmed(seed, speeds):
+    """A drive through the room with features that are followed for four seconds, and no map."""
+    log = camera_world.simulate(seed, SECONDS, speeds=speeds)
+    rng, points = np.random.default_rng(seed), camera_world.with_views(camera_world.room())
+    times = np.arange(0.3, SECONDS, EVERY)
+    frames = []
+    for k, (t, pose) in enumerate(zip(times.tolist(), log.reference.at(times), strict=True)):
+        found, shown = camera_world.frame(points, pose, t, rng, clutter=60)
+        tracks = np.where(shown < 0, 10**6 + 1000 * k + np.arange(len(shown)), shown + 1000 * int(t / 4.0))
+        frames.append(replace(found, tracks=tracks))
+    rig = log.rig.model_copy(update={"sensors": ("odometry", "camera")})
+    streams = {"odometry": log.streams["odometry"], "camera": FeatureStream(times, frames)}
+    return replace(log, rig=rig, world=World(), streams=streams)
+
+
+@pytest.fixture(scope="module")
+def days():
+    """Of each seed the map of a first drive, and the log of a second one in it."""
+    found = {}
+    for seed in SEEDS:
+        monday, tuesday = filmed(seed, camera_world.circle), filmed(seed + 100, camera_world.weave)
+        found[seed] = replace(tuesday, world=map_of(run(monday, UNKNOWN), monday))
+    return found
+
+
+@pytest.mark.parametrize("name", ["smoother", "ekf", "monoslam"])
+def test_the_error_of_the_map_is_in_the_covariances(days, name):
+    """Within one drive it is nearly the same all the time: each drive counts for one pose. False alarm: one in a thousand."""
+    found = [score(run(log, RunConfig(name)), log) for log in days.values()]
+    low, high = chi2.ppf((0.0005, 0.9995), 3 * len(found)) / len(found)
+    for kind in ("causal", "final"):
+        assert low < np.mean([one[f"{kind}.anees"] for one in found]) < high
+        assert np.sqrt(np.mean([one[f"{kind}.position_rmse"] ** 2 for one in found])) < 0.25
+
+
+def test_what_the_map_may_be_wrong_by_is_told_once(days):
+    log = days[SEEDS[0]]
+    told = [w for w in run(log, RunConfig("ekf")).warnings if "made without a reference: it may be wrong by 0." in w]
+    assert len(told) == 1
+    others = (RunConfig("dead_reckoning", sensors=("odometry",)), UNKNOWN)
+    assert not any("without a reference" in w for config in others for w in run(log, config).warnings)
+
+
+def test_a_localizer_knows_it_too(days):
+    log = days[SEEDS[0]]
+    localizer = fgloc.Localizer(log.rig, log.world, "ekf")
+    localizer.initialize(log.reference.poses[0], np.diag((0.01, 0.01, 0.01)) ** 2, t=0.0)
+    for m in log.measurements(log.rig.sensors):
+        localizer.push(m)
+    found, error = localizer.estimate(), CommonError.of(log.world.points)
+    own = found.covariance - error.at(found.pose[None])[0]
+    assert np.linalg.eigvalsh(own)[0] > 0.0
+    assert np.linalg.eigvalsh(own)[-1] < 0.1**2
+    path = localizer.trajectory()
+    assert np.all(np.linalg.eigvalsh(path.covariances - error.at(path.poses))[:, 0] > -1e-12)
+    np.testing.assert_allclose(localizer.belief().modes[0].covariance, found.covariance)
+
+
+def test_points_that_a_map_lacks_are_added_to_it(days):
+    log = days[SEEDS[0]]
+    half = np.flatnonzero(log.world.points.positions[:, 0] < 0.0)
+    known = replace(log, world=World(points=chosen(log.world.points, half)))
+    found = map_of(run(known, RunConfig("smoother", {"landmarks": "extended"})), known)
+    assert set(known.world.points.names) <= set(found.points.names)
+    assert len(found.points) > len(half) + 10
+    assert map_of(run(log, RunConfig("smoother")), log) is None
