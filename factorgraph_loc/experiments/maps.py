@@ -15,7 +15,7 @@ from factorgraph_loc.drawing.figures import save
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.colmap import points_of
 from factorgraph_loc.experiments.output import beside
-from factorgraph_loc.experiments.preparation import first_odometry, resolve_prior
+from factorgraph_loc.experiments.preparation import START_SIGMA, first_odometry, resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import parse_model, replacing
 from factorgraph_loc.files.temporary import writing
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 SUFFIX = ".world.toml"
 POINTS = "points"
 MAPPERS = ("batch", "smoother", "ekf")  # the estimators that estimate landmarks
-START_SIGMA = 1e-3  # m and rad; without a map the start defines the frame
 TURN_SIGMA, SHIFT_SIGMA = 0.01, 0.02  # rad, m: of a reference without covariances, for points
 HEIGHTS = (-10.0, 20.0)  # m
 OF_REFERENCE = "that of the reference"

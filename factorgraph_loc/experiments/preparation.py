@@ -21,6 +21,7 @@ from factorgraph_loc.text import listed, quoted
 # of a start taken from the reference
 REFERENCE_POSITION_SIGMA = 0.02  # m
 REFERENCE_HEADING_SIGMA = 0.01  # rad
+START_SIGMA = 1e-3  # m and rad: of a start that defines the frame
 
 KNOWN = "reference, log or X,Y,HEADING"
 EXPECTED = "reference, log, unknown, X,Y or X,Y,HEADING"
@@ -54,8 +55,8 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
 
 
 def at_origin(log: Log) -> PosePrior:
-    """The start (0, 0, 0) of a log without other information, at the first odometry."""
-    return PosePrior(first_odometry(log), np.zeros(3), _covariance(POSITION_SIGMA, HEADING_SIGMA))
+    """The start (0, 0, 0) of a log without other information, at the first odometry: exact, as it defines the frame."""
+    return PosePrior(first_odometry(log), np.zeros(3), _covariance(START_SIGMA, START_SIGMA))
 
 
 def check_prior(prior: str | None) -> None:

@@ -273,6 +273,7 @@ def test_a_log_that_tells_nothing_of_its_start_begins_at_the_origin(log, fake):
     bare = replace(log, reference=None, world=World())
     result = run(bare, RunConfig("fake"))
     assert fake.made.prior.pose.tolist() == [0.0, 0.0, 0.0]
+    assert np.sqrt(np.diag(fake.made.prior.covariance)).max() < 0.002  # it is where the frame is
     assert result.config["prior"] == "origin"
     assert result.warnings[0].startswith("straight: has neither a start nor a reference: begins at (0, 0, 0)")
     # in a map of what its sensors see, the origin is a place like any other
