@@ -27,7 +27,6 @@ from factorgraph_loc.files.models import file_name, write_text, write_toml
 from factorgraph_loc.files.temporary import of_system, require_free, sweep, temporary_folder, writing
 from factorgraph_loc.io.native.world_file import write_world
 from factorgraph_loc.io.results import FILES, trajectory_of
-from factorgraph_loc.mapping.point_maps import merged
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
@@ -97,6 +96,8 @@ def map_of(result: RunResult, log: Log) -> World | None:
     if points is None or not len(points):
         return None
     if known is not None and result.config["settings"].get("landmarks") == "extended":
+        from factorgraph_loc.mapping.point_maps import merged  # noqa: PLC0415 - other runs need no trees of scipy
+
         points, _ = merged(known, points)
     return log.world.model_copy(update={"name": f"{log.name}-map", "points": points})
 

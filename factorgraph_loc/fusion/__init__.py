@@ -11,6 +11,7 @@ __all__ = [
     "guarded",
     "kld",
     "least_squares",
+    "map_frame",
     "mapping",
     "marginals",
     "particle_filter",
