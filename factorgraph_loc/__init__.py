@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.model.world import World
     from factorgraph_loc.sensors.camera.measurement import PixelSightings
     from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream, RightSightingStream, SightingStream
+    from factorgraph_loc.sensors.inertial.measurement import Inertial, InertialStream
     from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeStream
     from factorgraph_loc.sensors.landmarks.settings import Landmark
     from factorgraph_loc.sensors.loops.measurement import Loops, LoopStream
@@ -80,6 +81,8 @@ __all__ = [
     "ImageStream",
     "IncrementOdometry",
     "IncrementStream",
+    "Inertial",
+    "InertialStream",
     "InputError",
     "Landmark",
     "Localizer",
@@ -192,6 +195,7 @@ _MODULES = {
     "sensors.camera.stream": ("FeatureStream", "ImageStream", "RightSightingStream", "SightingStream"),
     "sensors.landmarks.settings": ("Landmark",),
     "sensors.landmarks.measurement": ("BearingRange", "BearingRangeStream"),
+    "sensors.inertial.measurement": ("Inertial", "InertialStream"),
     "sensors.loops.measurement": ("LoopStream", "Loops"),
     "sensors.odometry.measurement": (
         "IncrementOdometry",

@@ -7,6 +7,7 @@ SENSORS.own |= {
     "landmarks": "factorgraph_loc.sensors.landmarks:SENSOR",
     "rfid": "factorgraph_loc.sensors.rfid:SENSOR",
     "twist": "factorgraph_loc.sensors.twist:SENSOR",
+    "inertial": "factorgraph_loc.sensors.inertial:SENSOR",
     "camera": "factorgraph_loc.sensors.camera:SENSOR",
     "loops": "factorgraph_loc.sensors.loops:SENSOR",
 }

@@ -5,6 +5,7 @@ __all__ = [
     "binding",
     "calibrating",
     "camera",
+    "inertial",
     "interfaces",
     "known_position",
     "landmarks",

@@ -52,8 +52,8 @@ class Channel:
 
     @property
     def in_space(self) -> bool:
-        """Whether only logs in three dimensions have it: there is no table for it in a log of a robot on a floor."""
-        return bool(self.described) and not self.tables
+        """Whether only robots in space use it: it measures their motion, or a log of a robot on a floor has no table for it."""
+        return self.motion == "space" or (bool(self.described) and not self.tables)
 
 
 @dataclass(frozen=True)

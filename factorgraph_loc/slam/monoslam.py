@@ -6,9 +6,9 @@ turn rate w^R in its own frame; points that are not in the map follow. The error
 degrees of freedom. The camera is mounted on R by the rig's extrinsics, so R replaces the paper's camera frame.
 
 Odometry replaces the constant-velocity prediction of x, y and heading; height, roll and pitch stay near those of a robot on the
-floor. A motion measured in space (``twist``) replaces all six. Without either, velocity is constant up to random impulses. Map
-points are searched where they are predicted (:mod:`.monoslam_search`); others enter the state by inverse depth
-(:mod:`.monoslam_map`). RFID is ignored.
+floor. A motion measured in space (``twist``) replaces all six; an inertial unit tells how velocity and orientation change, and its
+biases are states. Without either, velocity is constant up to random impulses. Map points are searched where they are predicted
+(:mod:`.monoslam_search`); others enter the state by inverse depth (:mod:`.monoslam_map`). RFID is ignored.
 """
 
 import math
@@ -28,7 +28,7 @@ from factorgraph_loc.model.trajectory3 import Trajectory3, planar_estimate, plan
 from factorgraph_loc.sensors.camera.sensor import CAMERAS, Pixels
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.registry import moving
-from factorgraph_loc.sensors.twist.measurement import in_space, twist_settings
+from factorgraph_loc.slam.inertial_motion import measured_motion
 from factorgraph_loc.slam.monoslam_invariance import carried
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
 from factorgraph_loc.slam.monoslam_past import UpdateRecord, smoothed
@@ -51,7 +51,6 @@ from factorgraph_loc.slam.space_motion import (
     Origin,
     RobotState,
     Step,
-    TwistChain,
     about_z,
     constant_velocity,
     cross,
@@ -59,7 +58,9 @@ from factorgraph_loc.slam.space_motion import (
     on_the_floor,
     planar,
     standstill,
+    unobservable,
 )
+from factorgraph_loc.slam.space_motion_models import KnownState
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import FLOATS, TILTS
 from factors import se2
@@ -116,13 +117,17 @@ class Monoslam(Filter):
         self._settings = settings
         self.supports_unknown_start = settings.landmarks == "known"
         self._looker = FeatureMatcher(setup, self.diagnostics, settings.landmarks)
-        twist = twist_settings(setup)
-        self._twists = None if twist is None else TwistChain(twist, HORIZON)
         self._wheels = bool(moving(setup.sensors, "floor"))
         self._planar = self._wheels if settings.planar is None else settings.planar
+        # one eye begins points at depths so vague that this filter would mistake how far a known acceleration led
+        clear = settings.landmarks != "unknown" or self._looker.two_eyes
+        inertial = clear and not (self._wheels and self._planar)
+        self._chain, self._measured = measured_motion(setup, HORIZON, inertial=inertial)
+        self._inertial = self._measured is not None and self._measured.by_velocity  # it tells how the velocity changes
+        self._constants = self._motion.constants if self._measured is None else self._measured.constants
         camera = setup.rig.find(CameraSettings) if any(name in setup.sensors for name in CAMERAS) else None
-        constants = self._motion.constants.names
-        self._scale = constants.index(SCALE) if SCALE in constants else None
+        names = self._constants.names
+        self._scale = names.index(SCALE) if SCALE in names else None
         self._told = False  # whether it was said that the scale is unknown
         self._mounting = np.zeros((6, 6)) if camera is None else _of_mounting(camera)
         self._step: Step | None = None
@@ -140,22 +145,22 @@ class Monoslam(Filter):
 
     def process(self, measurement: Measurement) -> None:
         """Process one measurement, in order or late by at most ``max_delay``."""
-        twist = in_space(measurement)
-        if twist is not None and self._twists is not None:
-            self._ahead = None
-            if not self._twists.add(twist.t, twist.v, twist.w):
-                self.diagnostics.drop_late("twist")
-        else:
+        taken = None if self._chain is None else self._chain.take(measurement)
+        if taken is None:
             super().process(measurement)
+            return
+        self._ahead = None
+        if not taken:
+            self.diagnostics.drop_late(measurement.modality)
 
     def learnt(self) -> Learnt:
-        """The constants of the odometry, and the points in the state, seen from above, without those of unknown depth."""
+        """The constants of what measures motion, and the points in the state, seen from above, without those of unknown depth."""
         state: SlamState | None = self._state
         if state is None:
             return Learnt()
         sigmas = np.sqrt(np.diag(state.covariance)[ROBOT : state.base])
         found = zip(state.constants.tolist(), sigmas.tolist(), strict=True)
-        values = dict(zip(self._motion.constants.names, found, strict=True))
+        values = dict(zip(self._constants.names, found, strict=True))
         points = {}
         for point, start in zip(state.points, state.starts().tolist(), strict=True):
             if not point.ray:
@@ -192,8 +197,7 @@ class Monoslam(Filter):
 
     def _start(self, prior: PosePrior) -> SlamState:
         s = self._settings
-        constants = self._motion.constants
-        covariance = _starting(constants.sigmas)
+        covariance = _starting(self._constants.sigmas)
         if s.planar is None:
             self._planar = prior.space is None
         if prior.space is not None:
@@ -205,33 +209,33 @@ class Monoslam(Filter):
             covariance[UPRIGHT, UPRIGHT] = np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
         if s.landmarks == "unknown":
-            free = PLANAR if self._planar else list(range(6))
-            spread = np.zeros((6, 6))
-            spread[np.ix_(free, free)] = covariance[np.ix_(free, free)]
-            scaled = not self._by_velocity or self._looker.two_eyes
-            self._origin = Origin(robot, spread, 0.0 if scaled else UNSCALED)
-            covariance[free] = covariance[:, free] = 0.0
-        return SlamState(robot, np.zeros(len(constants.names)), covariance)
+            free = unobservable(robot, floor=self._planar, gravity=self._inertial)
+            told, pose = np.eye(6) - free, covariance[:6, :6]
+            scaled = self._inertial or not self._by_velocity or self._looker.two_eyes
+            self._origin = Origin(robot, free @ pose @ free, 0.0 if scaled else UNSCALED)
+            covariance[:6, :6] = told @ pose @ told
+        return SlamState(robot, np.zeros(len(self._constants.names)), covariance)
 
     def _seek(self, m: Pixels) -> SlamState | None:
         eye = self._looker.eye(m)
         camera = None if eye is None else self._looker.relocated(m, eye)
         if eye is None or camera is None:
             return None
-        sigmas = self._motion.constants.sigmas
+        sigmas = self._constants.sigmas
         nowhere = RobotState(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
         return self._standing(camera, eye, SlamState(nowhere, np.zeros(len(sigmas)), _starting(sigmas)))
 
     @property
     def _by_velocity(self) -> bool:
-        """Whether no motion is measured, so that the motion is predicted from the velocity."""
-        return self._twists is None and not (self._planar and self._wheels)
+        """Whether the motion is predicted from the velocity."""
+        return self._inertial or (self._measured is None and not (self._planar and self._wheels))
 
     def _predict(self, t: float) -> None:
         increment = self._travelled(t)
         s, robot, dt = self._settings, self._state.robot, increment.duration
-        if self._twists is not None:
-            step = measured(robot, self._twists.between(self._t, self._t + dt), dt)
+        if self._measured is not None:
+            known = KnownState(self._t, robot, self._state.covariance, self._state.constants)
+            step = self._measured.step(known, self._t + dt)
         elif not self._by_velocity:
             delta, by_constants = self._motion.changed(increment, self._state.constants)
             step = measured(robot, planar(delta, increment.covariance, by_constants), dt)

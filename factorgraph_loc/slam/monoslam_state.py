@@ -82,15 +82,8 @@ class SlamState:
         )
 
     def moved(self, step: Step) -> SlamState:
-        """The state after a prediction, which changes the robot only."""
-        known = step.transition.shape[1]
-        carried = step.transition @ self.covariance[:known]
-        covariance = self.covariance.copy()
-        covariance[:ROBOT] = carried
-        covariance[ROBOT:, :ROBOT] = carried[:, ROBOT:].T
-        corner = carried[:, :known] @ step.transition.T + step.noise
-        covariance[:ROBOT, :ROBOT] = 0.5 * (corner + corner.T)
-        return replace(self, robot=step.robot, covariance=covariance)
+        """The state after a prediction, which changes the robot alone."""
+        return replace(self, robot=step.robot, covariance=step.carried(self.covariance))
 
 
 @dataclass(frozen=True)

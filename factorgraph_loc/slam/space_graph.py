@@ -1,15 +1,16 @@
 """The factor graph of a camera in space: all its poses, from its motion and points of a known map.
 
-One ``gtsam.Pose3`` per stamp; its motion as measured (``twist``), or with a velocity that changes at random
-(:mod:`.space_motion_models`); and for each image the points that the monoSLAM filter matched, with Huber loss. That filter runs
-along and provides initial values. Points that the map lacks are not used.
+One ``gtsam.Pose3`` per stamp; its motion as measured (``twist``), with a velocity that changes at random
+(:mod:`.space_motion_models`), or with one that an inertial unit tells (:mod:`.inertial_motion`); and for each image the points that
+the monoSLAM filter matched, with Huber loss. That filter runs along and provides initial values. Points that the map lacks are not
+used.
 
 Point factors are linearised here, as in :mod:`~factorgraph_loc.fusion.problem`, and GTSAM solves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -25,21 +26,12 @@ from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.camera.sensor import Pixels
-from factorgraph_loc.sensors.twist.measurement import in_space, twist_settings
+from factorgraph_loc.slam.inertial_motion import STRIDE, measured_motion
 from factorgraph_loc.slam.monoslam import MonoslamSettings
 from factorgraph_loc.slam.monoslam_past import UpdateRecord
 from factorgraph_loc.slam.monoslam_sighting import Match
 from factorgraph_loc.slam.monoslam_state import Eye, Sights, SlamState, each_squared
-from factorgraph_loc.slam.space_motion import ROBOT, TwistChain
-from factorgraph_loc.slam.space_motion_models import (
-    AT_ONCE,
-    ConstantVelocity,
-    KnownState,
-    MeasuredMotion,
-    SpaceMotion,
-    pose_of,
-    robot_of,
-)
+from factorgraph_loc.slam.space_motion_models import AT_ONCE, ConstantVelocity, KnownState, robot_of
 from factors import positive
 from factors.camera.depth import with_inverse
 from factors.robust import huber_loss, huber_weight
@@ -68,7 +60,7 @@ def start_in_space(name: str, prior: PosePrior) -> PosePrior:
 
 def known_start(t: float, state: SlamState) -> KnownState:
     """What is known when a filter begins."""
-    return KnownState(t, state.robot, state.covariance[:ROBOT, :ROBOT])
+    return KnownState(t, state.robot, state.covariance[: state.base, : state.base], state.constants)
 
 
 @dataclass(frozen=True)
@@ -117,11 +109,8 @@ class SpaceProblem:
 
     def __init__(self, name: str, setup: Setup, settings: MonoslamSettings) -> None:
         self._name = name
-        twist = twist_settings(setup)
-        self._chain = None if twist is None else TwistChain(twist)
-        self.motion: SpaceMotion = ConstantVelocity(settings.acceleration, settings.angular_acceleration)
-        if self._chain is not None:
-            self.motion = MeasuredMotion(self._chain)
+        self._chain, measured = measured_motion(setup)
+        self.motion = measured or ConstantVelocity(settings.acceleration, settings.angular_acceleration)
         self.images: dict[tuple[float, bool], SeenPoints] = {}
         self.first: KnownState | None = None
         self._conclusion: tuple[Trajectory3, Diagnostics] | None = None  # the result, until the next measurement
@@ -129,9 +118,8 @@ class SpaceProblem:
     def take(self, measurement: Measurement) -> None:
         """Take in the motion, if a measurement tells it; what was concluded holds no more."""
         self._conclusion = None
-        twist = in_space(measurement)
-        if twist is not None and self._chain is not None:
-            self._chain.add(twist.t, twist.v, twist.w)
+        if self._chain is not None:
+            self._chain.take(measurement)
 
     def see(self, m: Pixels, match: Match, eye: Eye) -> None:
         """Take in what was matched in an image."""
@@ -143,7 +131,7 @@ class SpaceProblem:
 
     def later(self, known: KnownState, t: float) -> KnownState:
         """What is known at ``t``."""
-        return known.moved(self.motion.step(known.robot, known.t, t), t) if t > known.t else known
+        return known.moved(self.motion.step(known, t), t) if t > known.t else known
 
     def concluded(
         self,
@@ -165,18 +153,20 @@ class SpaceProblem:
     def _solution(
         self, records: Sequence[UpdateRecord], ticks: Array, mounting: Array, diagnostics: Diagnostics
     ) -> Trajectory3:
-        past = {record.t: record.robot for record in records}
+        past = {record.t: KnownState(record.t, record.robot, record.covariance, record.constants) for record in records}
         if not past:  # nothing told where an unknown start was
             return Trajectory3(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 6, 6)))
         t = np.array(sorted(past))
         t = t[np.append(True, np.diff(t) > AT_ONCE)]
         values = gtsam.Values()
+        sizes: dict[int, int] = {}
         for i, stamp in enumerate(t.tolist()):
-            values.insert(i, pose_of(past[stamp]))
+            values.insert(self.motion.values(i, past[stamp]))
+            sizes |= self.motion.sizes(i)
         images = [(int(_at(t, image.t)), image) for image in self.images.values()]
-        values, linear = _solved(self._motion_factors(t), images, values)
+        values, linear = _solved(self._motion_factors(t), images, values, sizes)
         rows = _at(t, ticks).tolist()
-        spreads = self._covariances(linear, rows, t, diagnostics)
+        spreads = self._covariances(linear, sizes, rows, t, diagnostics)
         poses = [values.atPose3(i) for i in rows]
         return Trajectory3(
             ticks,
@@ -189,20 +179,25 @@ class SpaceProblem:
         """The factors of the start and of the motion between the stamps."""
         assert self.first is not None
         start = self.later(self.first, float(t[0]))
-        times, factors = t.tolist(), [start.prior(0)]
+        times, factors = t.tolist(), [self.motion.prior(0, start)]
         for i in range(1, len(times)):
             part = slice(max(0, i - 2), i + 1)
-            factors.append(self.motion.factor(range(len(times))[part], times[part], start))
+            factors += self.motion.factors(range(len(times))[part], times[part], start)
         return factors
 
     def _covariances(
-        self, linear: gtsam.GaussianFactorGraph, rows: list[int], t: Array, diagnostics: Diagnostics
+        self,
+        linear: gtsam.GaussianFactorGraph,
+        sizes: Mapping[int, int],
+        rows: list[int],
+        t: Array,
+        diagnostics: Diagnostics,
     ) -> dict[int, Array]:
         """Covariances (6, 6) of the poses ``rows``. Raises RunFailedError if they are not determined."""
         try:
-            found = covariances(linear, dict.fromkeys(range(len(t)), 6), rows)
+            found = covariances(linear, sizes, rows)
         except IndeterminateError as error:
-            what = "all poses" if error.key is None else f"the pose at {t[error.key]:.3f} s"
+            what = "all poses" if error.key is None else f"the pose at {t[error.key % STRIDE]:.3f} s"
             raise RunFailedError(f"{self._name}: the measurements do not determine {what}") from error
         if found.damping:
             diagnostics.events.append((float(t[-1]), damped(found.damping)))
@@ -215,11 +210,13 @@ def _at(t: Array, stamps: Array | float) -> NDArray[np.intp]:
 
 
 def _solved(
-    motion: Sequence[gtsam.NonlinearFactor], images: list[tuple[int, SeenPoints]], values: gtsam.Values
+    motion: Sequence[gtsam.NonlinearFactor],
+    images: list[tuple[int, SeenPoints]],
+    values: gtsam.Values,
+    sizes: Mapping[int, int],
 ) -> tuple[gtsam.Values, gtsam.GaussianFactorGraph]:
     """The optimum, and the problem linearised there."""
     units = {image.size: gtsam.noiseModel.Unit.Create(image.size) for _, image in images}
-    sizes = dict.fromkeys(range(values.size()), 6)
 
     def cost(at: gtsam.Values) -> float:
         moved = sum(factor.error(_only(factor, at)) for factor in motion)
@@ -243,7 +240,9 @@ def _solved(
 
 
 def _only(factor: gtsam.NonlinearFactor, at: gtsam.Values) -> gtsam.Values:
-    """The poses of a factor: GTSAM copies all that it is given for each call of a factor of ours."""
+    """The poses of a factor of ours: GTSAM copies all that it is given for each call of one."""
+    if not isinstance(factor, gtsam.CustomFactor):
+        return at
     values = gtsam.Values()
     for key in factor.keys():  # noqa: SIM118
         values.insert(key, at.atPose3(key))

@@ -12,12 +12,16 @@ from __future__ import annotations
 
 import bisect
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 import gtsam
 import numpy as np
 
+from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.sensors.twist.measurement import in_space
 from factorgraph_loc.sensors.twist.settings import TwistSettings
 from factors.se2 import Array
 
@@ -62,17 +66,31 @@ class RobotState:
 
 @dataclass(frozen=True)
 class Step:
-    """A prediction: the resulting ``robot``, the ``transition`` (12, 12 + P) of its error and that of the odometry's P constants,
-    and the added ``noise`` (12, 12).
+    """A prediction: the resulting ``robot``, the ``transition`` (12, 12 + P) of its error and that of P constants of what measures
+    motion, the added ``noise`` (12, 12), and the variances ``drift`` (P,) by which constants change at random, if they do.
     """
 
     robot: RobotState
     transition: Array
     noise: Array
+    drift: Array = field(default_factory=lambda: np.zeros(0))
+
+    def carried(self, covariance: Array) -> Array:
+        """The ``covariance`` (12 + P + D, 12 + P + D) of an error state, of which others are constant."""
+        known = self.transition.shape[1]
+        carried = self.transition @ covariance[:known]
+        found = covariance.copy()
+        found[:ROBOT] = carried
+        found[ROBOT:, :ROBOT] = carried[:, ROBOT:].T
+        corner = carried[:, :known] @ self.transition.T + self.noise
+        found[:ROBOT, :ROBOT] = 0.5 * (corner + corner.T)
+        changing = np.arange(ROBOT, ROBOT + len(self.drift))
+        found[changing, changing] += self.drift
+        return found
 
     def then(self, transition: Array, noise: Array, robot: RobotState) -> Step:
-        """This step followed by another."""
-        return Step(robot, transition @ self.transition, transition @ self.noise @ transition.T + noise)
+        """This step followed by another, of the robot alone."""
+        return Step(robot, transition @ self.transition, transition @ self.noise @ transition.T + noise, self.drift)
 
 
 @dataclass(frozen=True)
@@ -113,6 +131,17 @@ class Origin:
         jacobian = rotation @ np.column_stack((-cross(rotation.T @ (point - self.robot.position)), np.eye(3)))
         away = point - self.robot.position
         return np.asarray(jacobian @ self.covariance @ jacobian.T + self.scale**2 * np.outer(away, away))
+
+
+def unobservable(robot: RobotState, *, floor: bool, gravity: bool) -> Array:
+    """The projection (6, 6) of errors of a pose on those that nothing tells of without a map. A ``floor`` tells height, roll and
+    pitch, ``gravity`` roll and pitch."""
+    free = np.eye(6)
+    if floor:
+        free[UPRIGHT, UPRIGHT] = 0.0
+    elif gravity:
+        free[TURN, TURN] = np.outer(robot.rotation[2], robot.rotation[2])  # about the vertical
+    return free
 
 
 def standstill(robot: RobotState) -> Step:
@@ -186,35 +215,53 @@ def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float) 
     return step.then(transition, noise, RobotState(position, rotation, velocity, rate))
 
 
-class TwistChain:
-    """Integrates measured velocities to the motion between two times. ``horizon``: seconds of rows that are kept."""
+class Chain(ABC):
+    """Rows (6,) of a sensor of motion in space. ``horizon``: seconds of rows that are kept."""
 
-    def __init__(self, settings: TwistSettings, horizon: float = math.inf) -> None:
-        self._spread = np.square((*settings.turn, *settings.shift))
+    def __init__(self, horizon: float = math.inf) -> None:
         self._horizon = horizon
         self._t: list[float] = []
-        self._rows: list[tuple[Array, Array]] = []
+        self._rows: list[Array] = []
 
-    def add(self, t: float, v: Array, w: Array) -> bool:
+    @abstractmethod
+    def take(self, m: Measurement) -> bool | None:
+        """Take the row of a measurement, see :meth:`add`; None if it is of another sensor."""
+
+    def add(self, t: float, row: Array) -> bool:
         """Add a row; False if it is older than the newest, whose motion was used already."""
         if self._t and t < self._t[-1]:
             return False
         self._t.append(t)
-        self._rows.append((v, w))
+        self._rows.append(row)
         old = bisect.bisect_left(self._t, t - self._horizon) - 1
         if old > 0:
             del self._t[:old], self._rows[:old]
         return True
 
+    def parts(self, start: float, end: float) -> Iterator[tuple[int, float, float]]:
+        """The parts from ``start`` to ``end`` between rows: the number of the row before, or -1, and when each begins and ends."""
+        first, last = bisect.bisect_right(self._t, start), bisect.bisect_left(self._t, end)
+        for k, (a, b) in enumerate(pairwise([start, *self._t[first:last], end])):
+            yield first - 1 + k, a, b
+
+
+class TwistChain(Chain):
+    """Integrates measured velocities, and turn rates, to the motion between two times."""
+
+    def __init__(self, settings: TwistSettings, horizon: float = math.inf) -> None:
+        super().__init__(horizon)
+        self._spread = np.square((*settings.turn, *settings.shift))
+
+    def take(self, m: Measurement) -> bool | None:
+        twist = in_space(m)
+        return None if twist is None else self.add(twist.t, np.concatenate((twist.v, twist.w)))
+
     def between(self, start: float, end: float) -> Displacement:
         """The motion from ``start`` to ``end``; a velocity is held until the next row, for at most :data:`HOLD`."""
         rotation, shift, covariance = np.eye(3), np.zeros(3), np.zeros((6, 6))
-        first, last = bisect.bisect_right(self._t, start), bisect.bisect_left(self._t, end)
-        cuts = [start, *(t for t in self._t[first:last]), end]
-        for k, (a, b) in enumerate(pairwise(cuts)):
-            row = first - 1 + k
+        for row, a, b in self.parts(start, end):
             held = b - a if row >= 0 and b - self._t[row] <= HOLD else 0.0
-            v, w = self._rows[row] if held else (np.zeros(3), np.zeros(3))
+            v, w = np.split(self._rows[row] if held else np.zeros(6), 2)
             turned = exp(w * (b - a))
             moved = exp(w * (0.5 * (b - a))) @ v * (b - a)
             transition = np.zeros((6, 6))

@@ -1,18 +1,20 @@
 """Motion in space as factors of a graph: measured, or with a velocity that changes at random.
 
-A velocity is no variable: between two poses it is their difference over the time between them, as in the filter that predicts by it
-(:func:`~factorgraph_loc.slam.space_motion.constant_velocity`).
+In these a velocity is no variable: between two poses it is their difference over the time between them, as in the filter that
+predicts by it (:func:`~factorgraph_loc.slam.space_motion.constant_velocity`). It is one in :mod:`.inertial_motion`.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import gtsam
 import numpy as np
 
+from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.slam.space_motion import (
     POSES,
     ROBOT,
@@ -34,20 +36,17 @@ AT_ONCE = 1e-3  # s between stamps of one pose: from less no velocity can be com
 
 @dataclass(frozen=True)
 class KnownState:
-    """What is known of the robot at ``t`` [s]: its mean, and the covariance (12, 12) of the error state of the filter."""
+    """What is known of the robot and of P ``constants`` (P,) at ``t`` [s]: their mean, and the covariance (12 + P, 12 + P) of the
+    error state of the filter."""
 
     t: float
     robot: RobotState
     covariance: Array
+    constants: Array = field(default_factory=lambda: np.zeros(0))
 
     def moved(self, step: Step, t: float) -> KnownState:
         """What is known at ``t``, after that step."""
-        return KnownState(t, step.robot, step.transition @ self.covariance @ step.transition.T + step.noise)
-
-    def prior(self, key: int) -> gtsam.NonlinearFactor:
-        """The prior factor on the variable ``key``, a pose."""
-        noise = gtsam.noiseModel.Gaussian.Covariance(self.covariance[POSES, POSES])
-        return gtsam.PriorFactorPose3(key, pose_of(self.robot), noise)
+        return KnownState(t, step.robot, step.carried(self.covariance), self.constants)
 
     def by_pose(self) -> tuple[Array, Array]:
         """How the expected velocities depend on the error of the pose (6, 6), and their covariance (6, 6) if that is known."""
@@ -55,44 +54,78 @@ class KnownState:
         return gain, self.covariance[VELOCITIES, VELOCITIES] - gain @ self.covariance[POSES, VELOCITIES]
 
 
-class SpaceMotion(Protocol):
-    """A model of how the robot moves."""
+class SpaceMotion(ABC):
+    """A model of how the robot moves.
 
-    def step(self, robot: RobotState, start: float, end: float) -> Step:
-        """Where it is at ``end``."""
+    ``by_velocity``: whether it moves on by the velocity it has. ``constants``: of what measures the motion, which change at
+    random. In a graph a pose has its number as key; a model may have further variables beside each.
+    """
 
-    def factor(self, keys: Sequence[int], times: Sequence[float], start: KnownState) -> gtsam.NonlinearFactor:
-        """The factor on the last of the poses ``keys`` and one or two before; ``start``: what is known of the first of all."""
+    by_velocity: ClassVar[bool] = True
+    constants: Estimated = NOTHING
 
+    @abstractmethod
+    def step(self, known: KnownState, end: float) -> Step:
+        """Where the robot is at ``end``."""
+
+    @abstractmethod
+    def factors(self, keys: Sequence[int], times: Sequence[float], start: KnownState) -> list[gtsam.NonlinearFactor]:
+        """The factors on the last of the poses ``keys`` and one or two before; ``start``: what is known of the first of all."""
+
+    @abstractmethod
     def state(
-        self, poses: Sequence[gtsam.Pose3], spread: Array, times: Sequence[float], start: KnownState
+        self, values: gtsam.Values, keys: Sequence[int], spread: Array, times: Sequence[float], start: KnownState
     ) -> KnownState:
-        """What is known at the last of one or two poses with the joint covariance ``spread``."""
+        """What is known at the last of one or two poses ``keys``; ``spread``: the joint covariance of :meth:`joint`."""
+
+    def joint(self, keys: Sequence[int]) -> list[int]:
+        """The variables that :meth:`state` needs the joint covariance of, in order of their keys."""
+        return list(keys)
+
+    def sizes(self, key: int) -> dict[int, int]:
+        """The variables of a pose, and how many values their errors have."""
+        return {key: 6}
+
+    def values(self, key: int, known: KnownState) -> gtsam.Values:
+        """The variables of a pose, as they are known."""
+        found = gtsam.Values()
+        found.insert(key, pose_of(known.robot))
+        return found
+
+    def prior(self, key: int, known: KnownState) -> gtsam.NonlinearFactor:
+        """The prior factor on the variables of a pose."""
+        noise = gtsam.noiseModel.Gaussian.Covariance(known.covariance[POSES, POSES])
+        return gtsam.PriorFactorPose3(key, pose_of(known.robot), noise)
 
 
-class MeasuredMotion:
+class MeasuredMotion(SpaceMotion):
     """Motion as a ``twist`` measures it."""
+
+    by_velocity = False
 
     def __init__(self, chain: TwistChain) -> None:
         self._chain = chain
 
-    def step(self, robot: RobotState, start: float, end: float) -> Step:
-        return measured(robot, self._chain.between(start, end), end - start)
+    def step(self, known: KnownState, end: float) -> Step:
+        return measured(known.robot, self._chain.between(known.t, end), end - known.t)
 
-    def factor(self, keys: Sequence[int], times: Sequence[float], start: KnownState) -> gtsam.NonlinearFactor:
+    def factors(self, keys: Sequence[int], times: Sequence[float], start: KnownState) -> list[gtsam.NonlinearFactor]:
         by = self._chain.between(times[-2], times[-1])
-        moved = gtsam.Pose3(gtsam.Rot3(by.rotation), by.shift)
-        return gtsam.BetweenFactorPose3(keys[-2], keys[-1], moved, gtsam.noiseModel.Gaussian.Covariance(by.covariance))
+        moved, noise = (
+            gtsam.Pose3(gtsam.Rot3(by.rotation), by.shift),
+            gtsam.noiseModel.Gaussian.Covariance(by.covariance),
+        )
+        return [gtsam.BetweenFactorPose3(keys[-2], keys[-1], moved, noise)]
 
     def state(
-        self, poses: Sequence[gtsam.Pose3], spread: Array, times: Sequence[float], start: KnownState
+        self, values: gtsam.Values, keys: Sequence[int], spread: Array, times: Sequence[float], start: KnownState
     ) -> KnownState:
         covariance = np.zeros((ROBOT, ROBOT))
         covariance[POSES, POSES] = spread[-6:, -6:]
-        return KnownState(times[-1], robot_of(poses[-1]), covariance)
+        return KnownState(times[-1], robot_of(values.atPose3(keys[-1])), covariance)
 
 
-class ConstantVelocity:
+class ConstantVelocity(SpaceMotion):
     """A velocity and a turn rate that are constant but for an impulse at each step, as in the filter.
 
     ``acceleration`` [m/s^2], ``angular`` [rad/s^2]: standard deviations of what acts over a step (Davison et al., 2007, section
@@ -102,11 +135,11 @@ class ConstantVelocity:
     def __init__(self, acceleration: float, angular: float) -> None:
         self._sigmas = np.repeat((acceleration, angular), 3)
 
-    def step(self, robot: RobotState, start: float, end: float) -> Step:
-        impulse = self._sigmas * (end - start)
-        return constant_velocity(robot, end - start, impulse[:3], impulse[3:])
+    def step(self, known: KnownState, end: float) -> Step:
+        impulse = self._sigmas * (end - known.t)
+        return constant_velocity(known.robot, end - known.t, impulse[:3], impulse[3:])
 
-    def factor(self, keys: Sequence[int], times: Sequence[float], start: KnownState) -> gtsam.NonlinearFactor:
+    def factors(self, keys: Sequence[int], times: Sequence[float], start: KnownState) -> list[gtsam.NonlinearFactor]:
         spans = np.diff(times)
         impulse = np.diag(np.square(self._sigmas * spans[-1]))
         gain, rest = start.by_pose() if len(keys) == 2 else (np.empty(0), np.zeros((6, 6)))
@@ -127,11 +160,12 @@ class ConstantVelocity:
                     jacobians[i] = jacobian
             return found - before
 
-        return gtsam.CustomFactor(noise, list(keys), error)
+        return [gtsam.CustomFactor(noise, list(keys), error)]
 
     def state(
-        self, poses: Sequence[gtsam.Pose3], spread: Array, times: Sequence[float], start: KnownState
+        self, values: gtsam.Values, keys: Sequence[int], spread: Array, times: Sequence[float], start: KnownState
     ) -> KnownState:
+        poses = [values.atPose3(key) for key in keys]
         robot, covariance = robot_of(poses[-1]), np.zeros((ROBOT, ROBOT))
         if len(poses) > 1:
             found, by_first, by_second = velocities(poses[0], poses[1], times[-1] - times[-2])

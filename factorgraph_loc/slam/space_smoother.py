@@ -35,7 +35,7 @@ from factorgraph_loc.slam.space_graph import (
     start_in_space,
 )
 from factorgraph_loc.slam.space_motion import POSES
-from factorgraph_loc.slam.space_motion_models import AT_ONCE, KnownState, SpaceMotion, pose_of
+from factorgraph_loc.slam.space_motion_models import AT_ONCE, KnownState, SpaceMotion
 from factors.se2 import Array
 
 NAME = "space_smoother"
@@ -110,7 +110,7 @@ class SpaceSmoother(Monoslam):
             return
         if self._window is None:
             self._window = _Window(known, self._problem.motion, self._lag)
-        self._known = self._window.add(image, pose_of(self._state.robot))
+        self._known = self._window.add(image, known_start(m.t, self._state))
 
     def _estimate(self) -> PoseEstimate:
         assert self._known is not None
@@ -138,29 +138,29 @@ class _Window:
         self._solver = gtsam.IncrementalFixedLagSmoother(lag, parameters)
         self._start, self._motion_model = start, motion
         self._keys, self._times = [0], [start.t]  # of the newest poses
-        self._update([start.prior(0)], pose_of(start.robot))
+        self._update([motion.prior(0, start)], start)
 
-    def add(self, image: SeenPoints, guess: gtsam.Pose3) -> KnownState:
+    def add(self, image: SeenPoints, guess: KnownState) -> KnownState:
         """Add an image, of the newest pose or of a later one, and return what is known of the robot then."""
         if image.t > self._times[-1] + AT_ONCE:
             self._keys, self._times = [*self._keys[-2:], self._keys[-1] + 1], [*self._times[-2:], image.t]
-            motion = self._motion_model.factor(self._keys, self._times, self._start)
-            self._update([motion, _factor(image, self._keys[-1])], guess)
+            motion = self._motion_model.factors(self._keys, self._times, self._start)
+            self._update([*motion, _factor(image, self._keys[-1])], guess)
         else:
             self._update([_factor(image, self._keys[-1])])
         keys, times = self._keys[-2:], self._times[-2:]
-        poses = [self._solver.calculateEstimatePose3(key) for key in keys]
-        spread = self._solver.getISAM2().jointMarginalCovariance(keys).fullMatrix()
-        return self._motion_model.state(poses, spread, times, self._start)
+        spread = self._solver.getISAM2().jointMarginalCovariance(self._motion_model.joint(keys)).fullMatrix()
+        return self._motion_model.state(self._solver.calculateEstimate(), keys, spread, times, self._start)
 
-    def _update(self, factors: list[gtsam.NonlinearFactor], guess: gtsam.Pose3 | None = None) -> None:
+    def _update(self, factors: list[gtsam.NonlinearFactor], guess: KnownState | None = None) -> None:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for factor in factors:
             graph.push_back(factor)
         if guess is not None:
-            values.insert(self._keys[-1], guess)
+            values = self._motion_model.values(self._keys[-1], guess)
+        kept = [variable for key in self._keys[-2:] for variable in self._motion_model.sizes(key)]
         try:
-            self._solver.update(graph, values, dict.fromkeys(self._keys[-2:], self._times[-1]))
+            self._solver.update(graph, values, dict.fromkeys(kept, self._times[-1]))
         except RuntimeError as error:
             raise RunFailedError(
                 f"{NAME}: the measurements do not determine the pose at {self._times[-1]:.3f} s"

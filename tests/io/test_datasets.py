@@ -6,6 +6,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.inertial.settings import InertialSettings
 from factors.camera import model as reprojection
 
 SENSOR = """\
@@ -62,6 +63,31 @@ def euroc(tmp_path):
     return folder.parent
 
 
+UNIT = """\
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0.0, -1.0, 0.0, 0.1, 1.0, 0.0, 0.0, -0.2, 0.0, 0.0, 1.0, 0.05, 0.0, 0.0, 0.0, 1.0]
+rate_hz: 200
+gyroscope_noise_density: 1.6968e-04     # [ rad / s / sqrt(Hz) ]
+gyroscope_random_walk: 1.9393e-05       # [ rad / s^2 / sqrt(Hz) ]
+accelerometer_noise_density: 2.0000e-3  # [ m / s^2 / sqrt(Hz) ]
+accelerometer_random_walk: 3.0000e-3    # [ m / s^3 / sqrt(Hz) ]
+"""
+
+
+@pytest.fixture
+def flown(euroc):
+    """The folder with an inertial unit, which is turned left by a quarter."""
+    unit = euroc / "mav0" / "imu0"
+    unit.mkdir()
+    (unit / "sensor.yaml").write_text(UNIT)
+    rows = "".join(f"{int(STATES[0]) + 5_000_000 * i},0.1,0.2,{0.3 + i},1.0,2.0,9.5\n" for i in range(-1, 3))
+    header = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y,w_RS_S_z,a_RS_S_x [m s^-2],a_RS_S_y,a_RS_S_z\n"
+    (unit / "data.csv").write_text(header + rows)
+    return euroc
+
+
 @pytest.fixture
 def tum_rgbd(tmp_path):
     folder = tmp_path / "desk"
@@ -113,6 +139,19 @@ def test_euroc_places_the_camera_as_its_calibration_does(euroc, one):
     expected = (np.linalg.inv(body @ T_BS) @ np.column_stack((points, np.ones(2))).T).T[:, :3]
     np.testing.assert_allclose(in_camera(log, points), expected, atol=1e-9)
     assert (log.rig.camera.width, log.rig.camera.fy, log.rig.camera.distortion[3]) == (752, 457.296, 1.76187114e-05)
+
+
+def test_euroc_has_an_inertial_unit(flown, one):
+    log = one(flown, reader="euroc")
+    rows, unit = log.streams["inertial"], log.rig.find(InertialSettings)
+    np.testing.assert_allclose(rows.t, (-0.005, 0.0, 0.005, 0.01), atol=1e-12)
+    np.testing.assert_allclose((rows.ax, rows.ay, rows.az), np.tile(((1.0,), (2.0,), (9.5,)), 4))
+    np.testing.assert_allclose((rows.wx, rows.wy, rows.wz - np.arange(-1, 3)), np.tile(((0.1,), (0.2,), (0.3,)), 4))
+    np.testing.assert_allclose((unit.x, unit.y, unit.z, unit.roll, unit.pitch), (0.1, -0.2, 0.05, 0.0, 0.0), atol=1e-12)
+    assert unit.yaw == pytest.approx(np.pi / 2)
+    assert (unit.force_noise, unit.turn_noise, unit.force_walk, unit.turn_walk) == (2e-3, 1.6968e-4, 3e-3, 1.9393e-5)
+    assert log.rig.sensors == ("camera", "inertial")
+    assert "not read" not in log.metadata
 
 
 def test_tum_poses_are_those_of_the_camera(tum_rgbd, one):
@@ -186,6 +225,11 @@ def test_kitti_cameras_stand_beside_the_first(kitti_odometry, one):
             ("0.5,", "0.5,2"),
             ("data.csv:2", "quaternion", "expected 1"),
         ),
+        ("flown", "mav0/imu0/data.csv", ("1.0,2.0", "1.0,2e9"), ("data.csv:2: 6 is", "m/s^2 in -1000 to 1000")),
+        ("flown", "mav0/imu0/data.csv", (",9.5", ""), ("data.csv:2", "column")),
+        ("flown", "mav0/imu0/sensor.yaml", ("2.0000e-3", "-1"), ("sensor.yaml", "force_noise")),
+        ("flown", "mav0/imu0/sensor.yaml", ("gyroscope_r", "r"), ("sensor.yaml: gyroscope_random_walk is missing",)),
+        ("flown", "mav0/imu0/sensor.yaml", ("-1.0,", "-2.0,"), ("sensor.yaml", "T_BS", "a pose")),
         ("tum_rgbd", "rgb.txt", (" rgb/gone.png", ""), ("rgb.txt:5", "2 values")),
         ("tum_rgbd", "rgb.txt", ("rgb/gone.png", "../../etc"), ("rgb.txt:5", "leaves its folder")),
         ("tum_rgbd", "groundtruth.txt", ("1305031102.2553", "1305031101.2553"), ("groundtruth.txt:3", "not before")),
@@ -210,7 +254,7 @@ def test_bad_files(kind, file, change, fragments, refused, request):
     assert change[0] in text
     (folder / file).write_text(text.replace(*change, 1))
     options = {"sequence": 3, "camera": 2} if kind == "kitti_odometry" else {}
-    refused(folder, *fragments, reader=kind, options=options)
+    refused(folder, *fragments, reader="euroc" if kind == "flown" else kind, options=options)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,8 @@ from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import FeatureStream, RightSightingStream, SightingStream
+from factorgraph_loc.sensors.inertial.measurement import InertialStream
+from factorgraph_loc.sensors.inertial.settings import InertialSettings
 from factorgraph_loc.sensors.twist.measurement import TwistStream
 from factorgraph_loc.sensors.twist.settings import TwistSettings
 from factorgraph_loc.vision.frame import CameraFrame
@@ -26,7 +28,28 @@ RIG = Rig(
     camera=CameraSettings(x=0.05, y=0.1, roll=0.1, pitch=0.2, **LENS),
     camera_right=CameraSettings(x=0.05, y=-0.1, roll=0.1, pitch=0.2, **LENS),
 )
+RIG_INERTIAL = RIG.model_copy(
+    update={
+        "sensors": ("inertial", "sightings"),
+        "inertial": InertialSettings(
+            x=0.1,
+            y=-0.05,
+            z=0.02,
+            roll=0.1,
+            pitch=-0.2,
+            yaw=0.5,
+            force_noise=0.01,
+            turn_noise=1e-3,
+            force_walk=2e-3,
+            turn_walk=2e-4,
+            force_bias=0.2,
+            turn_bias=0.02,
+        ),
+    }
+)
+ROWS = 200.0  # rows of the inertial unit a second
 POINTS = np.random.default_rng(11).uniform((2.0, -2.0, -1.5), (4.0, 2.0, 1.0), (15, 3))
+WORLD = World(points=PointMap.of([f"p{i}" for i in range(len(POINTS))], POINTS))
 
 
 def carried(seed):
@@ -44,9 +67,46 @@ def carried(seed):
         positions.append(positions[-1] + rotations[-1] @ half @ true_v[i] * STEP)
         rotations.append(rotations[-1] @ half @ half)
     truth = Trajectory3(t, np.array(positions), np.array(rotations))
+    return Log("carried", RIG, WORLD, {"twist": TwistStream(t, v, w)} | seen_along(truth, rng), reference3=truth)
+
+
+def swayed(seed):
+    """A vehicle that starts at rest and sways, with an inertial unit that is turned and 10 cm from its origin."""
+    rng, unit = np.random.default_rng(seed), RIG_INERTIAL.inertial
+    t = np.arange(round(SECONDS / STEP) + 1) * STEP
+    rows = np.arange(round((SECONDS + 0.1) * ROWS)) / ROWS
+    turn = Rotation.from_euler("ZYX", (unit.yaw, unit.pitch, unit.roll))
+    arm = np.array((unit.x, unit.y, unit.z))
+    small = 1e-4
+    before, here, after = (along(rows + shift) for shift in (-small, 0.0, small))
+    ahead, there, behind = ((p + r.apply(arm)) for p, r in (after, here, before))
+    up = np.array((0.0, 0.0, unit.gravity))
+    force = (here[1] * turn).inv().apply((ahead - 2.0 * there + behind) / small**2 + up)
+    rate = turn.inv().apply((before[1].inv() * after[1]).as_rotvec() / (2.0 * small))
+    values = np.hstack((force, rate))
+    for part, bias, noise, walk in (
+        (slice(0, 3), unit.force_bias, unit.force_noise, unit.force_walk),
+        (slice(3, 6), unit.turn_bias, unit.turn_noise, unit.turn_walk),
+    ):
+        drift = walk / np.sqrt(ROWS) * rng.standard_normal((len(rows), 3)).cumsum(axis=0)
+        values[:, part] += bias * rng.standard_normal(3) + drift
+        values[:, part] += noise * np.sqrt(ROWS) * rng.standard_normal((len(rows), 3))
+    positions, rotations = along(t)
+    truth = Trajectory3(t, positions, rotations.as_matrix())
+    streams = {"inertial": InertialStream(rows, *values.T)} | seen_along(truth, rng)
+    return Log("swayed", RIG_INERTIAL, WORLD, streams, reference3=truth)
+
+
+def along(t):
+    """Positions (N, 3) and rotations of the vehicle that sways."""
+    positions = (1.0 - np.cos(np.outer(t, (1.1, 0.9, 1.3)))) * (0.2, 0.3, 0.1)
+    return positions, Rotation.from_euler("ZYX", np.sin(np.outer(t, (0.8, 0.9, 1.1))) * (0.3, 0.2, 0.2))
+
+
+def seen_along(truth, rng):
+    """The streams of both cameras along a trajectory, from its second pose."""
+    positions, rotations, t, streams = truth.positions, truth.rotations, truth.t, {}
     names = [f"p{i}" for i in range(len(POINTS))]
-    world = World(points=PointMap.of(names, POINTS))
-    streams = {"twist": TwistStream(t, v, w)}
     for sensor, kind, settings in (
         ("sightings", SightingStream, RIG.camera),
         ("sightings_right", RightSightingStream, RIG.camera_right),
@@ -61,7 +121,7 @@ def carried(seed):
             seen.append(pixels[visible] + SIGMA * rng.standard_normal((len(visible), 2)))
         k, i = np.array(rows).T
         streams[sensor] = kind(t[k], [names[j] for j in i.tolist()], *np.concatenate(seen).T)
-    return Log("carried", RIG, world, streams, reference3=truth)
+    return streams
 
 
 def with_features(log, tempering):

@@ -87,7 +87,7 @@ def test_impulses_are_those_of_the_published_model():
 def chain(rows):
     made = TwistChain(TwistSettings(shift=(0.1, 0.2, 0.3), turn=(0.01, 0.02, 0.03)))
     for t, v, w in rows:
-        assert made.add(t, np.array(v), np.array(w))
+        assert made.add(t, np.array((*v, *w)))
     return made
 
 
@@ -107,7 +107,7 @@ def test_motion_in_pieces_is_that_in_one():
 
 def test_motion_that_nobody_measured_is_unknown():
     made = chain([(0.0, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))])
-    assert not made.add(-0.1, np.zeros(3), np.zeros(3))
+    assert not made.add(-0.1, np.zeros(6))
     found = made.between(3.0, 4.0)
     np.testing.assert_array_equal(found.shift, np.zeros(3))
     np.testing.assert_allclose(np.diag(found.covariance), space_motion.UNKNOWN**2)

@@ -1,5 +1,7 @@
 """Motion in space as factors: derivatives against numerical ones, and what is known of velocities against sampled ones."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -31,7 +33,7 @@ def test_velocities_are_those_of_the_step():
     """A step at a velocity and turn rate gives these back."""
     rng = np.random.default_rng(5)
     known = start(poses(1, rng)[0], rng)
-    there = ConstantVelocity(1.0, 1.0).step(known.robot, 0.0, 0.4).robot
+    there = ConstantVelocity(1.0, 1.0).step(replace(known, t=0.0), 0.4).robot
     found = velocities(pose_of(known.robot), pose_of(there), 0.4)[0]
     np.testing.assert_allclose(found, np.concatenate((known.robot.velocity, known.robot.rate)), atol=1e-9)
 
@@ -52,7 +54,7 @@ def test_derivatives_of_the_factor(count):
     known = start(at[0], rng)  # where the first pose is: its error enters to first order
     for key, pose in enumerate(at):
         values.insert(key, pose)
-    factor = ConstantVelocity(0.7, 0.9).factor(range(count), TIMES[:count], known)
+    (factor,) = ConstantVelocity(0.7, 0.9).factors(range(count), TIMES[:count], known)
     jacobian, _ = factor.linearize(values).jacobian()
 
     def error(d):
@@ -73,7 +75,10 @@ def test_what_is_known_of_pose_and_velocity(count):
     rng = np.random.default_rng(5)
     at = poses(count, rng)
     known, root = start(at[0], rng), 0.01 * rng.standard_normal((6 * count, 6 * count))
-    found = ConstantVelocity(0.7, 0.9).state(at, root @ root.T, TIMES[:count], known)
+    values = gtsam.Values()
+    for key, pose in enumerate(at):
+        values.insert(key, pose)
+    found = ConstantVelocity(0.7, 0.9).state(values, range(count), root @ root.T, TIMES[:count], known)
     drawn, gain, rest = [], *known.by_pose()
     still = np.linalg.cholesky(rest)
     for d in (root @ rng.standard_normal((6 * count, 20000))).T:
