@@ -359,8 +359,9 @@ def test_a_long_pause_holds_no_ticks(log):
 
 
 @pytest.mark.parametrize("name", ["monoslam", "space_smoother"])
-def test_a_camera_in_space_begins_where_an_image_tells(name):
-    log = space_world.carried(1)
+@pytest.mark.parametrize("drive", [space_world.carried, space_world.swayed])
+def test_a_camera_in_space_begins_where_an_image_tells(name, drive):
+    log = drive(1)
     localizer = fgloc.Localizer(log.rig, log.world, estimator=name)
     localizer.initialize()
     for measurement in log.measurements(log.rig.sensors):

@@ -74,7 +74,7 @@ def swayed(seed):
     """A vehicle that starts at rest and sways, with an inertial unit that is turned and 10 cm from its origin."""
     rng, unit = np.random.default_rng(seed), RIG_INERTIAL.inertial
     t = np.arange(round(SECONDS / STEP) + 1) * STEP
-    rows = np.arange(round((SECONDS + 0.1) * ROWS)) / ROWS
+    rows = np.arange(round(SECONDS * ROWS) + 1) / ROWS
     turn = Rotation.from_euler("ZYX", (unit.yaw, unit.pitch, unit.roll))
     arm = np.array((unit.x, unit.y, unit.z))
     small = 1e-4
