@@ -11,12 +11,14 @@ from factorgraph_loc.vision.images import decoded
 from factors.se2 import Array
 
 EDGE = 0.05  # relative difference of the depths around a pixel, beyond which it may show either side of an edge
+BEYOND = np.iinfo(np.uint16).max  # what cameras write where nothing is in their range
 AROUND = np.ones((3, 3), dtype=np.uint8)
 
 
 def depths_at(path: Path, pixels: Array, size: tuple[int, int], unit: float) -> Array:
-    """The depths (K,) [m] at ``pixels`` (K, 2) in the 16-bit image ``path`` of ``size`` (width, height), NaN where there is none
-    and at edges; a value of 1 is ``unit`` [m]. InputError if it is missing, cannot be decoded, or is no such image."""
+    """The depths (K,) [m] at ``pixels`` (K, 2) in the 16-bit image ``path`` of ``size`` (width, height), NaN where there is none,
+    with a value of 0 or the largest, and at edges; a value of 1 is ``unit`` [m]. InputError if it is missing, cannot be decoded, or
+    is no such image."""
     image = decoded(read_bytes(path, IMAGE), path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.shape != size[::-1]:
         channels = f", {image.shape[2]} channels" if image.ndim == 3 else ""
@@ -25,4 +27,5 @@ def depths_at(path: Path, pixels: Array, size: tuple[int, int], unit: float) -> 
     column, row = np.clip(np.rint(pixels).astype(np.int64), 0, np.array(size) - 1).T
     least, most = (found[row, column].astype(float) for found in (cv2.erode(image, AROUND), cv2.dilate(image, AROUND)))
     value = image[row, column]
-    return np.where((least > 0) & (most - least <= EDGE * value), value * unit, np.nan)
+    measured = (least > 0) & (most < BEYOND)
+    return np.where(measured & (most - least <= EDGE * value), value * unit, np.nan)

@@ -105,7 +105,7 @@ def test_points_that_the_map_lacks_and_pixels_outside(log):
 def test_no_images(log):
     nothing = replace(log, streams=dict(log.streams) | {"camera": ImageStream(np.empty(0), [])})
     found = inspect(nothing)
-    assert found.images == inspect_camera.ImageSummary(0, 0, 0, {}, "orb", 0.0, None)
+    assert found.images == inspect_camera.ImageSummary(0, 0, 0, 0, {}, "orb", 0.0, None)
     assert found.problems == ("camera is empty",)
 
 

@@ -19,9 +19,10 @@ def test_depths_are_told_where_they_are_sure(tmp_path):
     image = np.full((30, 40), 2000, dtype=np.uint16)
     image[:, 20:] = 3000  # an edge
     image[10, 5] = 0  # nothing was measured
+    image[22:26, 8:12] = 65535  # nothing was near enough
     pixels = np.array(((10.4, 20.0), (30.0, 3.6), (19.6, 15.0), (18.6, 15.0), (5.0, 10.0), (6.0, 9.0), (39.4, 29.4)))
-    found = depths_at(written(tmp_path / "depth.png", image), pixels, SIZE, 0.001)
-    np.testing.assert_allclose(found, (2.0, 3.0, np.nan, np.nan, np.nan, np.nan, 3.0))
+    found = depths_at(written(tmp_path / "depth.png", image), np.vstack((pixels, (9.0, 23.0))), SIZE, 0.001)
+    np.testing.assert_allclose(found, (2.0, 3.0, np.nan, np.nan, np.nan, np.nan, 3.0, np.nan))
 
 
 def test_a_slope_is_no_edge(tmp_path):

@@ -104,7 +104,9 @@ def _depths(
     camera = log.rig.of(CameraSettings)
     depths: list[Array | None] = [None] * len(found)
     if camera.depth is None:
-        return depths, ()
+        unused = sum(file is not None for file in stream.depth)
+        told = f"{log.name}: {unused} depth images are not used, as the rig {log.rig.name} has no [camera.depth]"
+        return depths, (told,) if unused else ()
     faults = []
     for i, (file, features) in enumerate(zip(stream.depth, found, strict=True)):
         if file is None:

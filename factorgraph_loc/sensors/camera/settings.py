@@ -50,7 +50,7 @@ class DepthSettings(FileModel):
     """Depth images beside the images, of the same size and as seen by the same camera: the depth along the optical axis."""
 
     unit: Annotated[float, Field(gt=0.0, le=1.0), InUnit("m")] = 0.001
-    """depth that a value of 1 stands for; 0 stands for none"""
+    """depth that a value of 1 stands for; 0 and 65535 stand for none"""
     inverse_sigma: Annotated[float, Field(ge=1e-6, le=10.0), InUnit("1/m")] = 0.003
     """standard deviation of the inverse of a depth: 3 mm at 1 m, 27 mm at 3 m"""
 

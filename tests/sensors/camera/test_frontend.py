@@ -18,6 +18,7 @@ from factorgraph_loc.sensors.camera import frontend
 from factorgraph_loc.sensors.camera.frontend import with_features
 from factorgraph_loc.sensors.camera.settings import CameraSettings, DepthSettings
 from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
+from factorgraph_loc.sensors.camera.summary import summarize
 from factorgraph_loc.vision.feature_cache import FeatureCache
 from factorgraph_loc.vision.features import EXTRACTORS, extractor
 from factorgraph_loc.vision.settings import FrontendSettings
@@ -98,6 +99,9 @@ def test_features_have_depths_where_the_rig_has_depth_images(log, tmp_path):
     cv2.imwrite(str(files[8]), np.full(SIZE, 4000, dtype=np.uint16))
     log = replace(log, streams={"camera": replace(stream, depth=files)})
     assert all(frame.depths is None for frame in frames(log)[0])
+    (told,) = frames(log)[1]
+    assert "9 depth images are not used, as the rig" in told
+    assert "9 depth images, but its rig has no [camera.depth]" in " ".join(summarize(log).problems)
     camera = log.rig.of(CameraSettings).model_copy(update={"depth": DepthSettings(unit=0.0005)})
     found, warnings = frames(replace(log, rig=Rig(camera=camera)))
     for k, frame in enumerate(found):
