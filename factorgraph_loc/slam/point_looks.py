@@ -1,4 +1,4 @@
-"""The last view of each point of a graph."""
+"""The views of each point of a graph: the last one, and some before it for a map."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +14,8 @@ from factorgraph_loc.vision.frame import CameraFrame
 from factors import se2
 from factors.camera.model import CameraModel, camera_pose
 from factors.se2 import Array
+
+APART, VIEWS = 0.5, 4  # m travelled between views that a map keeps, and their number for each point
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +33,12 @@ class Look:
 
 
 class PointLooks:
-    """The last view of each point, by key, by a camera ``model``."""
+    """The last view of each point, by key, by a camera ``model``; others are there for the map at the end."""
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
         self._looks: dict[int, Look] = {}
+        self._earlier: dict[int, list[Look]] = {}
         self._feature = ""
 
     def __contains__(self, key: int) -> bool:
@@ -48,35 +51,49 @@ class PointLooks:
         """Store the view of a ``point`` from the feature ``row`` of a frame, taken at a ``keyframe``."""
         self._feature = frame.feature
         seen_from = camera_pose(self._model, guess[0])[0]
-        self._looks[point] = Look(frame.descriptors[row], float(frame.sizes[row]), seen_from, way, keyframe, guess)
+        look = Look(frame.descriptors[row], float(frame.sizes[row]), seen_from, way, keyframe, guess)
+        before, earlier = self._looks.get(point), self._earlier.setdefault(point, [])
+        if before is not None and len(earlier) < VIEWS - 1 and (not earlier or before.way >= earlier[-1].way + APART):
+            earlier.append(before)
+        self._looks[point] = look
 
     def map_of(self, names: Sequence[str], keys: Sequence[int], positions: Array, covariances: Array) -> PointMap:
         """A map of the points, with their last views, in the given order."""
-        shown = [i for i, key in enumerate(keys) if key in self._looks]
-        if not shown:
-            return PointMap.of(tuple(names), positions, covariances)
-        looks = [self._looks[keys[i]] for i in shown]
-        return PointMap(
-            tuple(names),
-            positions,
-            covariances,
-            self._feature,
-            np.array(shown),
-            np.array([look.descriptor for look in looks]),
-            np.array([look.seen_from for look in looks]),
-            np.array([look.size for look in looks]),
-        )
+        looks = [(i, self._looks[key]) for i, key in enumerate(keys) if key in self._looks]
+        return self._seen(PointMap.of(tuple(names), positions, covariances), looks)
 
     def settled(
         self, points: PointMap, keys: Sequence[int], values: Mapping[int, Array], spreads: Mapping[int, Array]
     ) -> PointMap:
-        """A map of the points ``keys`` with its views at the poses of their keyframes, which are among ``values``: their body-frame
-        covariances among ``spreads`` are those of the error that all points seen from there have in common."""
-        if not len(points.owners):
+        """The map of the points ``keys`` with all their views at the poses of their keyframes, which are among ``values``: their
+        body-frame covariances among ``spreads`` are those of the error that all points seen from there have in common."""
+        rows = [
+            (i, look)
+            for i, key in enumerate(keys)
+            if key in self._looks
+            for look in (
+                *(one for one in self._earlier[key] if self._looks[key].way >= one.way + APART),
+                self._looks[key],
+            )
+        ]
+        if not rows:
             return points
-        looks = [self._looks[keys[i]] for i in points.owners.tolist()]
+        looks = [look for _, look in rows]
         poses = np.array([values.get(look.keyframe, look.guess[0]) for look in looks])
         body = np.array([spreads.get(look.keyframe, look.guess[1]) for look in looks])
         seen_from = np.array([camera_pose(self._model, pose)[0] for pose in poses])
         common = carried(se2.body_to_world(poses, body), seen_from[:, :2] - poses[:, :2])
-        return replace(points, seen_from=seen_from, common=common)
+        return replace(self._seen(points, rows), seen_from=seen_from, common=common)
+
+    def _seen(self, points: PointMap, rows: Sequence[tuple[int, Look]]) -> PointMap:
+        """The map with these views, each with the number of its point."""
+        if not rows:
+            return points
+        return replace(
+            points,
+            feature=self._feature,
+            owners=np.array([i for i, _ in rows]),
+            descriptors=np.array([look.descriptor for _, look in rows]),
+            seen_from=np.array([look.seen_from for _, look in rows]),
+            sizes=np.array([look.size for _, look in rows]),
+        )

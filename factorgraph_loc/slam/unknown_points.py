@@ -244,7 +244,7 @@ class UnknownPoints:
         self._new, self._loops = NewPoints(self.model), LoopClosure()
 
     def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
-        """All points that were ever in the graph, under the first of their keys; features with their last view. ``values`` and
+        """All points that were ever in the graph, under the first of their keys; features with some views. ``values`` and
         ``spreads`` are of keyframes too."""
         keys: dict[str, int] = {}
         for key, name in self._names.items():
@@ -253,8 +253,8 @@ class UnknownPoints:
         if not keys:
             return None
         positions, covariances = (np.array([part[key] for key in keys.values()]) for part in (values, spreads))
-        found = self._looks.map_of(tuple(keys), tuple(keys.values()), positions, covariances)
-        return self._looks.settled(found, tuple(keys.values()), values, spreads)
+        points = PointMap.of(tuple(keys), positions, covariances)
+        return self._looks.settled(points, tuple(keys.values()), values, spreads)
 
     def _tilts(self, keyframe: Keyframe, tilt: Array, sigma: float, graph: GraphView, addition: Addition) -> None:
         """Make a variable of the ``tilt`` of the robot at a new keyframe, of a floor that is level to ``sigma`` [rad]."""

@@ -79,6 +79,16 @@ def test_a_localizer_knows_it_too(days):
     np.testing.assert_allclose(localizer.belief().modes[0].covariance, found.covariance)
 
 
+def test_points_are_known_from_several_sides(days):
+    points = days[SEEDS[0]].world.points
+    counts = np.bincount(points.owners, minlength=len(points))
+    assert counts.min() == 1
+    assert 2 <= counts.max() <= 4
+    twice = np.flatnonzero(counts >= 2)
+    apart = [np.ptp(points.seen_from[points.owners == i], axis=0).max() for i in twice.tolist()]
+    assert np.median(apart) > 0.3  # m, after 0.5 m of the way
+
+
 def test_points_that_a_map_lacks_are_added_to_it(days):
     log = days[SEEDS[0]]
     half = np.flatnonzero(log.world.points.positions[:, 0] < 0.0)
