@@ -17,7 +17,8 @@ from factors.se2 import Array
 class GraphView:
     """What a mapper sees of its graph: the ``keyframes``; estimates of all variables but poses, to which it adds
     (``values``, ``spreads``); the ``current`` estimate of a variable by key; which keyframes are open; the motion ``between``
-    two of them; keys of the sensor's constants (``shared``), and the values (P,) of these."""
+    two of them; what wheels that ``slip`` do to an increment, as the motion tells it; keys of the sensor's constants (``shared``),
+    and the values (P,) of these."""
 
     keyframes: Sequence[Keyframe]
     values: Values
@@ -25,6 +26,7 @@ class GraphView:
     current: Callable[[int], Array]
     is_open: Callable[[int], bool]
     between: Callable[[Keyframe, Keyframe], Increment]
+    slip: Callable[[Increment], tuple[Array, float]]
     shared: tuple[int, ...] = ()
     constants: Array | None = None
 

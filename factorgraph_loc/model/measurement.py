@@ -221,6 +221,9 @@ class Motion(Protocol):
     def factor(self, increment: Increment) -> Factor:
         """An increment as a factor on two poses, and on the constants if there are any."""
 
+    def slip(self, increment: Increment) -> tuple[Array, float]:
+        """The covariance (3, 3) that an increment has more if wheels slip, and minus the logarithm of how probable that is."""
+
     def exact_factor(self, increment: Increment) -> Factor:
         """An increment without constants as a factor on two poses."""
 

@@ -25,6 +25,7 @@ from factorgraph_loc.slam.new_points import FEWEST as FEWEST_SIGHTINGS
 from factorgraph_loc.slam.new_points import KeyframeCamera, NewPoints, sightings_of
 from factorgraph_loc.slam.point_looks import PointLooks
 from factorgraph_loc.slam.refound_points import refound
+from factorgraph_loc.slam.slipping import unless_slipped
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.spread import spread_out
@@ -124,9 +125,7 @@ class UnknownPoints:
         points = [self._points[names[i]] for i in old]
         known = np.array([rows[i] in certain for i in old], dtype=bool)
         named = m.names is not None
-        guess, tilt, sigma, right = self._placed(
-            model, points, pixels[old], keyframe.t, guess, graph, known, named=named
-        )
+        guess, tilt, sigma, right = self._placed(model, points, pixels[old], keyframe, guess, graph, known, named=named)
         self._tilts(keyframe, tilt, sigma, graph, addition)
         if m.frame is not None:
             known_rows = [(rows[i], names[i], bool(agrees)) for i, agrees in zip(old, right, strict=True)]
@@ -273,7 +272,7 @@ class UnknownPoints:
         model: CameraModel,
         points: list[_Point],
         pixels: Array,
-        t: float,
+        keyframe: Keyframe,
         guess: Guess,
         graph: GraphView,
         known: Truths,
@@ -294,8 +293,10 @@ class UnknownPoints:
         camera = lifted(model, *guess)
         _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, positions)
         noise = (model.sigma**2 + SLACK**2) * np.eye(2) + by_point @ spreads @ by_point.transpose(0, 2, 1)
-        recent = np.array([t - point.last < RECENT for point in points])
-        right = known.copy()
+        recent = np.array([keyframe.t - point.last < RECENT for point in points])
+        level, seen = replace(model, tilt=sigma), (positions[recent], pixels[recent], spreads[recent], noise[recent])
+        guess = unless_slipped(level, keyframe, guess, graph.slip, seen)
+        camera, right = lifted(model, *guess), known.copy()
         placed, tilt = guess, LEVEL
         fewest = 2 if named else REVISITED  # a name needs one other to confirm it
         revisited = max(fewest, math.ceil(AGREED * np.count_nonzero(~recent & ~known)))

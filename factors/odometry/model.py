@@ -26,6 +26,7 @@ from factors.se2 import Array
 # minimum noise of an increment without duration, whose covariance must be invertible
 MINIMUM_POSITION_VARIANCE = 1e-8
 MINIMUM_HEADING_VARIANCE = 1e-8
+SLIPS, SHORTEST = 0.01, 1e-6  # 1/s: how often wheels slip; s: a duration that is not zero
 LEAST_POSITION, LEAST_HEADING = 1e-3, 1e-4  # m, rad per sqrt(s): minimum noise
 
 
@@ -97,6 +98,23 @@ def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) ->
     covariance, if the walk is uniform along the chord.
     """
     return Increment(*relative(np.array(model.noise()), start, end))
+
+
+def slip(model: OdometryModel, increment: Increment, *, use_gyro: bool) -> tuple[Array, float]:
+    """The covariance (3, 3) that an increment has more if its wheels slip, and minus the logarithm of how probable that is.
+
+    The error along the way, and that of the heading unless a gyro tells it, are then those of an unknown motion, with what they
+    displace the end by as in :func:`relative_motion`; sideways wheels are held.
+    """
+    duration = max(increment.duration, SHORTEST)
+    along, heading = model.unknown_distance**2 * duration, 0.0 if use_gyro else model.unknown_rotation**2 * duration
+    x, y, turned = increment.delta.tolist()
+    c, s, ahead = math.cos(turned), math.sin(turned), model.direction - turned / 2.0
+    way, lever = np.array((math.cos(ahead), math.sin(ahead), 0.0)), np.array((s * x - c * y, c * x + s * y, 0.0))
+    covariance = along * np.outer(way, way) + heading / 3.0 * np.outer(lever, lever)
+    covariance[2] = covariance[:, 2] = heading / 2.0 * lever
+    covariance[2, 2] = heading
+    return covariance, -math.log(-math.expm1(-SLIPS * duration))
 
 
 # the constants that recalibrated() changes

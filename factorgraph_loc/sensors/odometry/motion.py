@@ -20,7 +20,7 @@ from factors import se2
 from factors.motion import ChainState, Increment
 from factors.odometry import kernels
 from factors.odometry.chain import OdometryChain
-from factors.odometry.model import PARAMETERS, OdometryFactor, OdometryModel, between_factor
+from factors.odometry.model import PARAMETERS, OdometryFactor, OdometryModel, between_factor, slip
 from factors.se2 import Array
 
 # m, rad, s: over which the error of a constant accumulates before other sensors correct it
@@ -171,6 +171,9 @@ class OdometryMotion:
     def factor(self, increment: Increment) -> OdometryFactor:
         """An increment as a factor on two poses, and on the constants if there are any."""
         return OdometryFactor(increment, self.constants.indices)
+
+    def slip(self, increment: Increment) -> tuple[Array, float]:
+        return slip(self._chain.model, increment, use_gyro=self._use_gyro)
 
     def exact_factor(self, increment: Increment) -> OdometryFactor:
         """An increment without constants as a factor on two poses."""

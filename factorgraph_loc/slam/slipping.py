@@ -1,0 +1,65 @@
+"""Whether wheels slipped between two keyframes: points of the graph, all seen lately, say so together.
+
+A factor between two poses that chose the likelier of two noises by itself (Olson, Agarwal, International Journal of Robotics
+Research 32(7), 2013) has many optima, and a graph of points falls into wrong ones. So this is decided once, before the keyframe
+comes in.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_loc.fusion.graph_parts import Guess, Keyframe
+from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, lifted
+from factorgraph_loc.vision.consensus import agreeing
+from factors import positive
+from factors.camera.factor import ReprojectionFactor
+from factors.camera.model import CameraModel
+from factors.motion import Increment
+from factors.se2 import Array
+from factors.update import robust_update
+
+ENOUGH = 6  # points that must agree
+COMMON = np.diag((0.02, 0.02, 0.005)) ** 2  # m, rad: error that all points may have in common
+
+
+def unless_slipped(
+    model: CameraModel,
+    keyframe: Keyframe,
+    guess: Guess,
+    slip: Callable[[Increment], tuple[Array, float]],
+    seen: tuple[Array, Array, Array, Array],
+) -> Guess:
+    """The ``guess`` of the pose of a new keyframe; if wheels slipped on the step to it, both are less certain from now on.
+
+    ``slip``: see :class:`~factorgraph_loc.model.measurement.Motion`. ``seen``: points (K, 3), their pixels (K, 2), their
+    covariances (K, 3, 3), and those (K, 2, 2) of the pixels [px^2].
+    """
+    step = keyframe.from_previous
+    if step is None or keyframe.factor is not None or len(seen[0]) < ENOUGH:
+        return guess
+    added, rarity = slip(step)
+    if _evidence(model, guess[0], (step.covariance, step.covariance + added), seen) < rarity:
+        return guess
+    keyframe.from_previous = replace(step, covariance=step.covariance + added)
+    return guess[0], guess[1] + added
+
+
+def _evidence(
+    model: CameraModel, pose: Array, spreads: tuple[Array, Array], seen: tuple[Array, Array, Array, Array]
+) -> float:
+    """By how much the second of two covariances (3, 3) of a predicted ``pose`` (3,) makes what is seen more probable than the
+    first: the difference of the logarithms."""
+    points, pixels, of_points, noise = seen
+    agrees = agreeing(model, lifted(model, pose, spreads[1]), points, pixels, noise)
+    if np.count_nonzero(agrees) < ENOUGH:
+        return 0.0
+    factor = ReprojectionFactor(model, points[agrees], pixels[agrees], point_covariances=of_points[agrees])
+    found = robust_update(factor, pose, spreads[1], ITERATIONS, SETTLED)
+    # what the image tells by itself
+    after = positive.inverse(found.covariance)
+    told = positive.inverse(positive.nearest(after - positive.inverse(spreads[1])))
+    off, told = told @ after @ found.delta, told + COMMON
+    fits = [positive.squared(off, spread + told) + np.linalg.slogdet(spread + told)[1] for spread in spreads]
+    return 0.5 * float(fits[0] - fits[1])

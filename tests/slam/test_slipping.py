@@ -1,0 +1,64 @@
+"""Wheels that slipped between two keyframes are told from noise by the points that both see."""
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.fusion.graph_parts import Keyframe
+from factorgraph_loc.slam.slipping import unless_slipped
+from factors import se2
+from factors.camera.model import CameraModel, predict
+from factors.motion import ChainState, Increment
+from factors.odometry.model import Growth, OdometryModel, relative_motion, slip
+
+MODEL = CameraModel(370.0, 370.0, 240.0, 180.0, width=480, height=360, position=np.array((0.1, 0.0, 0.6)))
+WHEELS = OdometryModel(along=Growth(0.05, 0.0, 0.005), lateral=Growth(0.02, 0.0, 0.005), heading=Growth(0.05, 0.05, 0.002))
+RESTS, DRIVES = (0.0, 0.6), (0.27, 0.0)  # m driven, s at rest, of 0.6 s
+SURVEYED = 0.03  # m, standard deviation of points
+
+
+def step_and_pixels(way, rest, slid, rng, count):
+    """A step of 0.6 s as wheels tell it, and what is seen at its end by a robot that slid by ``slid`` (3,) besides."""
+    states = ChainState(0.0, *np.zeros(7)), ChainState(0.6, way, 0.0, 0.0, way, 0.0, 0.0, rest)
+    step = relative_motion(WHEELS, *states)
+    moved = se2.compose(step.delta, se2.exp(np.linalg.cholesky(step.covariance) @ rng.standard_normal(3)))
+    points = rng.uniform((2.0, -1.0, 0.0), (6.0, 1.0, 1.5), (count, 3))
+    seen = points + SURVEYED * rng.standard_normal((count, 3))
+    pixels, _ = predict(MODEL, se2.compose(moved, np.asarray(slid)), seen)
+    return step, points, pixels + rng.standard_normal((count, 2))
+
+
+def widened(way, rest, slid, seed, count=20):
+    """Whether a step counts as one in which wheels slipped."""
+    step, points, pixels = step_and_pixels(way, rest, slid, np.random.default_rng(seed), count)
+    keyframe = Keyframe(1, 0.6, ChainState(0.6, *np.zeros(7)), step)
+    guess = step.delta, step.covariance
+    spreads = np.broadcast_to(SURVEYED**2 * np.eye(3), (count, 3, 3))
+    noise = np.broadcast_to(25.0 * np.eye(2), (count, 2, 2))
+    told = unless_slipped(MODEL, keyframe, guess, lambda s: slip(WHEELS, s, use_gyro=False), (points, pixels, spreads, noise))
+    assert (told is guess) == (keyframe.from_previous is step)
+    return keyframe.from_previous is not step
+
+
+@pytest.mark.parametrize("slid", [(0.0, 0.0, 0.2), (0.02, 0.0, -0.2), (-0.1, 0.0, 0.25)])
+@pytest.mark.parametrize("motion", [RESTS, DRIVES], ids=["at rest", "driving"])
+def test_a_slip_is_seen(motion, slid):
+    assert sum(widened(*motion, slid, seed) for seed in range(20)) == 20
+
+
+@pytest.mark.parametrize("motion", [RESTS, DRIVES], ids=["at rest", "driving"])
+def test_noise_is_no_slip(motion):
+    assert not any(widened(*motion, np.zeros(3), seed) for seed in range(100))
+
+
+def test_few_points_tell_nothing_of_the_wheels():
+    assert not any(widened(*DRIVES, (0.0, 0.0, 0.3), seed, count=5) for seed in range(20))
+
+
+def test_sideways_wheels_are_held():
+    spread, _ = slip(WHEELS, Increment(np.array((0.3, 0.0, 0.0)), np.eye(3), 0.5), use_gyro=False)
+    along, aside, heading = np.diag(spread)
+    assert along > 0.0
+    assert heading > 0.0
+    assert aside == pytest.approx(heading * 0.3**2 / 3.0)  # a turn on the way displaces the end
+    gyro, _ = slip(WHEELS, Increment(np.array((0.3, 0.0, 0.0)), np.eye(3), 0.5), use_gyro=True)
+    assert np.diag(gyro)[1:] == pytest.approx(0.0)
