@@ -11,7 +11,9 @@ from factors.motion import ChainState, Increment
 from factors.odometry.model import Growth, OdometryModel, relative_motion, slip
 
 MODEL = CameraModel(370.0, 370.0, 240.0, 180.0, width=480, height=360, position=np.array((0.1, 0.0, 0.6)))
-WHEELS = OdometryModel(along=Growth(0.05, 0.0, 0.005), lateral=Growth(0.02, 0.0, 0.005), heading=Growth(0.05, 0.05, 0.002))
+WHEELS = OdometryModel(
+    along=Growth(0.05, 0.0, 0.005), lateral=Growth(0.02, 0.0, 0.005), heading=Growth(0.05, 0.05, 0.002)
+)
 RESTS, DRIVES = (0.0, 0.6), (0.27, 0.0)  # m driven, s at rest, of 0.6 s
 SURVEYED = 0.03  # m, standard deviation of points
 
@@ -34,7 +36,9 @@ def widened(way, rest, slid, seed, count=20):
     guess = step.delta, step.covariance
     spreads = np.broadcast_to(SURVEYED**2 * np.eye(3), (count, 3, 3))
     noise = np.broadcast_to(25.0 * np.eye(2), (count, 2, 2))
-    told = unless_slipped(MODEL, keyframe, guess, lambda s: slip(WHEELS, s, use_gyro=False), (points, pixels, spreads, noise))
+    told = unless_slipped(
+        MODEL, keyframe, guess, lambda s: slip(WHEELS, s, use_gyro=False), (points, pixels, spreads, noise)
+    )
     assert (told is guess) == (keyframe.from_previous is step)
     return keyframe.from_previous is not step
 
