@@ -70,9 +70,10 @@ def carried(seed):
     return Log("carried", RIG, WORLD, {"twist": TwistStream(t, v, w)} | seen_along(truth, rng), reference3=truth)
 
 
-def swayed(seed):
-    """A vehicle that starts at rest and sways, with an inertial unit that is turned and 10 cm from its origin."""
-    rng, unit = np.random.default_rng(seed), RIG_INERTIAL.inertial
+def swayed(seed, **settings):
+    """A vehicle that starts at rest and sways, with an inertial unit that is turned and 10 cm from its origin; ``settings``: of the
+    unit, where they differ."""
+    rng, unit = np.random.default_rng(seed), RIG_INERTIAL.inertial.model_copy(update=settings)
     t = np.arange(round(SECONDS / STEP) + 1) * STEP
     rows = np.arange(round(SECONDS * ROWS) + 1) / ROWS
     turn = Rotation.from_euler("ZYX", (unit.yaw, unit.pitch, unit.roll))
@@ -94,7 +95,8 @@ def swayed(seed):
     positions, rotations = along(t)
     truth = Trajectory3(t, positions, rotations.as_matrix())
     streams = {"inertial": InertialStream(rows, *values.T)} | seen_along(truth, rng)
-    return Log("swayed", RIG_INERTIAL, WORLD, streams, reference3=truth)
+    rig = RIG_INERTIAL.model_copy(update={"inertial": unit})
+    return Log("swayed", rig, WORLD, streams, reference3=truth)
 
 
 def along(t):

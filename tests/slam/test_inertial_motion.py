@@ -224,6 +224,23 @@ def test_a_late_image_counts_once():
     np.testing.assert_array_less(np.abs(space.pose_errors(ours, theirs)[-1]) / sigmas, 0.4)
 
 
+def test_a_precise_unit_while_little_is_seen():
+    """As good as a data sheet says of one at rest, with two points in the first two seconds: what the window solves then is nearly
+    singular. NEES of 8 runs within bounds as above."""
+    noise = {"force_noise": 2e-3, "turn_noise": 1.7e-4, "force_walk": 3e-3, "turn_walk": 1.9e-5}
+    causal, final = [], []
+    for seed in range(8):
+        log = swayed(seed, **noise)
+        seen = log.streams["sightings"]
+        kept = selected(seen, np.array([name in {"p0", "p1"} for name in seen.point]) | (seen.t > 2.0))
+        result = estimated(replace(log, streams=dict(log.streams) | {"sightings": kept}), "space_smoother")
+        causal.append(nees(result.causal_space, log))
+        final.append(nees(result.final_space, log, len(result.final_space) // 2))
+    low, high = chi2.ppf((5e-4, 1.0 - 5e-4), 6 * 8)
+    assert low < sum(causal) < high
+    assert low < sum(final) < high
+
+
 def test_a_second_without_rows():
     """NEES of 8 runs in the middle of the pause, of the final trajectory, and at the end: within bounds as above."""
     causal, final = [], []
