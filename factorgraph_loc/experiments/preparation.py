@@ -2,9 +2,10 @@
 an estimator runs."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, PosePrio
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory3 import Trajectory3, planar_estimate
 from factorgraph_loc.sensors.interfaces import PreparedLog, Use, lacking_section
-from factorgraph_loc.sensors.registry import channels, functions, moving
+from factorgraph_loc.sensors.registry import channels, functions, moving, sensor_of
 from factorgraph_loc.text import listed, quoted
 
 # of a start taken from the reference
@@ -171,6 +172,17 @@ def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel
     kind = registry.estimator_type(estimator)
     modalities = getattr(kind, "modalities", frozenset[str]())
     return Use(log, tuple(sensors), estimator, settings, modalities, getattr(kind, "estimates_points", False))
+
+
+def with_own_map(use: Use, given: Mapping[str, Any]) -> tuple[Use, tuple[str, ...]]:
+    """The run, and a warning if the map has nothing that its sensors could find: what one of them sees beside measured motion is
+    estimated then, unless the settings that are ``given`` say what is done."""
+    seeing = {sensor_of(name).name for name in use.sensors if not channels()[name].motion}
+    if "landmarks" in given or not any(seeing == {name} and lacks(use) for name, lacks in functions("unmapped")):
+        return use, ()
+    settings = registry.settings_of(use.estimator, {**given, "landmarks": "unknown"})
+    told = f"the map has nothing that the {listed(sorted(seeing))} could find: it is estimated ({use.estimator}.landmarks=unknown)"
+    return replace(use, settings=settings), (f"{use.log.name}: {told}",)
 
 
 def prepare(use: Use, progress: Callable[[float], None] = lambda _: None) -> PreparedLog:

@@ -29,6 +29,7 @@ from factorgraph_loc.experiments.preparation import (
     unused,
     use_of,
     used_sensors,
+    with_own_map,
 )
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fusion import registry
@@ -98,7 +99,8 @@ def run(
     require_one_span(log)
     sensors = used_sensors(log, config.sensors)
     settings = registry.settings_of(config.estimator, config.settings)
-    use = use_of(log, sensors, config.estimator, settings)
+    use, own_map = with_own_map(use_of(log, sensors, config.estimator, settings), config.settings)
+    settings = use.settings
     for _, check in functions("check"):
         check(use)
     prior, prior_source = resolve_prior(log, config.prior)
@@ -185,6 +187,7 @@ def run(
         warnings=_once(
             *log.warnings,
             *unstated,
+            *own_map,
             *unused(log, sensors),
             *prepared.warnings,
             *(line for _, doubts in functions("doubts") for line in doubts(use, estimator.diagnostics, learnt)),

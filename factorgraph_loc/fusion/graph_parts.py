@@ -26,7 +26,8 @@ class GraphSettings(FileModel):
     self_calibration: bool = True
     """whether constants to which the rig gives an uncertainty are variables"""
     landmarks: MapUse = "known"
-    """known takes the map as it is and ignores other landmarks, extended estimates the others, unknown estimates all"""
+    """known takes the map as it is and ignores other landmarks, extended estimates the others, unknown estimates all, as runs with
+    images and measured motion alone do by default where the map has no points"""
     visual_odometry: bool = False
     """whether features that are followed from image to image, and are no points of map or graph, tell the motion"""
 

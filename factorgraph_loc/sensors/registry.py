@@ -70,8 +70,9 @@ class SensorType:
     :class:`~factorgraph_loc.fusion.map_frame.MapFrame`, or None.
 
     For runs (:class:`~factorgraph_loc.sensors.interfaces.Use`): ``check``: ``(use)``, raises InputError if log and settings do not
-    fit; ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.interfaces.PreparedLog`; ``doubts``: ``(use,
-    diagnostics, learnt)``, warnings at the end; ``reliability``: ``(use, diagnostics, learnt, final) ->``
+    fit; ``unmapped``: ``(use)``, whether the map has nothing that the sensor could find, which the estimator can do without;
+    ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.interfaces.PreparedLog`; ``doubts``: ``(use, diagnostics,
+    learnt)``, warnings at the end; ``reliability``: ``(use, diagnostics, learnt, final) ->``
     :class:`~factorgraph_loc.model.reliability.Reliability` along the final trajectory, or None; ``findable``: ``(log, sensors)``,
     a plural for the map elements that the channels can detect and a message that none was detected, or None; ``mappable``:
     ``(log)``, the world layer that ``fgloc map`` can make, or None.
@@ -98,6 +99,7 @@ class SensorType:
     check: Place = ""
     prepare: Place = ""
     doubts: Place = ""
+    unmapped: Place = ""
     reliability: Place = ""
     findable: Place = ""
     mappable: Place = ""

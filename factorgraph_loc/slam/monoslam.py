@@ -94,7 +94,7 @@ class MonoslamSettings(FilterSettings):
     tilt_sigma: Annotated[float, Field(ge=1e-5, le=0.5), InUnit("rad")] = 0.005
     """standard deviation of roll and pitch of a robot on a floor"""
     landmarks: MapUse = "known"
-    """known takes the map's points and ignores others, extended estimates the others, unknown estimates all"""
+    """known takes the map's points and ignores others, extended estimates the others, unknown all: the default without a map"""
     self_calibration: bool = True
     """whether the odometry's constants to which the rig gives an uncertainty are states"""
     max_points: Annotated[int, Field(ge=1, le=1000)] = 100

@@ -59,15 +59,29 @@ def with_points(log, views):
         ("ekf", {}, ""),
         ("ekf", {"landmarks": "unknown"}, ""),
         ("particle_filter", {"particles": 50}, ""),
-        ("smoother", {}, ", or smoother.landmarks=unknown"),
-        ("batch", {}, ", or batch.landmarks=unknown"),
-        ("monoslam", {}, ", or monoslam.landmarks=unknown"),
+        ("smoother", {"landmarks": "known"}, ", or smoother.landmarks=unknown"),
+        ("batch", {"landmarks": "known"}, ", or batch.landmarks=unknown"),
+        ("monoslam", {"landmarks": "known"}, ", or monoslam.landmarks=unknown"),
     ],
 )
 def test_a_camera_in_a_map_without_points(blank, sensor, name, settings, hint):
     result = run(blank, RunConfig(name, settings, ("odometry", sensor)))
     assert result.warnings == (NO_POINTS + hint,)
     assert sum(result.diagnostics.ignored.values()) == (24 if sensor == "camera" else 2)
+
+
+@pytest.mark.parametrize("sensor", ["camera", "sightings"])
+@pytest.mark.parametrize("name", ["smoother", "batch", "monoslam"])
+def test_images_and_wheels_alone_make_a_map_by_themselves(blank, name, sensor):
+    result = run(blank, RunConfig(name, sensors=("odometry", sensor)))
+    told = f"straight: the map has nothing that the camera could find: it is estimated ({name}.landmarks=unknown)"
+    assert result.warnings == (told,)
+    assert result.config["settings"]["landmarks"] == "unknown"
+    # not beside what may be in the map, nor where the map has points
+    beside = run(blank, RunConfig(name, sensors=("odometry", "bearing_range", sensor)))
+    assert beside.config["settings"]["landmarks"] == "known"
+    named = run(with_points(blank, 2), RunConfig(name, sensors=("odometry", sensor)))
+    assert named.config["settings"]["landmarks"] == "known"
 
 
 @pytest.mark.parametrize("name", ["smoother", "monoslam"])

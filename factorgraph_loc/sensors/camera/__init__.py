@@ -65,6 +65,7 @@ SENSOR = SensorType(
     summarize="factorgraph_loc.sensors.camera.summary:summarize",
     prepare="factorgraph_loc.sensors.camera.prepare:prepare",
     doubts="factorgraph_loc.sensors.camera.describe:doubts",
+    unmapped="factorgraph_loc.sensors.camera.describe:unmapped",
     findable="factorgraph_loc.sensors.camera.describe:findable",
     mappable="factorgraph_loc.sensors.camera.describe:mappable",
     draw="factorgraph_loc.sensors.camera.draw:draw",

@@ -41,19 +41,32 @@ def frame_error(setup: Setup, modalities: Container[str], landmarks: MapUse) -> 
 
 def doubts(use: Use, _diagnostics: Diagnostics, _learnt: Learnt) -> Iterator[str]:
     """A map without points that the camera could find, where the estimator needs them; a known map that was not wanted."""
-    used = [name for name in NAMES if name in use.sensors]
-    points = use.log.world.points
-    if not used or "camera" not in use.modalities:
-        return
-    if points is not None and len(points.owners if used == ["camera"] else points):
-        if getattr(use.settings, "landmarks", "known") == "unknown" and not use.estimates_points:
+    landmarks = getattr(use.settings, "landmarks", "known")
+    if _has_points(use):
+        if landmarks == "unknown" and not use.estimates_points:
             yield f"{use.log.name}: {use.estimator} does not estimate points: those of the map are used as they are"
-        return
-    if getattr(use.settings, "visual_odometry", False):
-        return
-    others = ""
-    if use.estimates_points:
-        if getattr(use.settings, "landmarks", "known") != "known":
-            return
-        others = f", or {use.estimator}.landmarks=unknown"
-    yield f"{use.log.name}: the map has no points that a camera could find: give --world{others}"
+    elif _looks(use) and not _follows(use) and not (use.estimates_points and landmarks != "known"):
+        others = f", or {use.estimator}.landmarks=unknown" if use.estimates_points else ""
+        yield f"{use.log.name}: the map has no points that a camera could find: give --world{others}"
+
+
+def unmapped(use: Use) -> bool:
+    """Whether the estimator can do without a map that has no points."""
+    return use.estimates_points and _looks(use) and not _has_points(use) and not _follows(use)
+
+
+def _looks(use: Use) -> bool:
+    return "camera" in use.modalities and any(name in use.sensors for name in NAMES)
+
+
+def _follows(use: Use) -> bool:
+    """Whether features that are no points tell the motion."""
+    return getattr(use.settings, "visual_odometry", False) is True
+
+
+def _has_points(use: Use) -> bool:
+    """Whether the camera is used, and the map has points that it could find."""
+    points = use.log.world.points
+    if points is None or not _looks(use):
+        return False
+    return bool(len(points) if "sightings" in use.sensors else len(points.owners))
