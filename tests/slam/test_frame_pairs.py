@@ -77,7 +77,7 @@ def test_without_points_it_tells_the_heading_better_than_the_wheels():
     for seed in (1, 2, 4):
         log = replace(camera_world.simulate(seed, 24.0, limit=60), world=World())
         for on in squares:
-            result = run(log, RunConfig("smoother", {"visual_odometry": on}))
+            result = run(log, RunConfig("smoother", {"landmarks": "known", "visual_odometry": on}))
             error = se2.wrap(result.final.poses[:, 2] - log.reference.at(result.final.t)[:, 2])
             squares[on] += float(np.mean(error**2))
     assert squares[True] < 0.6 * squares[False]
