@@ -123,9 +123,11 @@ def test_what_is_said_is_what_the_fault_adds():
 
 
 def test_a_run_that_does_not_come_back_is_called_lost():
-    assert cells([run_with(0.05)])[2] == "0.050"
-    assert cells([run_with(0.05), run_with(0.3)])[2] == "0.300, lost"
-    assert cells([run_with(0.05), Attempt(None, {}, failure="no")])[0] == "1 of 2 refused"
+    right = [run_with(0.01)]
+    assert cells([run_with(0.05)], right)[2] == "0.050"
+    assert cells([run_with(0.05), run_with(0.3)], right)[2] == "0.300, lost"
+    assert cells([run_with(0.05), run_with(0.3)], [run_with(0.2)])[2] == "0.300"
+    assert cells([run_with(0.05), Attempt(None, {}, failure="no")], right)[0] == "1 of 2 refused"
 
 
 def test_ratios_and_differences_are_of_the_logs_that_both_have():
