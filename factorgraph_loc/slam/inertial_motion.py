@@ -97,9 +97,8 @@ class InertialMotion(SpaceMotion):
         values = self.values(0, known)
         values.insert(1, there.pose())
         values.insert(1 + STRIDE, there.velocity())
-        jacobian, _ = (
-            _factor(0, 1, motion).linearize(values).jacobian()
-        )  # by pose and velocity, here and there, and biases
+        # by pose and velocity, here and there, and biases
+        jacobian, _ = _factor(0, 1, motion).linearize(values).jacobian()
         back = np.linalg.inv(jacobian[:, 9:18])
         transition, noise = np.zeros((ROBOT, ROBOT + 6)), np.zeros((ROBOT, ROBOT))
         transition[:9, MOVING] = -back @ np.delete(jacobian, np.s_[9:18], axis=1)

@@ -111,11 +111,8 @@ class MeasuredMotion(SpaceMotion):
 
     def factors(self, keys: Sequence[int], times: Sequence[float], start: KnownState) -> list[gtsam.NonlinearFactor]:
         by = self._chain.between(times[-2], times[-1])
-        moved, noise = (
-            gtsam.Pose3(gtsam.Rot3(by.rotation), by.shift),
-            gtsam.noiseModel.Gaussian.Covariance(by.covariance),
-        )
-        return [gtsam.BetweenFactorPose3(keys[-2], keys[-1], moved, noise)]
+        moved, noise = gtsam.Pose3(gtsam.Rot3(by.rotation), by.shift), gtsam.noiseModel.Gaussian.Covariance
+        return [gtsam.BetweenFactorPose3(keys[-2], keys[-1], moved, noise(by.covariance))]
 
     def state(
         self, values: gtsam.Values, keys: Sequence[int], spread: Array, times: Sequence[float], start: KnownState

@@ -26,11 +26,8 @@ from factors.se2 import Array
 # m, rad, s: over which the error of a constant accumulates before other sensors correct it
 WAY, TURN, TIME = 4.0, 4.0, 8.0
 HORIZON = 5.0  # s of odometry that are kept
-UNUSED = {
-    "imu": "yaw rate",
-    "twist": "motion in space",
-    "inertial": "inertial unit",
-}  # reason why rows of an unused sensor are ignored
+# reason why rows of an unused sensor are ignored
+UNUSED = {"imu": "yaw rate", "twist": "motion in space", "inertial": "inertial unit"}
 TWIST_TIME = 0.1  # s over which the velocity is averaged
 
 
