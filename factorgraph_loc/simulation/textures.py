@@ -64,9 +64,9 @@ def floor(rng: np.random.Generator, height: int, width: int, texel: float) -> Ca
     """Carpet tiles of a few shades, with threads, stains and scraps."""
     shade = np.array(_dull(rng))
     shades = shade * rng.uniform(0.75, 1.25, (4, 1)) + rng.uniform(-8.0, 8.0, (4, 3))
-    rows, columns = (int(np.ceil(side * texel / TILE)) for side in (height, width))
-    small = shades[rng.choice(4, (rows, columns), p=(0.55, 0.25, 0.12, 0.08))].astype(np.uint8)
     side = round(TILE / texel)
+    rows, columns = -(-height // side), -(-width // side)
+    small = shades[rng.choice(4, (rows, columns), p=(0.55, 0.25, 0.12, 0.08))].astype(np.uint8)
     tiled = small.repeat(side, axis=0).repeat(side, axis=1)[:height, :width]
     out = pictures.shaded(tiled, 1.0 + 0.05 * _grain(rng, height, width))
     out[::side] = (out[::side] * 0.7).astype(np.uint8)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.sensors.rfid.map import Tag
-from factorgraph_loc.simulation import preset
+from factorgraph_loc.simulation import preset, textures
 from factorgraph_loc.simulation.renderer import Renderer
 from factorgraph_loc.simulation.scene import ROOM_HEIGHT, make_scene
 from factorgraph_loc.simulation.settings import ImageSettings
@@ -278,3 +278,7 @@ def test_memory_of_a_large_building_is_bounded():
 def test_another_image_size(room):
     small = CameraModel(200.0, 200.0, 79.5, 59.5, 160, 120, position=MODEL.position, rotation=MODEL.rotation)
     assert Renderer(room, small).image(*reprojection.camera_pose(small, POSE)).shape == (120, 160, 3)
+
+
+def test_tiles_cover_a_floor_where_texels_do_not_divide_them():
+    assert textures.floor(np.random.default_rng(0), 1101, 905, 0.005976).shape == (1101, 905, 3)
