@@ -13,7 +13,9 @@ The information is for Gaussian noise, to first order. For a translation that is
 points lie in one plane, its direction is biased; such motions are rejected.
 """
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +38,8 @@ DEPTHS = 0.3  # 1/m: variation of the inverse depth across the image
 BLURRED = 0.05  # rad: largest standard deviation of a useful direction
 NEAR, NEAREST = 1.0, 0.5  # m: few points are nearer, and none
 SHORTEST = 1e-4  # m, least translation with a direction
+SCALED = 0.01  # of the focal length, for its derivative
+WORST = 1e12  # condition of the information of two images
 SMALLEST = 1e-7  # m and rad: converged step
 
 
@@ -70,6 +74,38 @@ def frame_motion(
     if moved.agrees.sum() < max(MIN_MATCHES, MIN_SHARE * len(pairs)) or _blur(moved, model.position) > BLURRED:
         return None
     return moved
+
+
+def turned(
+    model: CameraModel, first: Array, second: Array, starts: Sequence[Array]
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """By how much the robot turned [rad] between two images with K features at the pixels ``first`` and ``second`` (K, 2), and the
+    relative error of the focal length, each with its standard deviation. ``starts`` (3,): motions, one of them near the true one.
+
+    None with too few matches or too few inliers."""
+    if len(first) < MIN_MATCHES:
+        return None
+    pairs = RayPairs.of(model, first, second)
+    found = _refined(pairs, min(starts, key=lambda motion: _misfit(pairs, motion)), model.robust)
+    if found.agrees.sum() < max(MIN_MATCHES, MIN_SHARE * len(pairs)):
+        return None
+    residual, _, signal = sampson(pairs, found.delta)
+    weight = _weight(pairs, found.delta, residual, model.robust)
+    longer, shorter = (
+        sampson(RayPairs.of(replace(model, fx=s * model.fx, fy=s * model.fy), first, second), found.delta)[0]
+        for s in (1.0 + SCALED, 1.0 - SCALED)
+    )
+    by_focal = (longer - shorter) / (2.0 * SCALED)
+    # there is no information along the translation, only across it and of the rotation
+    x, y, _ = _along(found.delta, pairs.position)
+    jacobian = np.column_stack((signal @ (-y, x, 0.0), signal[:, 2], by_focal))
+    information = (weight[:, None] * jacobian).T @ jacobian
+    if np.linalg.cond(information) > WORST:
+        return None
+    covariance = np.linalg.inv(information)
+    focal = -float(covariance[2] @ (jacobian.T @ (weight * residual)))
+    turn_sigma = math.sqrt(np.linalg.inv(information[:2, :2])[1, 1])
+    return (float(found.delta[2]), turn_sigma), (focal, math.sqrt(covariance[2, 2]))
 
 
 def _start(pairs: RayPairs, predicted: Array, rng: np.random.Generator) -> Array:

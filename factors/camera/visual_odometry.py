@@ -88,7 +88,10 @@ def nearness(pairs: RayPairs, motion: Array) -> tuple[Array, Array]:
     # a / rho = tau + mu R b, crossed with R b
     far = np.column_stack((y * turned[:, 2], -x * turned[:, 2], x * turned[:, 1] - y * turned[:, 0]))
     squared = np.maximum(np.einsum("ki,ki->k", far, far), 1e-18)
-    rho = np.einsum("ki,ki->k", np.cross(a, turned), far) / squared
+    # a x R b, which numpy takes long for
+    u, v = a.T, turned.T
+    across = np.column_stack((u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]))
+    rho = np.einsum("ki,ki->k", across, far) / squared
     noise = np.einsum("kij,kij->k", pairs.first_noise, pairs.first_noise) / 2.0
     noise += np.einsum("kij,kij->k", pairs.second_noise, pairs.second_noise) / 2.0
     return rho, np.sqrt(noise * np.einsum("ki,ki->k", turned, turned) / squared)

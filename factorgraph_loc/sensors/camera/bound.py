@@ -22,6 +22,7 @@ from factorgraph_loc.sensors.camera.sensor import (
     Predicted,
 )
 from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.turn_check import TurnCheck
 from factors.camera import model as reprojection
 from factors.camera.factor import ReprojectionFactor
 from factors.camera.floor import TiltScale
@@ -119,7 +120,9 @@ class CameraSensor(Sensor):
         self._uncertain, self._motion = constants, motion
         self.constants = constants if binding.calibration == "all" else NOTHING
         self._carries = binding.calibration != "particles"  # too many for particles
-        self.points = KnownPoints(setup, diagnostics, constants, use, motion)
+        self.points = KnownPoints(setup, diagnostics, constants, use)
+        model = self.points.model
+        self._check = None if model is None else TurnCheck(model, motion, diagnostics, constants)
         # times [s] of recent looks at what was surveyed with an error and is not estimated
         self._looks: dict[str, list[float]] = defaultdict(list)
         self._before: deque[tuple[float, TiltScale | None]] = deque()  # what was known of the floor before an image
@@ -130,7 +133,13 @@ class CameraSensor(Sensor):
             # camera's mounting is estimated
             self.solve_every = 0.0 if constants.names else SOLVE_EVERY
 
+    @property
+    def inconsistent(self) -> bool:
+        return self._check is not None and self._check.told
+
     def observe(self, m: Pixels, view: View) -> Iterator[PixelObservation | NewVariable]:
+        if self._check is not None and not m.right:
+            self._check.add(m.t, m.names if m.frame is None else m.frame.tracks, m.pixels)
         twist = self._motion.twist(m.t) if self.points.needs_twist else None
         predicted, values, spreads = Predicted(view.pose, view.covariance), {}, {}
         shared = () if m.right else self._shared

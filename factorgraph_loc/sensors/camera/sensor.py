@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from statistics import median
 from types import MappingProxyType
 
 import numpy as np
@@ -14,10 +13,8 @@ from factorgraph_loc.maps.common_error import without_common
 from factorgraph_loc.maps.markers import marker_of
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.model.setup import MapUse, Setup
-from factorgraph_loc.sensors.camera.clock_check import ClockCheck
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
@@ -65,7 +62,7 @@ class KnownPoints:
     """Turns camera measurements into factors. Points that map or rig lack are counted as ignored, outliers as rejected.
 
     ``estimated``: the camera's constants that are estimated. ``use``: see
-    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`. ``motion``: used to check the timestamps of images.
+    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`.
     """
 
     def __init__(
@@ -74,7 +71,6 @@ class KnownPoints:
         diagnostics: Diagnostics,
         estimated: Estimated,
         use: MapUse = "known",
-        motion: Motion | None = None,
     ) -> None:
         used = any(sensor in setup.sensors for sensor in CAMERAS)
         settings = setup.rig.camera if used else None
@@ -94,9 +90,6 @@ class KnownPoints:
         self.associator: Associator | None = None
         if self.model is not None and "camera" in setup.sensors and len(self.map.owners):
             self.associator = Associator(self.map, self.model)
-        self._clock: ClockCheck | None = None
-        if motion is not None and not self.needs_twist:
-            self._clock = ClockCheck(motion, diagnostics)
         self.missed = False  # whether points of the map were missing in the last image
         self._map_matters = False
         self._inexact = np.zeros(len(self.map), dtype=bool)
@@ -219,8 +212,6 @@ class KnownPoints:
         u, v = (-factor.model.sigma * update.residual.T).tolist()
         self._diagnostics.add_residuals("camera.u", u)
         self._diagnostics.add_residuals("camera.v", v)
-        if self._clock is not None:
-            self._clock.add(t, median(u) / factor.model.fx)
 
     def _model_of(self, m: Pixels) -> CameraModel | None:
         """Of the camera that took an image. The constants of the second one are not estimated."""
