@@ -3,7 +3,8 @@
 Davison et al., 2007 (see :mod:`~factorgraph_loc.slam.space_motion`), section III.E: a point is searched in the 99 % ellipse of
 its innovation. Outliers are rejected by consensus: each match alone corrects the prediction, and the correction that most others
 agree with defines the inliers (Civera, Grasa, Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal of Field Robotics
-27(5), 2010). The corrected pixels follow from the innovation covariance, so that all matches are tried, not a random sample.
+27(5), 2010). The corrected pixels follow from the innovation covariance, so that all matches are tried, not a random sample. Of
+the inliers, each must be inside the gate of what all others together tell.
 """
 
 import numpy as np
@@ -14,19 +15,19 @@ from factors.se2 import Array
 from factors.update import GATE
 
 FEWEST = 3  # matches that must agree
-JOINT = 1.5  # mean squared innovation per degree of freedom below which all are inliers
 
 
 def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
     """Which of the ``residual`` (K, 2) [px], measured minus predicted, are inliers; all if fewer than :data:`FEWEST`."""
     count = len(residual)
-    each = innovation.each(noise)
+    right = np.ones(count, dtype=bool)
     if count < FEWEST:
-        return np.ones(count, dtype=bool)
-    whitened = np.linalg.solve(innovation.root(noise), residual.ravel())
-    if whitened @ whitened < JOINT * 2 * count:
-        return np.ones(count, dtype=bool)
+        return right
+    total = innovation.total(noise)
+    if _confirmed(residual, total, right).all():
+        return right
     blocks = innovation.covariance.reshape(count, 2, count, 2).transpose(0, 2, 1, 3)  # (of j, by i)
+    each = innovation.each(noise)
     gains = blocks @ np.linalg.inv(each)[None]
     corrected = residual[:, None] - np.einsum("jiab,ib->jia", gains, residual)
     spread = each[:, None] - gains @ blocks.transpose(0, 1, 3, 2)
@@ -35,11 +36,35 @@ def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
     spread[..., 1, 1] = np.maximum(spread[..., 1, 1], noise[:, None, 1, 1])
     distances = squared(corrected.reshape(-1, 2), spread.reshape(-1, 2, 2)).reshape(count, count)
     i = np.arange(count)
-    distances[i, i] = squared(residual, each)
+    distances[i, i], spread[i, i] = squared(residual, each), each
     inside = distances < GATE
-    cost = np.minimum(distances, GATE).sum(axis=0)
-    best = int(np.argmin(cost))
-    return np.asarray(inside[:, best])
+    # a match of a point that is hardly known explains everything, as it tells nothing
+    told = np.log(np.linalg.det(each)[:, None] / np.linalg.det(spread))
+    best = int(np.argmax(np.where(inside, GATE - distances + told, 0.0).sum(axis=0)))
+    return _confirmed(residual, total, inside[:, best])
+
+
+def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
+    """Those of ``right`` (K,) that lie inside the gate of what all others of them tell; the worst is left out first."""
+    rows = np.flatnonzero(right)
+    count = len(rows)
+    values = (2 * rows[:, None] + np.arange(2)).ravel()
+    information, pixels = np.linalg.inv(total[np.ix_(values, values)]), residual[rows].ravel()
+    while count >= FEWEST:
+        i = np.arange(count)
+        own = np.linalg.inv(information.reshape(count, 2, count, 2)[i, :, i, :])
+        off = own @ (information @ pixels).reshape(count, 2, 1)  # from what the others tell
+        distances = squared(off[..., 0], own)
+        worst = int(np.argmax(distances))
+        if distances[worst] < GATE:
+            break
+        kept = np.repeat(i != worst, 2)
+        cross = information[np.ix_(kept, ~kept)]
+        information = information[np.ix_(kept, kept)] - cross @ own[worst] @ cross.T
+        rows, pixels, count = np.delete(rows, worst), pixels[kept], count - 1
+    found = np.zeros(len(right), dtype=bool)
+    found[rows] = True
+    return found
 
 
 def find(

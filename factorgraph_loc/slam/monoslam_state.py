@@ -248,13 +248,17 @@ class Innovation:
         blocks = self.covariance.reshape(2 * noise.shape[:2])
         return np.asarray(blocks[k, :, k, :] + noise)
 
-    def root(self, noise: Array) -> Array:
-        """The Cholesky factor (2K, 2K) of the innovation covariance, with ``noise`` (K, 2, 2)."""
+    def total(self, noise: Array) -> Array:
+        """The innovation covariance (2K, 2K), with ``noise`` (K, 2, 2)."""
         total = self.covariance.copy()
         blocks = total.reshape(2 * noise.shape[:2])
         k = np.arange(len(noise))
         blocks[k, :, k, :] += noise
-        return positive.root(total)
+        return total
+
+    def root(self, noise: Array) -> Array:
+        """The Cholesky factor (2K, 2K) of :meth:`total`."""
+        return positive.root(self.total(noise))
 
     def gain(self, noise: Array) -> tuple[Array, Array]:
         """:meth:`root`, and its inverse times ``carried`` transposed."""
