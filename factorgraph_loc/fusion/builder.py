@@ -282,7 +282,8 @@ class Builder:
         key = graph.keys.get(sensor.modality)
         shared = () if key is None else (key,)
         constants = None if key is None else graph.values[key]
-        return GraphView(graph.keyframes, *estimates, between, graph.motion.slip, shared, constants)
+        motion = between, graph.motion.slip, graph.motion.twist
+        return GraphView(graph.keyframes, *estimates, *motion, shared, constants)
 
     def _add_block(self, new: NewVariable, sensor: Sensor, view: _KeyframeView, addition: Addition) -> None:
         """A landmark comes into the graph, with the sightings that told it, or with its prior."""

@@ -17,8 +17,8 @@ from factors.se2 import Array
 class GraphView:
     """What a mapper sees of its graph: the ``keyframes``; estimates of all variables but poses, to which it adds
     (``values``, ``spreads``); the ``current`` estimate of a variable by key; which keyframes are open; the motion ``between``
-    two of them; what wheels that ``slip`` do to an increment, as the motion tells it; keys of the sensor's constants (``shared``),
-    and the values (P,) of these."""
+    two of them; what wheels that ``slip`` do to an increment, and the robot's velocity (``twist``, (3,)) at a time, as the motion
+    tells them; keys of the sensor's constants (``shared``), and the values (P,) of these."""
 
     keyframes: Sequence[Keyframe]
     values: Values
@@ -27,6 +27,7 @@ class GraphView:
     is_open: Callable[[int], bool]
     between: Callable[[Keyframe, Keyframe], Increment]
     slip: Callable[[Increment], tuple[Array, float]]
+    twist: Callable[[float], Array]
     shared: tuple[int, ...] = ()
     constants: Array | None = None
 

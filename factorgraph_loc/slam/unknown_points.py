@@ -19,6 +19,7 @@ from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, Pixels, lifted
+from factorgraph_loc.slam.image_times import ImageTimes
 from factorgraph_loc.slam.local_bundle import bundled
 from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints
 from factorgraph_loc.slam.new_points import FEWEST as FEWEST_SIGHTINGS
@@ -78,15 +79,13 @@ class UnknownPoints:
     _names: dict[int, str] = field(default_factory=dict)  # by key, of all points that ever were in the graph
     _loops: LoopClosure = field(default_factory=LoopClosure)
     _distance_travelled: float = 0.0  # m
-    _again_as: dict[Hashable, Hashable] = field(
-        default_factory=dict
-    )  # names of points that are continued by new tracks
+    _again_as: dict[Hashable, Hashable] = field(default_factory=dict)  # names of points that new tracks continue
     _anchored: dict[int, bool] = field(default_factory=dict)  # keyframes with sightings
 
     def __post_init__(self) -> None:
         self._new, self._looks = NewPoints(self.model), PointLooks(self.model)
         self._lens = reprojection.lens_of(self.model)
-        self._floor = TiltScale.guessed(self.model.tilt)
+        self._floor, self._times = TiltScale.guessed(self.model.tilt), ImageTimes(self.estimated)
 
     def take(
         self,
@@ -102,7 +101,9 @@ class UnknownPoints:
 
         The covariance is not reduced: the points are as uncertain as the poses that observed them.
         """
-        model = self.model
+        model, (index, times) = self.model, (keyframe.index, self._times)
+        times.add(keyframe, graph)
+        guess = times.at_image(index, guess, graph)
         if graph.constants is not None:
             model = recalibrated(model, self.estimated.full(graph.constants, len(reprojection.PARAMETERS)))
         # those that have been followed for longest come first
@@ -154,7 +155,7 @@ class UnknownPoints:
             addition.nodes.append(prior)
             for sighting in seen:
                 self._hang(graph.keyframes[sighting.keyframe], key, sighting.pixel, graph, addition)
-        return pose, guess[1]
+        return times.at_stamp(index, (pose, guess[1]), graph)
 
     def _named(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: GraphView) -> list[Hashable]:
         """The name of each row: of a feature, the number of its track, or of the track that its point was added with."""
@@ -351,7 +352,8 @@ class UnknownPoints:
 
     def _hang(self, keyframe: Keyframe, key: int, pixel: Array, graph: GraphView, addition: Addition) -> None:
         keys = (keyframe.key, *graph.shared, tilt_key(keyframe.index), key)
-        node = Node(keys, PointFactor(self.model, self._lens, pixel, self.estimated.indices), 2)
+        twist = self._times.twists.get(keyframe.index)
+        node = Node(keys, PointFactor(self.model, self._lens, pixel, self.estimated.indices, twist), 2)
         keyframe.nodes.append(node)
         addition.nodes.append(node)
 
@@ -367,7 +369,7 @@ class UnknownPoints:
         slacks = self._slacks(newest, graph)
         if not self._anchored[newest.index]:
             last = [index for index in sorted(slacks)[-BUNDLE:] if graph.is_open(index)]
-            poses = [pose if i == newest.index else graph.current(graph.keyframes[i].key) for i in last]
+            poses = [pose if i == newest.index else self._times.pose(i, graph) for i in last]
             level = replace(self.model, tilt=self._floor.sigma)
             found = bundled(level, [graph.keyframes[i] for i in last], poses, self._new.waiting())
             if found is not None:
@@ -377,16 +379,14 @@ class UnknownPoints:
         places = {newest.index: KeyframeCamera.of(self.model, pose, slacks[newest.index], tilt)}
         for i in {s.keyframe for name in names for s in self._new.waiting()[name]}:
             if i not in places and i in slacks and graph.is_open(i):
-                there, tilt = graph.current(graph.keyframes[i].key), graph.values[tilt_key(i)]
+                there, tilt = self._times.pose(i, graph), graph.values[tilt_key(i)]
                 places[i] = KeyframeCamera.of(self.model, there, slacks[i], tilt)
         return places, pose
 
     def _slacks(self, newest: Keyframe, graph: GraphView) -> dict[int, float]:
         """The pixel error of the last keyframes relative to the newest."""
         slacks: dict[int, float] = {}
-        to_anchor = since = (
-            0.0  # variance of the rotation from the newest to the first anchored keyframe, and from that one on
-        )
+        to_anchor = since = 0.0  # variance of the rotation from the newest to the first anchored keyframe, and since
         reached = False
         for index in range(newest.index, max(-1, newest.index - HORIZON), -1):
             if self._anchored.get(index, False):

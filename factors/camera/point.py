@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from factors import se2
 from factors.camera import point_kernels as kernels
 from factors.camera.kernels import Lens
-from factors.camera.model import PARAMETERS, CameraModel, lens_of, recalibrated
+from factors.camera.model import PARAMETERS, TIME_OFFSET, CameraModel, lens_of, recalibrated
 from factors.camera.point_kernels import BEHIND, CONSTANTS, POINT, TILT
 from factors.robust import huber_loss
 from factors.se2 import Array
@@ -21,13 +22,15 @@ class PointFactor:
     """A point seen at ``pixel`` (2,). ``lens``: of the ``model``, for compiled code.
 
     The values of the factor are the robot's pose (3,); corrections (P,) of the constants with indices ``estimated`` in
-    :data:`~factors.camera.model.PARAMETERS`, if any; the robot's roll and pitch (2,) [rad]; and the point (3,).
+    :data:`~factors.camera.model.PARAMETERS`, if any; the robot's roll and pitch (2,) [rad]; and the point (3,). ``twist`` (3,): the
+    robot's velocity, needed if the time offset is among them.
     """
 
     model: CameraModel
     lens: Lens
     pixel: Array
     estimated: tuple[int, ...] = ()
+    twist: Array | None = None
 
     @property
     def alike(self) -> Hashable:
@@ -45,6 +48,10 @@ class PointFactor:
         """:meth:`linearize` of N factors with the same camera and constants: residuals (N, 2) and Jacobians (N, 2, d)."""
         estimated, constants = factors[0].estimated, values[0][1]
         residual, jacobian, _ = _seen(factors, values)
+        if TIME_OFFSET in estimated:
+            twists, later = _later(factors, values)
+            jacobian[..., CONSTANTS + TIME_OFFSET] = np.einsum("nri,ni->nr", jacobian[..., :TILT], twists)
+            jacobian[..., :TILT] = jacobian[..., :TILT] @ se2.adjoint(se2.inverse(later))
         blocks = [jacobian[..., :TILT], jacobian[..., TILT:POINT], jacobian[..., POINT:CONSTANTS]]
         if estimated:
             turn = np.zeros(3)
@@ -79,5 +86,14 @@ def _seen(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> 
         np.array([v[-1] for v in values], dtype=float),
         np.array([f.pixel for f in factors], dtype=float),
     )
+    if TIME_OFFSET in first.estimated:
+        poses = se2.compose(poses, _later(factors, values)[1])
     camera = lens, model.position, model.rotation
     return kernels.seen(*camera, poses, tilts, points, pixels, model.sigma, model.robust)
+
+
+def _later(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array]:
+    """The velocities (N, 3) of the robot, and how far (N, 3) it moves within the time offset."""
+    twists = np.array([f.twist for f in factors], dtype=float)
+    seconds = float(values[0][1][factors[0].estimated.index(TIME_OFFSET)])
+    return twists, se2.exp(seconds * twists)

@@ -14,8 +14,9 @@ from factors.graph import VectorPriorFactor, jacobian_factor, jacobian_factors
 from factors.robust import huber_loss
 
 POSE, TILT, POINT = np.array((0.1, 0.2, 0.3)), np.array((0.02, -0.03)), np.array((5.0, 2.5, 1.4))
-ESTIMATED = (0, 3, 5, 6)
-CHANGES = np.array((0.02, -0.03, 0.04, 0.02))
+ESTIMATED = (0, 3, 5, 6, 7)
+CHANGES = np.array((0.02, -0.03, 0.04, 0.02, 0.1))
+TWIST = np.array((0.4, 0.05, -0.5))
 
 
 def seen(error=(0.0, 0.0), tilt=TILT):
@@ -44,7 +45,7 @@ def test_it_is_gtsam_s_factor_of_a_robot_in_space(error, tilt):
 
 @pytest.mark.parametrize("estimated", [(), ESTIMATED])
 def test_its_jacobians_are_the_numerical_ones(estimated):
-    factor = replace(seen((0.5, -0.4)), estimated=estimated)
+    factor = replace(seen((0.5, -0.4)), estimated=estimated, twist=TWIST)
     values = [POSE, *([CHANGES] if estimated else []), TILT, POINT]
     residual, blocks = factor.linearize(values)
     for place, block in enumerate(blocks):
@@ -62,7 +63,9 @@ def test_its_jacobians_are_the_numerical_ones(estimated):
 def test_many_are_linearised_as_each_by_itself(estimated):
     rng = np.random.default_rng(0)
     pixels = seen().pixel + rng.normal(0.0, 5.0, (4, 2))
-    factors = [PointFactor(MODEL, lens_of(MODEL), pixel, estimated) for pixel in pixels]
+    factors = [
+        PointFactor(MODEL, lens_of(MODEL), pixel, estimated, (1.0 + i) * TWIST) for i, pixel in enumerate(pixels)
+    ]
     constants = {9: CHANGES} if estimated else {}
     values = constants | {i: POSE + rng.normal(0.0, 0.01, 3) for i in range(4)}
     values |= {10 + i: TILT + rng.normal(0.0, 0.01, 2) for i in range(4)} | {20: POINT, 21: POINT + 0.1}

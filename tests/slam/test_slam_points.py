@@ -15,6 +15,7 @@ from factorgraph_loc.fusion.variables import pose_key
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.settings import CameraUncertainty
 from factorgraph_loc.sensors.camera.stream import FeatureStream
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
@@ -261,3 +262,15 @@ def test_a_few_named_points_close_a_loop(seed):
     log = fgloc.simulate("office", seed, changes=changed)
     result = run(log, RunConfig("smoother", UNKNOWN, ("odometry", "sightings")))
     assert score(result, log)["aligned.position_rmse"] < 0.16
+
+
+@pytest.mark.parametrize("late", [0.1, -0.1])
+@pytest.mark.parametrize("name", ["smoother", "batch"])
+def test_points_without_a_map_tell_the_time_offset(name, late):
+    """Four standard deviations: below 1e-4 of false alarms."""
+    log = camera_world.simulate(1, SECONDS, speeds=camera_world.weave)
+    stamped = camera_world.with_sightings(log, t=log.streams["sightings"].t + late)
+    unsure = camera_world.with_camera(stamped, uncertainty=CameraUncertainty(time_offset=0.1))
+    offset, sigma = run(unsure, CONFIGS[name]).learnt.values["camera.time_offset"]
+    assert abs(offset + late) < 4.0 * sigma
+    assert sigma < 0.03
