@@ -22,11 +22,13 @@ from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings
 from factorgraph_loc.model.belief import Learnt, LearntPoint, PoseEstimate, PosePrior, SpacePose
 from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3, planar_estimate, planar_trajectory
 from factorgraph_loc.sensors.camera.sensor import CAMERAS, Pixels
 from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.turn_check import TurnCheck
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.slam.inertial_motion import measured_motion
 from factorgraph_loc.slam.monoslam_invariance import carried
@@ -39,6 +41,7 @@ from factorgraph_loc.slam.monoslam_state import (
     MapPoint,
     SlamState,
     each_squared,
+    starting,
     weighted,
     widened,
 )
@@ -70,7 +73,6 @@ from factors.se2 import Array
 
 SETTLED = 1e-3  # m, rad: step of the iterated update below which it has converged
 HORIZON = 5.0  # s of measured motion that are kept
-VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s at the start
 LATELY = 5.0  # s: a point in the state that was not seen since may be hidden
 LOST_AFTER = 5  # consecutive images without a match, after which the filter is lost
 SCALE = "scale_distance"  # the constant of the odometry
@@ -129,6 +131,8 @@ class Monoslam(Filter):
         names = self._constants.names
         self._scale = names.index(SCALE) if SCALE in names else None
         self._told = False  # whether it was said that the scale is unknown
+        turns = camera.model() if camera is not None and self._wheels and self._planar else None
+        self._check = TurnCheck(turns, self._motion, self.diagnostics, NOTHING)
         self._mounting = np.zeros((6, 6)) if camera is None else _of_mounting(camera)
         self._step: Step | None = None
         self._predicted, self._anew = np.empty((0, 0)), False
@@ -197,7 +201,7 @@ class Monoslam(Filter):
 
     def _start(self, prior: PosePrior) -> SlamState:
         s = self._settings
-        covariance = _starting(self._constants.sigmas)
+        covariance = starting(self._constants.sigmas)
         if s.planar is None:
             self._planar = prior.space is None
         if prior.space is not None:
@@ -223,7 +227,7 @@ class Monoslam(Filter):
             return None
         sigmas = self._constants.sigmas
         nowhere = RobotState(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
-        return self._standing(camera, eye, SlamState(nowhere, np.zeros(len(sigmas)), _starting(sigmas)))
+        return self._standing(camera, eye, SlamState(nowhere, np.zeros(len(sigmas)), starting(sigmas)))
 
     @property
     def _by_velocity(self) -> bool:
@@ -261,6 +265,7 @@ class Monoslam(Filter):
             return
         if self._origin is not None and m.frame is not None and m.frame.depths is not None:
             self._origin = replace(self._origin, scale=0.0)
+        self._check.add(m)
         match = self._looker.match(m, self._state, eye)
         self._matched(m, match, eye)
         state, self._anew = self._relocated(m, self._state, eye, match)
@@ -332,7 +337,7 @@ class Monoslam(Filter):
         s = self._settings
         position, rotation = carrier(eye.model, camera.position, camera.rotation)
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
-        covariance = _starting(np.zeros(len(before.constants)))
+        covariance = starting(np.zeros(len(before.constants)))
         covariance[ROBOT:, ROBOT:] = before.covariance[ROBOT : before.base, ROBOT : before.base]
         back = np.linalg.inv(eye.lift)
         covariance[:6, :6] = back @ camera.covariance @ back.T
@@ -367,7 +372,8 @@ class Monoslam(Filter):
     def _estimate(self) -> PoseEstimate:
         robot = self._state.robot
         spread = self._spread(robot, self._state.covariance)
-        return planar_estimate(self._t, SpacePose(robot.position, robot.rotation, spread))
+        found = planar_estimate(self._t, SpacePose(robot.position, robot.rotation, spread))
+        return replace(found, status="ambiguous") if self._check.told else found
 
     def _spread(self, robot: RobotState, covariance: Array) -> Array:
         """The covariance (6, 6) of a pose, including that of the start without a map, or of the camera's mounting in one."""
@@ -392,9 +398,3 @@ def _of_mounting(camera: CameraSettings) -> Array:
     u, lever = camera.uncertainty, np.eye(6)
     lever[SHIFT, TURN] = cross(camera.model().position)
     return (lever * np.square((u.roll, u.pitch, u.yaw, u.x, u.y, u.z))) @ lever.T
-
-
-def _starting(sigmas: Array) -> Array:
-    """The covariance (12 + P, 12 + P) of a start, except for the pose; ``sigmas`` (P,): of the constants."""
-    motion = np.array([0.0] * 6 + [VELOCITY_SIGMA] * 3 + [RATE_SIGMA] * 3)
-    return np.diag(np.concatenate((motion, sigmas)) ** 2)

@@ -25,6 +25,7 @@ from factors.update import GATE, GATES
 Integers = NDArray[np.int64]
 Truths = NDArray[np.bool_]
 POSE = 6  # first values of the error state: those of the pose
+VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s at the start
 
 
 @dataclass(frozen=True)
@@ -280,6 +281,12 @@ def each_squared(residual: Array, covariance: Array) -> Array:
     if found.shape[1] > 2:  # given the pixel
         found[:, 2] = np.maximum(0.0, positive.squared(residual, covariance) - found[:, 1])
     return found
+
+
+def starting(sigmas: Array) -> Array:
+    """The covariance (12 + P, 12 + P) of a start, except for the pose; ``sigmas`` (P,): of the constants."""
+    motion = np.array([0.0] * POSE + [VELOCITY_SIGMA] * 3 + [RATE_SIGMA] * 3)
+    return np.diag(np.concatenate((motion, sigmas)) ** 2)
 
 
 def weighted(noise: Array, factors: Array) -> Array:

@@ -17,6 +17,7 @@ __all__ = [
     "settings",
     "stream",
     "tables",
+    "turn_check",
 ]
 
 SENSOR = SensorType(

@@ -121,8 +121,7 @@ class CameraSensor(Sensor):
         self.constants = constants if binding.calibration == "all" else NOTHING
         self._carries = binding.calibration != "particles"  # too many for particles
         self.points = KnownPoints(setup, diagnostics, constants, use)
-        model = self.points.model
-        self._check = None if model is None else TurnCheck(model, motion, diagnostics, constants)
+        self._check = TurnCheck(self.points.model, motion, diagnostics, constants)
         # times [s] of recent looks at what was surveyed with an error and is not estimated
         self._looks: dict[str, list[float]] = defaultdict(list)
         self._before: deque[tuple[float, TiltScale | None]] = deque()  # what was known of the floor before an image
@@ -135,11 +134,10 @@ class CameraSensor(Sensor):
 
     @property
     def inconsistent(self) -> bool:
-        return self._check is not None and self._check.told
+        return self._check.told
 
     def observe(self, m: Pixels, view: View) -> Iterator[PixelObservation | NewVariable]:
-        if self._check is not None and not m.right:
-            self._check.add(m.t, m.names if m.frame is None else m.frame.tracks, m.pixels)
+        self._check.add(m)
         twist = self._motion.twist(m.t) if self.points.needs_twist else None
         predicted, values, spreads = Predicted(view.pose, view.covariance), {}, {}
         shared = () if m.right else self._shared

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,10 +19,11 @@ from numpy.typing import NDArray
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.settings import Estimated
+from factorgraph_loc.sensors.camera.sensor import Pixels
 from factorgraph_loc.vision.frame_motion import turned
 from factors import se2
 from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel
-from factors.se2 import Array, Integers
+from factors.se2 import Array
 
 OFFSETS = np.linspace(-0.3, 0.3, 31)  # s that are tried
 SHORTEST, LONGEST = 0.15, 1.0  # s between images that are compared
@@ -43,9 +43,12 @@ class _Image(NamedTuple):
 
 
 class TurnCheck:
-    """Tells each constant that is wrong once, as an event; see the module. ``estimated``: constants that are not checked."""
+    """Tells each constant that is wrong once, as an event; see the module. ``estimated``: constants that are not checked. Without a
+    ``model`` nothing is."""
 
-    def __init__(self, model: CameraModel, motion: Motion, diagnostics: Diagnostics, estimated: Estimated) -> None:
+    def __init__(
+        self, model: CameraModel | None, motion: Motion, diagnostics: Diagnostics, estimated: Estimated
+    ) -> None:
         self._model, self._motion, self._diagnostics = model, motion, diagnostics
         self._open = {FOCAL, TIME_OFFSET} - set(estimated.indices)
         self.told = False  # whether a constant is wrong
@@ -56,20 +59,23 @@ class TurnCheck:
         self._turns = np.zeros((4, len(OFFSETS)))
         self._focal = np.zeros(4)  # number, and moments of the error of the focal length with their weight
 
-    def add(self, t: float, names: Sequence[str] | Integers, pixels: Array) -> None:
-        """Add an image, in which things with these ``names`` are seen at ``pixels`` (K, 2); a late one is left out."""
-        last = self._last
-        if not self._open or not self._left or (last is not None and t < last.t + SHORTEST):
+    def add(self, m: Pixels) -> None:
+        """Add an image; one of a second camera and a late one are left out."""
+        model, last, t = self._model, self._last, m.t
+        if model is None or m.right or not self._open or not self._left:
+            return
+        if last is not None and t < last.t + SHORTEST:
             return
         while self._waiting and self._waiting[0][1].t + OFFSETS[-1] < t:
             first, second = self._waiting.popleft()
             if t - first.t < self._motion.horizon - LONGEST:  # the odometry of then is still kept
-                self._compare(first, second)
-        self._last = _Image(t, np.asarray(names), np.asarray(pixels, dtype=float))
+                self._compare(model, first, second)
+        names = m.names if m.frame is None else m.frame.tracks
+        self._last = _Image(t, np.asarray(names), np.asarray(m.pixels, dtype=float))
         if last is not None and t < last.t + LONGEST:
             self._waiting.append((last, self._last))
 
-    def _compare(self, first: _Image, second: _Image) -> None:
+    def _compare(self, model: CameraModel, first: _Image, second: _Image) -> None:
         """Compare the turn between two images with those of the wheels at all offsets."""
         motion, middle = self._motion, len(OFFSETS) // 2
         begin, constants = motion.state(first.t), np.zeros(len(motion.constants.names))
@@ -81,7 +87,7 @@ class TurnCheck:
         _, rows, others = np.intersect1d(first.names, second.names, return_indices=True)
         step = motion.relative(begin, motion.state(second.t))
         starts = [np.append(step.delta[:2], turn) for turn in turns[::5].tolist()]
-        found = turned(self._model, first.pixels[rows], second.pixels[others], starts)
+        found = turned(model, first.pixels[rows], second.pixels[others], starts)
         if found is None:
             return
         (turn, sigma), (focal, spread) = found

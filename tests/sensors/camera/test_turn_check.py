@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from camera_world import CAMERA, RIG, room, sightings, weave
+from camera_world import CAMERA, RIG, room, sightings, weave, with_sightings
 
+from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.settings import NOTHING, Estimated
@@ -24,16 +25,16 @@ RIGHT_LENS = CAMERA.model_copy(update={"pixel_sigma": 0.5})
 WRONG_LENS = RIGHT_LENS.model_copy(update={"fx": 1.05 * CAMERA.fx, "fy": 1.05 * CAMERA.fy})
 
 
-def drive(seed, speeds=weave):
+def drive(seed, speeds=weave, seconds=SECONDS):
     """A log of exact poses, noisy wheels, and pixels."""
     rng = np.random.default_rng(seed)
-    t = np.arange(0.0, SECONDS, STEP)
+    t = np.arange(0.0, seconds, STEP)
     v, w = speeds(t)
     poses = [np.array((1.0, -1.0, 0.0))]
     for step in se2.exp(np.column_stack((v, 0.0 * v, w))[:-1] * STEP):
         poses.append(se2.compose(poses[-1], step))
     truth = Trajectory(t, np.array(poses))
-    seen = sightings(truth, POINTS, np.arange(0.5, SECONDS - 0.5, 0.2), rng, RIGHT_LENS, limit=60)
+    seen = sightings(truth, POINTS, np.arange(0.5, seconds - 0.5, 0.2), rng, RIGHT_LENS, limit=60)
     v, w = np.array((v, w)) + NOISE[:, None] * rng.standard_normal((2, len(t)))
     return Log("room", RIG, World(), {"odometry": VelocityStream(t, v, w), "sightings": seen}, truth)
 
@@ -45,7 +46,7 @@ def told(log, camera=RIGHT_LENS, late=0.0, scale=1.0, estimated=NOTHING):
     diagnostics = Diagnostics()
     check = TurnCheck(camera.model(), whole_motion(log, ("odometry",)), diagnostics, estimated)
     for m in log.streams["sightings"].measurements(late):
-        check.add(m.t, m.names, m.pixels)
+        check.add(m)
     assert check.told == bool(diagnostics.events)
     return [what for _, what in diagnostics.events]
 
@@ -81,3 +82,13 @@ def test_what_is_estimated_is_not_told():
 def test_where_the_robot_hardly_turns_nothing_is_told():
     straight = drive(1, lambda t: (np.full(len(t), 0.05), np.full(len(t), 0.02)))
     assert told(straight, WRONG_LENS, late=0.1) == []
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "monoslam"])
+def test_a_run_without_a_map_does_not_claim_to_be_localized_with_a_wrong_clock(estimator):
+    log = drive(1, seconds=25.0)
+    for late, status in ((0.0, "localized"), (0.1, "ambiguous")):
+        stamped = with_sightings(log, t=log.streams["sightings"].t + late)
+        result = run(stamped, RunConfig(estimator, {"landmarks": "unknown"}))
+        assert result.status[-1] == status
+        assert any("time_offset" in what for _, what in result.diagnostics.events) == (late > 0.0)
