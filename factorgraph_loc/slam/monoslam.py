@@ -41,6 +41,7 @@ from factorgraph_loc.slam.monoslam_state import (
     MapPoint,
     SlamState,
     each_squared,
+    of_mounting,
     starting,
     weighted,
     widened,
@@ -48,15 +49,12 @@ from factorgraph_loc.slam.monoslam_state import (
 from factorgraph_loc.slam.space_motion import (
     PLANAR,
     ROBOT,
-    SHIFT,
-    TURN,
     UPRIGHT,
     Origin,
     RobotState,
     Step,
     about_z,
     constant_velocity,
-    cross,
     measured,
     on_the_floor,
     planar,
@@ -133,7 +131,7 @@ class Monoslam(Filter):
         self._told = False  # whether it was said that the scale is unknown
         turns = camera.model() if camera is not None and self._wheels and self._planar else None
         self._check = TurnCheck(turns, self._motion, self.diagnostics, NOTHING)
-        self._mounting = np.zeros((6, 6)) if camera is None else _of_mounting(camera)
+        self._mounting = np.zeros((6, 6)) if camera is None else of_mounting(camera)
         self._step: Step | None = None
         self._predicted, self._anew = np.empty((0, 0)), False
         # without a map the start is unobservable: its uncertainty is kept out of the state, where it would shrink as the
@@ -266,14 +264,22 @@ class Monoslam(Filter):
         if self._origin is not None and m.frame is not None and m.frame.depths is not None:
             self._origin = replace(self._origin, scale=0.0)
         self._check.add(m)
-        match = self._looker.match(m, self._state, eye)
+        state, match = self._found(m, self._state, eye)
         self._matched(m, match, eye)
-        state, self._anew = self._relocated(m, self._state, eye, match)
+        state, self._anew = self._relocated(m, state, eye, match)
         if len(match.pixels) and not self._anew and not self._vague(state):
             state = self._corrected(m, state, eye, match)
         if not self._anew and self._settings.landmarks != "known":
             state = self._managed(m, state, eye, match)
-        self._state = state
+        self._state = replace(state, seen=self._odometry)
+
+    def _found(self, m: Pixels, state: SlamState, eye: Eye) -> tuple[SlamState, Match]:
+        """What is found in an image, and the state before it; without a map images tell whether wheels slipped since the last."""
+        wheels = self._measured is None and not self._by_velocity
+        if self._settings.landmarks == "known" or not wheels or state.seen is None:
+            return state, self._looker.match(m, state, eye)
+        slip = self._motion.slip(self._motion.relative(state.seen, self._odometry))
+        return self._looker.unless_slipped(m, state, eye, *slip)
 
     def _matched(self, m: Pixels, match: Match, eye: Eye) -> None:
         """Called after each image with its matches."""
@@ -391,10 +397,3 @@ class Monoslam(Filter):
     def _kept(self, s: SlamState) -> Array:
         """The covariance (12 + P, 12 + P) of a state without its points."""
         return s.covariance[: s.base, : s.base].copy()
-
-
-def _of_mounting(camera: CameraSettings) -> Array:
-    """The covariance (6, 6) of a pose if images tell that of the camera alone, of what is not known of the mounting."""
-    u, lever = camera.uncertainty, np.eye(6)
-    lever[SHIFT, TURN] = cross(camera.model().position)
-    return (lever * np.square((u.roll, u.pitch, u.yaw, u.x, u.y, u.z))) @ lever.T

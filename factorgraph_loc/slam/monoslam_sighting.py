@@ -13,12 +13,15 @@ from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.sensors.camera.sensor import DISAGREES, EXACT, MOST, Pixels
 from factorgraph_loc.slam.monoslam_search import agreeing, find
 from factorgraph_loc.slam.monoslam_state import Eye, Innovation, Integers, Sights, SlamState, Truths
+from factorgraph_loc.slam.slipping import ENOUGH, more_probable
+from factorgraph_loc.slam.space_motion import PLANAR
 from factorgraph_loc.vision import consensus
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.relocalization import located
 from factorgraph_loc.vision.spread import spread_out
+from factors.camera import inverse_depth
 from factors.camera.depth import with_inverse
 from factors.se2 import Array
 
@@ -85,6 +88,18 @@ class FeatureMatcher:
     def match(self, m: Pixels, state: SlamState, eye: Eye) -> Match:
         """The pixels that belong to points; outliers are removed and counted as rejected."""
         return self._named(m, m.names, state, eye) if m.frame is None else self._searched(m.frame, state, eye)
+
+    def unless_slipped(
+        self, m: Pixels, state: SlamState, eye: Eye, added: Array, rarity: float
+    ) -> tuple[SlamState, Match]:
+        """The state, less certain by ``added`` (3, 3) in x, y and heading if the pixels tell of wheels that slipped, and
+        :meth:`match`. ``rarity``: minus the logarithm of how probable that is."""
+        mark, slipped = self._diagnostics.mark(), state.widened(added)
+        match = self.match(m, slipped, eye)
+        if len(match.pixels) >= ENOUGH and _slip(match, state, eye, added) > rarity:
+            return slipped, match
+        self._diagnostics.take_back(self._diagnostics.since(mark))
+        return state, self.match(m, state, eye)
 
     def new(self, m: Pixels, state: SlamState, eye: Eye, match: Match, tracks: frozenset[int]) -> list[int]:
         """Rows of an image that may become points: unmatched features that were tracked from the previous image (``tracks``), or
@@ -228,3 +243,15 @@ def _visible(eye: Eye, sights: Sights) -> tuple[Sights, Integers]:
     """Those in front of the camera and inside its image."""
     inside = np.flatnonzero((sights.depths > 0.0) & eye.model.contains(sights.pixels))
     return sights[inside], inside
+
+
+def _slip(match: Match, state: SlamState, eye: Eye, added: Array) -> float:
+    """By how much pixels are more probable if the pose is less certain by ``added`` (3, 3): the difference of the logarithms."""
+    sights = eye.all(state, match.mapped, match.points, match.spreads)
+    covariance = Innovation.of(sights, state.covariance).total(sights.noise)
+    # points of unknown depth all began at the same, so that they may be nearer or farther together, as after a slip
+    depths = np.minimum(sights.starts + inverse_depth.SIZE - 1, len(state.covariance) - 1)
+    alike = (sights.by_point[:, :, -1] * np.sqrt(state.covariance[depths, depths])[:, None]).ravel()
+    by_pose = sights.by_pose[:, :, PLANAR].reshape(-1, 3)
+    covariance += np.outer(alike, alike)
+    return more_probable((match.pixels - sights.pixels).ravel(), (covariance, covariance + by_pose @ added @ by_pose.T))

@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from factorgraph_loc.slam.space_motion import ROBOT, RobotState, Step, cross
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.slam.space_motion import PLANAR, ROBOT, SHIFT, TURN, RobotState, Step, cross
 from factors import positive
 from factors.camera import inverse_depth
 from factors.camera.depth import linearize_with_depth
 from factors.camera.model import CameraModel, linearize_in_space, mounted
+from factors.motion import ChainState
 from factors.se2 import Array
 from factors.update import GATE, GATES
 
@@ -51,7 +53,8 @@ class SlamState:
     """``robot``, corrections ``constants`` (P,) of the odometry's constants, and ``values`` (D,) of ``points`` one after the other;
     ``covariance`` (12 + P + D, 12 + P + D) of the error state.
 
-    ``tracks``: in the newest image; ``met``: number of points so far; ``lost``: consecutive images without a match.
+    ``tracks``: in the newest image; ``met``: number of points so far; ``lost``: consecutive images without a match; ``seen``:
+    the odometry at the newest image.
     """
 
     robot: RobotState
@@ -62,6 +65,7 @@ class SlamState:
     tracks: frozenset[int] = frozenset()
     met: int = 0
     lost: int = 0
+    seen: ChainState | None = None
 
     @property
     def base(self) -> int:
@@ -82,9 +86,22 @@ class SlamState:
             covariance=covariance,
         )
 
+    def widened(self, spread: Array) -> SlamState:
+        """The state of a robot whose x, y and heading are less certain, by ``spread`` (3, 3)."""
+        covariance = self.covariance.copy()
+        covariance[np.ix_(PLANAR, PLANAR)] += spread
+        return replace(self, covariance=covariance)
+
     def moved(self, step: Step) -> SlamState:
         """The state after a prediction, which changes the robot alone."""
         return replace(self, robot=step.robot, covariance=step.carried(self.covariance))
+
+
+def of_mounting(camera: CameraSettings) -> Array:
+    """The covariance (6, 6) of a pose if images tell that of the camera alone, of what is not known of the mounting."""
+    u, lever = camera.uncertainty, np.eye(6)
+    lever[SHIFT, TURN] = cross(camera.model().position)
+    return (lever * np.square((u.roll, u.pitch, u.yaw, u.x, u.y, u.z))) @ lever.T
 
 
 @dataclass(frozen=True)

@@ -61,5 +61,11 @@ def _evidence(
     after = positive.inverse(found.covariance)
     told = positive.inverse(positive.nearest(after - positive.inverse(spreads[1])))
     off, told = told @ after @ found.delta, told + COMMON
-    fits = [positive.squared(off, spread + told) + np.linalg.slogdet(spread + told)[1] for spread in spreads]
+    return more_probable(off, (spreads[0] + told, spreads[1] + told))
+
+
+def more_probable(off: Array, spreads: tuple[Array, Array]) -> float:
+    """By how much the second of two covariances (D, D) of an error ``off`` (D,) makes it more probable than the first: the
+    difference of the logarithms."""
+    fits = [positive.squared(off, spread) + np.linalg.slogdet(spread)[1] for spread in spreads]
     return 0.5 * float(fits[0] - fits[1])

@@ -21,6 +21,7 @@ from factorgraph_loc.sensors.camera.stream import FeatureStream
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factorgraph_loc.simulation import preset, simulate
+from factorgraph_loc.slam.monoslam_sighting import FeatureMatcher
 from factorgraph_loc.slam.monoslam_state import Innovation
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera import model as reprojection
@@ -307,3 +308,43 @@ def test_an_innovation_that_rounding_made_singular_still_has_a_gain():
     root, spread = innovation.gain(np.broadcast_to(1e-4 * np.eye(2), (2, 2, 2)))
     assert np.allclose(root @ root.T, innovation.covariance, rtol=1e-9)
     assert np.all(np.isfinite(spread))
+
+
+@pytest.fixture(scope="module")
+def turning():
+    """``turning(seed)``: a drive among many points, and the same with wheels that rest while the robot turns by some 0.35 rad."""
+
+    def make(seed):
+        world = {"points": 900, "tags": 20}
+        log = simulate(preset("office", {"world": world, "world_seed": 5, "drive": {"duration": SECONDS}}), seed)
+        rows = log.streams["odometry"]
+        parts = [(rows.t >= t) & (rows.t < t + 0.6) for t in np.arange(8.0, 25.0, 0.1)]
+        rests = min(parts, key=lambda part: abs(abs(rows.dtheta[part].sum()) - 0.35))
+        slid = replace(rows, dtheta=np.where(rests, 0.0, rows.dtheta))
+        return log, replace(log, streams={**log.streams, "odometry": slid})
+
+    return make
+
+
+@pytest.mark.parametrize("seed", [5, 7])
+def test_wheels_that_rest_while_it_turns_are_told_by_the_points(turning, seed):
+    """The heading was off by a third of the turn."""
+    log, slid = turning(seed)
+    result = estimated(slid, landmarks="unknown")
+    assert errors(result.causal(), log.reference).heading[-20:].mean() < 0.03
+
+
+def test_wheels_that_hold_do_not_slip(turning, monkeypatch):
+    """Of some 450 images at most 0.9 count as slips on average, as a slip must be the likelier at one in a hundred seconds."""
+    slipped, judged = [], FeatureMatcher.unless_slipped
+
+    def counted(self, m, state, *slip):
+        found = judged(self, m, state, *slip)
+        slipped.append(found[0] is not state)
+        return found
+
+    monkeypatch.setattr(FeatureMatcher, "unless_slipped", counted)
+    for seed in (4, 5, 6):
+        estimated(turning(seed)[0], landmarks="unknown")
+    assert len(slipped) > 400
+    assert sum(slipped) <= 1
