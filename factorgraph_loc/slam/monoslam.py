@@ -45,6 +45,7 @@ from factorgraph_loc.slam.monoslam_state import (
     starting,
     weighted,
     widened,
+    with_floor,
 )
 from factorgraph_loc.slam.space_motion import (
     PLANAR,
@@ -65,6 +66,7 @@ from factorgraph_loc.slam.space_motion_models import KnownState
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import FLOATS, TILTS
 from factors import se2
+from factors.camera.floor import TiltScale
 from factors.camera.model import carrier
 from factors.robust import huber_weight
 from factors.se2 import Array
@@ -126,8 +128,7 @@ class Monoslam(Filter):
         self._inertial = self._measured is not None and self._measured.by_velocity  # it tells how the velocity changes
         self._constants = self._motion.constants if self._measured is None else self._measured.constants
         camera = setup.rig.find(CameraSettings) if any(name in setup.sensors for name in CAMERAS) else None
-        names = self._constants.names
-        self._scale = names.index(SCALE) if SCALE in names else None
+        self._scale = self._constants.names.index(SCALE) if SCALE in self._constants.names else None
         self._told = False  # whether it was said that the scale is unknown
         turns = camera.model() if camera is not None and self._wheels and self._planar else None
         self._check = TurnCheck(turns, self._motion, self.diagnostics, NOTHING)
@@ -216,7 +217,8 @@ class Monoslam(Filter):
             scaled = self._inertial or not self._by_velocity or self._looker.two_eyes
             self._origin = Origin(robot, free @ pose @ free, 0.0 if scaled else UNSCALED)
             covariance[:6, :6] = told @ pose @ told
-        return SlamState(robot, np.zeros(len(self._constants.names)), covariance)
+        floor = TiltScale.guessed(s.tilt_sigma) if self._planar and s.landmarks != "known" else None
+        return SlamState(robot, np.zeros(len(self._constants.names)), covariance, floor=floor)
 
     def _seek(self, m: Pixels) -> SlamState | None:
         eye = self._looker.eye(m)
@@ -248,7 +250,7 @@ class Monoslam(Filter):
                 impulse[2] = turning[0] = turning[1] = 0.0
             step = constant_velocity(robot, dt, impulse, turning)
         if self._planar:
-            step = on_the_floor(step, dt, s.height_sigma, s.tilt_sigma)
+            step = on_the_floor(step, dt, s.height_sigma, *self._state.sway(s.tilt_sigma))
         self._step = step
         self._state = self._state.moved(step)
         self._predicted = self._kept(self._state)
@@ -275,8 +277,7 @@ class Monoslam(Filter):
 
     def _found(self, m: Pixels, state: SlamState, eye: Eye) -> tuple[SlamState, Match]:
         """What is found in an image, and the state before it; without a map images tell whether wheels slipped since the last."""
-        wheels = self._measured is None and not self._by_velocity
-        if self._settings.landmarks == "known" or not wheels or state.seen is None:
+        if self._settings.landmarks == "known" or self._measured is not None or self._by_velocity or state.seen is None:
             return state, self._looker.match(m, state, eye)
         slip = self._motion.slip(self._motion.relative(state.seen, self._odometry))
         return self._looker.unless_slipped(m, state, eye, *slip)
@@ -312,7 +313,7 @@ class Monoslam(Filter):
         after = prior.plus(delta, prior.covariance - spread.T @ spread)
         if self._settings.landmarks == "known":
             return after
-        return replace(after, covariance=carried(prior, after, self._scale))
+        return replace(with_floor(prior, after, self._t), covariance=carried(prior, after, self._scale))
 
     def _report(self, m: Pixels, match: Match, residual: Array, innovation: Innovation, noise: Array) -> None:
         sensor = "camera_right" if m.right else "camera"
@@ -351,7 +352,7 @@ class Monoslam(Filter):
             if abs(position[2]) > FLOATS or rotation[2, 2] < math.cos(TILTS):
                 return None
             covariance[UPRIGHT, UPRIGHT] += np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
-        return SlamState(robot, before.constants, covariance)
+        return SlamState(robot, before.constants, covariance, floor=before.floor)
 
     def _managed(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> SlamState:
         """The state after counting, deleting, converting (to x, y, z) and adding points."""

@@ -6,6 +6,7 @@ the innovation. The noise of outliers is widened, as in :mod:`~factors.update`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,10 +16,22 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.slam.space_motion import PLANAR, ROBOT, SHIFT, TURN, RobotState, Step, cross
+from factorgraph_loc.slam.space_motion import (
+    PLANAR,
+    ROBOT,
+    SETTLING,
+    SHIFT,
+    TURN,
+    UNEVEN,
+    RobotState,
+    Step,
+    cross,
+    tilt_of,
+)
 from factors import positive
 from factors.camera import inverse_depth
 from factors.camera.depth import linearize_with_depth
+from factors.camera.floor import TiltScale
 from factors.camera.model import CameraModel, linearize_in_space, mounted
 from factors.motion import ChainState
 from factors.se2 import Array
@@ -54,7 +67,7 @@ class SlamState:
     ``covariance`` (12 + P + D, 12 + P + D) of the error state.
 
     ``tracks``: in the newest image; ``met``: number of points so far; ``lost``: consecutive images without a match; ``seen``:
-    the odometry at the newest image.
+    the odometry at the newest image; ``floor``: how level it is, where that is learnt.
     """
 
     robot: RobotState
@@ -66,6 +79,7 @@ class SlamState:
     met: int = 0
     lost: int = 0
     seen: ChainState | None = None
+    floor: TiltScale | None = None
 
     @property
     def base(self) -> int:
@@ -86,6 +100,10 @@ class SlamState:
             covariance=covariance,
         )
 
+    def sway(self, usual: float) -> tuple[float, float]:
+        """Standard deviation of the tilt [rad], ``usual`` where no floor is learnt, and its time constant [s]."""
+        return (usual, SETTLING) if self.floor is None else (self.floor.sigma, UNEVEN)
+
     def widened(self, spread: Array) -> SlamState:
         """The state of a robot whose x, y and heading are less certain, by ``spread`` (3, 3)."""
         covariance = self.covariance.copy()
@@ -95,6 +113,20 @@ class SlamState:
     def moved(self, step: Step) -> SlamState:
         """The state after a prediction, which changes the robot alone."""
         return replace(self, robot=step.robot, covariance=step.carried(self.covariance))
+
+
+def with_floor(before: SlamState, after: SlamState, t: float) -> SlamState:
+    """The state ``after`` an update at ``t`` that learns how level the floor is from how the tilt changed since the last image, as
+    points lean with the robot that saw them first."""
+    if before.floor is None or before.seen is None or t <= before.seen.t:
+        return replace(after, floor=before.floor)
+    sigma, share = before.floor.sigma, -math.expm1(-2.0 * (t - before.seen.t) / UNEVEN)  # of its variance that is new
+    was, now = (positive.inverse(s.covariance[:2, :2]) for s in (before, after))
+    told, known = now - was, before.covariance[:2, :2] - share * sigma**2 * np.eye(2)
+    weight = np.linalg.inv(np.eye(2) + told @ known)  # what is told of the new part
+    covariance = positive.inverse(share * weight @ told + np.eye(2) / sigma**2)
+    tilt = math.sqrt(share) * covariance @ weight @ now @ (tilt_of(after.robot) - tilt_of(before.robot))
+    return replace(after, floor=before.floor.learnt(tilt, covariance, sigma)[0])
 
 
 def of_mounting(camera: CameraSettings) -> Array:

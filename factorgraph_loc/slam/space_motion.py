@@ -31,7 +31,7 @@ POSES, VELOCITIES = slice(0, 6), slice(6, 12)
 PLANAR = [3, 4, 2]  # indices in the pose's error: x, y and heading of a level robot
 UPRIGHT = [0, 1, 5]  # the components held by the floor: roll, pitch, height
 NO_VELOCITY = [8, 9, 10]  # their velocities
-SETTLING = 1.0  # s, time constant of the return to the floor
+SETTLING, UNEVEN = 1.0, 3.0  # s, time constant of the return to the floor; where its unevenness is learnt
 HOLD = 1.0  # s, for which a measured velocity is held
 SHORTEST = 1e-3  # s, shortest interval from which a velocity is computed
 UNKNOWN = 0.5  # m and rad per sqrt(s) without measured motion
@@ -195,13 +195,13 @@ def planar(delta: Array, covariance: Array, by_constants: Array) -> Displacement
     return Displacement(about_z(heading), np.array((x, y, 0.0)), spread, derivative)
 
 
-def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float) -> Step:
+def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float, settling: float) -> Step:
     """A step of a robot on the floor: height, roll and pitch follow a stationary process about zero with these standard
-    deviations, and have no velocity. For small tilts.
+    deviations and the time constant ``settling`` [s], and have no velocity. For small tilts.
     """
-    keep = math.exp(-dt / SETTLING)
+    keep = math.exp(-dt / settling)
     robot = step.robot
-    heading = about_z(math.atan2(robot.rotation[1, 0], robot.rotation[0, 0]))
+    heading = heading_of(robot)
     rotation = heading @ exp(keep * log(heading.T @ robot.rotation))
     position = np.array((robot.position[0], robot.position[1], keep * robot.position[2]))
     velocity = np.array((robot.velocity[0], robot.velocity[1], 0.0))
@@ -211,8 +211,18 @@ def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float) 
     transition[UPRIGHT, UPRIGHT] = keep
     transition[NO_VELOCITY, NO_VELOCITY] = 0.0
     noise[UPRIGHT, UPRIGHT] = (1.0 - keep**2) * sigmas**2
-    noise[NO_VELOCITY, NO_VELOCITY] = np.square((height_sigma, tilt_sigma, tilt_sigma)) / SETTLING**2
+    noise[NO_VELOCITY, NO_VELOCITY] = np.square((height_sigma, tilt_sigma, tilt_sigma)) / settling**2
     return step.then(transition, noise, RobotState(position, rotation, velocity, rate))
+
+
+def heading_of(robot: RobotState) -> Array:
+    """The rotation (3, 3) of a level robot with the same heading."""
+    return about_z(math.atan2(robot.rotation[1, 0], robot.rotation[0, 0]))
+
+
+def tilt_of(robot: RobotState) -> Array:
+    """Roll and pitch (2,) [rad] of a robot that is nearly level."""
+    return log(heading_of(robot).T @ robot.rotation)[:2]
 
 
 class Chain(ABC):

@@ -42,7 +42,7 @@ def test_the_error_is_carried_as_the_state_moves(step):
 
 def test_the_floor_carries_the_error_of_a_level_robot_as_stated():
     def step(robot):
-        return space_motion.on_the_floor(space_motion.measured(robot, MOTION_ON_FLOOR, DT), DT, 0.01, 0.01)
+        return space_motion.on_the_floor(space_motion.measured(robot, MOTION_ON_FLOOR, DT), DT, 0.01, 0.01, 1.0)
 
     np.testing.assert_allclose(step(LEVEL).transition, numerical(lambda r: step(r).robot, LEVEL), atol=2e-6)
 
@@ -70,7 +70,7 @@ def test_odometry_replaces_the_noise_of_what_it_measures_and_the_floor_holds_the
     still = space_motion.planar(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 0)))
     robot, covariance = LEVEL, np.zeros((12, 12))
     for _ in range(100):
-        step = space_motion.on_the_floor(space_motion.measured(robot, still, DT), DT, 0.02, 0.03)
+        step = space_motion.on_the_floor(space_motion.measured(robot, still, DT), DT, 0.02, 0.03, 1.0)
         robot, covariance = step.robot, step.transition @ covariance @ step.transition.T + step.noise
     np.testing.assert_allclose(np.diag(covariance)[:6], (0.03**2, 0.03**2, 0, 0, 0, 0.02**2), atol=1e-9)
     moved = space_motion.measured(LEVEL, MOTION_ON_FLOOR, DT)
