@@ -96,6 +96,18 @@ def test_a_moving_object_is_not_followed_as_if_it_stood():
     assert np.count_nonzero(found[:, 0] >= 100) > 0.95 * 200
 
 
+def test_the_room_beside_an_object_with_most_of_the_features_is_followed_too():
+    rng = np.random.default_rng(5)
+    points, looks = scene(rng, 300)
+    first, second = (view(points, np.array((0.0, 0.0, z)), turn, 0.2, rng) for z, turn in ((0.0, 0.0), (0.1, 0.08)))
+    sliding = np.arange(300) < 240
+    first[sliding] = rng.uniform((320.0, 20.0), (500.0, 460.0), (240, 2))
+    second[sliding] = first[sliding] + (60.0, 0.0) + rng.normal(scale=0.2, size=(240, 2))
+    found = paired(first, looks, second, looks)
+    assert np.count_nonzero(found[:, 0] < 240) > 0.95 * 240
+    assert np.count_nonzero(found[:, 0] >= 240) > 0.9 * 60
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_a_camera_that_stands_still_keeps_everything(noise):
     rng = np.random.default_rng(6)
