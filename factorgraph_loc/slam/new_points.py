@@ -7,7 +7,7 @@ front of the camera, and small residuals. A sighting that contradicts the others
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,9 +93,14 @@ class NewPoints:
         waiting.append(sighting)
         del waiting[:-MAX_WAITING]
 
-    def forget(self, keyframe: int) -> None:
-        """Drop the points that were last seen long before a keyframe."""
-        self._waiting = {k: v for k, v in self._waiting.items() if v[-1].keyframe >= keyframe - PATIENCE}
+    def those(self, trusted: Callable[[Hashable], bool]) -> Mapping[Hashable, Sequence[PointSighting]]:
+        """The collected sightings of ``trusted`` points."""
+        return {name: seen for name, seen in self._waiting.items() if trusted(name)}
+
+    def forget(self, keyframe: int, wrong: Container[Hashable] = ()) -> None:
+        """Drop the points that were last seen long before a keyframe, and the ``wrong`` ones."""
+        since = keyframe - PATIENCE
+        self._waiting = {k: v for k, v in self._waiting.items() if v[-1].keyframe >= since and k not in wrong}
 
     def ready(
         self, names: Iterable[Hashable], places: Callable[[int], KeyframeCamera | None], most: int = 1000

@@ -16,6 +16,7 @@ from factorgraph_loc.sensors.base import Sensor
 from factorgraph_loc.sensors.camera.bound import CameraSensor
 from factorgraph_loc.sensors.camera.sensor import Pixels
 from factorgraph_loc.slam.frame_pairs import FramePairs
+from factorgraph_loc.slam.moving_things import MovingThings
 from factorgraph_loc.slam.new_points import FEWEST
 from factorgraph_loc.slam.unknown_points import HORIZON, UnknownPoints
 from factors.camera.model import CameraModel
@@ -40,6 +41,7 @@ class PointMapper:
         self._unknown: UnknownPoints | None = None
         if settings.landmarks != "known":
             self._unknown = UnknownPoints(model, diagnostics, camera.constants)
+        self._things = MovingThings(model)
         self._pairs = FramePairs(model) if settings.visual_odometry else None
         self._taken = -math.inf
         self._tracks = np.empty(0, dtype=np.int64)  # of the last keyframe
@@ -73,12 +75,15 @@ class PointMapper:
             used = {i for i, name in enumerate(m.names) if name in points.map.index}
         else:
             names, used = m.frame.tracks.tolist(), set(points.used.tolist())
+        self._things.look(keyframe, names, m.pixels, graph)
+        moving = self._things.moving()
+        used |= {i for i, name in enumerate(names) if name in moving}
         if self._unknown is not None:
             self._taken = m.t
             if m.frame is not None:
                 self._tracks = m.frame.tracks
             rows = [i for i in range(len(names)) if i not in used]
-            guess = self._unknown.take(m, rows, keyframe, guess, graph, addition)
+            guess = self._unknown.take(m, rows, keyframe, guess, graph, addition, self._things)
         if self._pairs is not None and is_new:
             if self._unknown is not None:
                 used |= {i for i, name in enumerate(names) if self._unknown.uses(name)}

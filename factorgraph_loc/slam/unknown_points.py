@@ -22,6 +22,7 @@ from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, Pixels, l
 from factorgraph_loc.slam.image_times import ImageTimes
 from factorgraph_loc.slam.local_bundle import bundled
 from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints
+from factorgraph_loc.slam.moving_things import MovingThings
 from factorgraph_loc.slam.new_points import FEWEST as FEWEST_SIGHTINGS
 from factorgraph_loc.slam.new_points import KeyframeCamera, NewPoints, sightings_of
 from factorgraph_loc.slam.point_looks import PointLooks
@@ -95,6 +96,7 @@ class UnknownPoints:
         guess: Guess,
         graph: GraphView,
         addition: Addition,
+        things: MovingThings,
     ) -> Guess:
         """Turn ``rows`` of what is seen from a new keyframe into factors and variables, and return its pose, corrected by the
         points.
@@ -121,8 +123,7 @@ class UnknownPoints:
         chosen = spread_out(pixels, PER_KEYFRAME + WAITING, priority).tolist()
         rows, names, pixels = [rows[i] for i in chosen], [names[i] for i in chosen], pixels[chosen]
         old = [i for i, name in enumerate(names) if name in self._points]
-        few = spread_out(pixels[old], PER_KEYFRAME).tolist()
-        old = [old[i] for i in few]
+        old = [old[i] for i in spread_out(pixels[old], PER_KEYFRAME).tolist()]
         points = [self._points[names[i]] for i in old]
         known = np.array([rows[i] in certain for i in old], dtype=bool)
         named = m.names is not None
@@ -137,9 +138,9 @@ class UnknownPoints:
         fresh = [i for i, name in enumerate(names) if name not in self._points]
         for i, sighting in zip(fresh, sightings_of(self.model, keyframe.index, pixels[fresh]), strict=True):
             self._new.add(names[i], sighting)
-        self._new.forget(keyframe.index)
-        waiting = [names[i] for i in fresh if self._new.count(names[i]) >= FEWEST_SIGHTINGS]
-        places, pose = self._places(keyframe, guess[0], waiting, graph)
+        self._new.forget(keyframe.index, things.moving())
+        waiting = [n for i in fresh if self._new.count(n := names[i]) >= FEWEST_SIGHTINGS and things.trusts(n)]
+        places, pose = self._places(keyframe, guess[0], waiting, graph, things)
         for name, found, seen in self._new.ready(waiting, places.get, PER_KEYFRAME - len(old)):
             key = point_key(len(self._names))
             self._names[key] = f"track{name}" if m.names is None else str(name)
@@ -162,8 +163,7 @@ class UnknownPoints:
         if m.frame is None:
             return [m.names[i] for i in rows]
         tracks = m.frame.tracks[list(rows)].tolist()
-        # the track that a point was added with may itself return
-        gone = self._points.keys() - set(tracks)
+        gone = self._points.keys() - set(tracks)  # the track that a point was added with may itself return
         self._again_as = {track: name for track, name in self._again_as.items() if name in gone}
         names: list[Hashable] = [self._again_as.get(track, track) for track in tracks]
         seen = set(names)
@@ -358,7 +358,7 @@ class UnknownPoints:
         addition.nodes.append(node)
 
     def _places(
-        self, newest: Keyframe, pose: Array, names: Sequence[Hashable], graph: GraphView
+        self, newest: Keyframe, pose: Array, names: Sequence[Hashable], graph: GraphView, things: MovingThings
     ) -> tuple[dict[int, KeyframeCamera], Array]:
         """The camera poses of the keyframes that see waiting points, by number, with the pixel errors they cause in the newest
         one; and the pose (3,) of the newest keyframe.
@@ -371,7 +371,7 @@ class UnknownPoints:
             last = [index for index in sorted(slacks)[-BUNDLE:] if graph.is_open(index)]
             poses = [pose if i == newest.index else self._times.pose(i, graph) for i in last]
             level = replace(self.model, tilt=self._floor.sigma)
-            found = bundled(level, [graph.keyframes[i] for i in last], poses, self._new.waiting())
+            found = bundled(level, [graph.keyframes[i] for i in last], poses, self._new.those(things.trusts))
             if found is not None:
                 placed = zip(last[-len(found) :], found, strict=True)
                 return {i: KeyframeCamera.of(self.model, p, SLACK, t) for i, (p, t) in placed}, found[-1][0]

@@ -16,7 +16,7 @@ from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
-from factorgraph_loc.sensors.camera.stream import FeatureStream
+from factorgraph_loc.sensors.camera.stream import FeatureStream, SightingStream
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
 
@@ -28,6 +28,22 @@ CONFIGS = {
 }
 SEEDS = range(1, 9)
 SECONDS = 24.0
+
+
+def with_object(log, count=40, seed=0):
+    """Points of an object that covers a third of each image and slides to and fro in it."""
+    rng = np.random.default_rng(seed)
+    s = log.streams["sightings"]
+    t = np.unique(s.t)
+    u = 213.0 * (1.0 + np.sin(2.0 * np.pi * t / 8.0))[:, None] + rng.uniform(0.0, 213.0, count)
+    v = np.tile(rng.uniform(0.0, 480.0, count), (len(t), 1))
+    seen = np.stack((u, v)) + camera_world.CAMERA.pixel_sigma * rng.standard_normal((2, len(t), count))
+    stamps = np.concatenate((s.t, np.repeat(t, count)))
+    order = np.argsort(stamps, kind="stable")
+    names = [*s.point, *[f"object{i}" for i in range(count)] * len(t)]
+    columns = (np.concatenate((old, new.ravel()))[order] for old, new in zip((s.u, s.v), seen, strict=True))
+    stream = SightingStream(stamps[order], [names[i] for i in order], *columns)
+    return replace(log, streams={**log.streams, "sightings": stream})
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +146,12 @@ def test_wrong_pixels_do_little_harm(mapped, log, name):
     result = run(with_wrong(log, 0.1), CONFIGS[name])
     assert rmse(result, log) < max(2.0 * rmse(mapped(name), log), 0.2)
     assert result.diagnostics.rejected["camera: does not agree with the others"] > 5
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_an_object_with_most_of_the_points_is_not_taken_for_the_room(mapped, logs, seed):
+    result = run(with_object(logs[seed]), CONFIGS["smoother"])
+    assert rmse(result, logs[seed]) < max(2.0 * rmse(mapped("smoother", seed), logs[seed]), 0.2)
 
 
 @pytest.mark.parametrize("name", ["smoother", "batch"])

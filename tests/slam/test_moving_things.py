@@ -1,0 +1,60 @@
+"""What moves by itself is told from wheels that slip, however much of the image it covers."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.fusion.graph_parts import Keyframe
+from factorgraph_loc.slam.moving_things import MovingThings
+from factors import se2
+from factors.camera.model import CameraModel, predict
+from factors.motion import ChainState
+from factors.odometry.model import Growth, OdometryModel, relative_motion
+
+MODEL = CameraModel(370.0, 370.0, 240.0, 180.0, width=480, height=360, position=np.array((0.1, 0.0, 0.6)))
+WHEELS = OdometryModel(
+    along=Growth(0.05, 0.0, 0.005), lateral=Growth(0.02, 0.0, 0.005), heading=Growth(0.05, 0.05, 0.002)
+)
+ROOM, OBJECT = 40, 80
+SEEDS = range(20)
+
+
+def looked(seed, slid=(0.0, 0.0, 0.0), across=0.0, room=ROOM, count=OBJECT):
+    """After two images 0.6 s apart from a robot that slid by ``slid`` (3,) besides what its wheels tell, of points of a room, and
+    of ``count`` others that slide ``across`` the image [px]."""
+    rng = np.random.default_rng(seed)
+    begin, end = ChainState(0.0, *np.zeros(7)), ChainState(0.6, 0.2, 0.0, 0.05, 0.2, 0.05, 0.0, 0.0)
+    step = relative_motion(WHEELS, begin, end)
+    error = np.linalg.cholesky(step.covariance) @ rng.standard_normal(3)
+    moved = se2.compose(se2.compose(step.delta, se2.exp(error)), np.asarray(slid))
+    points = rng.uniform((2.0, -1.0, 0.0), (6.0, 1.0, 1.5), (room, 3))
+    others = rng.uniform((150.0, 0.0), (300.0, 360.0), (count, 2))
+    names = [f"room{i}" for i in range(room)] + [f"object{i}" for i in range(count)]
+    things = MovingThings(MODEL)
+    graph = SimpleNamespace(between=lambda *_: step)
+    for i, pose in enumerate((np.zeros(3), moved)):
+        pixels = np.concatenate((predict(MODEL, pose, points)[0], others + np.array((i * across, 0.0))))
+        seen = pixels + rng.standard_normal(pixels.shape)
+        things.look(Keyframe(i, 0.6 * i, (begin, end)[i], None), names, seen, graph)
+    return things
+
+
+@pytest.mark.parametrize("across", [-60.0, 90.0])
+def test_an_object_that_has_most_of_the_tracks_is_seen_to_move(across):
+    for seed in SEEDS:
+        things = looked(seed, across=across)
+        # a few features of either agree with both motions
+        assert len(things.moving() & {f"object{i}" for i in range(OBJECT)}) > 0.8 * OBJECT
+        assert sum(things.trusts(f"room{i}") for i in range(ROOM)) >= 0.5 * ROOM
+        assert not any(things.trusts(name) for name in things.moving())
+        assert not things.trusts("new")
+
+
+@pytest.mark.parametrize("slid", [(0.0, 0.0, 0.2), (0.05, 0.0, -0.2), (-0.1, 0.0, 0.1), (0.0, 0.0, 0.0)])
+def test_wheels_that_slip_are_no_moving_thing(slid):
+    for seed in SEEDS:
+        things = looked(seed, slid=slid, room=60, count=0)
+        assert not things.moving()
+        assert things.trusts("room0")
+        assert things.trusts("new")
