@@ -173,8 +173,11 @@ class Graph:
             keys = (*keys, self.keys[MOTION])
         if keyframe.factor is None:
             increment = keyframe.from_previous
-            make = self.motion.exact_factor if keyframe.is_elsewhere else self.motion.factor
-            keyframe.factor = make(increment)
+            if keyframe.is_elsewhere:
+                keyframe.factor = self.motion.exact_factor(increment)
+            else:
+                scale_known = not any(mapper.estimates for mapper in self.mappers)
+                keyframe.factor = self.motion.factor(increment, scale_known=scale_known)
         return keyframe.factor, keys
 
     def learnt(self, poses: Iterable[Array] = (), covariances: Iterable[Array] = ()) -> Learnt:

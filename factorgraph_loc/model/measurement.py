@@ -218,8 +218,9 @@ class Motion(Protocol):
     def twist(self, t: float) -> Array:
         """The robot's velocity (3,) just before ``t``, in the robot frame."""
 
-    def factor(self, increment: Increment) -> Factor:
-        """An increment as a factor on two poses, and on the constants if there are any."""
+    def factor(self, increment: Increment, *, scale_known: bool) -> Factor:
+        """An increment as a factor on two poses, and on the constants if there are any. ``scale_known``: whether anything else than
+        the motion tells the scale of what is estimated."""
 
     def slip(self, increment: Increment) -> tuple[Array, float]:
         """The covariance (3, 3) that an increment has more if wheels slip, and minus the logarithm of how probable that is."""

@@ -278,6 +278,28 @@ def linearize_changed(
 
 
 @compiled
+def linearize_as_reported(
+    start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
+) -> tuple[Array, Array, Array, Array]:
+    """:func:`linearize_changed` with the translation of the residual, and its noise, in the unit that the wheels report."""
+    unit = 1.0 + _full(constants, indices)[0]
+    as_reported = whitener.copy()
+    for i in range(3):
+        as_reported[i, 0] /= unit
+        as_reported[i, 1] /= unit
+    delta, by_changes = changed(twist, moving, constants, indices)
+    residual, by_start, by_end, by_constants = linearize(start, end, delta, by_changes, as_reported)
+    rx, ry, turned = _between(start, end)
+    ex, ey, angle = _between(delta, np.array((rx, ry, turned)))
+    x, y, _ = log(ex, ey, angle)
+    for j in range(len(indices)):
+        if indices[j] == 0:
+            for i in range(3):
+                by_constants[i, j] -= (as_reported[i, 0] * x + as_reported[i, 1] * y) / unit
+    return residual, by_start, by_end, by_constants
+
+
+@compiled
 def linearize_all(
     poses: Array,
     first: Integers,

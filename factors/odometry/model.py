@@ -19,7 +19,16 @@ from numpy.typing import NDArray
 
 from factors import se2
 from factors.motion import ChainState, Increment
-from factors.odometry.kernels import Noise, linearize, linearize_changed, recalibrate, relative, twist, whitener
+from factors.odometry.kernels import (
+    Noise,
+    linearize,
+    linearize_as_reported,
+    linearize_changed,
+    recalibrate,
+    relative,
+    twist,
+    whitener,
+)
 from factors.odometry.stack import OdometryStack
 from factors.se2 import Array
 
@@ -199,3 +208,22 @@ class OdometryFactor:
         """Half the squared whitened residual."""
         residual, _ = self.linearize(values)
         return 0.5 * float(residual @ residual)
+
+
+class ScaleFreeOdometryFactor(OdometryFactor):
+    """An increment where the wheels alone tell the scale of what is estimated; its residual is in the unit that they report.
+
+    A residual in metres becomes smaller as the world does, and nothing opposes that: the most probable world would be too small by
+    ``n s^2``, where ``n`` increments are estimated and ``s`` is the standard deviation of the scale.
+    """
+
+    kind = None  # not linearised together
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, its translation divided by the scale, and its Jacobians."""
+        start, end, *constants = values
+        if not constants:
+            return super().linearize(values)
+        changed = self._arc, self._increment.moving, constants[0], self._indices
+        residual, *blocks = linearize_as_reported(start, end, *changed, self._whitener)
+        return residual, blocks

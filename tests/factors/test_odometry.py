@@ -20,6 +20,7 @@ from factors.odometry.model import (
     Growth,
     OdometryFactor,
     OdometryModel,
+    ScaleFreeOdometryFactor,
     between_factor,
     recalibrated,
 )
@@ -333,10 +334,11 @@ def test_jacobian_of_the_parameters_is_the_numerical_one(delta, parameters):
     np.testing.assert_allclose(jacobian, numerical, atol=1e-7)
 
 
+@pytest.mark.parametrize("kind", [OdometryFactor, ScaleFreeOdometryFactor])
 @given(increments, increments, increments, st.integers(0, 1000))
-def test_jacobians_of_the_factor_are_the_numerical_ones(delta, start, moved, seed):
-    factor = OdometryFactor(Increment(delta, random_covariance(seed), 0.5), (0, 2))
-    values = [start, se2.compose(start, moved), np.array((0.03, -0.1))]
+def test_jacobians_of_the_factor_are_the_numerical_ones(kind, delta, start, moved, seed):
+    factor = kind(Increment(delta, random_covariance(seed), 0.5), (0, 1, 2))
+    values = [start, se2.compose(start, moved), np.array((0.03, -0.04, -0.1))]
     _, blocks = factor.linearize(values)
     step = 1e-6
     for i, block in enumerate(blocks):
@@ -348,6 +350,18 @@ def test_jacobians_of_the_factor_are_the_numerical_ones(delta, start, moved, see
                 value = values[i] + d if i == 2 else se2.compose(values[i], se2.exp(d))
                 shifted.append(factor.linearize([*values[:i], value, *values[i + 1 :]])[0])
             np.testing.assert_allclose(block[:, j], (shifted[0] - shifted[1]) / (2 * step), atol=1e-4)
+
+
+@given(increments, increments, st.floats(-0.3, 0.3), st.integers(0, 1000))
+def test_no_scale_is_preferred_where_only_the_wheels_tell_one(delta, moved, change, seed):
+    # in a world that is larger by the same factor as what the wheels are corrected by, the wheels are wrong by as much
+    factor = ScaleFreeOdometryFactor(Increment(delta, random_covariance(seed), 0.5), (0,))
+    larger = moved * (1.0 + change, 1.0 + change, 1.0)
+    residuals = [
+        factor.linearize([np.zeros(3), end, np.array((constant,))])[0]
+        for end, constant in ((moved, 0.0), (larger, change))
+    ]
+    np.testing.assert_allclose(*residuals, rtol=1e-6, atol=1e-6)
 
 
 @given(increments, increments, increments, st.integers(0, 1000))

@@ -20,7 +20,14 @@ from factors import se2
 from factors.motion import ChainState, Increment
 from factors.odometry import kernels
 from factors.odometry.chain import OdometryChain
-from factors.odometry.model import PARAMETERS, OdometryFactor, OdometryModel, between_factor, slip
+from factors.odometry.model import (
+    PARAMETERS,
+    OdometryFactor,
+    OdometryModel,
+    ScaleFreeOdometryFactor,
+    between_factor,
+    slip,
+)
 from factors.se2 import Array
 
 # m, rad, s: over which the error of a constant accumulates before other sensors correct it
@@ -165,9 +172,10 @@ class OdometryMotion:
         moved[:, 2] += changes[1] * moved[:, 2] - changes[2] * moving + changes[3] * ways
         return np.asarray(se2.exp(moved))
 
-    def factor(self, increment: Increment) -> OdometryFactor:
+    def factor(self, increment: Increment, *, scale_known: bool) -> OdometryFactor:
         """An increment as a factor on two poses, and on the constants if there are any."""
-        return OdometryFactor(increment, self.constants.indices)
+        kind = OdometryFactor if scale_known else ScaleFreeOdometryFactor
+        return kind(increment, self.constants.indices)
 
     def slip(self, increment: Increment) -> tuple[Array, float]:
         return slip(self._chain.model, increment, use_gyro=self._use_gyro)
