@@ -324,13 +324,8 @@ def test_jacobian_of_the_parameters_is_the_numerical_one(delta, parameters):
     increment = Increment(delta, np.eye(3), 0.7)
     _, jacobian = recalibrated(increment, parameters)
     step = 1e-6
-    numerical = np.column_stack(
-        [
-            se2.log(se2.between(recalibrated(increment, parameters - d)[0], recalibrated(increment, parameters + d)[0]))
-            / (2 * step)
-            for d in step * np.eye(4)
-        ]
-    )
+    sides = [[recalibrated(increment, parameters + sign * d)[0] for sign in (-1, 1)] for d in step * np.eye(4)]
+    numerical = np.column_stack([se2.log(se2.between(*pair)) / (2 * step) for pair in sides])
     np.testing.assert_allclose(jacobian, numerical, atol=1e-7)
 
 
@@ -357,10 +352,8 @@ def test_no_scale_is_preferred_where_only_the_wheels_tell_one(delta, moved, chan
     # in a world that is larger by the same factor as what the wheels are corrected by, the wheels are wrong by as much
     factor = ScaleFreeOdometryFactor(Increment(delta, random_covariance(seed), 0.5), (0,))
     larger = moved * (1.0 + change, 1.0 + change, 1.0)
-    residuals = [
-        factor.linearize([np.zeros(3), end, np.array((constant,))])[0]
-        for end, constant in ((moved, 0.0), (larger, change))
-    ]
+    ends = (moved, 0.0), (larger, change)
+    residuals = [factor.linearize([np.zeros(3), end, np.array((constant,))])[0] for end, constant in ends]
     np.testing.assert_allclose(*residuals, rtol=1e-6, atol=1e-6)
 
 
