@@ -25,6 +25,7 @@ from factorgraph_loc.fusion.variables import (
     is_constant,
     is_point,
     is_pose,
+    leaving_key,
     read,
     retract,
     to_gtsam,
@@ -36,6 +37,7 @@ from factors.se2 import Array
 _State = tuple[gtsam.NonlinearFactorGraph, Values, frozenset[int]]
 # s that a pose may stay longer in a window, so that several are read at a time; less with points, which make it large
 MARGIN, WITH_POINTS = 2.0, 1.0
+FOREVER = 1e300  # s, with which only what holds variables leaves a window
 
 
 class Solver(Protocol):
@@ -58,7 +60,7 @@ class Solver(Protocol):
 
     def begin(
         self,
-        factors: Iterable[gtsam.NonlinearFactor],
+        factors: Sequence[gtsam.NonlinearFactor],
         nodes: Sequence[Node],
         values: Values,
         stamps: Mapping[int, float],
@@ -93,7 +95,7 @@ class FullHistory:
 
     def begin(
         self,
-        factors: Iterable[gtsam.NonlinearFactor],
+        factors: Sequence[gtsam.NonlinearFactor],
         nodes: Sequence[Node],
         values: Values,
         stamps: Mapping[int, float],
@@ -151,22 +153,28 @@ class Window:
 
     def begin(
         self,
-        factors: Iterable[gtsam.NonlinearFactor],
+        factors: Sequence[gtsam.NonlinearFactor],
         nodes: Sequence[Node],
         values: Values,
         stamps: Mapping[int, float],
     ) -> None:
         self._before = self._state()
         self._stamps |= {key: t for key, t in stamps.items() if not is_constant(key)}
-        now, lag = max(self._stamps.values()), math.inf
-        leaving = [key for key, t in self._stamps.items() if t < now - self.lag]
+        now, lag = max(self._stamps.values()), FOREVER
+        holding = _holding(factors, values)  # GTSAM may fail where others leave with these
+        leaving = [] if holding else [key for key, t in self._stamps.items() if t < now - self.lag]
         if leaving:
             stamps = {**stamps, **dict.fromkeys(filter(is_constant, self._ours.at), now)}
             lag = self.lag
         with gtsam_errors():
             graph, removed = self._ours.added(self._smoother, factors, nodes, values)
+            start = to_gtsam(values)
+            for key, factor in holding.items():
+                graph.add(factor)
+                start.insert(key, np.zeros(1))
+            stamps = {**stamps, **dict.fromkeys(holding, -math.inf)}
             self._smoother.setSmootherLag(lag)
-            self._smoother.update(graph, to_gtsam(values), cast("Mapping[Any, Any]", stamps), removed)
+            self._smoother.update(graph, start, cast("Mapping[Any, Any]", stamps), removed)
             self._ours.place(self._smoother.getISAM2Result().getNewFactorsIndices())
         for key in leaving:
             del self._stamps[key]
@@ -231,7 +239,7 @@ class _Ours:
     def added(
         self,
         solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother,
-        factors: Iterable[gtsam.NonlinearFactor],
+        factors: Sequence[gtsam.NonlinearFactor],
         nodes: Sequence[Node],
         values: Values,
     ) -> tuple[gtsam.NonlinearFactorGraph, list[int]]:
@@ -313,6 +321,19 @@ class _Linear:
 
     def __init__(self, node: Node) -> None:
         self.node, self.slot = node, -1
+
+
+def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[int, gtsam.NonlinearFactor]:
+    """Factors that tell nothing, by the variables on which they are besides. As these leave the solver at once, iSAM2 takes what
+    marginal ``factors`` are on for what it marginalised itself, and never linearises it elsewhere."""
+    marginal = (factor.keys() for factor in factors if isinstance(factor, gtsam.LinearContainerFactor))
+    held = dict.fromkeys(key for keys in marginal for key in keys)
+    unit, out = gtsam.noiseModel.Unit.Create(1), dict[int, gtsam.NonlinearFactor]()
+    for i, key in enumerate(held):
+        nothing = np.zeros((1, len(values[key])))
+        factor = gtsam.JacobianFactor(leaving_key(i), np.ones((1, 1)), key, nothing, np.zeros(1), unit)
+        out[leaving_key(i)] = gtsam.LinearContainerFactor(factor)
+    return out
 
 
 def _linear(isam: gtsam.ISAM2) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:

@@ -48,6 +48,11 @@ def point_key(index: int) -> int:
     return int(gtsam.symbol("p", index))
 
 
+def leaving_key(index: int) -> int:
+    """The key of a variable that only serves to leave a window, with number ``index``."""
+    return int(gtsam.symbol("q", index))
+
+
 def is_point(key: int) -> bool:
     """Whether the variable is a point in space."""
     return key >> _CHARACTER == _POINT

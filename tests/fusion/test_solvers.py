@@ -11,7 +11,7 @@ from landmark_world import simulate
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.solvers import MARGIN, FullHistory, Window, read_all
 from factorgraph_loc.fusion.summary import MarginalSummary
-from factorgraph_loc.fusion.variables import index_of, is_pose, pose_key, read
+from factorgraph_loc.fusion.variables import Node, index_of, is_pose, landmark_key, pose_key, read, to_gtsam
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factors import se2
 
@@ -150,3 +150,38 @@ def test_our_factors_are_linearised_where_isam2_linearises(skip, lag, log):
     settings = {"landmarks": "unknown", "relinearize_threshold": 0.02, "relinearize_skip": skip, "lag": lag}
     run(log, RunConfig("smoother", settings, prior=START), watch=watch)
     assert len(moved) > 5
+
+
+class _Seen:
+    """A landmark at (10, 0) m in the frame of the robot, with a standard deviation of 1 cm."""
+
+    def linearize(self, values):
+        (x, y, heading), landmark = values
+        c, s = np.cos(heading), np.sin(heading)
+        back = np.array(((c, s), (-s, c)))
+        there = back @ (landmark - (x, y))
+        by_pose = np.array(((-1.0, 0.0, there[1]), (0.0, -1.0, -there[0])))
+        return 100.0 * (there - (10.0, 0.0)), [100.0 * by_pose, 100.0 * back]
+
+    def cost(self, values):
+        residual, _ = self.linearize(values)
+        return 0.5 * float(residual @ residual)
+
+
+def test_a_window_that_begins_with_marginal_factors_linearises_what_they_are_on_where_they_do():
+    """The robot turns by 0.3 rad, with all that it sees: linearised before and after that, these would seem to tell its heading."""
+    pose, landmark, unit = pose_key(0), landmark_key(0), gtsam.noiseModel.Unit.Create(2)
+    values = {pose: np.zeros(3), landmark: np.array((10.0, 0.0))}
+    start = gtsam.noiseModel.Diagonal.Sigmas(np.array((0.1, 0.1, 0.3)))
+    residual, blocks = _Seen().linearize(list(values.values()))
+    seen = gtsam.JacobianFactor(pose, blocks[0], landmark, blocks[1], -residual, unit)
+    turned = gtsam.PriorFactorPose2(pose, gtsam.Pose2(0.0, 0.0, 0.3), start).linearize(to_gtsam(values))
+    window = Window(gtsam.ISAM2Params(), 0.02, 10.0, lambda event: None)
+    factors = [gtsam.LinearContainerFactor(factor, to_gtsam(values)) for factor in (turned, seen)]
+    node = Node((pose, landmark), _Seen(), 2)
+    window.begin(factors, [node], values, {pose: 0.0, landmark: 0.0})
+    for t in range(1, 5):
+        window.update([node], {}, float(t))
+    assert window.value(pose)[2] == pytest.approx(0.3, abs=0.01)
+    assert np.sqrt(window.covariance(pose)[2, 2]) == pytest.approx(0.3, rel=1e-4)
+    assert set(window._ours.at) == set(values)
