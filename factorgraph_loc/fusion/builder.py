@@ -249,9 +249,7 @@ class Builder:
             correction = here.correct(*view.guess, {}, {}, here.iterations or ITERATIONS_OF_GUESS)
             if seen.is_judged and not sensor.judge(here, correction, view):
                 continue
-            nodes = [graph.node(keyframe, term, sensor.modality) for term in seen.terms]
-            keyframe.nodes += nodes
-            addition.nodes += nodes
+            addition.hang(keyframe, *(graph.node(keyframe, term, sensor.modality) for term in seen.terms))
             if guess is not None:
                 self._search.expect(sensor, here, odometry, view)
                 self._search.keep(sensor, here, odometry, partial(laplace_evidence, here, *view.guess, correction))
@@ -291,12 +289,8 @@ class Builder:
         addition.values[key] = new.mean
         if not new.sightings:
             native = gtsam.PriorFactorVector(key, new.mean, gtsam.noiseModel.Gaussian.Covariance(new.noise))
-            prior = Node((key,), VectorPriorFactor(new.mean, new.noise), len(new.mean), native)
-            view.keyframe.nodes.append(prior)
-            addition.nodes.append(prior)
+            addition.hang(view.keyframe, Node((key,), VectorPriorFactor(new.mean, new.noise), len(new.mean), native))
         for t, seen in new.sightings:
             keyframe = self._graph.before(t)
             if self._backend.is_open(keyframe.index):
-                nodes = [self._graph.node(keyframe, term, sensor.modality) for term in seen.terms]
-                keyframe.nodes += nodes
-                addition.nodes += nodes
+                addition.hang(keyframe, *(self._graph.node(keyframe, term, sensor.modality) for term in seen.terms))

@@ -9,6 +9,7 @@ from pydantic import Field, PlainSerializer, ValidatorFunctionWrapHandler, WrapV
 from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.fusion.variables import Node, Values, pose_key
 from factorgraph_loc.model.setup import MapUse
+from factors import positive, se2
 from factors.graph import Factor
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
@@ -84,6 +85,13 @@ class Keyframe:
 
 
 Guess = tuple[Array, Array]  # a pose (3,) and its body-frame covariance (3, 3)
+# Gauss-Newton steps lead astray where points tell little: squared Mahalanobis distance of a pose from its guess
+JUMPED = 50.0
+
+
+def jumps(guess: Guess, pose: Array) -> bool:
+    """Whether ``pose`` (3,) is where the robot, by the ``guess`` of it, cannot be."""
+    return not positive.squared(se2.log(se2.between(guess[0], pose)), guess[1]) < JUMPED
 
 
 @dataclass
@@ -92,6 +100,11 @@ class Addition:
 
     nodes: list[Node] = field(default_factory=list)
     values: Values = field(default_factory=dict)
+
+    def hang(self, keyframe: Keyframe, *nodes: Node) -> None:
+        """Add factors, and keep them with a keyframe."""
+        keyframe.nodes += nodes
+        self.nodes += nodes
 
 
 class TickAt(NamedTuple):

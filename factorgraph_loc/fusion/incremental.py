@@ -15,7 +15,7 @@ import numpy as np
 
 from factorgraph_loc.fusion.graduation import best_optimum, settled
 from factorgraph_loc.fusion.graph import Graph
-from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe, SmootherSettings
+from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe, SmootherSettings, jumps
 from factorgraph_loc.fusion.kept import Kept
 from factorgraph_loc.fusion.marginals import IndeterminateError, covariances
 from factorgraph_loc.fusion.solvers import MARGIN, WITH_POINTS, FullHistory, Solver, Window, read_all
@@ -36,8 +36,6 @@ from factors import positive, se2
 from factors.se2 import Array
 
 NOWHERE: Mapping[int, Array] = {}
-# Gauss-Newton steps lead astray where points tell little: squared Mahalanobis distance of the newest pose from its guess
-JUMPED = 50.0
 ITERATIONS_AFTER_FAILURE = 10
 LAG = 10.0  # s of the window that causal estimates come from, where none is set
 # m, rad: a window, whose oldest points are soon linearised for good, linearises anew what moves that far from where it saw points
@@ -206,9 +204,8 @@ class Incremental:
         """RuntimeError if points that are estimated took the newest pose where it cannot be."""
         if not self._maps:
             return
-        (pose, spread), estimates = guess, self._solver.estimates()
-        off = se2.log(se2.between(pose, self._solver.value(newest.key)))
-        if not positive.squared(off, spread) < JUMPED:
+        estimates = self._solver.estimates()
+        if jumps(guess, self._solver.value(newest.key)):
             raise RuntimeError("the estimate jumped")
         self._last = estimates
 

@@ -93,8 +93,7 @@ class PointMapper:
                 predicted = graph.between(before, keyframe)
             node = self._pairs.take(keyframe, [names[i] for i in rows], m.pixels[rows], predicted)
             if node is not None:
-                keyframe.nodes.append(node)
-                addition.nodes.append(node)
+                addition.hang(keyframe, node)
         return guess
 
     def _maps(self, m: Pixels) -> bool:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe
+from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe, jumps
 from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.fusion.variables import Node, point_key, tilt_key
 from factorgraph_loc.maps.points import PointMap
@@ -151,9 +151,7 @@ class UnknownPoints:
             addition.values[key] = found.position
             graph.values[key], graph.spreads[key] = found.position, found.covariance
             native = gtsam.PriorFactorVector(key, found.position, gtsam.noiseModel.Diagonal.Sigmas(OPEN))
-            prior = Node((key,), VectorPriorFactor(found.position, OPEN), 3, native)
-            keyframe.nodes.append(prior)
-            addition.nodes.append(prior)
+            addition.hang(keyframe, Node((key,), VectorPriorFactor(found.position, OPEN), 3, native))
             for sighting in seen:
                 self._hang(graph.keyframes[sighting.keyframe], key, sighting.pixel, graph, addition)
         return times.at_stamp(index, (pose, guess[1]), graph)
@@ -264,9 +262,7 @@ class UnknownPoints:
         addition.values[key] = graph.values[key] = tilt
         sigmas = np.full(2, sigma)
         native = gtsam.PriorFactorVector(key, LEVEL, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
-        prior = Node((key,), VectorPriorFactor(LEVEL, sigmas), 2, native)
-        keyframe.nodes.append(prior)
-        addition.nodes.append(prior)
+        addition.hang(keyframe, Node((key,), VectorPriorFactor(LEVEL, sigmas), 2, native))
 
     def _placed(
         self,
@@ -308,11 +304,14 @@ class UnknownPoints:
             if np.count_nonzero(agrees) >= enough and placed is guess:
                 factor = ReprojectionFactor(model, positions[agrees], pixels[agrees], point_covariances=spreads[agrees])
                 leaning = pixel_kernels.leaning(factor.packed(), *guess)
-                self._floor, sigma = self._floor.learnt(*leaning, model.tilt)
-                factor = replace(factor, model=replace(model, tilt=sigma))
+                floor, unlevel = self._floor.learnt(*leaning, model.tilt)
+                factor = replace(factor, model=replace(model, tilt=unlevel))
                 update = robust_update(factor, *guess, ITERATIONS, SETTLED)
-                placed = se2.compose(guess[0], se2.exp(update.delta)), guess[1]
-                tilt = sigma * factor.levelled([placed[0]])[1]
+                pose = se2.compose(guess[0], se2.exp(update.delta))
+                if which is recent and jumps(guess, pose):  # a few wrong points agree, too
+                    continue
+                placed, self._floor, sigma = (pose, guess[1]), floor, unlevel
+                tilt = sigma * factor.levelled([pose])[1]
             elif np.count_nonzero(agrees) < enough and placed is not guess:
                 seen_from = reprojection.camera_pose(model, placed[0], tilt)
                 error = reprojection.linearize_in_space(model, *seen_from, positions)[0] - pixels
@@ -353,9 +352,8 @@ class UnknownPoints:
     def _hang(self, keyframe: Keyframe, key: int, pixel: Array, graph: GraphView, addition: Addition) -> None:
         keys = (keyframe.key, *graph.shared, tilt_key(keyframe.index), key)
         twist = self._times.twists.get(keyframe.index)
-        node = Node(keys, PointFactor(self.model, self._lens, pixel, self.estimated.indices, twist), 2)
-        keyframe.nodes.append(node)
-        addition.nodes.append(node)
+        factor = PointFactor(self.model, self._lens, pixel, self.estimated.indices, twist)
+        addition.hang(keyframe, Node(keys, factor, 2))
 
     def _places(
         self, newest: Keyframe, pose: Array, names: Sequence[Hashable], graph: GraphView, things: MovingThings

@@ -176,7 +176,7 @@ def test_a_window_that_begins_with_marginal_factors_linearises_what_they_are_on_
     residual, blocks = _Seen().linearize(list(values.values()))
     seen = gtsam.JacobianFactor(pose, blocks[0], landmark, blocks[1], -residual, unit)
     turned = gtsam.PriorFactorPose2(pose, gtsam.Pose2(0.0, 0.0, 0.3), start).linearize(to_gtsam(values))
-    window = Window(gtsam.ISAM2Params(), 0.02, 10.0, lambda event: None)
+    window = Window(gtsam.ISAM2Params(), 0.02, 10.0, [].append)
     factors = [gtsam.LinearContainerFactor(factor, to_gtsam(values)) for factor in (turned, seen)]
     node = Node((pose, landmark), _Seen(), 2)
     window.begin(factors, [node], values, {pose: 0.0, landmark: 0.0})
