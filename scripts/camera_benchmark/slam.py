@@ -9,6 +9,7 @@ import numpy as np
 from benchmarking.report import Report
 
 from camera_benchmark.drives import RATE, TAGS, Drive, log_of
+from camera_benchmark.frame import FrameKnown, frame_known, sentence
 from camera_benchmark.options import CameraOptions
 from camera_benchmark.report import (
     ACCURACY,
@@ -23,6 +24,7 @@ from camera_benchmark.report import (
 from factorgraph_loc.evaluation.statistics import pooled_rms
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.simulation import preset, simulate
+from factorgraph_loc.simulation.settings import SimulationSettings
 
 RUNS, DURATION = 50, 120.0  # s; identified points
 RENDERED_RUNS, RENDERED_DURATION = 5, 300.0  # s; images
@@ -68,11 +70,14 @@ def section(options: CameraOptions) -> Report:
         if folder is not None:
             count = min(count, runs)
         jobs = [Job(Drive(first + i, first + i, duration), folder) for i in range(count)]
-        outcomes = report.collect(mapped, jobs, [f"{name}, seed {job.drive.seed}" for job in jobs])
+        labels = [f"{name}, seed {job.drive.seed}" for job in jobs]
+        known = report.collect(frame, jobs, labels)
+        outcomes = report.collect(mapped, jobs, labels)
         found = {jobs[i].drive.seed: outcome for i, outcome in outcomes.items()}
         failures(report, found)
         what = f"at most 20 of {POINTS} identified points in each" if folder is None else "rendered"
         report.say(f"{len(found)} offices of {duration:.0f} s, {RATE:.0f} images/s, {what}:")
+        report.say(sentence(list(known.values())))
         table(report, name, found)
     return report
 
@@ -106,6 +111,17 @@ def mapped(job: Job) -> dict[str, Attempt]:
     """All runs on a drive; jobs can be sent to other processes."""
     if job.folder is not None:
         return attempts(log_of(job.drive, job.folder)[0], configs("camera"))
+    return attempts(simulate(settings(job), job.drive.seed), configs("sightings"))
+
+
+def frame(job: Job) -> FrameKnown:
+    """What tells where the frame of a drive lies."""
+    return frame_known(simulate(settings(job), job.drive.seed))
+
+
+def settings(job: Job) -> SimulationSettings:
+    """Those of a drive, with identified points unless it is rendered."""
+    if job.folder is not None:
+        return job.drive.settings()
     world = {"tags": TAGS, "points": POINTS}
-    changes = {"world": world, "pixels": {"rate": RATE}, "drive": {"duration": job.drive.duration}}
-    return attempts(simulate(preset("office", changes), job.drive.seed), configs("sightings"))
+    return preset("office", {"world": world, "pixels": {"rate": RATE}, "drive": {"duration": job.drive.duration}})

@@ -10,6 +10,7 @@ from camera_benchmark import faulty
 from camera_benchmark.drives import SIGMAS, with_errors
 from camera_benchmark.faults import cells, said
 from camera_benchmark.faulty import Given
+from camera_benchmark.frame import frame_known
 from camera_benchmark.report import NOTHING, Attempt, accuracy_cells, paired, ratio_cell
 from camera_benchmark.reprojection import reprojection_residuals, spread_of
 from space_world import SIGMA, carried
@@ -21,6 +22,10 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream
+from factorgraph_loc.sensors.rfid.settings import SurveySettings
+from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.simulation import preset, simulate
+from factors.rfid.detection import RfidLikelihood
 
 COUNT = 60
 
@@ -152,3 +157,30 @@ def test_residuals_of_the_true_poses_are_the_noise_of_the_pixels():
     assert spread_of(reprojection_residuals(log.reference3, log, "sightings_right"))["u_rms"] == pytest.approx(
         SIGMA, rel=0.1
     )
+
+
+def test_the_bound_of_a_frame_is_that_of_the_probabilities_of_all_reads():
+    log = simulate(preset("office", {"world": {"tags": 20}, "drive": {"duration": 30.0}}), 5)
+    found = frame_known(log)
+
+    likelihood = RfidLikelihood(log.rig.rfid.model(), tag_map(log.world, SurveySettings()).tags)
+    poses = log.reference.at(np.unique(log.streams["rfid"].t))
+    middle = np.mean(np.vstack((log.reference.poses[:1], poses)), axis=0)[:2]
+
+    def probabilities(move):
+        c, s = np.cos(move[2]), np.sin(move[2])
+        places = middle + (poses[:, :2] - middle) @ np.array(((c, s), (-s, c))) + move[:2]
+        moved = np.column_stack((places, poses[:, 2] + move[2]))
+        return np.concatenate([likelihood.probabilities(moved, antenna).ravel() for antenna in range(8)])
+
+    p = probabilities(np.zeros(3))
+    slope = np.array([probabilities(step) - probabilities(-step) for step in 1e-4 * np.eye(3)]) / 2e-4
+    x, y = log.reference.poses[0, :2] - middle
+    of_start = np.linalg.inv(np.array(((1, 0, -y), (0, 1, x), (0, 0, 1))))
+    told = (slope / (p * (1.0 - p))) @ slope.T
+    told += np.linalg.inv(of_start @ np.diag(log.start.sigmas**2) @ of_start.T)
+    spread, away = np.linalg.inv(told), np.mean(np.sum((poses[:, :2] - middle) ** 2, axis=1))
+
+    assert found.least == pytest.approx(np.sqrt(spread[0, 0] + spread[1, 1] + spread[2, 2] * away), rel=0.02)
+    off = (log.start.pose - log.reference.poses[0]) / log.start.sigmas
+    assert found.nees == pytest.approx(off @ off)
