@@ -6,7 +6,10 @@ A keyframe is described by how its descriptors differ from the words of a small 
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
+from scipy.cluster.vq import kmeans2, vq
 
 from factorgraph_loc.vision.keypoints import Descriptors, Integers
 from factors.se2 import Array
@@ -24,12 +27,9 @@ class KeyframeLooks:
         self._of = self._of.ravel()
         values = _values(descriptors)
         sample = values[np.linspace(0, len(values) - 1, min(SAMPLE, len(values))).astype(np.int64)]
-        self._words = sample[np.linspace(0, len(sample) - 1, min(WORDS, len(sample))).astype(np.int64)]
-        for _ in range(ROUNDS):
-            nearest = self._nearest(sample)
-            sums, counts = np.zeros_like(self._words), np.bincount(nearest, minlength=len(self._words))
-            np.add.at(sums, nearest, sample)
-            self._words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], self._words)
+        begin = sample[np.linspace(0, len(sample) - 1, min(WORDS, len(sample))).astype(np.int64)]
+        with warnings.catch_warnings(action="ignore"):  # of words that nothing is nearest to, which stay where they are
+            self._words, _ = kmeans2(sample, begin, ROUNDS, minit="matrix")
         self._looks = self._described(values, self._of)
 
     def __len__(self) -> int:
@@ -42,12 +42,9 @@ class KeyframeLooks:
         alike[np.argsort(-(self._looks @ look), kind="stable")[:NEAREST]] = True
         return np.flatnonzero(alike[self._of])
 
-    def _nearest(self, values: Array) -> Integers:
-        return np.asarray((np.sum(self._words**2, axis=1) - 2.0 * values @ self._words.T).argmin(axis=1))
-
     def _described(self, values: Array, of: Integers) -> Array:
         """The descriptions (K, WORDS * D) of K images, from the values (M, D) in image ``of`` (M,)."""
-        nearest, count = self._nearest(values), len(self._words)
+        (nearest, _), count = vq(values, self._words), len(self._words)
         looks = np.zeros((int(of.max()) + 1, count, values.shape[1]))
         np.add.at(looks, (of, nearest), values - self._words[nearest])
         looks /= np.maximum(np.linalg.norm(looks, axis=2), 1e-9)[..., None]
