@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.settings import Estimated
@@ -20,7 +21,7 @@ from factorgraph_loc.sensors.inertial.measurement import inertial as row_of
 from factorgraph_loc.sensors.inertial.measurement import inertial_settings
 from factorgraph_loc.sensors.inertial.settings import InertialSettings
 from factorgraph_loc.sensors.twist.measurement import twist_settings
-from factorgraph_loc.slam.space_motion import RATE, ROBOT, SHORTEST, Chain, RobotState, Step, TwistChain, cross
+from factorgraph_loc.slam.space_motion import RATE, ROBOT, SHORTEST, Chain, RobotState, Step, TwistChain
 from factorgraph_loc.slam.space_motion_models import KnownState, MeasuredMotion, SpaceMotion, pose_of, robot_of
 from factors import positive
 from factors.se2 import Array
@@ -29,6 +30,7 @@ STRIDE = 1 << 32  # between the keys of a pose, of its velocity, and of its bias
 BIASES = tuple(f"{what}_bias_{axis}" for what in ("force", "turn") for axis in "xyz")
 MOVING = np.r_[0:9, ROBOT : ROBOT + 6]  # pose, velocity and biases in the error state
 HOLD = 0.1  # s, for which a row is held
+UNIT = np.eye(3)
 UNKNOWN_FORCE, UNKNOWN_TURN = 5.0, 1.0  # densities [m/s^2, rad/s per sqrt(Hz)] of the noise where there are no rows
 
 
@@ -54,31 +56,36 @@ class InertialChain(Chain):
     def between(self, start: float, end: float, biases: Array) -> gtsam.PreintegratedImuMeasurements:
         """The motion from ``start`` to ``end``, with ``biases`` (6,) near the true ones."""
         found = gtsam.PreintegratedImuMeasurements(self._params, bias_of(biases))
-        for row, a, b in self.parts(start, end):
-            if b <= a:
-                continue
-            held, dt = row >= 0 and b - self._t[row] <= HOLD, b - a
+        parts = [(row, a, b) for row, a, b in self.parts(start, end) if b > a]
+        if not parts:
+            return found
+        rows, begins, ends = (np.array(column) for column in zip(*parts, strict=True))
+        dt = (ends - begins)[:, None]
+        first, last = self._at(rows, begins), self._at(rows, ends)
+        force, turn = np.split(0.5 * (first + last), 2, axis=1)
+        force = force - np.cross((last - first)[:, 3:] / dt, self._arm)
+        # GTSAM takes the axes to be those of the part's beginning
+        force = force + 0.5 * dt * np.cross(turn, force - np.cross(turn, np.cross(turn, self._arm)))
+        for (row, a, b), mean_force, mean_turn in zip(parts, force, turn, strict=True):
+            held = row >= 0 and b - self._t[row] <= HOLD
             by_force, by_turn = self._densities if held else (UNKNOWN_FORCE, UNKNOWN_TURN)
-            self._params.setAccelerometerCovariance(by_force**2 * np.eye(3))
-            self._params.setGyroscopeCovariance(by_turn**2 * np.eye(3))
+            self._params.setAccelerometerCovariance(by_force**2 * UNIT)
+            self._params.setGyroscopeCovariance(by_turn**2 * UNIT)
             # what white noise within the part adds to the position, beside that of its mean
-            self._params.setIntegrationCovariance((by_force * dt) ** 2 / 12.0 * np.eye(3))
-            first, last = self._at(max(row, 0), a), self._at(max(row, 0), b)
-            force, turn = np.split(0.5 * (first + last), 2)
-            turning, faster = cross(turn), (last - first)[3:] / dt
-            force = force - cross(faster) @ self._arm
-            # GTSAM takes the axes to be those of the part's beginning
-            force = force + 0.5 * dt * turning @ (force - turning @ turning @ self._arm)
-            found.integrateMeasurement(force, turn, dt)
+            self._params.setIntegrationCovariance((by_force * (b - a)) ** 2 / 12.0 * UNIT)
+            found.integrateMeasurement(mean_force, mean_turn, b - a)
         return found
 
-    def _at(self, row: int, t: float) -> Array:
-        """Force and turn rate (6,) at ``t``, after a row."""
+    def _at(self, rows: NDArray[np.int64], t: Array) -> Array:
+        """Force and turn rate (N, 6) at times ``t`` (N,), each after one of ``rows`` (N,), which ascend."""
         if not self._rows:
-            return np.zeros(6)
-        after = min(row + 1, len(self._rows) - 1)
-        share = np.clip((t - self._t[row]) / max(self._t[after] - self._t[row], SHORTEST), 0.0, 1.0)
-        return np.asarray((1.0 - share) * self._rows[row] + share * self._rows[after])
+            return np.zeros((len(t), 6))
+        begin, end = max(rows[0], 0), rows[-1] + 2
+        times, values = np.array(self._t[begin:end]), np.array(self._rows[begin:end])
+        before = np.maximum(rows - begin, 0)
+        after = np.minimum(before + 1, len(times) - 1)
+        share = np.clip((t - times[before]) / np.maximum(times[after] - times[before], SHORTEST), 0.0, 1.0)[:, None]
+        return np.asarray((1.0 - share) * values[before] + share * values[after])
 
 
 class InertialMotion(SpaceMotion):
