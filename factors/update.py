@@ -128,7 +128,8 @@ def landmark_update(
     ``constants`` (P,): those that are estimated, whose columns begin at ``first``."""
     if factor.free:
         return None
-    known = packed(factor.model), factor.look, pose, covariance, constants, factor.places, first
+    before = np.ascontiguousarray(covariance)  # for each other order in memory it would be compiled anew
+    known = packed(factor.model), factor.look, pose, before, constants, factor.places, first
     there, delta, after, residual, nis, dof = landmark_kernels.updated(*known, iterations, converged, GATE)
     return Correction(delta, after, residual, nis, dof) if there else None
 

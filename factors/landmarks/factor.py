@@ -108,7 +108,7 @@ class BearingRangeFactor:
             *(spread is not None, _EXACTLY if spread is None else spread),
             float(len(self.points) if self.in_look is None else self.in_look),
             *(twist is not None, _NOWHERE if twist is None else twist),
-            EXACT if spreads is None else spreads,
+            EXACT if spreads is None else np.ascontiguousarray(spreads),
         )
 
     @property

@@ -162,7 +162,8 @@ class OdometryChain:
         """A pose (3,) at ``start``, moved to ``t`` under changed ``constants`` (P,): the pose there, and its body-frame and world
         covariances, from its body-frame ``covariance`` (3, 3)."""
         known = self._knots, self._count, self._constants, self._noise
-        at, body, world = moved_to(*known, tuple(start), t, pose, covariance, constants, indices)
+        before = np.ascontiguousarray(covariance)  # for each other order in memory it would be compiled anew
+        at, body, world = moved_to(*known, tuple(start), t, pose, before, constants, indices)
         return at, body, world
 
     def relatives(self, starts: Array, ends: Array, constants: Array, indices: Integers) -> tuple[Array, Array]:

@@ -30,7 +30,7 @@ def scene(seed=0):
     rounds = np.ones(len(ANTENNAS), dtype=np.int64)
     whole = TagReadCounts(offsets, np.arange(len(ANTENNAS)), rounds, hits, odds, elsewhere)
     tags = np.flatnonzero(hits.any(axis=0) | (odds != PRIOR))
-    listed = {"hits": hits[:, tags], "odds": odds[tags], "elsewhere": elsewhere[tags]}
+    listed = {"hits": np.ascontiguousarray(hits[:, tags]), "odds": odds[tags], "elsewhere": elsewhere[tags]}
     return likelihood, whole, replace(whole, **listed, tags=tags, others=PRIOR)
 
 
