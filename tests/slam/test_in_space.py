@@ -1,6 +1,7 @@
 """Estimators of a robot that moves in space, on made-up runs and on the recorded one."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -33,6 +34,12 @@ def estimated(log, name, sensors=None, **settings):
     return run(log, RunConfig(name, settings, sensors))
 
 
+@cache
+def of(seed, name, sensors=RIG.sensors):
+    """The result of a run that several tests look at."""
+    return estimated(carried(seed), name, sensors)
+
+
 def at_the_end(log, *, forget=False):
     """The window when the last measurement has come, with ticks; ``forget``: it may forget what is older than a second."""
     setup = Setup(RIG, log.world, RIG.sensors, np.random.default_rng(1))
@@ -54,8 +61,7 @@ def nees(found, log, row=-1):
 @pytest.mark.parametrize("sensors", [RIG.sensors, ("sightings", "sightings_right")], ids=["measured", "steady"])
 def test_the_batch_is_where_the_smoothed_filter_is(sensors):
     """Both are the optimum of one problem, which is nearly linear, also where the velocity is what changes at random."""
-    log = carried(1)
-    smoothed, batch = (estimated(log, name, sensors).final_space for name in ("monoslam", "space_batch"))
+    smoothed, batch = (of(1, name, sensors).final_space for name in ("monoslam", "space_batch"))
     apart = space.pose_errors(smoothed, batch)
     sigmas = np.sqrt(np.array([np.diag(c) for c in batch.covariances]))
     assert np.quantile(np.abs(apart) / sigmas, 0.95) < 0.3
@@ -66,8 +72,7 @@ def test_the_batch_is_where_the_smoothed_filter_is(sensors):
 @pytest.mark.parametrize("sensors", [RIG.sensors, ("sightings", "sightings_right")], ids=["measured", "steady"])
 def test_the_window_is_where_the_filter_is(sensors):
     """Both know the same at any time of a problem that is nearly linear."""
-    log = carried(1)
-    filtered, window = (estimated(log, name, sensors).causal_space for name in ("monoslam", "space_smoother"))
+    filtered, window = (of(1, name, sensors).causal_space for name in ("monoslam", "space_smoother"))
     sigmas = np.sqrt(np.array([np.diag(c) for c in window.covariances]))
     assert np.quantile(np.abs(space.pose_errors(filtered, window)) / sigmas, 0.95) < 0.4
     ratio = np.array([np.diag(c) for c in filtered.covariances]) / sigmas**2
@@ -75,8 +80,7 @@ def test_the_window_is_where_the_filter_is(sensors):
 
 
 def test_the_final_trajectory_of_the_window_is_that_of_the_batch():
-    log = carried(2)
-    window, batch = (estimated(log, name).final_space for name in ("space_smoother", "space_batch"))
+    window, batch = (of(2, name).final_space for name in ("space_smoother", "space_batch"))
     np.testing.assert_array_equal(window.positions, batch.positions)
     np.testing.assert_array_equal(window.covariances, batch.covariances)
 
@@ -106,7 +110,7 @@ def test_a_whole_problem_forgets_nothing():
 @pytest.mark.parametrize("name", ["monoslam", "space_batch", "space_smoother"])
 def test_a_camera_finds_its_place_in_the_map(name):
     log = carried(1)
-    known = score(estimated(log, name), log)
+    known = score(of(1, name), log)
     found = run(log, RunConfig(name, prior="unknown"))
     figures = score(found, log)
     assert figures["final.space_position_rmse"] < 1.1 * known["final.space_position_rmse"]
@@ -136,8 +140,7 @@ def test_covariances_in_space_are_those_of_the_errors():
     """NEES of 8 independent runs, causal at their end and of the final ones in their middle: each fails a right one with 0.1 %."""
     causal, final, window = [], [], []
     for seed in range(8):
-        log = carried(seed)
-        result = estimated(log, "space_smoother")
+        log, result = carried(seed), of(seed, "space_smoother")
         final.append(nees(result.final_space, log, len(result.final_space) // 2))
         window.append(nees(result.causal_space, log))
         causal.append(nees(estimated(log, "monoslam", smooth=False).final_space, log))
@@ -288,7 +291,7 @@ def test_the_residual_of_an_image_has_the_derivatives_that_it_says(depths):
 
 def test_figures_in_space():
     log = carried(2)
-    figures = score(estimated(log, "monoslam"), log)
+    figures = score(of(2, "monoslam"), log)
     assert figures["causal.space_position_rmse"] < 0.03
     assert figures["final.space_position_rmse"] < figures["causal.space_position_rmse"]
     assert figures["final.space_rotation_rmse"] < 0.01

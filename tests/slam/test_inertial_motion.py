@@ -176,7 +176,7 @@ def nees(found, log, row=-1):
 @pytest.mark.parametrize("name", ["monoslam", "space_smoother"])
 def test_an_inertial_unit_helps_and_the_covariances_are_those_of_the_errors(name):
     """NEES of 8 runs, causal at their end and final in their middle, within bounds that fail right covariances with 0.1 % each; and
-    errors of half of those without, or less."""
+    errors of three runs are half of those without, or less."""
     causal, final, errors, blind = [], [], [], []
     for seed in range(8):
         log = swayed(seed)
@@ -184,11 +184,12 @@ def test_an_inertial_unit_helps_and_the_covariances_are_those_of_the_errors(name
         causal.append(nees(result.causal_space, log))
         final.append(nees(result.final_space, log, len(result.final_space) // 2))
         errors.append(score(result, log)["final.space_position_rmse"])
-        blind.append(score(estimated(log, name, ("sightings",)), log)["final.space_position_rmse"])
+        if seed < 3:
+            blind.append(score(estimated(log, name, ("sightings",)), log)["final.space_position_rmse"])
     low, high = chi2.ppf((5e-4, 1.0 - 5e-4), 6 * 8)
     assert low < sum(causal) < high
     assert low < sum(final) < high
-    assert np.mean(errors) < 0.5 * np.mean(blind)
+    assert np.mean(errors[:3]) < 0.5 * np.mean(blind)
 
 
 def test_biases_are_learnt():
@@ -258,23 +259,23 @@ def test_a_second_without_rows():
 
 
 def test_without_a_map_one_eye_does_not_use_it_and_two_eyes_do():
-    """One eye cannot know the scale and says so. NEES of two eyes over 8 runs: below what a right one exceeds once in 10,000."""
+    """One eye cannot know the scale and says so. NEES of two eyes over 8 runs: below what a right one exceeds once in 10,000. In
+    four of them the errors are half of those without, or less."""
     alone = run(swayed(0), RunConfig("monoslam", {"landmarks": "unknown"}, SENSORS))
     assert any("scale is unknown" in text for _, text in alone.diagnostics.events)
     assert alone.diagnostics.ignored["inertial unit"] == len(swayed(0).streams["inertial"].t)
     found, errors, blind = [], [], []
     for seed in range(8):
         log = swayed(seed)
-        for sensors, kept in (((*SENSORS, "sightings_right"), errors), (("sightings", "sightings_right"), blind)):
+        for sensors in ((*SENSORS, "sightings_right"), ("sightings", "sightings_right"))[: 2 if seed < 4 else 1]:
             result = run(log, RunConfig("monoslam", {"landmarks": "unknown"}, sensors))
             assert not any("scale is unknown" in text for _, text in result.diagnostics.events)
-            kept.append(
-                np.linalg.norm(space.pose_errors(result.final_space, log.reference3.at(result.final_space.t))[-1, 3:])
-            )
+            last = space.pose_errors(result.final_space, log.reference3.at(result.final_space.t))[-1, 3:]
+            (errors if "inertial" in sensors else blind).append(np.linalg.norm(last))
             if "inertial" in sensors:
                 found.append(nees(result.final_space, log))
     assert sum(found) < chi2.ppf(1.0 - 1e-4, 6 * 8)
-    assert np.mean(errors) < 0.5 * np.mean(blind)
+    assert np.mean(errors[:4]) < 0.5 * np.mean(blind)
 
 
 @pytest.mark.parametrize("name", ["ekf", "smoother"])
