@@ -28,7 +28,6 @@ def bad_field(file: object, field: str, value: object, expected: str, *, row: in
     return InputError(f"{where}: {plain(field)} is {quoted(value)}, expected {expected}")
 
 
-def unusable(error: OSError, path: object = None) -> InputError:
-    """The error for a file or folder that cannot be read or written; ``path`` is used if the error has no file name."""
-    where = error.filename if error.filename is not None else path
-    return InputError(f"{plain(where)}: {told(error)}" if where is not None else told(error))
+def unusable(error: OSError) -> InputError:
+    """The error for a file or folder that cannot be read or written."""
+    return InputError(told(error) if error.filename is None else f"{plain(error.filename)}: {told(error)}")

@@ -24,9 +24,9 @@ def plain(text: object, limit: int | None = NAME) -> str:
     return whole if limit is None else shortened(whole, limit)
 
 
-def quoted(value: object, limit: int = VALUE) -> str:
-    """The ``repr`` of ``value`` in at most ``limit`` characters. Long texts, long lists and huge integers are abbreviated."""
-    return plain(_written(value, limit, DEPTH), limit)
+def quoted(value: object) -> str:
+    """The ``repr`` of ``value`` in at most :data:`VALUE` characters. Long texts, long lists and huge integers are abbreviated."""
+    return plain(_written(value, VALUE, DEPTH), VALUE)
 
 
 def listed(names: Iterable[object], most: int = LISTED) -> str:

@@ -103,18 +103,6 @@ def image_update(
     return replace(found, covariance=reset @ found.covariance @ reset.T)
 
 
-def linearized_update(
-    factor: SightingFactor, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
-) -> Correction:
-    """Kalman update of ``pose`` (3,) and correlated states by a factor of any kind on the pose only; see :func:`update_state`."""
-
-    def linearize(delta: Array) -> tuple[Array, Array]:
-        residual, (block,) = factor.whitened([se2.compose(pose, se2.exp(delta[:3]))])
-        return residual, block
-
-    return update_state(linearize, covariance, factor.weight, iterations, factor.dof(), converged)
-
-
 def landmark_update(
     factor: BearingRangeFactor,
     pose: Array,

@@ -48,24 +48,6 @@ def draw_ancestors(
     )
 
 
-def transition_log_density(
-    predicted: Array, constants: Array, after: Array, constants_after: Array, covariance: Array
-) -> Array:
-    """Log-density (M, N), up to a constant, of states ``after`` (M, 3), (M, P) given noise-free predictions (N, 3), (N, P).
-
-    The body-frame error is taken to first order: log(p^-1 * a) is the difference, turned into the frame of p. This is the plain
-    twin of what the compiled kernel computes.
-    """
-    whitener = np.linalg.inv(positive.root(covariance))
-    c, s = np.cos(predicted[:, 2]), np.sin(predicted[:, 2])
-    dx = after[:, None, 0] - predicted[:, 0]
-    dy = after[:, None, 1] - predicted[:, 1]
-    heading = np.mod(after[:, None, 2] - predicted[:, 2] + np.pi, 2.0 * np.pi) - np.pi
-    pose = np.stack((c * dx + s * dy, c * dy - s * dx, heading), axis=-1)
-    error = np.concatenate((pose, constants_after[:, None] - constants), axis=-1) @ whitener.T
-    return np.asarray(-0.5 * np.sum(error**2, axis=-1))
-
-
 @compiled
 def _draw(
     predicted: Array,

@@ -19,11 +19,11 @@ def enough(cells: Array | NDArray[np.int64]) -> Array:
     return np.asarray(freedom / (2.0 * ERROR) * (1.0 - a + np.sqrt(a) * QUANTILE) ** 3)
 
 
-def prefix(poses: Array, rng: np.random.Generator, least: int, cell: Array = CELL) -> NDArray[np.int64]:
+def prefix(poses: Array, rng: np.random.Generator, least: int) -> NDArray[np.int64]:
     """Places among draws (N, 3) of as many as are enough, at least ``least``: in random order they are taken one by one until their
     number is enough for the cells that they have occupied."""
     order = rng.permutation(len(poses))
-    _, first = np.unique(cell_numbers(poses[order], cell), return_index=True)
+    _, first = np.unique(cell_numbers(poses[order], CELL), return_index=True)
     occupied = np.searchsorted(np.sort(first), np.arange(1, len(poses) + 1), side="left")
     needed = enough(np.arange(len(first) + 1))[occupied]
     reached = np.arange(1, len(poses) + 1) >= np.maximum(needed, least)

@@ -40,13 +40,13 @@ def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
     return np.array(chosen, dtype=np.int64)
 
 
-def overlapping_pairs(cameras: Cameras, *, apart: float = APART, askew: float = ASKEW) -> list[tuple[int, int]]:
+def overlapping_pairs(cameras: Cameras) -> list[tuple[int, int]]:
     """Pairs (i, j), i < j, of frames that overlap: for each frame the nearest ones, and some farther ones."""
     pairs = set()
     for i in range(len(cameras)):
         distance = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
         turn = _angles(cameras.rotations, cameras.rotations[i])
-        cost = distance / apart + turn / askew
+        cost = distance / APART + turn / ASKEW
         cost[i] = np.inf
         order = np.argsort(cost, kind="stable")
         order = order[cost[order] < 1.0]

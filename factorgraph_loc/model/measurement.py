@@ -94,10 +94,6 @@ class Rows:
         """Those from ``first`` to before ``last``."""
         return Rows(self.kind, self.times[first:last], tuple([values[first:last] for values in self.values]))
 
-    def singly(self) -> Iterator[Measurement]:
-        """Each as a measurement of its own."""
-        return map(self.kind, self.times.tolist(), *(values.tolist() for values in self.values))
-
 
 @dataclass(frozen=True)
 class Stream:

@@ -47,16 +47,16 @@ def as_image(array: object, source: object = "image") -> Image:
     return np.ascontiguousarray(np.rint(array * 255.0), dtype=np.uint8)
 
 
-def as_mask(mask: object, image: Image, source: object = "mask") -> Mask | None:
+def as_mask(mask: object, image: Image) -> Mask | None:
     """Convert ``mask`` (H, W) of bool or ``uint8`` to ``uint8``, not 0 where features are wanted; None means everywhere. Raises
     InputError for another type or a size different from ``image``."""
     if mask is None:
         return None
     if not isinstance(mask, np.ndarray) or mask.dtype not in (np.dtype(bool), np.dtype(np.uint8)):
         kind = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
-        raise InputError(f"{source}: is of {kind}, expected an array of bool or uint8")
+        raise InputError(f"mask: is of {kind}, expected an array of bool or uint8")
     if mask.shape != image.shape[:2]:
-        raise InputError(f"{source}: has shape {mask.shape}, expected that of the image, {image.shape[:2]}")
+        raise InputError(f"mask: has shape {mask.shape}, expected that of the image, {image.shape[:2]}")
     return np.ascontiguousarray(mask != 0, dtype=np.uint8)
 
 

@@ -80,16 +80,12 @@ def match_guided(
     points: Array,
     *,
     binary: bool,
-    ratio: float = RATIO,
-    mutual: bool = True,
-    probability: float = GATE,
 ) -> Matches:
     """:func:`match` of ``first`` (N, D) with ``second`` (M, D) at ``points`` (M, 2), inside the :func:`gates` of the predictions
     only.
 
     ``predicted`` (N, 2) [px] with ``covariances`` (N, 2, 2) [px^2] of prediction and measurement together."""
-    allowed = gates(predicted, covariances, points, probability)
-    return match(first, second, binary=binary, ratio=ratio, mutual=mutual, allowed=allowed)
+    return match(first, second, binary=binary, allowed=gates(predicted, covariances, points))
 
 
 def gates(predicted: Array, covariances: Array, points: Array, probability: float = GATE) -> Truths:

@@ -71,10 +71,6 @@ class TagReadCounts:
         hits, odds, elsewhere = listing(self.tags, self.hits, self.odds, self.elsewhere, self.others, tags)
         return replace(self, hits=hits, odds=odds, elsewhere=elsewhere, tags=tags)
 
-    def hits_of(self, tags: Integers) -> Integers:
-        """The number of rounds (K, U) that read each of ``tags`` (U,), ascending."""
-        return listing(self.listed, self.hits, self.odds, self.elsewhere, self.others, tags)[0]
-
     def with_odds(self, odds: Array) -> TagReadCounts:
         """The same with log-odds ``odds`` (T,) of all tags of the map."""
         return replace(self, odds=odds if self.tags is None else odds[self.tags])

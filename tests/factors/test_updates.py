@@ -19,7 +19,7 @@ from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, RfidModel
-from factors.update import landmark_update, linearized_update, robust_update, update_state
+from factors.update import landmark_update, robust_update, update_state
 
 CLOSE = 1e-8  # standard deviations
 
@@ -149,7 +149,12 @@ def seen(covariance, sigma, iterations=3):
     points = np.array(((4.0, 1.0), (-2.0, 5.0), (1.0, -3.0)))
     ranges, bearings = predict_landmarks(model, np.array((0.1, -0.1, 0.02)), points)
     factor = BearingRangeFactor(model, points, ranges, bearings)
-    return linearized_update(factor, np.zeros(3), covariance, iterations)
+
+    def linearize(delta):
+        residual, (by_pose,) = factor.whitened([se2.exp(delta[:3])])
+        return residual, by_pose
+
+    return update_state(linearize, covariance, factor.weight, iterations, factor.dof())
 
 
 def test_an_update_by_roots_is_the_one_by_information(rng, monkeypatch):

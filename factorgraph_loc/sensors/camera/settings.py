@@ -9,13 +9,11 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.model.settings import SensorSettings
+from factorgraph_loc.model.settings import Angle, Offset, SensorSettings
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 
-Angle = Annotated[float, Field(ge=-math.pi, le=math.pi), InUnit("rad")]
-Offset = Annotated[float, Field(ge=-10.0, le=10.0), InUnit("m")]
 Focal = Annotated[float, Field(gt=1.0, le=1e5), InUnit("px")]
 Pixel = Annotated[float, Field(ge=-1e5, le=1e5), InUnit("px")]
 Lens = Annotated[float, Field(ge=-1000.0, le=1000.0)]
