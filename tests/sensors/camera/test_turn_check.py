@@ -1,6 +1,7 @@
 """A wrong clock and a wrong focal length are told by how images turn, without a map, and wheels are not mistaken for them."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ RIGHT_LENS = CAMERA.model_copy(update={"pixel_sigma": 0.5})
 WRONG_LENS = RIGHT_LENS.model_copy(update={"fx": 1.05 * CAMERA.fx, "fy": 1.05 * CAMERA.fy})
 
 
+@cache
 def drive(seed, speeds=weave, seconds=SECONDS):
     """A log of exact poses, noisy wheels, and pixels."""
     rng = np.random.default_rng(seed)
