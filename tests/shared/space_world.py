@@ -48,6 +48,7 @@ RIG_INERTIAL = RIG.model_copy(
     }
 )
 ROWS = 200.0  # rows of the inertial unit a second
+SWAYING = 6.0  # s
 POINTS = np.random.default_rng(11).uniform((2.0, -2.0, -1.5), (4.0, 2.0, 1.0), (15, 3))
 WORLD = World(points=PointMap.of([f"p{i}" for i in range(len(POINTS))], POINTS))
 
@@ -74,8 +75,8 @@ def swayed(seed, **settings):
     """A vehicle that starts at rest and sways, with an inertial unit that is turned and 10 cm from its origin; ``settings``: of the
     unit, where they differ."""
     rng, unit = np.random.default_rng(seed), RIG_INERTIAL.inertial.model_copy(update=settings)
-    t = np.arange(round(SECONDS / STEP) + 1) * STEP
-    rows = np.arange(round(SECONDS * ROWS) + 1) / ROWS
+    t = np.arange(round(SWAYING / STEP) + 1) * STEP
+    rows = np.arange(round(SWAYING * ROWS) + 1) / ROWS
     turn = Rotation.from_euler("ZYX", (unit.yaw, unit.pitch, unit.roll))
     arm = np.array((unit.x, unit.y, unit.z))
     small = 1e-4
