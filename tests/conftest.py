@@ -1,5 +1,6 @@
 """What several tests share."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from factorgraph_loc.threads import use_one_thread
 
 # before numpy is imported, as commands do: two threads spend most of their time waiting for each other, ten times the work itself
 use_one_thread()
+gc.set_threshold(50_000)  # as the command does: a search through all that the tests import takes a third of a second
 # the same examples on each run; no deadline, as the first call of a compiled function takes seconds
 settings.register_profile("seeded", derandomize=True, deadline=None)
 settings.load_profile("seeded")

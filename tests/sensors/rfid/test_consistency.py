@@ -102,7 +102,7 @@ def test_scans_that_come_again_count_once():
 
 @cache
 def office() -> Log:
-    return simulate(preset("office", {"drive": {"duration": 90.0}}), 7)
+    return simulate(preset("office", {"drive": {"duration": 60.0}}), 7)
 
 
 def told(log: Log, **changes: float) -> Log:
