@@ -2,24 +2,13 @@
 
 import numpy as np
 import pytest
+from mounted_camera import MODEL
 
 from factors import se2
 from factors.camera.model import CameraModel, mounting, predict
 from factors.camera.visual_odometry import RayPairs, VisualOdometryFactor, from_epipole, nearness, sampson, translation
 from factors.se2 import Array
 
-MODEL = CameraModel(
-    500.0,
-    520.0,
-    320.0,
-    240.0,
-    640,
-    480,
-    distortion=(-0.1, 0.02, 0.001, -0.002),
-    position=np.array((0.2, -0.05, 0.8)),
-    rotation=mounting(0.02, -0.1, 0.3),
-    sigma=0.7,
-)
 MOTION = np.array((0.3, 0.04, 0.12))
 
 
