@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from landmark_world import with_sightings
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED, score
@@ -123,10 +124,6 @@ def test_why_a_start_stayed_unknown_is_told_by_the_sensors_that_were_used(blank,
     both = replace(both, streams=dict(both.streams) | {"bearing_range": unseen})
     assert why(both, "bearing_range") == "no landmark of the map was seen"
     assert why(both, "bearing_range", "camera") == "its landmarks and points did not determine the pose"
-
-
-def with_sightings(log, **columns):
-    return replace(log, streams=log.streams | {"bearing_range": replace(log.streams["bearing_range"], **columns)})
 
 
 NOTHING = np.full(8, np.nan)

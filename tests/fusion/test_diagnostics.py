@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import landmark_world
 import numpy as np
 import pytest
 from landmark_world import simulate
@@ -11,7 +12,6 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.belief import PoseEstimate, gaussian_belief
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
@@ -57,8 +57,7 @@ def test_a_late_look_counts_once(late, name):
 
 @pytest.mark.parametrize("name", ["smoother", "batch"])
 def test_a_look_counts_once_when_a_graph_goes_back(name):
-    log = simulate(seconds=20.0)
-    kidnapped = join(cut(log, 0.0, 10.0), cut(simulate(seed=3, seconds=37.0), 25.0, 37.0))
+    kidnapped = landmark_world.kidnapped()
     result = run(kidnapped, RunConfig(name))
     assert [what.partition(":")[0] for _, what in result.diagnostics.events] == ["lost"]
     assert told(result).tolist() == looks(kidnapped).tolist()

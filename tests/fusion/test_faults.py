@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from landmark_world import simulate
+from landmark_world import simulate, with_sightings
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import errors, score
@@ -44,10 +44,6 @@ def clean(log):
         return known[name]
 
     return of
-
-
-def with_sightings(log, **columns):
-    return replace(log, streams={**log.streams, "bearing_range": replace(log.streams["bearing_range"], **columns)})
 
 
 def rows_of(stream, rows):

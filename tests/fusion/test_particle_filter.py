@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+import landmark_world
 import numpy as np
 import pytest
-from landmark_world import simulate
+from landmark_world import simulate, with_sightings
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.evaluation.metrics import errors, score
@@ -31,16 +32,12 @@ def log():
 
 
 @pytest.fixture(scope="module")
-def kidnapped(log):
-    """After 10 s the robot is carried to where another run is at 25 s."""
-    return join(cut(log, 0.0, 10.0), cut(simulate(seed=3, seconds=37.0), 25.0, 37.0))
+def kidnapped():
+    return landmark_world.kidnapped()
 
 
 def only(log, landmarks):
-    s = log.streams["bearing_range"]
-    rows = [i for i, name in enumerate(s.landmark) if name in landmarks]
-    stream = BearingRangeStream(s.t[rows], [s.landmark[i] for i in rows], s.range[rows], s.bearing[rows])
-    return replace(log, streams={**log.streams, "bearing_range": stream})
+    return with_sightings(log, np.isin(log.streams["bearing_range"].landmark, list(landmarks)))
 
 
 def events(result):

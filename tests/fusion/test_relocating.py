@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+import landmark_world
 import numpy as np
 import pytest
-from landmark_world import simulate
+from landmark_world import dirty, simulate, swapped, with_sightings
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import errors
@@ -28,33 +29,8 @@ def log():
 
 
 @pytest.fixture(scope="module")
-def kidnapped(log):
-    """After 10 s the robot is carried to where another run is at 25 s."""
-    return join(cut(log, 0.0, 10.0), cut(simulate(seed=3, seconds=37.0), 25.0, 37.0))
-
-
-def with_sightings(log, keep=None, **columns):
-    s = replace(log.streams["bearing_range"], **columns)
-    rows = np.arange(len(s.t)) if keep is None else np.flatnonzero(keep)
-    stream = BearingRangeStream(s.t[rows], [s.landmark[i] for i in rows], s.range[rows], s.bearing[rows])
-    return replace(log, streams={**log.streams, "bearing_range": stream})
-
-
-def dirty(log, seed=5):
-    """A tenth of the rows says anything."""
-    rng, s = np.random.default_rng(seed), log.streams["bearing_range"]
-    bad = rng.random(len(s.t)) < 0.1
-    return with_sightings(
-        log,
-        range=np.where(bad, rng.uniform(0.3, 8.0, len(bad)), s.range),
-        bearing=np.where(bad, rng.uniform(-np.pi, np.pi, len(bad)), s.bearing),
-    )
-
-
-def swapped(log, one, other):
-    landmarks = dict(log.world.landmarks)
-    landmarks[one], landmarks[other] = landmarks[other], landmarks[one]
-    return replace(log, world=log.world.model_copy(update={"landmarks": landmarks}))
+def kidnapped():
+    return landmark_world.kidnapped()
 
 
 def silent(log, start, end):

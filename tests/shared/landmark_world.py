@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
@@ -146,3 +146,34 @@ def miscalibrated(log, truth, *, depth=False, seed=0):
         }
     )
     return replace(log, rig=rig, streams={"odometry": replace(odometry, v=v, w=w), "bearing_range": seen})
+
+
+def kidnapped():
+    """A log in which the robot is carried after 10 s to where another run is at 25 s."""
+    return join(cut(simulate(seconds=20.0), 0.0, 10.0), cut(simulate(seed=3, seconds=37.0), 25.0, 37.0))
+
+
+def with_sightings(log, keep=None, **columns):
+    """The log with other columns of its sightings, or without some rows."""
+    s = replace(log.streams["bearing_range"], **columns)
+    rows = np.arange(len(s.t)) if keep is None else np.flatnonzero(keep)
+    stream = BearingRangeStream(s.t[rows], [s.landmark[i] for i in rows], s.range[rows], s.bearing[rows])
+    return replace(log, streams={**log.streams, "bearing_range": stream})
+
+
+def dirty(log, seed=5):
+    """A tenth of the rows says anything."""
+    rng, s = np.random.default_rng(seed), log.streams["bearing_range"]
+    bad = rng.random(len(s.t)) < 0.1
+    return with_sightings(
+        log,
+        range=np.where(bad, rng.uniform(0.3, 8.0, len(bad)), s.range),
+        bearing=np.where(bad, rng.uniform(-np.pi, np.pi, len(bad)), s.bearing),
+    )
+
+
+def swapped(log, one, other):
+    """The log with two landmarks of its map in each other's place."""
+    landmarks = dict(log.world.landmarks)
+    landmarks[one], landmarks[other] = landmarks[other], landmarks[one]
+    return replace(log, world=log.world.model_copy(update={"landmarks": landmarks}))

@@ -1,17 +1,16 @@
 """Where a robot is, from the last sightings alone, on a simulated run and on recorded ones."""
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from landmark_world import simulate
+from landmark_world import dirty, simulate, swapped, with_sightings
 
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.landmarks.finder import Relocalizer, TrackMonitor, _apart, _insert, _thinned
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks
 from factorgraph_loc.sensors.landmarks.window import Sighting
 from factorgraph_loc.sensors.odometry.motion import OdometryMotion
@@ -67,30 +66,6 @@ def error(log, found):
     difference[2] = se2.wrap_scalar(difference[2])
     squared = difference @ np.linalg.solve(found.covariance, difference)
     return np.hypot(*difference[:2]), abs(difference[2]), squared
-
-
-def with_sightings(log, keep=None, **columns):
-    s = log.streams["bearing_range"]
-    rows = np.arange(len(s.t)) if keep is None else np.flatnonzero(keep)
-    s = replace(s, **columns)
-    stream = BearingRangeStream(s.t[rows], [s.landmark[i] for i in rows], s.range[rows], s.bearing[rows])
-    return replace(log, streams={**log.streams, "bearing_range": stream})
-
-
-def dirty(log, share=0.1):
-    rng, s = np.random.default_rng(4), log.streams["bearing_range"]
-    bad = rng.random(len(s.t)) < share
-    return with_sightings(
-        log,
-        range=np.where(bad, rng.uniform(0.3, 8.0, len(bad)), s.range),
-        bearing=np.where(bad, rng.uniform(-np.pi, np.pi, len(bad)), s.bearing),
-    )
-
-
-def swapped(log, one, other):
-    landmarks = dict(log.world.landmarks)
-    landmarks[one], landmarks[other] = landmarks[other], landmarks[one]
-    return replace(log, world=log.world.model_copy(update={"landmarks": landmarks}))
 
 
 @pytest.mark.parametrize("disturbed", [lambda log: log, dirty, lambda log: swapped(log, "b", "h")])
