@@ -176,7 +176,7 @@ class Graph:
             if keyframe.is_elsewhere:
                 keyframe.factor = self.motion.exact_factor(increment)
             else:
-                scale_known = not any(mapper.estimates for mapper in self.mappers)
+                scale_known = all(mapper.knows_scale for mapper in self.mappers)
                 keyframe.factor = self.motion.factor(increment, scale_known=scale_known)
         return keyframe.factor, keys
 

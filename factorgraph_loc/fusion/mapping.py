@@ -36,13 +36,15 @@ class Mapper(Protocol):
     """Makes variables of points that a sensor sees and no map has.
 
     ``fewest``: sightings that a point of the graph needs; ``horizon``: keyframes back that it may look at; ``rejected``: what is
-    said of sightings that turn out to be of something else; ``estimates``: whether points become variables.
+    said of sightings that turn out to be of something else; ``estimates``: whether points become variables; ``knows_scale``:
+    whether their scale comes from elsewhere than the motion.
     """
 
     fewest: int
     horizon: int
     rejected: str
     estimates: bool
+    knows_scale: bool
 
     def is_due(self, m: Any) -> bool:
         """Whether a measurement needs a keyframe of its own."""

@@ -24,7 +24,7 @@ from factorgraph_loc.slam.local_bundle import bundled
 from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints
 from factorgraph_loc.slam.moving_things import MovingThings
 from factorgraph_loc.slam.new_points import FEWEST as FEWEST_SIGHTINGS
-from factorgraph_loc.slam.new_points import KeyframeCamera, NewPoints, sightings_of
+from factorgraph_loc.slam.new_points import KeyframeCamera, NewPoints, PointSighting, sightings_of
 from factorgraph_loc.slam.point_looks import PointLooks
 from factorgraph_loc.slam.refound_points import refound
 from factorgraph_loc.slam.slipping import unless_slipped
@@ -119,9 +119,11 @@ class UnknownPoints:
                 model, Image(m.frame, keyframe, guess, self._distance_travelled), rows, names, graph
             )
         pixels = np.asarray(m.pixels[rows], dtype=float)
+        depths = None if m.frame is None or m.frame.depths is None else m.frame.depths[rows]
         priority = [len(names) if name in self._points else self._new.count(name) for name in names]
         chosen = spread_out(pixels, PER_KEYFRAME + WAITING, priority).tolist()
         rows, names, pixels = [rows[i] for i in chosen], [names[i] for i in chosen], pixels[chosen]
+        sightings = sightings_of(self.model, keyframe.index, pixels, None if depths is None else depths[chosen])
         old = [i for i, name in enumerate(names) if name in self._points]
         old = [old[i] for i in spread_out(pixels[old], PER_KEYFRAME).tolist()]
         points = [self._points[names[i]] for i in old]
@@ -133,11 +135,11 @@ class UnknownPoints:
             known_rows = [(rows[i], names[i], bool(agrees)) for i, agrees in zip(old, right, strict=True)]
             self._remember(m.frame, known_rows, keyframe.key, guess)
         for i, agrees in zip(old, right.tolist(), strict=True):
-            self._again(names[i], pixels[i], bool(agrees), keyframe, guess[0], model, graph, addition)
+            self._again(names[i], sightings[i], bool(agrees), keyframe, guess[0], model, graph, addition)
         self._anchored[keyframe.index] = int(np.count_nonzero(right)) >= ANCHORED
         fresh = [i for i, name in enumerate(names) if name not in self._points]
-        for i, sighting in zip(fresh, sightings_of(self.model, keyframe.index, pixels[fresh]), strict=True):
-            self._new.add(names[i], sighting)
+        for i in fresh:
+            self._new.add(names[i], sightings[i])
         self._new.forget(keyframe.index, things.moving())
         waiting = [n for i in fresh if self._new.count(n := names[i]) >= FEWEST_SIGHTINGS and things.trusts(n)]
         places, pose = self._places(keyframe, guess[0], waiting, graph, things)
@@ -153,7 +155,7 @@ class UnknownPoints:
             native = gtsam.PriorFactorVector(key, found.position, gtsam.noiseModel.Diagonal.Sigmas(OPEN))
             addition.hang(keyframe, Node((key,), VectorPriorFactor(found.position, OPEN), 3, native))
             for sighting in seen:
-                self._hang(graph.keyframes[sighting.keyframe], key, sighting.pixel, graph, addition)
+                self._hang(graph.keyframes[sighting.keyframe], key, sighting, graph, addition)
         return times.at_stamp(index, (pose, guess[1]), graph)
 
     def _named(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: GraphView) -> list[Hashable]:
@@ -324,7 +326,7 @@ class UnknownPoints:
     def _again(
         self,
         name: Hashable,
-        pixel: Array,
+        sighting: PointSighting,
         agrees: bool,
         keyframe: Keyframe,
         pose: Array,
@@ -347,13 +349,13 @@ class UnknownPoints:
         point.strikes, point.last = 0, keyframe.t
         _, _, by_point, _ = reprojection.linearize(model, pose, position[None])
         point.information += by_point[0].T @ by_point[0] / model.sigma**2
-        self._hang(keyframe, point.key, pixel, graph, addition)
+        self._hang(keyframe, point.key, sighting, graph, addition)
 
-    def _hang(self, keyframe: Keyframe, key: int, pixel: Array, graph: GraphView, addition: Addition) -> None:
+    def _hang(self, keyframe: Keyframe, key: int, seen: PointSighting, graph: GraphView, addition: Addition) -> None:
         keys = (keyframe.key, *graph.shared, tilt_key(keyframe.index), key)
         twist = self._times.twists.get(keyframe.index)
-        factor = PointFactor(self.model, self._lens, pixel, self.estimated.indices, twist)
-        addition.hang(keyframe, Node(keys, factor, 2))
+        factor = PointFactor(self.model, self._lens, seen.seen, self.estimated.indices, twist)
+        addition.hang(keyframe, Node(keys, factor, factor.rows))
 
     def _places(
         self, newest: Keyframe, pose: Array, names: Sequence[Hashable], graph: GraphView, things: MovingThings

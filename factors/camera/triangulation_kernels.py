@@ -18,23 +18,29 @@ FOUND, NONE, BEHIND = 0, 1, 2
 
 @compiled(error_model="numpy")
 def triangulated(
-    k: Lens, centres: Array, turns: Array, rays: Array, pixels: Array, sigmas: Array, spread: float
+    k: Lens, centres: Array, turns: Array, rays: Array, seen: Array, sigmas: Array, spread: float
 ) -> tuple[int, Array, Array, Array]:
     """How it ends, a point (3,), its covariance (3, 3) and squared whitened residuals (M,), seen by cameras at ``centres`` (M, 3)
     with rotations ``turns`` (M, 3, 3).
 
-    ``rays`` (M, 3): its directions in their frames; ``pixels`` (M, 2): where it is seen, with standard deviations ``sigmas`` (M,).
-    ``spread``: the largest standard deviation allowed, relative to the least depth.
+    ``rays`` (M, 3): its directions in their frames; ``seen`` (M, 3): its pixels and inverses of its depths [1/m], NaN where none
+    was measured; ``sigmas`` (M, 2): standard deviations of each pixel coordinate and of the inverse depth. ``spread``: the largest
+    one of the point that is allowed, relative to its least depth. Without any depth, rays must not be nearly parallel.
     """
     ways = np.empty_like(rays)
     for m in range(len(rays)):
         ways[m] = product(turns[m], rays[m].reshape(3, 1)).reshape(3)
     covariance, squared = np.zeros((3, 3)), np.full(len(rays), np.inf)
-    if product_by_transpose(ways, ways).min() > math.cos(MIN_PARALLAX):
-        return NONE, np.zeros(3), covariance, squared
-    point = _nearest(centres, ways)
+    point, is_deep = np.zeros(3), False
+    for m in range(len(rays)):
+        if seen[m, 2] > 0.0:
+            point, is_deep = centres[m] + ways[m] / (seen[m, 2] * rays[m, 2]), True
+    if not is_deep:
+        if product_by_transpose(ways, ways).min() > math.cos(MIN_PARALLAX):
+            return NONE, point, covariance, squared
+        point = _nearest(centres, ways)
     for iteration in range(ITERATIONS + 1):
-        told, pull, depth = _told(k, centres, turns, pixels, sigmas, point, squared)
+        told, pull, depth = _told(k, centres, turns, seen, sigmas, point, squared)
         if not depth > NEAREST:
             return BEHIND, point, covariance, squared
         covariance = inverse(told)
@@ -64,20 +70,25 @@ def _nearest(centres: Array, ways: Array) -> Array:
 
 @compiled(error_model="numpy")
 def _told(
-    k: Lens, centres: Array, turns: Array, pixels: Array, sigmas: Array, point: Array, squared: Array
+    k: Lens, centres: Array, turns: Array, seen: Array, sigmas: Array, point: Array, squared: Array
 ) -> tuple[Array, Array, float]:
     """The information (3, 3) on a point and its gradient (3, 1), and the least depth; ``squared`` residuals (M,) in place."""
-    told, pull, depth, row = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3)
+    told, pull, depth, row, error = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3), np.empty(3)
     for m in range(len(centres)):
         local = product((point - centres[m]).reshape(1, 3), turns[m])
         depth = min(depth, local[0, 2])
         u, v, by_u, by_v = pixel(k, local[0, 0], local[0, 1], local[0, 2])
-        error = (u - pixels[m, 0]) / sigmas[m], (v - pixels[m, 1]) / sigmas[m]
-        squared[m] = error[0] ** 2 + error[1] ** 2
-        for r in range(2):
+        error[0], error[1], error[2] = u - seen[m, 0], v - seen[m, 1], 1.0 / local[0, 2] - seen[m, 2]
+        squared[m] = 0.0
+        for r in range(3 if seen[m, 2] > 0.0 else 2):
+            sigma = sigmas[m, 0] if r < 2 else sigmas[m, 1]
             d = by_u if r == 0 else by_v
+            if r == 2:
+                d = (0.0, 0.0, -1.0 / local[0, 2] ** 2)
+            error[r] /= sigma
+            squared[m] += error[r] ** 2
             for j in range(3):
-                row[j] = (turns[m, j, 0] * d[0] + turns[m, j, 1] * d[1] + turns[m, j, 2] * d[2]) / sigmas[m]
+                row[j] = (turns[m, j, 0] * d[0] + turns[m, j, 1] * d[1] + turns[m, j, 2] * d[2]) / sigma
             for i in range(3):
                 pull[i, 0] -= row[i] * error[r]
                 for j in range(3):
