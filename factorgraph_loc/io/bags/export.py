@@ -4,7 +4,7 @@ proposes for it reads the same log; rig and map are written to files next to the
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import IMAGE, read_bytes
 from factorgraph_loc.files.checks import absolute
 from factorgraph_loc.files.temporary import sweep, temporary_folder
+from factorgraph_loc.io.bags.camera import COMPRESSED
 from factorgraph_loc.io.bags.fields import INITIAL_POSE, READ, ROUND, definitions, tables_of_messages
 from factorgraph_loc.io.bags.file import ROS1, SUFFIXES, require_rosbags
 from factorgraph_loc.io.bags.poses import POINT
@@ -34,6 +35,7 @@ from factors.se2 import Array
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
+DEPTHS = "/camera/aligned_depth/image/compressed"
 MAP, ODOM, BASE, CAMERA = "map", "odom", "base_link", "camera"
 FRAMES = {"sightings": CAMERA}  # frames of tables, if not the robot frame
 PNG_OR_JPEG = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
@@ -96,6 +98,11 @@ def _write(log: Log, folder: Path, suffix: str) -> Path:
 def _sources(log: Log, build: _Builder) -> list[Iterator[Message]]:
     """The messages of each stream in order of arrival."""
     sources = [_arriving(_of_stream(name, stream, log, build)) for name, stream in log.streams.items()]
+    sources += [
+        _arriving(_of_depths(stream, log.t0_ns, build))
+        for stream in log.streams.values()
+        if isinstance(stream, ImageStream)
+    ]
     if log.reference is not None:
         sources.append(_arriving(_of_reference(log.reference, log.t0_ns, build)))
     if log.start is not None:
@@ -162,7 +169,7 @@ def _of_stream(name: str, stream: Stream, log: Log, build: _Builder) -> Iterator
             kind, rows = "sensor_msgs/msg/Imu", _imu(stream, build)
         case ImageStream():
             topic = f"/{name}/image/compressed"
-            kind, frame, rows = "sensor_msgs/msg/CompressedImage", CAMERA, _images(stream)
+            kind, frame, rows = COMPRESSED, CAMERA, _images(stream.file)
         case _:
             table = next(((k, t) for k, t in tables_of_messages().items() if t.name == name), None)
             if table is None:
@@ -212,8 +219,15 @@ def _imu(stream: YawRateStream, build: _Builder) -> Iterator[dict[str, Any]]:
         }
 
 
-def _images(stream: ImageStream) -> Iterator[dict[str, Any]]:
-    for file in stream.file:
+def _of_depths(stream: ImageStream, t0_ns: int, build: _Builder) -> Iterator[Message]:
+    there = [i for i, file in enumerate(stream.depth) if file is not None]
+    files = [file for file in stream.depth if file is not None]
+    t_ns = absolute(stream.t[there], t0_ns).tolist()
+    return _stamped(DEPTHS, COMPRESSED, t_ns, _images(files), CAMERA, build)
+
+
+def _images(files: Iterable[Path]) -> Iterator[dict[str, Any]]:
+    for file in files:
         content = read_bytes(file, IMAGE)
         kind = PNG_OR_JPEG.get(file.suffix.lower(), file.suffix.lstrip("."))
         yield {"format": kind, "data": np.frombuffer(content, dtype=np.uint8)}

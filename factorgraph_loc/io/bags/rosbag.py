@@ -31,7 +31,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import PosePath
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.settings import CameraSettings, DepthSettings
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.text import listed, plain, told
@@ -168,6 +168,7 @@ class Gathered:
     rfid: Reads | None = None
     bearing_range: Landmarks | None = None
     camera: Images | None = None
+    depth: Images | None = None
     info: Info | None = None
     sightings: PixelsOfPoints | None = None
     reference: Poses | FrameReference | None = None
@@ -192,8 +193,8 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     if isinstance(motion, WheelMotion) and motion.right is not None:
         listeners.add(motion.right.topic, motion.right, listeners.stamper(motion.right.topic, options.odometry.clock))
     gathered = _listen(listeners, options)
-    if gathered.camera:
-        stack.callback(gathered.camera.discard)
+    for images in filter(None, (gathered.camera, gathered.depth)):
+        stack.callback(images.discard)
     listeners.run()
 
     clock, warnings = bag_clock.report(listeners.stampers, options.clock)
@@ -207,7 +208,8 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     if gathered.bearing_range:
         streams["bearing_range"] = gathered.bearing_range.stream(frames, options.base_frame, t0_ns, warnings)
     if gathered.camera:
-        streams["camera"] = gathered.camera.stream(t0_ns, warnings)
+        seen = gathered.camera.stream(t0_ns, warnings)
+        streams["camera"] = seen.with_depths(gathered.depth.stream(t0_ns, warnings)) if gathered.depth else seen
     if gathered.sightings:
         streams["sightings"] = gathered.sightings.stream(t0_ns, warnings)
     streams |= {name: rows.stream(t0_ns, warnings) for name, rows in gathered.others.items()}
@@ -258,7 +260,7 @@ def _listen(listeners: Listeners, options: Options) -> Gathered:
         if (told := getattr(options, table.name)) is not None:
             out.others[table.name] = listeners.listen(told, DescribedRows(bag, told, table))
     if options.camera:
-        out.camera, out.info = _listen_to_camera(listeners, options.camera)
+        _listen_to_camera(listeners, options.camera, out)
     if options.reference:
         topic = options.reference
         stamper = listeners.stamper(topic.topic, topic.clock)
@@ -272,18 +274,23 @@ def _listen(listeners: Listeners, options: Options) -> Gathered:
     return out
 
 
-def _listen_to_camera(listeners: Listeners, options: CameraTopic) -> tuple[Images, Info | None]:
-    bag, stamper = listeners.bag, listeners.stamper(options.topic, options.clock)
-    images = Images(bag, options.topic, stamper)
+def _listen_to_camera(listeners: Listeners, options: CameraTopic, out: Gathered) -> None:
+    out.camera = _listen_to_images(listeners, options.topic, options.clock)
+    if options.depth:
+        out.depth = _listen_to_images(listeners, options.depth, options.clock)
+    if options.info:
+        out.info = Info(listeners.bag, options.info)
+        listeners.add(options.info, out.info, listeners.stamper(options.info, None), timed=False)
+
+
+def _listen_to_images(listeners: Listeners, topic: str, clock: Clock | None) -> Images:
+    stamper = listeners.stamper(topic, clock)
+    images = Images(listeners.bag, topic, stamper)
     if images.known:
         listeners.stampers.append(stamper)
     else:
-        listeners.add(options.topic, images, stamper)
-    info = None
-    if options.info:
-        info = Info(bag, options.info)
-        listeners.add(options.info, info, listeners.stamper(options.info, None), timed=False)
-    return images, info
+        listeners.add(topic, images, stamper)
+    return images
 
 
 def _reference(
@@ -304,6 +311,8 @@ def _rig(
     """The rig from the bag; a rig in the manifest replaces it."""
     base = options.base_frame
     camera = camera_of(gathered.info, frames, base, notes) if gathered.info else None
+    if camera is not None and gathered.depth:
+        camera = camera.model_copy(update={"depth": DepthSettings()})
     reads = streams.get("rfid")
     rfid = None
     if options.rfid and isinstance(reads, RfidStream) and reads.antenna:

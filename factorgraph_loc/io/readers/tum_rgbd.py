@@ -3,10 +3,7 @@ al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012). A depth
 colour image nearest in time. The accelerometer is not read."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, inside
@@ -35,7 +32,6 @@ RIG = Rig(
         depth=DepthSettings(unit=1.0 / 5000.0),
     ),
 )
-APART = 0.02  # s between a colour image and its depth image, as in the benchmark's own tool
 
 
 class Options(FileModel):
@@ -66,15 +62,10 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
 
 
 def _with_depth(images: ImageStream, path: Path, t0_ns: int, warnings: list[str]) -> ImageStream:
-    """The images with the depth image of each, nearest in time and at most :data:`APART` from it."""
+    """The images with the depth image of each, nearest in time."""
     if not (path / "depth.txt").is_file():
         return images
     depths = make_images(
         read_image_list(inside(path, "depth.txt", path), unit="s", separator=" "), t0_ns, warnings, path
     )
-    near = [int(np.abs(depths.t - t).argmin()) if len(depths.t) else -1 for t in images.t]
-    files = [
-        depths.file[i] if i >= 0 and abs(depths.t[i] - t) <= APART else None
-        for i, t in zip(near, images.t, strict=True)
-    ]
-    return replace(images, depth=files)
+    return images.with_depths(depths)
