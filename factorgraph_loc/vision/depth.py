@@ -16,14 +16,20 @@ AROUND = np.ones((3, 3), dtype=np.uint8)
 
 
 def depths_at(path: Path, pixels: Array, size: tuple[int, int], unit: float) -> Array:
-    """The depths (K,) [m] at ``pixels`` (K, 2) in the 16-bit image ``path`` of ``size`` (width, height), NaN where there is none,
-    with a value of 0 or the largest, and at edges; a value of 1 is ``unit`` [m]. InputError if it is missing, cannot be decoded, or
-    is no such image."""
-    image = decoded(read_bytes(path, IMAGE), path, cv2.IMREAD_UNCHANGED)
+    """As :func:`depths_in` of the image ``path``. InputError if it is missing, cannot be decoded, or is no such image."""
+    return depths_in(decoded(read_bytes(path, IMAGE), path, cv2.IMREAD_UNCHANGED), pixels, size, unit, str(path))
+
+
+def depths_in(image: object, pixels: Array, size: tuple[int, int], unit: float, where: str) -> Array:
+    """The depths (K,) [m] at ``pixels`` (K, 2) in a 16-bit image of ``size`` (width, height), NaN where there is none, with a value
+    of 0 or the largest, and at edges; a value of 1 is ``unit`` [m]. InputError, which begins with ``where``, if it is no such
+    image."""
+    expected = f"expected {size[0]} x {size[1]} px of uint16"
+    if not isinstance(image, np.ndarray) or image.ndim not in {2, 3}:
+        raise InputError(f"{where}: is {type(image).__name__}, {expected}")
     if image.dtype != np.uint16 or image.shape != size[::-1]:
         channels = f", {image.shape[2]} channels" if image.ndim == 3 else ""
-        given = f"{image.shape[1]} x {image.shape[0]} px of {image.dtype}{channels}"
-        raise InputError(f"{path}: has {given}, expected {size[0]} x {size[1]} px of uint16")
+        raise InputError(f"{where}: has {image.shape[1]} x {image.shape[0]} px of {image.dtype}{channels}, {expected}")
     column, row = np.clip(np.rint(pixels).astype(np.int64), 0, np.array(size) - 1).T
     least, most = (found[row, column].astype(float) for found in (cv2.erode(image, AROUND), cv2.dilate(image, AROUND)))
     value = image[row, column]
