@@ -193,7 +193,8 @@ class Incremental:
             with gtsam_errors():
                 self._solver.update(nodes, values, newest.t)
                 self._check_jump(newest, guess)
-                self._read(newest, {key for node in nodes for key in node.keys if key in self._graph.values})
+                touched = {key for node in nodes for key in node.keys if key in self._graph.values}
+                self._read(newest, {key for key in touched if not is_of_keyframe(key) or self.is_open(index_of(key))})
         except RuntimeError as error:
             self._graph.diagnostics.events.append((newest.t, f"solver rebuilt: {self._graph.reason(error)}"))
             self._rebuild(newest, guess)
