@@ -73,6 +73,12 @@ def test_a_window_that_is_built_anew_counts_nothing_twice(monkeypatch):
     assert np.max(squared) < 1.0  # the points are linearised at another update
 
 
+def test_a_window_that_keyframes_leave_is_not_built_anew():
+    """Now and then a point is taken in that was seen from a keyframe which leaves with the same update."""
+    result = run(camera_world.simulate(1, 20.0), RunConfig("smoother", {"landmarks": "unknown", "lag": 1.5}))
+    assert not result.diagnostics.events
+
+
 def test_covariances_of_poses_at_once_are_those_of_each(log):
     compared = []
 
