@@ -37,7 +37,7 @@ from factors.se2 import Array
 _State = tuple[gtsam.NonlinearFactorGraph, Values, frozenset[int]]
 # s that a pose may stay longer in a window, so that several are read at a time; less with points, which make it large
 MARGIN, WITH_POINTS = 2.0, 1.0
-FOREVER = 1e300  # s, with which only what holds variables leaves a window
+FOREVER = 1e300  # s; a lag with which only the variables that are added to leave at once do so
 
 
 class Solver(Protocol):
@@ -161,7 +161,8 @@ class Window:
         self._before = self._state()
         self._stamps |= {key: t for key, t in stamps.items() if not is_constant(key)}
         now, lag = max(self._stamps.values()), FOREVER
-        holding = _holding(factors, values)  # GTSAM may fail where others leave with these
+        holding = _holding(factors, values)
+        # GTSAM may fail where others leave in the same update
         leaving = [] if holding else [key for key, t in self._stamps.items() if t < now - self.lag]
         if leaving:
             stamps = {**stamps, **dict.fromkeys(filter(is_constant, self._ours.at), now)}

@@ -160,9 +160,7 @@ def agreed(
     """
     seen, places = list(seen), list(places)
     found = _triangulate(model, seen, places, MAX_SPREAD)
-    while found is not None and not found.squared.sum() < chi_squared.quantile(
-        GATE, sum(len(s.seen) for s in seen) - 3
-    ):
+    while found is not None and not _fits(found, seen):
         if len(seen) <= FEWEST:
             return None
         best: tuple[float, int, TriangulatedPoint] | None = None
@@ -175,6 +173,11 @@ def agreed(
         _, out, found = best
         del seen[out], places[out]
     return None if found is None else (found, seen)
+
+
+def _fits(point: TriangulatedPoint, seen: Sequence[PointSighting]) -> bool:
+    """Whether all that is ``seen`` of a point is as far from it as noise may be."""
+    return bool(point.squared.sum() < chi_squared.quantile(GATE, sum(len(s.seen) for s in seen) - 3))
 
 
 def triangulate(

@@ -43,7 +43,8 @@ class PointMapper:
             self._unknown = UnknownPoints(model, diagnostics, camera.constants)
         self._things = MovingThings(model)
         self._pairs = FramePairs(model) if settings.visual_odometry else None
-        self._taken, self._is_deep = -math.inf, False  # whether there are depths
+        self._taken = -math.inf
+        self._has_depths = False
         self._tracks = np.empty(0, dtype=np.int64)  # of the last keyframe
 
     @property
@@ -53,7 +54,7 @@ class PointMapper:
 
     @property
     def knows_scale(self) -> bool:
-        return self._unknown is None or self._is_deep or len(self._camera.points.map) > 0
+        return self._unknown is None or self._has_depths or len(self._camera.points.map) > 0
 
     def is_due(self, m: Pixels) -> bool:
         # estimated points need keyframes of their own
@@ -79,7 +80,7 @@ class PointMapper:
             used = {i for i, name in enumerate(m.names) if name in points.map.index}
         else:
             names, used = m.frame.tracks.tolist(), set(points.used.tolist())
-            self._is_deep |= m.frame.depths is not None
+            self._has_depths |= m.frame.depths is not None and bool(np.isfinite(m.frame.depths).any())
         self._things.look(keyframe, names, m.pixels, graph)
         moving = self._things.moving()
         used |= {i for i, name in enumerate(names) if name in moving}

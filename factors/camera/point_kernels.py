@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from factors.camera.kernels import NEAREST, Lens, pixel
+from factors.camera.kernels import NEAREST, Lens, inverse_depth, pixel
 from factors.compiled import compiled
 from factors.robust import huber_weight
 from factors.se2 import Array
@@ -82,10 +82,10 @@ def see(
     residual[0], residual[1] = (u - measured[0]) / sigmas[0], (v - measured[1]) / sigmas[0]
     squared[0] = residual[0] * residual[0] + residual[1] * residual[1]
     scale = math.sqrt(huber_weight(squared[0], robust)) / sigmas[0]
-    inverse, deep = 0.0, 0.0
+    inverse, by_inverse = inverse_depth(depth)
+    deep = 0.0
     if len(residual) == 3:
         # where a depth is wrong, as at an edge, the pixel is not
-        inverse = 1.0 / max(depth, NEAREST)
         residual[2] = (inverse - measured[2]) / sigmas[1]
         squared[1] = residual[2] * residual[2]
         weight = math.sqrt(huber_weight(squared[1], robust))
@@ -100,7 +100,7 @@ def see(
     for r in range(len(residual)):
         d = by_u if r == 0 else by_v
         if r == 2:
-            d, scale = (0.0, 0.0, -inverse * inverse), deep
+            d, scale = by_inverse, deep
         g0 = scale * (rotation[0, 0] * d[0] + rotation[0, 1] * d[1] + rotation[0, 2] * d[2])
         g1 = scale * (rotation[1, 0] * d[0] + rotation[1, 1] * d[1] + rotation[1, 2] * d[2])
         g2 = scale * (rotation[2, 0] * d[0] + rotation[2, 1] * d[1] + rotation[2, 2] * d[2])

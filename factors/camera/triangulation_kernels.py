@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from factors.camera.kernels import Lens, pixel
+from factors.camera.kernels import Lens, inverse_depth, pixel
 from factors.compiled import compiled
 from factors.se2 import Array
 from factors.small_kernels import inverse, product, product_by_transpose, solved
@@ -78,13 +78,14 @@ def _told(
         local = product((point - centres[m]).reshape(1, 3), turns[m])
         depth = min(depth, local[0, 2])
         u, v, by_u, by_v = pixel(k, local[0, 0], local[0, 1], local[0, 2])
-        error[0], error[1], error[2] = u - seen[m, 0], v - seen[m, 1], 1.0 / local[0, 2] - seen[m, 2]
+        inverse, by_inverse = inverse_depth(local[0, 2])
+        error[0], error[1], error[2] = u - seen[m, 0], v - seen[m, 1], inverse - seen[m, 2]
         squared[m] = 0.0
         for r in range(3 if seen[m, 2] > 0.0 else 2):
             sigma = sigmas[m, 0] if r < 2 else sigmas[m, 1]
             d = by_u if r == 0 else by_v
             if r == 2:
-                d = (0.0, 0.0, -1.0 / local[0, 2] ** 2)
+                d = by_inverse
             error[r] /= sigma
             squared[m] += error[r] ** 2
             for j in range(3):
