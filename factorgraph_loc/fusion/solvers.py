@@ -5,6 +5,10 @@ Python for each factor. A factor is linearised where iSAM2 linearises its variab
 update that moves these: were it left behind, the factors would no longer agree on what a turn of the whole graph does to the poses,
 and would seem to tell of the heading what nothing measured (Huang, Mourikis, Roumeliotis, International Journal of Robotics
 Research 29(5), 2010).
+
+iSAM2 never linearises anew what marginal factors are on. Where all that has moved by a translation since, our factors on it are
+linearised there, as far from the estimate they would mean nothing, and given to iSAM2 with that place: a translation of all of it
+changes nothing of what they tell of the heading.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ from factorgraph_loc.fusion.variables import (
     Values,
     gtsam_errors,
     is_constant,
+    is_place,
     is_point,
     is_pose,
     leaving_key,
@@ -34,7 +39,7 @@ from factors.graph import Factor, jacobian_factors, pose_array, silenced
 from factors.positive_kernels import inverse
 from factors.se2 import Array
 
-_State = tuple[gtsam.NonlinearFactorGraph, Values, frozenset[int]]
+_State = tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Values, frozenset[int]]
 # s that a pose may stay longer in a window, so that several are read at a time; less with points, which make it large
 MARGIN, WITH_POINTS = 2.0, 1.0
 FOREVER = 1e300  # s; a lag with which only the variables that are added to leave at once do so
@@ -143,8 +148,8 @@ class Window:
         self._smoother = gtsam.IncrementalFixedLagSmoother(lag, parameters)
         self._ours = _Ours(threshold, parameters.relinearizeSkip, on_failure)
         self._stamps: dict[int, float] = {}  # of the variables that may leave
-        # before the last update: all factors, where the variables were linearised, and which factors are ours
-        self._before: _State = gtsam.NonlinearFactorGraph(), {}, frozenset()
+        # before the last update: all factors, where iSAM2 linearised the variables, and where we did, and which factors are ours
+        self._before: _State = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, frozenset()
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
         # points leave when they are seen no more
@@ -216,12 +221,13 @@ class Window:
         return oldest_pose(self._before[0].keyVector())
 
     def summary(self, *, failed: bool) -> MarginalSummary | None:
-        graph, at, ours = self._before if failed else self._state()
-        return MarginalSummary.of(graph, at, ours) if graph.size() else None
+        graph, held, at, ours = self._before if failed else self._state()
+        return MarginalSummary.of(graph, held, at, ours) if graph.size() else None
 
     def _state(self) -> _State:
         """A copy of what the solver has, which changes in place."""
-        return gtsam.NonlinearFactorGraph(self._smoother.getFactors()), dict(self._ours.at), self._ours.slots
+        held = gtsam.Values(self._smoother.getISAM2().getLinearizationPoint())
+        return gtsam.NonlinearFactorGraph(self._smoother.getFactors()), held, dict(self._ours.at), self._ours.slots
 
 
 class _Ours:
@@ -233,6 +239,7 @@ class _Ours:
         self._threshold, self._skip, self._on_failure = threshold, skip, on_failure
         self._updates = 0
         self.at: Values = {}  # where each variable is linearised
+        self._carried: set[int] = set()  # those that iSAM2 linearises elsewhere
         self._on: defaultdict[int, dict[int, _Linear]] = defaultdict(dict)  # the factors on each, by their identity
         self._slots: set[int] = set()
         self._added: list[_Linear] = []  # those of the last update, with their places in it as slots
@@ -262,8 +269,9 @@ class _Ours:
             for key in node.keys:
                 self._on[key][id(linear)] = linear
         for linear, linearized in zip(self._added, self._linearized(), strict=True):
-            linear.slot = graph.size()
-            graph.add(gtsam.LinearContainerFactor(linearized))
+            linear.slot, keys = graph.size(), linear.node.keys
+            place = () if self._carried.isdisjoint(keys) else (to_gtsam({key: self.at[key] for key in keys}),)
+            graph.add(gtsam.LinearContainerFactor(linearized, *place))
         return graph, removed
 
     def _linearized(self) -> list[gtsam.GaussianFactor]:
@@ -284,6 +292,7 @@ class _Ours:
     def forget(self, key: int) -> None:
         """A variable has left the solver, with all factors on it."""
         del self.at[key]
+        self._carried.discard(key)
         for linear in self._on.pop(key, {}).values():
             self._slots.discard(linear.slot)
             for other in linear.node.keys:
@@ -307,12 +316,19 @@ class _Ours:
             return []
         isam = solver if isinstance(solver, gtsam.ISAM2) else solver.getISAM2()
         fixed = isam.getFixedVariables()  # what marginal factors are on
-        found: dict[int, _Linear] = {}
-        for key in moved:
-            if not fixed.count(key):
-                self.at[key] = read(solver, key)
-                found |= self._on.get(key, {})
-        return list(found.values())
+        anew = [key for key in moved if not fixed.count(key)]
+        self.at |= {key: read(solver, key) for key in anew}
+        anew += self._carry(solver, [key for key in keys if is_place(key) and fixed.count(key)])
+        return list({number: linear for key in anew for number, linear in self._on.get(key, {}).items()}.values())
+
+    def _carry(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother, fixed: Sequence[int]) -> Sequence[int]:
+        """Linearise factors on what iSAM2 does not move where that is now, but for what is left of the mean translation."""
+        ways = [read(solver, key)[:2] - self.at[key][:2] for key in fixed]
+        if not fixed or np.abs(way := np.mean(ways, axis=0)).max() < self._threshold:
+            return ()
+        self.at |= {key: np.append(self.at[key][:2] + way, self.at[key][2:]) for key in fixed}
+        self._carried.update(fixed)
+        return fixed
 
 
 class _Linear:

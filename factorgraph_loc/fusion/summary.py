@@ -31,15 +31,22 @@ class MarginalSummary:
     at: Values
 
     @classmethod
-    def of(cls, graph: gtsam.NonlinearFactorGraph, at: Values, ours: Collection[int] = ()) -> MarginalSummary:
-        """Of a graph that is linearised ``at`` there. ``ours``: places of factors of our own, which are not marginal ones."""
+    def of(
+        cls, graph: gtsam.NonlinearFactorGraph, held: gtsam.Values, at: Values, ours: Collection[int] = ()
+    ) -> MarginalSummary:
+        """Of a graph that iSAM2 has linearised where it ``held`` the variables, to be linearised ``at`` there. ``ours``: places of
+        factors of our own, which are not marginal ones."""
         every = (graph.at(i) for i in range(graph.size()) if i not in ours)
         there = to_gtsam(at)
+
+        def placed(factor: gtsam.LinearContainerFactor) -> gtsam.LinearContainerFactor:
+            """iSAM2 never moves what a marginal factor is on, and so gives it no place: elsewhere it needs one."""
+            return gtsam.LinearContainerFactor(
+                gtsam.LinearContainerFactor(factor.factor(), held).linearize(there), there
+            )
+
         kept = tuple(
-            # iSAM2 never moves what a marginal factor is on, and so gives it no place: elsewhere it needs one
-            gtsam.LinearContainerFactor(f.factor(), there) if isinstance(f, gtsam.LinearContainerFactor) else f
-            for f in every
-            if isinstance(f, KINDS)
+            placed(f) if isinstance(f, gtsam.LinearContainerFactor) else f for f in every if isinstance(f, KINDS)
         )
         return cls(kept, frozenset(graph.keyVector()), at)
 

@@ -68,6 +68,11 @@ def is_pose(key: int) -> bool:
     return key >> _CHARACTER == _POSE
 
 
+def is_place(key: int) -> bool:
+    """Whether the variable begins with x and y in the frame of the world."""
+    return key >> _CHARACTER in (_POSE, _POINT, _LANDMARK)
+
+
 def is_of_keyframe(key: int) -> bool:
     """Whether the variable is a pose or a tilt, which a window loses with its keyframe."""
     return key >> _CHARACTER in (_POSE, _TILT)
