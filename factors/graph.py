@@ -84,7 +84,7 @@ def silenced(factor: Factor, rows: int, on_failure: Callable[[str], None]) -> Fa
 
 def jacobian_factor(factor: Factor, keys: Sequence[int], values: Sequence[Array]) -> gtsam.GaussianFactor:
     """``factor`` linearised at ``values``."""
-    return _gaussian(keys, *factor.linearize(values))
+    return gaussian_factor(keys, *factor.linearize(values))
 
 
 def jacobian_factors(
@@ -105,11 +105,12 @@ def jacobian_factors(
             [f for f, _ in some], [[values[key] for key in keys] for _, keys in some]
         )
         for i, (_, keys), residual, *parts in zip(numbers, some, residuals, *blocks, strict=True):
-            out[i] = _gaussian(keys, residual, parts)
+            out[i] = gaussian_factor(keys, residual, parts)
     return out
 
 
-def _gaussian(keys: Sequence[int], residual: Array, blocks: Sequence[Array]) -> gtsam.GaussianFactor:
+def gaussian_factor(keys: Sequence[int], residual: Array, blocks: Sequence[Array]) -> gtsam.GaussianFactor:
+    """A linear factor from the whitened ``residual`` (m,) and a Jacobian (m, d) for each of its variables."""
     unit = _unit(len(residual))
     if len(blocks) > MOST_TERMS:
         return gtsam.GaussianConditional(list(zip(keys, blocks, strict=True)), 1, -residual, unit)

@@ -1,33 +1,24 @@
 """iSAM2 with the full history, and with a window that poses leave, behind one set of methods.
 
-Our own factors are linearised here and given to iSAM2 as linear ones: a callback from GTSAM copies all variables, and returns to
-Python for each factor. A factor is linearised where iSAM2 linearises its variables, and replaced in the
-update that moves these: were it left behind, the factors would no longer agree on what a turn of the whole graph does to the poses,
-and would seem to tell of the heading what nothing measured (Huang, Mourikis, Roumeliotis, International Journal of Robotics
-Research 29(5), 2010).
-
-iSAM2 never linearises anew what marginal factors are on. Where all that has moved by a translation since, our factors on it are
-linearised there, as far from the estimate they would mean nothing, and given to iSAM2 with that place: a translation of all of it
-changes nothing of what they tell of the heading.
+Our own factors are given to it as linear ones (:mod:`.linear_factors`).
 """
 
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, Protocol, cast
 
 import gtsam
 import numpy as np
 
+from factorgraph_loc.fusion.linear_factors import LinearFactors
 from factorgraph_loc.fusion.summary import MarginalSummary, oldest_pose
 from factorgraph_loc.fusion.variables import (
     Node,
     Values,
     gtsam_errors,
     is_constant,
-    is_place,
     is_point,
     is_pose,
     leaving_key,
@@ -35,7 +26,7 @@ from factorgraph_loc.fusion.variables import (
     retract,
     to_gtsam,
 )
-from factors.graph import Factor, jacobian_factors, pose_array, silenced
+from factors.graph import pose_array
 from factors.positive_kernels import inverse
 from factors.se2 import Array
 
@@ -91,7 +82,7 @@ class FullHistory:
     def __init__(self, parameters: gtsam.ISAM2Params, threshold: float) -> None:
         parameters.setRelinearizeThreshold(threshold)
         self._isam = gtsam.ISAM2(parameters)
-        self._ours = _Ours(threshold, parameters.relinearizeSkip, None)
+        self._ours = LinearFactors(threshold, parameters.relinearizeSkip, None)
         self._touched: Collection[int] = ()  # by the last update
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
@@ -146,9 +137,9 @@ class Window:
         parameters.setRelinearizeThreshold(threshold)
         self.lag = lag
         self._smoother = gtsam.IncrementalFixedLagSmoother(lag, parameters)
-        self._ours = _Ours(threshold, parameters.relinearizeSkip, on_failure)
+        self._ours = LinearFactors(threshold, parameters.relinearizeSkip, on_failure)
         self._stamps: dict[int, float] = {}  # of the variables that may leave
-        # before the last update: all factors, where iSAM2 linearised the variables, and where we did, and which factors are ours
+        # before the last update: all factors, where iSAM2 had the variables, where a new window begins, and which factors are ours
         self._before: _State = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, frozenset()
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
@@ -227,117 +218,7 @@ class Window:
     def _state(self) -> _State:
         """A copy of what the solver has, which changes in place."""
         held = gtsam.Values(self._smoother.getISAM2().getLinearizationPoint())
-        return gtsam.NonlinearFactorGraph(self._smoother.getFactors()), held, dict(self._ours.at), self._ours.slots
-
-
-class _Ours:
-    """Our factors in a solver of GTSAM's, and where that linearises its variables: those that moved as far as ``threshold``, at
-    each update whose number ``skip`` divides. ``on_failure`` is told of a factor that cannot be linearised, which then says
-    nothing; without it that is an error."""
-
-    def __init__(self, threshold: float, skip: int, on_failure: Callable[[str], None] | None) -> None:
-        self._threshold, self._skip, self._on_failure = threshold, skip, on_failure
-        self._updates = 0
-        self.at: Values = {}  # where each variable is linearised
-        self._carried: set[int] = set()  # those that iSAM2 linearises elsewhere
-        self._on: defaultdict[int, dict[int, _Linear]] = defaultdict(dict)  # the factors on each, by their identity
-        self._slots: set[int] = set()
-        self._added: list[_Linear] = []  # those of the last update, with their places in it as slots
-
-    def added(
-        self,
-        solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother,
-        factors: Sequence[gtsam.NonlinearFactor],
-        nodes: Sequence[Node],
-        values: Values,
-    ) -> tuple[gtsam.NonlinearFactorGraph, list[int]]:
-        """All that the next update is to add, which is to be told by :meth:`place`, and the slots of what it is to remove: factors
-        on variables that it will linearise elsewhere are replaced."""
-        self._added = self._moved(solver)
-        removed = [linear.slot for linear in self._added]
-        self._slots.difference_update(removed)
-        self.at |= values
-        graph = gtsam.NonlinearFactorGraph()
-        for factor in factors:
-            graph.add(factor)
-        for node in nodes:
-            if node.native is not None:
-                graph.add(node.native)
-                continue
-            linear = _Linear(node)
-            self._added.append(linear)
-            for key in node.keys:
-                self._on[key][id(linear)] = linear
-        for linear, linearized in zip(self._added, self._linearized(), strict=True):
-            linear.slot, keys = graph.size(), linear.node.keys
-            place = () if self._carried.isdisjoint(keys) else (to_gtsam({key: self.at[key] for key in keys}),)
-            graph.add(gtsam.LinearContainerFactor(linearized, *place))
-        return graph, removed
-
-    def _linearized(self) -> list[gtsam.GaussianFactor]:
-        """What is to be added, linearised. It does without a point that it is linearised at: the solver never leaves that."""
-        factors: list[tuple[Factor, tuple[int, ...]]] = []
-        for node in (linear.node for linear in self._added):
-            assert node.factor is not None
-            told = self._on_failure
-            factors.append((node.factor if told is None else silenced(node.factor, node.rows, told), node.keys))
-        return jacobian_factors(factors, self.at)
-
-    def place(self, slots: Sequence[int]) -> None:
-        """Take where the solver has put what was added."""
-        for linear in self._added:
-            linear.slot = slots[linear.slot]
-            self._slots.add(linear.slot)
-
-    def forget(self, key: int) -> None:
-        """A variable has left the solver, with all factors on it."""
-        del self.at[key]
-        self._carried.discard(key)
-        for linear in self._on.pop(key, {}).values():
-            self._slots.discard(linear.slot)
-            for other in linear.node.keys:
-                if other != key:
-                    self._on[other].pop(id(linear), None)
-
-    @property
-    def slots(self) -> frozenset[int]:
-        """Where they are in the solver."""
-        return frozenset(self._slots)
-
-    def _moved(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother) -> list[_Linear]:
-        """Those on variables that the next update will linearise elsewhere."""
-        self._updates += 1
-        if not self.at or self._updates % self._skip:
-            return []
-        keys, ends = list(self.at), np.cumsum([len(value) for value in self.at.values()])
-        change = np.maximum.reduceat(np.abs(solver.getDelta().vector(keys)), np.append(0, ends[:-1]))
-        moved = [keys[i] for i in np.flatnonzero(change >= self._threshold).tolist()]
-        if not moved:
-            return []
-        isam = solver if isinstance(solver, gtsam.ISAM2) else solver.getISAM2()
-        fixed = isam.getFixedVariables()  # what marginal factors are on
-        anew = [key for key in moved if not fixed.count(key)]
-        self.at |= {key: read(solver, key) for key in anew}
-        anew += self._carry(solver, [key for key in keys if is_place(key) and fixed.count(key)])
-        return list({number: linear for key in anew for number, linear in self._on.get(key, {}).items()}.values())
-
-    def _carry(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother, fixed: Sequence[int]) -> Sequence[int]:
-        """Linearise factors on what iSAM2 does not move where that is now, but for what is left of the mean translation."""
-        ways = [read(solver, key)[:2] - self.at[key][:2] for key in fixed]
-        if not fixed or np.abs(way := np.mean(ways, axis=0)).max() < self._threshold:
-            return ()
-        self.at |= {key: np.append(self.at[key][:2] + way, self.at[key][2:]) for key in fixed}
-        self._carried.update(fixed)
-        return fixed
-
-
-class _Linear:
-    """One of our factors, and its slot in the solver."""
-
-    __slots__ = ("node", "slot")
-
-    def __init__(self, node: Node) -> None:
-        self.node, self.slot = node, -1
+        return gtsam.NonlinearFactorGraph(self._smoother.getFactors()), held, self._ours.framed, self._ours.slots
 
 
 def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[int, gtsam.NonlinearFactor]:

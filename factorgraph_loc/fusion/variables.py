@@ -6,6 +6,7 @@ position of a landmark (2,) or point (3,).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
@@ -119,6 +120,22 @@ class gtsam_errors:  # noqa: N801 - used as a function
 def retract(key: int, value: Array, step: Array) -> Array:
     """A variable moved by a step of its tangent space."""
     return se2_kernels.moved(value, step) if is_pose(key) else value + step
+
+
+def frame_motions(values: Values) -> tuple[Array, list[int]]:
+    """The steps (n, 3) of the tangent spaces of all variables, one below the other, by which they move with the frame of the world
+    in x, in y, and about its origin, and where that of each ends."""
+    parts = []
+    for key, value in values.items():
+        part = np.zeros((len(value), 3))
+        if is_place(key):
+            part[:2] = (1.0, 0.0, -value[1]), (0.0, 1.0, value[0])
+        if is_pose(key):
+            c, s = math.cos(value[2]), math.sin(value[2])
+            part[:2] = np.array(((c, s), (-s, c))) @ part[:2]
+            part[2, 2] = 1.0
+        parts.append(part)
+    return np.vstack(parts), np.cumsum([len(part) for part in parts]).tolist()
 
 
 def to_gtsam(values: Values) -> gtsam.Values:

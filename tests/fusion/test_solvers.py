@@ -148,7 +148,7 @@ def test_our_factors_are_linearised_where_isam2_linearises(skip, lag, log):
             assert isinstance(factors.at(slot), gtsam.LinearContainerFactor)
         at = read_all(isam.getLinearizationPoint(), solver._ours.at)
         for key, value in solver._ours.at.items():
-            assert np.allclose(at[key], value, atol=1e-12) or key in solver._ours._carried
+            assert np.allclose(at[key], value, atol=1e-12) or key in solver._ours._held
             if not np.array_equal(value, first.setdefault(key, value)):
                 moved.add(key)
 
@@ -242,3 +242,4 @@ def test_what_a_window_sees_of_old_landmarks_is_linearised_where_they_are_by_now
     for one in (window, again):
         assert np.allclose(one.value(second), (0.5, 0.8, 0.0), atol=1e-3)
         assert np.allclose(one.value(landmark), (2.0, 0.8), atol=1e-3)
+        assert np.sqrt(one.covariance(first)[2, 2]) == pytest.approx(0.05, rel=1e-3)

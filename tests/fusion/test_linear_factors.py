@@ -1,0 +1,36 @@
+import numpy as np
+import pytest
+
+from factorgraph_loc.fusion.linear_factors import unaware
+from factorgraph_loc.fusion.variables import constants_key, frame_motions, landmark_key, point_key, pose_key, retract
+from factors import se2
+
+VALUES = {
+    pose_key(3): np.array((4.0, -2.0, 2.1)),
+    constants_key(0): np.array((0.3, 0.2)),
+    point_key(5): np.array((-1.0, 6.0, 0.8)),
+    landmark_key(1): np.array((7.0, 3.0)),
+}
+
+
+@pytest.mark.parametrize("column", range(3))
+def test_places_move_with_the_frame(column):
+    step, (motions, ends) = 1e-6 * np.eye(3)[column], frame_motions(VALUES)
+    for (key, value), part in zip(VALUES.items(), np.split(motions[:, column], ends[:-1]), strict=True):
+        there = retract(key, value, 1e-6 * part)
+        expected = value.copy()
+        if key != constants_key(0):
+            expected[:2] = se2.transform_from(step, value[:2])
+        if key == pose_key(3):
+            expected[2] += step[2]
+        assert np.allclose(there, expected, rtol=0.0, atol=1e-11)
+
+
+def test_a_constrained_jacobian_tells_nothing_of_the_frame_and_is_the_nearest():
+    rng, (motions, _) = np.random.default_rng(0), frame_motions(VALUES)
+    jacobian = rng.normal(size=(2, len(motions)))
+    nearest = unaware(jacobian, motions)
+    assert np.abs(nearest @ motions).max() < 1e-12
+    for _ in range(20):
+        other = nearest + 0.1 * unaware(rng.normal(size=jacobian.shape), motions)
+        assert np.linalg.norm(other - jacobian) > np.linalg.norm(nearest - jacobian)
