@@ -378,7 +378,7 @@ class Incremental:
 
     def _odometry_node(self, keyframe: Keyframe) -> Node:
         factor, keys = self._graph.odometry_factor(keyframe)
-        if len(keys) > 2:
+        if len(keys) > 2 or self._maps:  # GTSAM's own do not follow where points have gone
             return Node(keys, factor, 3)
         assert keyframe.from_previous is not None
         return Node(keys, native=self._graph.motion.native((keys[0], keys[1]), keyframe.from_previous))

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.variables import Node, Values, frame_motions, is_place, read, to_gtsam
+from factorgraph_loc.fusion.variables import Node, Values, frame_motions, is_place, is_pose, read, to_gtsam
 from factors.graph import Factor, gaussian_factor, jacobian_factors, silenced
 from factors.se2 import Array
 
@@ -131,10 +131,14 @@ class LinearFactors:
         return list({number: linear for key in anew for number, linear in self._on.get(key, {}).items()}.values())
 
     def _followed(self, held: Values) -> list[int]:
-        """Those of the places that iSAM2 holds, by their estimates, of which factors are to be linearised anew."""
+        """Of the places that iSAM2 holds, given their estimates, those whose factors are to be linearised anew.
+
+        None if they are poses only: in a known map GTSAM's factors of the odometry stay behind."""
+        if all(map(is_pose, held)):
+            return []
         for key in held:
             self._held.setdefault(key, self.at[key])
-        way = np.mean([held[key][:2] - self._held[key][:2] for key in held] or np.zeros((1, 2)), axis=0)
+        way = np.mean([held[key][:2] - self._held[key][:2] for key in held], axis=0)
         moved = {key: now for key, now in held.items() if np.abs(now - self.at[key]).max() >= self._threshold}
         if np.abs(way).max() >= self._threshold:
             self._held |= {key: np.append(self._held[key][:2] + way, self._held[key][2:]) for key in held}

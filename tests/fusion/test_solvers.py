@@ -46,6 +46,14 @@ def test_nothing_is_learnt_of_a_start_that_nothing_measures(log):
     assert np.allclose(sigmas, SIGMA, rtol=1e-4)
 
 
+@pytest.mark.parametrize("lag", [1.5, 6.0])
+def test_points_that_come_and_go_tell_nothing_of_the_heading_at_the_start(lag):
+    """The heading is never known better than it was then, though window and points have moved since, and the start has left."""
+    log = camera_world.simulate(1, 40.0)
+    result = run(log, RunConfig("smoother", {"landmarks": "unknown", "lag": lag}, prior=START))
+    assert np.sqrt(result.covariances[:, 2, 2]).min() > SIGMA * (1.0 - 1e-3)
+
+
 def test_a_window_that_is_built_anew_counts_nothing_twice(monkeypatch):
     """The failing update has been applied when it raises. The poses that are left are where they were, and known as well."""
     log = camera_world.simulate(1, 20.0)
