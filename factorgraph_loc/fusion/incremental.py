@@ -155,6 +155,8 @@ class Incremental:
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
         """Take what was added to a keyframe that is in the graph."""
         if guess is not None and (self._waits or keyframe.t < self._solved + self._solve_every):
+            if self._waits:  # what its error has in common with that of landmarks only the graph knows
+                guess = guess[0], self._graph.covariance
             self._wait(addition.nodes, addition.values, guess)
             return
         self._update(addition.nodes, addition.values)
