@@ -7,6 +7,7 @@ from factors.compiled import compiled
 from factors.odometry.kernels import carried
 from factors.se2 import Array, Integers
 from factors.se2_kernels import composed, exp, log, related
+from factors.small_kernels import put
 
 
 @compiled
@@ -47,6 +48,6 @@ def between(
                     ends = (1.0 - share) * covariances[k, m, n] + share * covariances[k + 1, m, n]
                     spreads[i, m, n] = ends + share * (1.0 - share) * step_noises[k, m, n]
         else:
-            spreads[i] = carried(covariances[k], deltas[i], noises[i])
+            put(carried(covariances[k], deltas[i], noises[i]), spreads[i])
         at[i, 0], at[i, 1], at[i, 2] = x, y, heading
     return at, spreads

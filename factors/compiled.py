@@ -37,7 +37,8 @@ def compiled(function: Any = None, /, **options: Any) -> Any:
 
 
 def _compiled(function: Any, options: dict[str, Any]) -> Any:
-    made = numba.njit(**options)(function)
+    # nothing calls it from C, for which numba would compile another function around it
+    made = numba.njit(**{"no_cfunc_wrapper": True, **options})(function)
     with suppress(RuntimeError):  # there is no place for it
         made._cache = _Shared(function)  # what `cache=True` does with numba's own class
     return made

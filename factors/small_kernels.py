@@ -75,6 +75,14 @@ def _substitute(upper: Array, out: Array) -> None:
 
 
 @compiled
+def put(matrix: Array, out: Array) -> None:
+    """Copy a matrix (M, N) into the first rows and columns of ``out``."""
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            out[i, j] = matrix[i, j]
+
+
+@compiled
 def inverse(matrix: Array) -> Array:
     """The inverse of a matrix (D, D). LinAlgError if it is singular."""
     return solved(matrix, np.eye(len(matrix)))[0]

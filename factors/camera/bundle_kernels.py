@@ -13,7 +13,7 @@ from factors.odometry.kernels import linearize as between
 from factors.robust import huber_loss
 from factors.se2 import Array, Integers
 from factors.se2_kernels import moved
-from factors.small_kernels import inverse, product, solved
+from factors.small_kernels import inverse, product, put, solved
 
 GAIN, DAMPING = 1e-6, 1e-4  # relative decrease of the cost below which it has converged, and what damps the first step
 
@@ -50,7 +50,9 @@ def adjusted(
         step, shifts = _step(poses, tilts, frames, starts, residual, jacobian, noise[2], deltas, whiteners, damping)
         new_poses, new_tilts, new_points = np.empty_like(poses), tilts.copy(), points.copy()
         for i in range(len(poses)):
-            new_poses[i] = moved(poses[i], step[i])
+            pose = moved(poses[i], step[i])
+            for j in range(3):
+                new_poses[i, j] = pose[j]
             new_tilts[i, 0] += step[i, 3]
             new_tilts[i, 1] += step[i, 4]
         for p in range(count):
@@ -121,7 +123,7 @@ def _step(
         of_point = damping * np.eye(3)
         for m in range(starts[p], starts[p + 1]):
             _add(residual[m], jacobian[m], POINT * frames[m], told, pull, of_point, pulls[p], mixed[m])
-        inverses[p] = inverse(of_point)
+        put(inverse(of_point), inverses[p])
         for m in range(starts[p], starts[p + 1]):
             share = product(mixed[m], inverses[p])
             for i in range(POINT):
@@ -131,15 +133,15 @@ def _step(
                         for q in range(POINT):
                             told[POINT * frames[m] + i, POINT * frames[o] + q] -= share[i, j] * mixed[o, q, j]
     for i in range(3):  # the first pose is held
-        told[i, :] = 0.0
-        told[:, i] = 0.0
+        for j in range(len(told)):
+            told[i, j] = told[j, i] = 0.0
         told[i, i], pull[i, 0] = 1.0, 0.0
     step, shifts = solved(told, pull)[0].reshape(len(poses), POINT), np.empty((count, 3))
     for p in range(count):
         left = pulls[p].copy().reshape(1, 3)
         for m in range(starts[p], starts[p + 1]):
             left -= product(step[frames[m]].reshape(1, POINT), mixed[m])
-        shifts[p] = product(left, inverses[p]).reshape(3)
+        put(product(left, inverses[p]), shifts[p : p + 1])
     return step, shifts
 
 

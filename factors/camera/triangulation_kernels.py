@@ -29,7 +29,8 @@ def triangulated(
     """
     ways = np.empty_like(rays)
     for m in range(len(rays)):
-        ways[m] = product(turns[m], rays[m].reshape(3, 1)).reshape(3)
+        way = product(turns[m], rays[m].reshape(3, 1))
+        ways[m, 0], ways[m, 1], ways[m, 2] = way[0, 0], way[1, 0], way[2, 0]
     covariance, squared = np.zeros((3, 3)), np.full(len(rays), np.inf)
     point, is_deep = np.zeros(3), False
     for m in range(len(rays)):

@@ -14,7 +14,7 @@ from factors.compiled import compiled
 from factors.robust import huber_weight
 from factors.se2 import Array
 from factors.se2_kernels import exp
-from factors.small_kernels import inverse
+from factors.small_kernels import inverse, put
 
 Row = tuple[float, float, float]
 WIDTH = 5  # of a Jacobian by a pose, and by roll and pitch of the robot in standard deviations
@@ -130,7 +130,7 @@ def updated(
     prediction, and their normalised square. ``gate``: of a single point."""
     n, size = len(seen.points), len(covariance) + 2  # the tilt comes last
     prior = np.eye(size)
-    prior[: size - 2, : size - 2] = inverse(covariance)
+    put(inverse(covariance), prior)
     first, jacobian = np.empty((n, 2)), np.empty((n, 2, WIDTH))
     _whiten(seen, pose[0], pose[1], pose[2], first, jacobian)
     weights, before = np.ones(n), np.zeros(size)
@@ -175,7 +175,7 @@ def leaning(seen: Seen, pose: Array, covariance: Array) -> tuple[Array, Array]:
     image, and their covariance (2, 2)."""
     residual, jacobian = whitened(seen, pose)
     prior = np.eye(WIDTH)
-    prior[:3, :3] = inverse(covariance)
+    put(inverse(covariance), prior)
     delta, after, _ = _solved(prior, residual, jacobian, np.ones(len(residual)), np.zeros(WIDTH))
     return seen.tilt * delta[3:], seen.tilt**2 * after[3:, 3:]
 

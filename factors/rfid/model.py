@@ -247,7 +247,8 @@ def _logits(
     out: Array,
 ) -> None:
     for i in range(len(points)):
-        out[i] = logit(kind, parameters, shape, knots, points[i, 0], points[i, 1], points[i, 2], facing[i])
+        found = logit(kind, parameters, shape, knots, points[i, 0], points[i, 1], points[i, 2], facing[i])
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = found
 
 
 @compiled

@@ -152,7 +152,8 @@ def sigma_poses(pose: Array, root: Array) -> Array:
     for i in range(6):
         sign = 1.0 if i < 3 else -1.0
         x, y, turned = se2_kernels.exp(sign * root[0, i % 3], sign * root[1, i % 3], sign * root[2, i % 3])
-        out[i] = pose[0] + c * x - s * y, pose[1] + s * x + c * y, se2_kernels.wrapped(pose[2] + turned)
+        out[i, 0], out[i, 1] = pose[0] + c * x - s * y, pose[1] + s * x + c * y
+        out[i, 2] = se2_kernels.wrapped(pose[2] + turned)
     return out
 
 

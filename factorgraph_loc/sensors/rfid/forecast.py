@@ -209,7 +209,8 @@ def log_weights(
         for i in range(count):
             silence[k + 1, i] = silence[k, i] + np.float32(rounds[k]) * silence[k + 1, i]
     for n in range(scans):
-        out[n] = silence[stops[n]]
+        for i in range(count):
+            out[n, i] = silence[stops[n], i]
     _add_reads(tables, cells, rounds, stops[:scans], seed, out)
     for n in range(scans):
         for i in range(count):
