@@ -48,6 +48,8 @@ def wait_for_results(out, count):
 
 
 def test_two_processes_share_the_work_of_one_experiment_and_one_that_is_killed_loses_nothing(start, tmp_path):
+    # what numba compiles in one go is rounded in another way than what it has kept, which the others use
+    assert start("compiled").wait(120) == 0
     killed = start("disturbed")
     wait_for_results(tmp_path / "disturbed", 3)
     killed.kill()
