@@ -38,7 +38,7 @@ from factors.camera.factor import ReprojectionFactor
 from factors.camera.floor import TiltScale
 from factors.camera.kernels import NEAREST
 from factors.camera.model import CameraModel, recalibrated
-from factors.camera.point import PointFactor
+from factors.camera.point import PointFactor, PointPrior
 from factors.graph import VectorPriorFactor
 from factors.se2 import Array
 from factors.update import robust_update
@@ -48,7 +48,7 @@ STRIKES = 2
 ANCHORED = 4  # points of the graph that determine a keyframe to SLACK pixels
 SLACK = 2.0  # px
 LEVEL = np.zeros(2)  # no tilt
-OPEN = np.full(3, 300.0)  # m: prior of a point, so weak that of thousands nothing is learnt of where the run began
+OPEN = 30.0  # m: weak prior of a point, about the size of a building
 LOST = 10.0  # s for which a lost point is searched: after that, too many others in a building look like it
 AGREED = 0.5  # fraction of inliers required of points not seen for longer: similar descriptors agree by chance
 RECENT = 5.0  # s: the error of a point seen since is correlated with that of the track
@@ -152,8 +152,8 @@ class UnknownPoints:
                 self._looks.keep(key, m.frame, row, self._distance_travelled, keyframe.key, guess)
             addition.values[key] = found.position
             graph.values[key], graph.spreads[key] = found.position, found.covariance
-            native = gtsam.PriorFactorVector(key, found.position, gtsam.noiseModel.Diagonal.Sigmas(OPEN))
-            addition.hang(keyframe, Node((key,), VectorPriorFactor(found.position, OPEN), 3, native))
+            prior = PointPrior.of(pose, found.position, OPEN)
+            addition.hang(keyframe, Node((keyframe.key, key), prior, 3))
             for sighting in seen:
                 self._hang(graph.keyframes[sighting.keyframe], key, sighting, graph, addition)
         return times.at_stamp(index, (pose, guess[1]), graph)

@@ -3,6 +3,7 @@ robot there, and the point."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
@@ -103,3 +104,39 @@ def _later(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) ->
     twists = np.array([f.twist for f in factors], dtype=float)
     seconds = float(values[0][1][factors[0].estimated.index(TIME_OFFSET)])
     return twists, se2.exp(seconds * twists)
+
+
+@dataclass(frozen=True, slots=True)
+class PointPrior:
+    """A weak prior of a point: where it is from the robot, ``mean`` (3,) [m] with the standard deviation ``sigma`` [m] of each
+    coordinate.
+
+    The values of the factor are the robot's pose (3,) and the point (3,). Priors in the frame of the world would tell of that: a
+    thousand of 30 m hold the robot to a metre.
+    """
+
+    mean: Array
+    sigma: float
+
+    @classmethod
+    def of(cls, pose: Array, point: Array, sigma: float) -> PointPrior:
+        """That of a ``point`` (3,) estimated from a ``pose`` (3,)."""
+        return cls(_from_robot(pose, point), sigma)
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (3,) and its Jacobians."""
+        pose, point = values
+        there = _from_robot(pose, point)
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        by_pose = np.array(((-1.0, 0.0, there[1]), (0.0, -1.0, -there[0]), (0.0, 0.0, 0.0)))
+        by_point = np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
+        return (there - self.mean) / self.sigma, [by_pose / self.sigma, by_point / self.sigma]
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """Half the squared whitened residual."""
+        residual = (_from_robot(*values) - self.mean) / self.sigma
+        return 0.5 * float(residual @ residual)
+
+
+def _from_robot(pose: Array, point: Array) -> Array:
+    return np.append(se2.transform_to(pose, point[:2]), point[2])

@@ -9,7 +9,7 @@ from mounted_camera import MODEL
 
 from factors import se2
 from factors.camera.model import camera_pose, lens_of, linearize_in_space
-from factors.camera.point import PointFactor
+from factors.camera.point import PointFactor, PointPrior
 from factors.graph import VectorPriorFactor, jacobian_factor, jacobian_factors
 from factors.robust import huber_loss
 
@@ -107,3 +107,17 @@ def test_a_point_behind_the_camera_is_astray_and_pulls_at_nothing():
     _, blocks = factor.linearize([POSE, TILT, behind])
     assert not np.any(np.concatenate(blocks, axis=1))
     assert factor.cost([POSE, TILT, behind]) > factor.cost([POSE, TILT, POINT + 0.1]) > huber_loss(0.0, MODEL.robust)
+
+
+def test_the_jacobians_of_a_prior_are_the_numerical_ones():
+    prior = PointPrior.of(POSE, POINT + np.array((0.3, -0.2, 0.1)), 0.5)
+    residual, blocks = prior.linearize([POSE, POINT])
+    assert prior.cost([POSE, POINT]) == pytest.approx(0.5 * residual @ residual) == pytest.approx(0.5 * 0.14 / 0.25)
+    for step in 1e-6 * np.eye(3):
+        by_pose = [prior.linearize([se2.compose(POSE, se2.exp(s)), POINT])[0] for s in (step, -step)]
+        by_point = [prior.linearize([POSE, POINT + s])[0] for s in (step, -step)]
+        for block, (ahead, back) in zip(blocks, (by_pose, by_point), strict=True):
+            np.testing.assert_allclose(block @ step, (ahead - back) / 2.0, rtol=0.0, atol=1e-12)
+    moved = se2.compose(np.array((3.0, -2.0, 1.0)), POSE)
+    point = np.append(se2.transform_from(np.array((3.0, -2.0, 1.0)), POINT[:2]), POINT[2])
+    np.testing.assert_allclose(prior.linearize([moved, point])[0], residual)  # it tells nothing of the frame
