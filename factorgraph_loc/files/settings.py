@@ -126,8 +126,11 @@ def _meaning(model: type[BaseModel], name: str) -> str:
 @cache
 def _docstrings(model: type[Any]) -> dict[str, str]:
     """The docstrings below the fields of a class itself. pydantic would read its source for them whenever the class is made."""
-    found = {}
-    (made,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
+    found: dict[str, str] = {}
+    try:
+        (made,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
+    except (OSError, TypeError):  # of a class typed at a prompt there is no source
+        return found
     for field, below in pairwise(made.body if isinstance(made, ast.ClassDef) else ()):
         match field, below:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):

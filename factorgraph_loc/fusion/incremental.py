@@ -311,7 +311,7 @@ class Incremental:
         self._stall(newest, guess, summary, failure)
 
     def _drop_newest(self, newest: Keyframe) -> None:
-        """Drop what the newest keyframe tells of poses; priors of points stay."""
+        """Drop what the newest keyframe tells of poses; the prior of its tilt stays."""
         if count := sum(node.has_pose for node in newest.nodes):
             self._graph.diagnostics.reject("newest keyframe: the graph cannot be solved with it", count)
             newest.nodes[:] = [node for node in newest.nodes if not node.has_pose]

@@ -82,7 +82,7 @@ class LinearFactors:
             return gtsam.LinearContainerFactor(linearized)
         jacobian, right = linearized.jacobian()
         motions, ends = frame_motions({key: self._held.get(key, self.at[key]) for key in keys})
-        if np.count_nonzero([is_place(key) for key in keys]) > 1:  # else it tells where the place is in the world
+        if sum(map(is_place, keys)) > 1:  # else it tells where the place is in the world
             jacobian = unaware(jacobian, motions)
         factor = gaussian_factor(keys, -right, np.split(jacobian, ends[:-1], axis=1))
         return gtsam.LinearContainerFactor(factor, to_gtsam({key: self.at[key] for key in keys}))
@@ -105,7 +105,7 @@ class LinearFactors:
 
     @property
     def framed(self) -> Values:
-        """Where the variables are linearised, but those that iSAM2 holds as far from each other as there."""
+        """Where a new solver is to linearise the variables, with what is held as far from each other as it was then."""
         return self.at | self._held
 
     @property
@@ -159,4 +159,5 @@ class _Linear:
 def unaware(jacobian: Array, motions: Array) -> Array:
     """The matrix nearest to a ``jacobian`` (m, n) that tells nothing of any of the ``motions`` (n, 3) of its variables (Hesch,
     Kottas, Bowman, Roumeliotis, IEEE Transactions on Robotics 30(1), 2014, section V)."""
-    return jacobian - jacobian @ motions @ np.linalg.solve(motions.T @ motions, motions.T)
+    basis = np.linalg.qr(motions)[0]
+    return np.asarray(jacobian - jacobian @ basis @ basis.T)

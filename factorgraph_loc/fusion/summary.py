@@ -82,7 +82,7 @@ class MarginalSummary:
 
 def is_missing(node: Node, present: Collection[int], known: Collection[int]) -> bool:
     """Whether a factor is to be added to a graph of the variables ``present``, of which a summary tells those that are ``known``:
-    it holds the priors of points, and what hangs on a pose that is gone."""
+    it holds priors of what is no pose, and what hangs on a pose that is gone."""
     if any(key not in present for key in node.keys):
         return False
     return node.has_pose or node.keys[0] not in known

@@ -98,3 +98,10 @@ def test_the_first_sentence():
     assert first_sentence(Grid) == "Another."
     assert first_sentence(Everything()) == "All kinds of fields."
     assert first_sentence(type("Bare", (), {})) == ""
+
+
+def test_settings_typed_at_a_prompt_have_no_meaning():
+    typed: dict = {"FileModel": FileModel, "__name__": "__console__"}
+    exec('class Typed(FileModel):\n    gain: float = 1.0\n    """how much"""', typed)
+    (setting,) = settings_in(typed["Typed"])
+    assert (setting.key, setting.default, setting.meaning) == ("gain", 1.0, "")
