@@ -1,11 +1,14 @@
 """Tracks on things that move by themselves: a second motion in the image, next to the one that wheels tell.
 
+A point that stands still is seen along the wheels' path where one distance of it explains; images up to :data:`MAX_TIME` apart
+are compared, since a thing that moves to and fro, or with the image of the room, agrees with the wheels for a moment.
+
 Wheels seldom slip. Where they do, all that stands still moves in the image as if the robot had turned by another angle, and what
 seems to agree with the wheels agrees with that, too. If some tracks agree with the wheels alone, the others are of a thing that
 moves, however many they are.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -24,48 +27,59 @@ MAX_TIME = 2.0  # s between two images that are compared
 ENOUGH = 8  # tracks that agree with the wheels alone
 COMMON = 0.8  # share of the others that another turn explains
 TURNS, BETWEEN = np.linspace(-0.6, 0.6, 61), 0.01  # rad: other turns that are tried, and error of the nearest one
-FARTHEST, NEAREST = 100.0, 0.5  # m
+FARTHEST, NEAREST, DISTANCES = 100.0, 0.5, 2  # m, and how many distances of a point are tried
 
 
 class MovingThings:
-    """Remembers the last image, and which tracks move or stand still."""
+    """Remembers the last images, and which tracks move or stand still."""
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
-        self._last: Keyframe | None = None
-        self._pixels: Mapping[Hashable, Array] = {}
-        self._moves: dict[Hashable, bool] = {}  # by track, once it is known
+        self._images: list[tuple[Keyframe, Mapping[Hashable, Array]]] = []
+        self._moving: set[Hashable] = set()
+        self._steady: set[Hashable] = set()  # tracks that agreed with the wheels
         self._doubts = False
 
-    def moving(self) -> set[Hashable]:
-        """The tracks in the last image that move by themselves."""
-        return {name for name in self._pixels if self._moves.get(name, False)}
+    def moving(self) -> Set[Hashable]:
+        """The tracks of the last images that move by themselves."""
+        return self._moving
 
     def trusts(self, name: Hashable) -> bool:
-        """Whether a track stands still; as long as something moves, it must have agreed with the wheels alone once."""
-        return not self._moves.get(name, self._doubts)
+        """Whether a track stands still; as long as something moves, it must have agreed with the wheels."""
+        return name not in self._moving and (not self._doubts or name in self._steady)
 
     def look(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: GraphView) -> None:
         """Learn from the tracks ``names``, seen at ``pixels`` (K, 2) from a keyframe."""
-        before, last, here = self._last, self._pixels, dict(zip(names, pixels, strict=True))
-        self._moves = {name: moves for name, moves in self._moves.items() if name in here or name in last}
-        if before is None or keyframe.t > before.t:
-            self._last, self._pixels = keyframe, here
-        common = [name for name in names if name in last]
-        if before is not None and common and 0.0 < keyframe.t - before.t <= MAX_TIME:
-            first, second = (np.array([seen[name] for name in common]) for seen in (last, here))
-            step = graph.between(before, keyframe)
-            right = fitting(self._model, first, second, step)
-            other = another(self._model, first, second, step, right)
-            known = np.array([self._moves.get(name, False) for name in common])
-            many = 2 * np.count_nonzero(known & ~right) > np.count_nonzero(~right)
-            told = other.any() and (many or np.count_nonzero(right & ~other) >= ENOUGH)
-            for name, fits, either in zip(common, right.tolist(), other.tolist(), strict=True):
-                if not fits and (told or name in self._moves):
-                    self._moves[name] = True
-                elif told and not either:
-                    self._moves.setdefault(name, False)
-        self._doubts = any(self._moves.get(name, False) for name in names)
+        here = dict(zip(names, pixels, strict=True))
+        self._images = [image for image in self._images if image[0].t >= keyframe.t - MAX_TIME]
+        for before, there in reversed(self._images):
+            if before.t < keyframe.t:
+                self._compare([name for name in names if name in there], there, here, graph.between(before, keyframe))
+        self._images.append((keyframe, here))
+        known = set[Hashable]().union(*(seen for _, seen in self._images))
+        self._moving &= known
+        self._steady &= known
+        self._doubts = not self._moving.isdisjoint(names)
+
+    def _compare(
+        self,
+        common: Sequence[Hashable],
+        there: Mapping[Hashable, Array],
+        here: Mapping[Hashable, Array],
+        step: Increment,
+    ) -> None:
+        """Learn from the ``common`` tracks of two images, and the ``step`` between these that wheels tell."""
+        if not common:
+            return
+        first, second = (np.array([seen[name] for name in common]) for seen in (there, here))
+        right = fitting(self._model, first, second, step)
+        other = another(self._model, first, second, step, right)
+        known = np.array([name in self._moving for name in common])
+        many = 2 * np.count_nonzero(known & ~right) > np.count_nonzero(~right)
+        told = other.any() and (many or np.count_nonzero(right & ~other) >= ENOUGH)
+        self._steady.update(name for name, fits in zip(common, right.tolist(), strict=True) if fits)
+        if told:
+            self._moving.update(name for name, fits in zip(common, right.tolist(), strict=True) if not fits)
 
 
 def another(model: CameraModel, first: Array, second: Array, step: Increment, right: Truths) -> Truths:
@@ -87,11 +101,18 @@ def another(model: CameraModel, first: Array, second: Array, step: Increment, ri
 
 
 def fitting(model: CameraModel, first: Array, second: Array, step: Increment) -> Truths:
-    """Which pairs of pixels (K, 2) fit a ``step`` of the robot between them, at some distance."""
+    """Which pairs of pixels (K, 2) fit a ``step`` of the robot between them, at some distance: that at which the rays are nearest
+    to each other, or that which fits best to an error of the step (Gauss-Newton)."""
     pairs = RayPairs.of(model, first, second)
-    nearer = np.clip(nearness(pairs, step.delta)[0], 1.0 / FARTHEST, 1.0 / NEAREST)
-    camera = lifted(model, step.delta, step.covariance)
-    points = model.position + pairs.first / nearer[:, None]
-    seen, by_camera, _ = linearize_in_space(model, camera.position, camera.rotation, points)
-    noise = by_camera @ camera.covariance @ by_camera.transpose(0, 2, 1) + 2.0 * model.sigma**2 * np.eye(2)
-    return np.asarray(positive.squared(seen - second, noise) < GATE)
+    camera, nearer = lifted(model, step.delta, step.covariance), nearness(pairs, step.delta)[0]
+    squared = np.full(len(pairs), np.inf)
+    for _ in range(DISTANCES):
+        nearer = np.clip(nearer, 1.0 / FARTHEST, 1.0 / NEAREST)
+        points = model.position + pairs.first / nearer[:, None]
+        seen, by_camera, by_point = linearize_in_space(model, camera.position, camera.rotation, points)
+        noise = by_camera @ camera.covariance @ by_camera.transpose(0, 2, 1) + 2.0 * model.sigma**2 * np.eye(2)
+        squared = np.minimum(squared, positive.squared(seen - second, noise))
+        by_nearness = -np.einsum("kij,kj->ki", by_point, pairs.first) / nearer[:, None] ** 2
+        weighted = np.linalg.solve(noise, by_nearness[..., None])[..., 0]
+        nearer = nearer + np.einsum("ki,ki->k", weighted, second - seen) / np.einsum("ki,ki->k", weighted, by_nearness)
+    return np.asarray(squared < GATE)

@@ -45,7 +45,7 @@ class PointMapper:
         self._pairs = FramePairs(model) if settings.visual_odometry else None
         self._taken = -math.inf
         self._has_depths = False
-        self._tracks = np.empty(0, dtype=np.int64)  # of the last keyframe
+        self._tracks: set[Hashable] = set()  # of the last keyframe, without those on things that move
 
     @property
     def estimates(self) -> bool:
@@ -64,10 +64,10 @@ class PointMapper:
 
     def _loses(self, m: Pixels) -> bool:
         """Whether an image has little in common with that of the last keyframe."""
-        if m.frame is None or not len(self._tracks):
+        if m.frame is None or not self._tracks:
             return False
-        common = np.count_nonzero(np.isin(m.frame.tracks, self._tracks))
-        return bool(common < LEAST_COMMON * len(m.frame.tracks))
+        seen = set(m.frame.tracks.tolist()) - self._things.moving()
+        return len(seen & self._tracks) < LEAST_COMMON * len(seen)
 
     def take(
         self, m: Pixels, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition, *, is_new: bool
@@ -87,7 +87,7 @@ class PointMapper:
         if self._unknown is not None:
             self._taken = m.t
             if m.frame is not None:
-                self._tracks = m.frame.tracks
+                self._tracks = set(names) - moving
             rows = [i for i in range(len(names)) if i not in used]
             guess = self._unknown.take(m, rows, keyframe, guess, graph, addition, self._things)
         if self._pairs is not None and is_new:

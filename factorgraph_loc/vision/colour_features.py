@@ -48,15 +48,17 @@ class ColourExtractor:
     """Extractor of colour features (:class:`~factorgraph_loc.vision.keypoints.Extractor`), at most ``count`` per image, with
     ``float32`` unit descriptors (N, 35).
 
-    ``paper_literal``: the neighbours of the paper (:func:`~factorgraph_loc.vision.descriptor.records`), for comparison. The
-    memory of an image is reused for the next one of its size, so an extractor must be used by one thread only.
+    ``everywhere``: of all parts of an image alike, not the strongest. ``paper_literal``: the neighbours of the paper
+    (:func:`~factorgraph_loc.vision.descriptor.records`), for comparison. The memory of an image is reused for the next one of its
+    size, so an extractor must be used by one thread only.
     """
 
     name = "colour"
     binary = False
 
-    def __init__(self, count: int, *, paper_literal: bool = False) -> None:
+    def __init__(self, count: int, *, everywhere: bool = False, paper_literal: bool = False) -> None:
         self._count = count
+        self._everywhere = everywhere
         self._paper_literal = paper_literal
         self._space: ScaleSpace | None = None
 
@@ -93,7 +95,7 @@ class ColourExtractor:
             return None, Keypoints.empty()
         channels = colour_channels(pixels)
         space = self._filled(channels)
-        return space, detector.detect(space, channels[1:], where, self._count)
+        return space, detector.detect(space, channels[1:], where, self._count, everywhere=self._everywhere)
 
     def _filled(self, channels: list[Float]) -> ScaleSpace:
         shape, colours = channels[0].shape, len(channels) - 1

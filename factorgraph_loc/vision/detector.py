@@ -15,13 +15,14 @@ from factorgraph_loc.vision.images import Mask
 from factorgraph_loc.vision.kernels import (
     Int32,
     corner_strength,
+    lonely,
     orientation_histograms,
     refined_peaks,
-    spread,
     structure_tensor,
 )
 from factorgraph_loc.vision.keypoints import Keypoints
 from factorgraph_loc.vision.scale_space import SCALES, SIGMAS, STEP, Octave, ScaleSpace, blur, more_blur
+from factorgraph_loc.vision.spread import PARTS, spread_out
 from factors.se2 import Array
 
 INTEGRATION = 0.8  # integration over characteristic scale; derivatives are taken one scale below
@@ -45,16 +46,22 @@ _OFFSETS: Float = _grid.reshape(-1, 2).astype(np.float32)
 _WEIGHTS: Float = np.exp(-(_grid[1:-1, 1:-1] ** 2).sum(axis=2) / (2.0 * ORIENTATION_WINDOW**2)).astype(np.float32)
 
 
-def detect(space: ScaleSpace, colours: list[Float], mask: Mask | None, count: int) -> Keypoints:
-    """At most ``count`` points, by descending strength, of the image in ``space``, where ``mask`` (H, W) is not 0; ``colours``:
-    its channels (H, W) besides E."""
+def detect(
+    space: ScaleSpace, colours: list[Float], mask: Mask | None, count: int, *, everywhere: bool = False
+) -> Keypoints:
+    """At most ``count`` points, by descending strength, of the image in ``space``, where ``mask`` (H, W) is not 0: the strongest,
+    or of all its parts ``everywhere``; ``colours``: its channels (H, W) besides E."""
     corners = np.vstack(_corners(space, colours))
     if mask is not None:
         x, y = np.rint(corners[:, :2]).astype(np.int64).T
         corners = corners[mask[y, x] > 0]
     corners = corners[np.argsort(-corners[:, 3], kind="stable")]
     places, scales = corners[:, :2].astype(np.float32), corners[:, 2].astype(np.float32)
-    corners = corners[spread(places, scales, CLEARANCE, STEP, count)]
+    alone = lonely(places, scales, CLEARANCE, STEP, len(corners) if everywhere else count)
+    best, others = np.flatnonzero(alone), np.flatnonzero(~alone)
+    if everywhere:
+        best = best[spread_out(corners[best, :2], count, cells=PARTS)]
+    corners = corners[np.sort(np.concatenate((best, others[: count - len(best)])))]
     points, sigmas = corners[:, :2], corners[:, 2]
     angles = orientations(space, points, sigmas)
     return Keypoints(points, 2.0 * sigmas, angles, corners[:, 3], space.levels(sigmas))

@@ -13,17 +13,20 @@ from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.colour_features import ColourExtractor
 from factorgraph_loc.vision.images import as_image, as_mask, is_blank
 from factorgraph_loc.vision.keypoints import Descriptors, Extractor, Integers, Keypoints
+from factorgraph_loc.vision.spread import PARTS, spread_out
 
 __all__ = ["EXTRACTORS", "Descriptors", "Extractor", "Integers", "Keypoints", "OpenCvExtractor", "extractor"]
 
+MORE = 10  # times as many features are found where those are chosen that are everywhere
 SIFT_CONTRAST = 0.01  # OpenCV's default of 0.04 finds too few points in indoor images
 
 
 class OpenCvExtractor:
     """An OpenCV feature behind :class:`Extractor`."""
 
-    def __init__(self, name: str, feature: cv2.Feature2D, count: int) -> None:
+    def __init__(self, name: str, feature: cv2.Feature2D, count: int, *, everywhere: bool = False) -> None:
         self.name = name
+        self._everywhere = everywhere
         self.binary = feature.descriptorType() == cv2.CV_8U
         self._feature = feature
         self._count = count
@@ -33,7 +36,8 @@ class OpenCvExtractor:
         where = as_mask(mask, pixels)
         if is_blank(pixels):
             return Keypoints.empty()
-        return self._strongest(Keypoints.from_cv2(self._feature.detect(pixels, where)))
+        found = Keypoints.from_cv2(self._feature.detect(pixels, where))
+        return found[self._chosen(found)]
 
     def compute(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, Descriptors]:
         pixels = as_image(image)
@@ -54,38 +58,44 @@ class OpenCvExtractor:
         if descriptors is None:
             return Keypoints.empty(), self._none()
         keypoints = Keypoints.from_cv2(found)
-        order = _strongest_first(keypoints, self._count)
+        order = self._chosen(keypoints)
         return keypoints[order], np.asarray(descriptors)[order]
 
-    def _strongest(self, keypoints: Keypoints) -> Keypoints:
-        return keypoints[_strongest_first(keypoints, self._count)]
+    def _chosen(self, keypoints: Keypoints) -> Integers:
+        """Indices of the points, by descending response: OpenCV keeps more than asked for at equal responses."""
+        order = np.argsort(-keypoints.responses, kind="stable").astype(np.int64)
+        if self._everywhere:
+            return order[spread_out(keypoints.points[order], self._count, cells=PARTS)]
+        return order[: self._count]
 
     def _none(self) -> Descriptors:
         kind = np.uint8 if self.binary else np.float32
         return np.empty((0, self._feature.descriptorSize()), dtype=kind)
 
 
-def _strongest_first(keypoints: Keypoints, count: int) -> Integers:
-    """Indices of at most ``count`` points by descending response: OpenCV keeps more at equal responses."""
-    return np.argsort(-keypoints.responses, kind="stable")[:count].astype(np.int64)
+def _colour(count: int, everywhere: bool) -> Extractor:
+    return ColourExtractor(count, everywhere=everywhere)
 
 
-def _sift(count: int) -> Extractor:
-    return OpenCvExtractor("sift", cv2.SIFT.create(nfeatures=count, contrastThreshold=SIFT_CONTRAST), count)
+def _sift(count: int, everywhere: bool) -> Extractor:
+    found = count * MORE if everywhere else count
+    feature = cv2.SIFT.create(nfeatures=found, contrastThreshold=SIFT_CONTRAST)
+    return OpenCvExtractor("sift", feature, count, everywhere=everywhere)
 
 
-def _orb(count: int) -> Extractor:
-    return OpenCvExtractor("orb", cv2.ORB.create(nfeatures=count), count)
+def _orb(count: int, everywhere: bool) -> Extractor:
+    feature = cv2.ORB.create(nfeatures=count * MORE if everywhere else count)
+    return OpenCvExtractor("orb", feature, count, everywhere=everywhere)
 
 
-EXTRACTORS: dict[str, Callable[[int], Extractor]] = {"colour": ColourExtractor, "sift": _sift, "orb": _orb}
+EXTRACTORS: dict[str, Callable[[int, bool], Extractor]] = {"colour": _colour, "sift": _sift, "orb": _orb}
 
 
-def extractor(name: str, count: int = 1000) -> Extractor:
-    """The extractor ``name`` of :data:`EXTRACTORS`, with at most ``count`` features per image. Raises InputError for an unknown
-    name."""
+def extractor(name: str, count: int = 1000, *, everywhere: bool = False) -> Extractor:
+    """The extractor ``name`` of :data:`EXTRACTORS`, with at most ``count`` features per image: the strongest, or of all its parts
+    ``everywhere``. Raises InputError for an unknown name."""
     if name not in EXTRACTORS:
         raise InputError(f"feature {quoted(name)} is not known{nearest(name, sorted(EXTRACTORS))}")
     if count < 1:
         raise InputError(f"feature {name}: count is {count}, expected at least 1")
-    return EXTRACTORS[name](count)
+    return EXTRACTORS[name](count, everywhere)

@@ -14,6 +14,7 @@ from factors.se2 import Array
 
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
+Truths = NDArray[np.bool_]
 
 HALF = np.float32(0.5)
 TINY = np.float32(1e-6)  # keeps a quotient finite where an image is flat
@@ -115,39 +116,25 @@ def refined_peaks(
 
 
 @compiled
-def spread(points: Float, scales: Float, reach: float, alike: float, count: int) -> Int64:
-    """Indices of ``count`` of the points (N, 2), sorted by descending strength, without a stronger one nearby.
+def lonely(points: Float, scales: Float, reach: float, alike: float, most: int) -> Truths:
+    """Which of the points (N, 2), sorted by descending strength, have no stronger one nearby: the first ones, at ``most`` so many.
 
-    Nearby: within ``reach`` times their own of the ``scales`` (N,), with a scale ratio of at most ``alike``. If there are too
-    few, the strongest of the others are added."""
-    total = len(points)
-    wanted, chosen = min(count, total), 0
-    taken = np.zeros(total, np.bool_)
-    for n in range(total):
-        if chosen == wanted:
+    Nearby: within ``reach`` times their own of the ``scales`` (N,), with a scale ratio of at most ``alike``."""
+    found, count = np.zeros(len(points), np.bool_), 0
+    for n in range(len(points)):
+        if count == most:
             break
         radius = (reach * scales[n]) ** 2
-        alone = True
+        found[n] = True
         for m in range(n):
             ratio = scales[m] / scales[n]
             if ratio <= alike and ratio * alike >= 1.0:
                 dx, dy = points[m, 0] - points[n, 0], points[m, 1] - points[n, 1]
                 if dx * dx + dy * dy < radius:
-                    alone = False
+                    found[n] = False
                     break
-        if alone:
-            taken[n] = True
-            chosen += 1
-    out, free = np.empty(wanted, np.int64), wanted - chosen  # places for the others
-    chosen = 0
-    for n in range(total):
-        if not taken[n] and free > 0:
-            taken[n] = True
-            free -= 1
-        if taken[n]:
-            out[chosen] = n
-            chosen += 1
-    return out
+        count += found[n]
+    return found
 
 
 @compiled(fastmath=FAST)

@@ -15,3 +15,5 @@ class FrontendSettings(FileModel):
     """kind of feature to detect, if the map's points have no descriptors"""
     count: Annotated[int, Field(ge=10, le=20_000)] = 500
     """largest number of features per image"""
+    everywhere: bool = False
+    """whether all parts of an image have as many features, if they can, not the strongest ones; so it is without a map of points"""

@@ -22,8 +22,7 @@ RADIUS = 0.25  # of the longer side of an image: largest displacement of a featu
 EPIPOLAR = 1.5  # px from the epipolar line
 CONFIDENCE, DRAWS = 0.99, 300  # samples of five pairs
 FEWEST = 16  # pairs needed for a meaningful consensus
-CELLS, MOST = 8, 2.0 / 3.0  # cells along the longer side of an image, and the share that no moving object covers
-ALIKE = 0.75  # share of the other pairs that agree, if they are of another body and not wrong
+ALIKE = 0.5  # share of the other pairs that agree, if they are of another body and not wrong
 THREADS = 2
 
 
@@ -85,10 +84,8 @@ def pairs(
         return found
     a, b = a[found[:, 0]], b[found[:, 1]]
     right = _of_one_geometry(a, b, focal)
-    cell = max(camera.width, camera.height) / CELLS
-    most = MOST * camera.width * camera.height / cell**2
     others = np.flatnonzero(~right)
-    if len(others) >= FEWEST and len(np.unique(np.floor(b[right] / cell), axis=0)) < most:
+    if len(others) >= FEWEST:
         too = _of_one_geometry(a[others], b[others], focal)
         if np.count_nonzero(too) > ALIKE * len(others):
             right[others] = too

@@ -47,7 +47,8 @@ SIGMAS = np.array(
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive with ``seed`` through the office ``world``, ``duration`` [s] long, and the features to detect."""
+    """A drive with ``seed`` through the office ``world``, ``duration`` [s] long, and the features to detect: ``everywhere`` where
+    there is no map."""
 
     world: int
     seed: int
@@ -55,6 +56,7 @@ class Drive:
     rate: float = RATE
     feature: str = "colour"
     count: int = COUNT
+    everywhere: bool = False
 
     def settings(self) -> SimulationSettings:
         changes: dict[str, Any] = {
@@ -62,9 +64,12 @@ class Drive:
             "world_seed": self.world,
             "drive": {"duration": self.duration},
             "images": {"rate": self.rate},
-            "rig": {"camera": {"frontend": {"feature": self.feature, "count": self.count}}},
+            "rig": {"camera": {"frontend": self.frontend()}},
         }
         return preset("office", changes)
+
+    def frontend(self) -> dict[str, Any]:
+        return {"feature": self.feature, "count": self.count, "everywhere": self.everywhere}
 
     def mapping(self) -> Drive:
         """The other drive through the same office, from which the map is learnt."""
@@ -152,7 +157,7 @@ def compressed(image: np.ndarray) -> np.ndarray:
 def _write_features(drives: Sequence[Drive], folder: Path) -> None:
     settings = drives[0].settings()
     assert settings.rig.camera is not None
-    finders = [extractor(drive.feature, drive.count) for drive in drives]
+    finders = [extractor(drive.feature, drive.count, everywhere=drive.everywhere) for drive in drives]
     contents: list[list[bytes]] = [[] for _ in drives]
     render, find = 0.0, np.zeros(len(drives))
     before = perf_counter()

@@ -6,7 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +16,9 @@ from camera_benchmark.drives import Drive, map_of, with_map, written
 from camera_benchmark.faulty import FAULTS, Given
 from camera_benchmark.office import BOTH, CAMERA
 from camera_benchmark.options import CameraOptions
-from camera_benchmark.report import NOTHING, Attempt, attempts
+from camera_benchmark.report import NOTHING, Attempt, attempt
 from factorgraph_loc.experiments.run import RunConfig
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.vision.feature_cache import VARIABLE
 
 SEEDS = 3
@@ -28,12 +29,13 @@ BACK = (
     0.10  # m: an estimate with a smaller error has recovered, and so has one with less than twice that without a fault
 )
 RIGHT = "none"
+NO_MAP = "smoother, camera, no map"
 CONFIGS = {
     "ekf, camera": RunConfig("ekf", sensors=CAMERA),
     "monoslam, camera": RunConfig("monoslam", sensors=CAMERA),
     "smoother, camera": RunConfig("smoother", sensors=CAMERA),
     "smoother, rfid, camera": RunConfig("smoother", sensors=BOTH),
-    "smoother, camera, no map": RunConfig("smoother", {"landmarks": "unknown"}, CAMERA),
+    NO_MAP: RunConfig("smoother", sensors=CAMERA),
 }
 SHOWN = 110  # characters of a message
 
@@ -80,7 +82,16 @@ def faulty(job: Job) -> dict[str, Attempt]:
     os.environ[VARIABLE] = str(job.folder)
     log = with_map(written(job.drive, job.folder), map_of(job.drive, job.folder))
     folder = job.folder / "faults" / f"{re.sub(r'[^a-z0-9]+', '-', job.fault.lower())}-{job.drive.seed}"
-    return attempts(FAULTS[job.fault](Given(log, np.random.default_rng(job.drive.seed), folder)), CONFIGS)
+    outcomes: dict[str, Attempt] = {}
+    for label, config in CONFIGS.items():
+        of = without_map(log) if label == NO_MAP else log
+        given = Given(of, np.random.default_rng(job.drive.seed), folder)
+        outcomes[label] = attempt(FAULTS[job.fault](given), config)
+    return outcomes
+
+
+def without_map(log: Log) -> Log:
+    return replace(log, world=log.world.model_copy(update={"points": None}))
 
 
 def cells(runs: Sequence[Attempt], right: Sequence[Attempt]) -> tuple[str, str, str]:

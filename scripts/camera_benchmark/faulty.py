@@ -109,7 +109,8 @@ def wrong_matches(given: Given) -> Log:
 def moved_landmark(given: Given) -> Log:
     """One part of the map, with the most points around it, has moved by a metre."""
     points = given.log.world.points
-    assert points is not None
+    if points is None:
+        return given.log
     cells = np.round(points.positions[:, :2] / MOVED_RADIUS)
     _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     chosen = cell.ravel() == int(np.argmax(counts))

@@ -44,7 +44,7 @@ def section(options: CameraOptions) -> Report:
     jobs = []
     for seed in range(FIRST_RENDERED, FIRST_RENDERED + count):
         second = Drive(seed, seed + AGAIN, min(DURATION, duration), MAP_RATE)
-        jobs.append(Job(Drive(seed, seed, duration), second, options.drives))
+        jobs.append(Job(Drive(seed, seed, duration, everywhere=True), second, options.drives))
     outcomes = report.collect(localized, jobs, [f"seed {job.first.seed}" for job in jobs])
     found = {jobs[i].first.seed: outcome.runs for i, outcome in outcomes.items()}
     failures(report, found)

@@ -69,7 +69,7 @@ def section(options: CameraOptions) -> Report:
         count, duration = options.count(runs), options.seconds(usual)
         if folder is not None:
             count = min(count, runs)
-        jobs = [Job(Drive(first + i, first + i, duration), folder) for i in range(count)]
+        jobs = [Job(Drive(first + i, first + i, duration, everywhere=True), folder) for i in range(count)]
         labels = [f"{name}, seed {job.drive.seed}" for job in jobs]
         known = report.collect(frame, jobs, labels)
         outcomes = report.collect(mapped, jobs, labels)

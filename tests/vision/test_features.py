@@ -25,6 +25,20 @@ class TestEveryExtractor:
         assert np.all((keypoints.points >= 0) & (keypoints.points <= (319, 239)))
         assert np.all(np.diff(keypoints.responses) <= 0)
 
+    def test_a_crowd_leaves_room_for_others_where_features_are_everywhere(self, name: str, picture: np.ndarray) -> None:
+        rng = np.random.default_rng(7)
+        crowded = picture.copy()
+        noise = rng.integers(0, 256, (40, 13, 3), dtype=np.uint8)
+        crowded[:, 100:204] = cv2.resize(noise, (104, 240), interpolation=cv2.INTER_CUBIC)
+        strongest, everywhere = (
+            extractor(name, 100, everywhere=way).detectAndCompute(crowded)[0] for way in (False, True)
+        )
+        inside = [np.mean((p.points[:, 0] > 96) & (p.points[:, 0] < 208)) for p in (strongest, everywhere)]
+        assert len(everywhere) == len(strongest) == 100
+        assert inside[0] > 0.7
+        assert inside[1] < 0.6
+        assert np.all(np.diff(everywhere.responses) <= 0)
+
     def test_detect_then_compute_is_detect_and_compute(self, name: str, picture: np.ndarray) -> None:
         features = extractor(name, 100)
         both, descriptors = features.detectAndCompute(picture)

@@ -7,10 +7,10 @@ from scipy.ndimage import map_coordinates
 
 from factorgraph_loc.vision.kernels import (
     corner_strength,
+    lonely,
     orientation_histograms,
     refined_peaks,
     sample_patches,
-    spread,
     structure_tensor,
 )
 
@@ -84,17 +84,17 @@ def test_what_is_weak_or_stronger_at_another_scale_is_dropped() -> None:
 
 @settings(max_examples=50)
 @given(seed=st.integers(0, 2**32 - 1), total=st.integers(0, 40), count=st.integers(1, 50), reach=st.floats(0.1, 5.0))
-def test_spread_is_that_of_its_definition(seed: int, total: int, count: int, reach: float) -> None:
+def test_lonely_points_are_those_of_the_definition(seed: int, total: int, count: int, reach: float) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(0.0, 10.0, (total, 2)).astype(np.float32)
     scales = np.exp2(rng.uniform(0.0, 2.0, total)).astype(np.float32)
-    free, crowded = [], []
+    free = []
     for n in range(total):
         distance = np.linalg.norm(points[:n] - points[n], axis=1)
         alike = np.abs(np.log2(scales[:n] / scales[n])) <= 0.5
-        (crowded if np.any(alike & (distance < reach * scales[n])) else free).append(n)
-    expected = sorted((free + crowded)[:count])
-    assert spread(points, scales, reach, 2.0**0.5, count).tolist() == expected
+        if not np.any(alike & (distance < reach * scales[n])):
+            free.append(n)
+    assert np.flatnonzero(lonely(points, scales, reach, 2.0**0.5, count)).tolist() == free[:count]
 
 
 def test_patches_are_bilinear_samples_in_the_frame_of_a_point() -> None:

@@ -27,5 +27,14 @@ def test_a_crowd_leaves_room_for_others_and_its_first_comes_first():
     assert 5 in chosen
 
 
+def test_few_cells_are_coarse_ones():
+    pixels = np.concatenate([np.random.default_rng(5).uniform(low, low + 100.0, (50, 2)) for low in (0.0, 100.0)])
+    pixels = np.concatenate((pixels, pixels[:50]))  # the first corner has twice as many
+    fine, coarse = (spread_out(pixels, 60, cells=cells) for cells in (None, 4))
+    assert np.count_nonzero(coarse % 100 >= 50) >= 25
+    # the first ones of a coarse cell are from all over it, or not
+    assert coarse[:25].max() < fine[:25].max()
+
+
 def test_pixels_in_one_place_are_no_fault():
     assert len(spread_out(np.zeros((30, 2)), 10)) == 10

@@ -46,6 +46,7 @@ FEATURE_CODE = (
     "kernels.py",
     "keypoints.py",
     "scale_space.py",
+    "spread.py",
     "weights.npz",
 )
 TRACK_CODE = ("matching.py", "tracks.py")
@@ -128,7 +129,7 @@ def _features(
     progress: Callable[[float], None],
 ) -> list[_ImageFile]:
     """The features of N images, from the cache if possible."""
-    about = f"{settings.feature} {settings.count} {size} {code_version(FEATURE_CODE)} "
+    about = f"{settings.model_dump_json()} {size} {code_version(FEATURE_CODE)} "
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading and hashing release the interpreter lock
         images = list(pool.map(lambda file: _looked_up(file, about, kept), files))
     wanted = {image.key: image.file for image in images if image.found is None and not image.fault}
@@ -195,7 +196,7 @@ def _find(file: Path, settings: FrontendSettings, size: Size) -> bytes | _ImageF
 @cache
 def _extractor(settings: FrontendSettings) -> Extractor:
     """The extractor, one per process because it reuses its memory."""
-    return extractor(settings.feature, settings.count)
+    return extractor(settings.feature, settings.count, everywhere=settings.everywhere)
 
 
 def _nothing(settings: FrontendSettings) -> ImageFeatures:

@@ -34,7 +34,7 @@ class LiveFrontend:
 
     def __init__(self, settings: FrontendSettings, camera: CameraModel, depth: DepthSettings | None = None) -> None:
         self._feature, self._camera, self._depth = settings.feature, camera, depth
-        self._extractor = extractor(settings.feature, settings.count)
+        self._extractor = extractor(settings.feature, settings.count, everywhere=settings.everywhere)
         self._last: deque[_RecentImage] = deque(maxlen=2)
         self._following = 0
 

@@ -24,13 +24,15 @@ def uses_images(sensors: Collection[str], modalities: Collection[str]) -> bool:
 
 
 def frontend_of(rig: Rig, world: World) -> FrontendSettings:
-    """The feature settings: those of the map's points, else those of the rig's camera."""
+    """The feature settings: those of the map's points, else those of the rig's camera.
+
+    Without a map features are taken everywhere, since most of the strongest may be those of a thing that moves.
+    """
     camera = rig.find(CameraSettings)
     settings = FrontendSettings() if camera is None else camera.frontend
-    points = world.points
-    if points is None or not points.feature or points.feature == settings.feature:
-        return settings
-    return FrontendSettings.model_validate(settings.model_dump() | {"feature": points.feature})
+    if world.points is None or not world.points.feature:
+        return settings.model_copy(update={"everywhere": True})
+    return settings.model_copy(update={"feature": world.points.feature})
 
 
 def frames_of(log: Log) -> tuple[Array, Sequence[CameraFrame]]:
