@@ -5,7 +5,7 @@ Research 32(7), 2013) has many optima, and a graph of points falls into wrong on
 comes in.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from factorgraph_loc.vision.consensus import agreeing
 from factors import positive
 from factors.camera.factor import ReprojectionFactor
 from factors.camera.model import CameraModel
-from factors.motion import Increment
+from factors.motion import Increment, propagate
 from factors.se2 import Array
 from factors.update import robust_update
 
@@ -44,6 +44,19 @@ def unless_slipped(
         return guess
     keyframe.from_previous = replace(step, covariance=step.covariance + added)
     return guess[0], guess[1] + added
+
+
+def moved_since(keyframes: Sequence[Keyframe], newest: Keyframe, t: float, most: int) -> Array | None:
+    """The covariance (3, 3) of the motion, with slips, to the ``newest`` of the ``keyframes`` from the last at or before ``t``, at
+    ``most`` so many steps; None if it is not known."""
+    steps: list[Increment] = []
+    while newest.t > t and newest.from_previous is not None and len(steps) < most:
+        steps.append(newest.from_previous)
+        newest = keyframes[newest.index - 1]
+    covariance = np.zeros((3, 3))
+    for step in reversed(steps):
+        covariance = propagate(covariance, step)
+    return covariance if steps else None
 
 
 def _evidence(

@@ -27,7 +27,7 @@ from factorgraph_loc.slam.new_points import FEWEST as FEWEST_SIGHTINGS
 from factorgraph_loc.slam.new_points import KeyframeCamera, NewPoints, PointSighting, sightings_of
 from factorgraph_loc.slam.point_looks import PointLooks
 from factorgraph_loc.slam.refound_points import refound
-from factorgraph_loc.slam.slipping import unless_slipped
+from factorgraph_loc.slam.slipping import moved_since, unless_slipped
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.spread import spread_out
@@ -43,10 +43,9 @@ from factors.graph import VectorPriorFactor
 from factors.se2 import Array
 from factors.update import robust_update
 
-PER_KEYFRAME, WAITING = 40, 60  # maximum number of estimated points per keyframe, and of points waiting
+PER_KEYFRAME, WAITING = 40, 160  # maximum number of estimated points per keyframe, and of points waiting
 STRIKES = 2
-ANCHORED = 4  # points of the graph that determine a keyframe to SLACK pixels
-SLACK = 2.0  # px
+ANCHORED, SLACK = 4, 2.0  # points of the graph that determine a keyframe to so many pixels
 LEVEL = np.zeros(2)  # no tilt
 OPEN = 30.0  # m: weak prior of a point, about the size of a building
 LOST = 10.0  # s for which a lost point is searched: after that, too many others in a building look like it
@@ -118,12 +117,12 @@ class UnknownPoints:
             certain = self._revisited(
                 model, Image(m.frame, keyframe, guess, self._distance_travelled), rows, names, graph
             )
-        pixels = np.asarray(m.pixels[rows], dtype=float)
-        depths = None if m.frame is None or m.frame.depths is None else m.frame.depths[rows]
         priority = [len(names) if name in self._points else self._new.count(name) for name in names]
+        pixels = np.asarray(m.pixels[rows], dtype=float)
         chosen = spread_out(pixels, PER_KEYFRAME + WAITING, priority).tolist()
         rows, names, pixels = [rows[i] for i in chosen], [names[i] for i in chosen], pixels[chosen]
-        sightings = sightings_of(self.model, keyframe.index, pixels, None if depths is None else depths[chosen])
+        depths = None if m.frame is None or m.frame.depths is None else m.frame.depths[rows]
+        sightings = sightings_of(self.model, keyframe.index, pixels, depths)
         old = [i for i, name in enumerate(names) if name in self._points]
         old = [old[i] for i in spread_out(pixels[old], PER_KEYFRAME).tolist()]
         points = [self._points[names[i]] for i in old]
@@ -295,10 +294,11 @@ class UnknownPoints:
         recent = np.array([keyframe.t - point.last < RECENT for point in points])
         level, seen = replace(model, tilt=sigma), (positions[recent], pixels[recent], spreads[recent], noise[recent])
         guess = unless_slipped(level, keyframe, guess, graph.slip, seen)
-        camera, right = lifted(model, *guess), known.copy()
-        placed, tilt = guess, LEVEL
-        fewest = 2 if named else REVISITED  # a name needs one other to confirm it
-        revisited = max(fewest, math.ceil(AGREED * np.count_nonzero(~recent & ~known)))
+        since = moved_since(graph.keyframes, keyframe, keyframe.t - RECENT, HORIZON)
+        near = guess if since is None else (guess[0], since)  # of a pose among the points that were seen since
+        camera, right, placed, tilt = lifted(model, *guess), known.copy(), guess, LEVEL
+        # a name needs one other to confirm it
+        revisited = max(2 if named else REVISITED, math.ceil(AGREED * np.count_nonzero(~recent & ~known)))
         for which, enough in ((recent, FEWEST), (~recent & ~known, revisited)):
             agrees = np.zeros(len(points), dtype=bool)
             if which.any():
@@ -310,7 +310,7 @@ class UnknownPoints:
                 factor = replace(factor, model=replace(model, tilt=unlevel))
                 update = robust_update(factor, *guess, ITERATIONS, SETTLED)
                 pose = se2.compose(guess[0], se2.exp(update.delta))
-                if which is recent and jumps(guess, pose):  # a few wrong points agree, too
+                if which is recent and jumps(near, pose):  # a few wrong points agree, too
                     continue
                 placed, self._floor, sigma = (pose, guess[1]), floor, unlevel
                 tilt = sigma * factor.levelled([pose])[1]

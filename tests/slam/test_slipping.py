@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.fusion.graph_parts import Keyframe
-from factorgraph_loc.slam.slipping import unless_slipped
+from factorgraph_loc.slam.slipping import moved_since, unless_slipped
 from factors import se2
 from factors.camera.model import CameraModel, predict
-from factors.motion import ChainState, Increment
+from factors.motion import ChainState, Increment, propagate
 from factors.odometry.model import Growth, OdometryModel, relative_motion, slip
 
 MODEL = CameraModel(370.0, 370.0, 240.0, 180.0, width=480, height=360, position=np.array((0.1, 0.0, 0.6)))
@@ -66,3 +66,18 @@ def test_sideways_wheels_are_held():
     assert aside == pytest.approx(heading * 0.3**2 / 3.0)  # a turn on the way displaces the end
     gyro, _ = slip(WHEELS, Increment(np.array((0.3, 0.0, 0.0)), np.eye(3), 0.5), use_gyro=True)
     assert np.diag(gyro)[1:] == pytest.approx(0.0)
+
+
+def test_how_far_the_motion_is_known_of_some_seconds():
+    rng = np.random.default_rng(3)
+    steps = [Increment(rng.normal(size=3), np.diag(rng.uniform(0.01, 0.1, 3)) ** 2, 1.0) for _ in range(9)]
+    keyframes = [Keyframe(i, float(i), ChainState(float(i), *np.zeros(7)), step) for i, step in enumerate(steps)]
+    expected = np.zeros((3, 3))
+    for step in steps[6:]:
+        expected = propagate(expected, step)
+    np.testing.assert_allclose(moved_since(keyframes, keyframes[8], 5.0, 60), expected)
+    np.testing.assert_allclose(moved_since(keyframes, keyframes[8], 5.9, 60), expected)
+    np.testing.assert_allclose(moved_since(keyframes, keyframes[8], 0.0, 3), expected)
+    keyframes[5].from_previous = None  # the robot was carried there
+    np.testing.assert_allclose(moved_since(keyframes, keyframes[8], 0.0, 60), expected)
+    assert moved_since(keyframes, keyframes[5], 0.0, 60) is None

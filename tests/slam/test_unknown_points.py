@@ -10,23 +10,27 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.slam.unknown_points import UnknownPoints, _Point
 from factors import se2
 from factors.camera.model import CameraModel, predict
-from factors.motion import ChainState
+from factors.motion import ChainState, Increment
 
 MODEL = CameraModel(370.0, 370.0, 240.0, 180.0, width=480, height=360, position=np.array((0.1, 0.0, 0.6)))
 GUESS = np.zeros(3), np.diag((0.2, 0.2, 0.05)) ** 2
+STEP, SLIPPED = np.diag((0.05, 0.05, 0.02)) ** 2, np.diag((0.3, 0.3, 0.15)) ** 2
 FEW = np.array(((3.0, -0.5, 0.4), (4.0, 0.6, 1.0), (5.0, -0.2, 1.4), (2.5, 0.3, 0.7)))
 
 
-def placed(moved, last):
-    """The pose (3,) from four points that were seen at ``last`` [s], by a robot that ``moved`` (3,) from its guess; and how many
-    of them count."""
+def placed(moved, last, step=STEP):
+    """The pose (3,) from four points that were seen at ``last`` [s], by a robot that ``moved`` (3,) from its guess after a ``step``
+    of this covariance (3, 3); and how many of them count."""
     points = UnknownPoints(MODEL, Diagnostics())
     known = [_Point(i, last, 1e4 * np.eye(3)) for i in range(len(FEW))]
-    graph = SimpleNamespace(current=FEW.__getitem__, slip=None)
+    keyframes = [
+        Keyframe(i, t, ChainState(t, *np.zeros(7)), Increment(np.zeros(3), step, t - 4.0))
+        for i, t in ((0, 4.0), (1, 10.0))
+    ]
+    graph = SimpleNamespace(current=FEW.__getitem__, keyframes=keyframes, slip=lambda _: (np.zeros((3, 3)), np.inf))
     pixels, _ = predict(MODEL, se2.exp(np.asarray(moved)), FEW)
-    keyframe = Keyframe(1, 10.0, ChainState(10.0, *np.zeros(7)), None)
     none = np.zeros(len(FEW), dtype=bool)
-    (pose, _), _, _, right = points._placed(MODEL, known, pixels, keyframe, GUESS, graph, none, named=True)
+    (pose, _), _, _, right = points._placed(MODEL, known, pixels, keyframes[1], GUESS, graph, none, named=True)
     return pose, np.count_nonzero(right)
 
 
@@ -38,12 +42,19 @@ def test_points_place_a_robot_near_its_guess(last):
     assert np.allclose(pose, se2.exp(np.array(moved)), atol=0.02)
 
 
-def test_a_few_points_seen_lately_do_not_place_it_where_it_cannot_be():
+@pytest.mark.parametrize("moved", [(0.1, -0.2, 0.4), (0.5, 0.0, 0.0)], ids=["from its guess", "since they were seen"])
+def test_a_few_points_seen_lately_do_not_place_it_where_it_cannot_be(moved):
     """They agree, which wrong matches do, too; seen long ago, they may close a loop."""
-    moved = (0.1, -0.2, 0.4)
     pose, count = placed(moved, 9.5)
     assert count == 0
     assert np.array_equal(pose, GUESS[0])
     pose, count = placed(moved, 1.0)
     assert count == len(FEW)
-    assert pose[2] == pytest.approx(0.4, abs=0.03)
+    assert np.allclose(pose, se2.exp(np.array(moved)), atol=0.08)
+
+
+def test_wheels_that_slipped_may_have_taken_it_far():
+    moved = (0.5, 0.0, 0.0)
+    pose, count = placed(moved, 9.5, SLIPPED)
+    assert count == len(FEW)
+    assert np.allclose(pose, se2.exp(np.array(moved)), atol=0.08)
