@@ -1,5 +1,5 @@
 # Sourced by the other scripts: makes .venv, installs the project into it with the pinned versions, and activates it.
-# Usage: source environment.sh EXTRA   (EXTRA is "" or "[test]")
+# Usage: source environment.sh EXTRA   (EXTRA is "", "[test]" or "[release]")
 
 find_python() {
     local candidate
@@ -27,16 +27,17 @@ make_venv() {
 }
 
 prepare() {
-    local extra=$1 stamp wanted
+    local extra=$1 stamp wanted others
     [ -x .venv/bin/pip ] || make_venv || return 1
-    # what is installed is named by a hash of what asks for it; a test environment serves the demo too
+    # what is installed is named by a hash of what asks for it, a line for each extra; a test environment serves the demo too
     wanted="$(cat pyproject.toml constraints.txt | sha256sum | cut -d' ' -f1)"
     stamp=.venv/installed
     unset PYTHONDONTWRITEBYTECODE # each of many processes would compile all modules anew, which are compiled when first imported
-    if ! grep -qx "$wanted$extra" "$stamp" 2>/dev/null && ! grep -qxF "$wanted[test]" "$stamp" 2>/dev/null; then
+    if ! grep -qxF -e "$wanted$extra" -e "$wanted${extra:-[test]}" "$stamp" 2>/dev/null; then
         echo "Installing the project and its dependencies into .venv (a few minutes the first time) ..."
         .venv/bin/python -m pip install -qq --no-compile --disable-pip-version-check -c constraints.txt -e ".$extra" || return 1
-        echo "$wanted$extra" >"$stamp"
+        others=$(grep -F "$wanted" "$stamp" 2>/dev/null) || true
+        printf '%s\n' "$wanted$extra" $others >"$stamp"
     fi
     export PATH="$PWD/.venv/bin:$PATH"
 }
