@@ -77,7 +77,7 @@ class Search:
         self._since = -math.inf
         self._advanced = -math.inf  # when a slice of work was done last
         self._horizon = motion.horizon
-        self._unsure = False  # whether a track that was found has not yet been known to half a metre
+        self._unsure = False  # whether a track that particles found has not yet been known to half a metre
         self.start: KnownPosition | None = None
 
     @property
@@ -183,7 +183,7 @@ class Search:
         return poses, now if reached is None or reached.t >= now.t else reached
 
     def is_unsure(self, covariance: Array) -> bool:
-        """Whether a track that was found has not yet been known to :data:`NEAR` with probability :data:`SURE`, nor is by its
+        """Whether a track that particles found has not yet been known to :data:`NEAR` with probability :data:`SURE`, nor is by its
         ``covariance`` (3, 3) now."""
         return self._unsure and beyond(covariance, NEAR) > 1.0 - SURE
 
@@ -285,7 +285,7 @@ class Search:
     def begin_track(self, *, found: bool) -> None:
         """A track begins: where the search ``found`` it, with what was seen again that led there, or where it was said to."""
         self.begin(None)
-        self._unsure = found
+        self._unsure = found and self._bounds is not None  # what tells a place by itself has said how near it is
         if found:
             self._kept.clear()
             self._last.clear()

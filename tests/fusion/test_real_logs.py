@@ -9,6 +9,7 @@ import pytest
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.readers import load
+from factorgraph_loc.model.log import cut
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 
@@ -53,6 +54,16 @@ def test_plaza2_is_as_accurate_as_the_reference_implementation(plaza2):
     assert smoother["final.heading_rmse"] < 1.1 * 0.017
     batch = scores(plaza2, "batch")
     assert smoother["final.position_rmse"] == pytest.approx(batch["final.position_rmse"], rel=0.02)
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
+def test_one_place_is_claimed_though_ranges_do_not_tell_it_to_half_a_metre(plaza2, estimator):
+    log = cut(plaza2, *(plaza2.streams["bearing_range"].t[0] + np.array((0.0, 60.0))))
+    result = run(log, RunConfig(estimator, {"smooth": False}, prior="unknown"))
+    found = next(t for t, what in result.diagnostics.events if what == "localized")
+    claimed = result.t[result.status.index("localized")]
+    assert found - 0.2 < claimed < found + 1.0
+    assert set(result.status[result.status.index("localized") :]) == {"localized"}
 
 
 @pytest.mark.parametrize("estimator", ["smoother", "batch"])
