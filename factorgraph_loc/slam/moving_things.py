@@ -1,7 +1,7 @@
 """Tracks on things that move by themselves: a second motion in the image, next to the one that wheels tell.
 
-A point that stands still is seen along the wheels' path where one distance of it explains; images up to :data:`MAX_TIME` apart
-are compared, since a thing that moves to and fro, or with the image of the room, agrees with the wheels for a moment.
+A point that stands still is seen where the motion that the wheels tell moves it in the image, at some distance of the point.
+Images up to :data:`MAX_TIME` apart are compared, since a thing that moves agrees with the wheels now and then.
 
 Wheels seldom slip. Where they do, all that stands still moves in the image as if the robot had turned by another angle, and what
 seems to agree with the wheels agrees with that, too. If some tracks agree with the wheels alone, the others are of a thing that

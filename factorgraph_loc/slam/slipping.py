@@ -47,8 +47,8 @@ def unless_slipped(
 
 
 def moved_since(keyframes: Sequence[Keyframe], newest: Keyframe, t: float, most: int) -> Array | None:
-    """The covariance (3, 3) of the motion, with slips, to the ``newest`` of the ``keyframes`` from the last at or before ``t``, at
-    ``most`` so many steps; None if it is not known."""
+    """The covariance (3, 3) of the motion, slips included, to the ``newest`` of the ``keyframes`` from the last one at or before
+    ``t`` [s], or from ``most`` steps ago; None where the step to the newest is not known."""
     steps: list[Increment] = []
     while newest.t > t and newest.from_previous is not None and len(steps) < most:
         steps.append(newest.from_previous)

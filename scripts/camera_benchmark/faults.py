@@ -91,6 +91,7 @@ def faulty(job: Job) -> dict[str, Attempt]:
 
 
 def without_map(log: Log) -> Log:
+    """The log with a map that has no points."""
     return replace(log, world=log.world.model_copy(update={"points": None}))
 
 
