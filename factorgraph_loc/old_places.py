@@ -72,13 +72,13 @@ _MODULES: dict[str, tuple[str, ...]] = {
 }
 _PACKAGES = ("factorgraph_loc.estimators", "factorgraph_loc.readers")
 _SCRIPTS = {  # used by the project's own benchmarks only
-    "factorgraph_loc.evaluation.ensembles": "benchmarking/statistics.py",
-    "factorgraph_loc.evaluation.grid_filter": "rfid_benchmark/grid_filter.py",
+    "factorgraph_loc.evaluation.ensembles": "benchmarks/benchmarking/statistics.py",
+    "factorgraph_loc.evaluation.grid_filter": "benchmarks/rfid_benchmark/grid_filter.py",
     "factorgraph_loc.evaluation.paper_figures": "paper_figures.py",
-    "factorgraph_loc.experiments.ensemble": "benchmarking/ensemble.py",
-    "factorgraph_loc.experiments.optimal": "rfid_benchmark/optimal.py",
-    "factorgraph_loc.experiments.simulated_trials": "rfid_benchmark/simulated_trials.py",
-    "factorgraph_loc.experiments.trials": "benchmarking/trials.py",
+    "factorgraph_loc.experiments.ensemble": "benchmarks/benchmarking/ensemble.py",
+    "factorgraph_loc.experiments.optimal": "benchmarks/rfid_benchmark/optimal.py",
+    "factorgraph_loc.experiments.simulated_trials": "benchmarks/rfid_benchmark/simulated_trials.py",
+    "factorgraph_loc.experiments.trials": "benchmarks/benchmarking/trials.py",
     "factorgraph_loc.vision.weight_learning": "weight_learning.py",
 }
 

@@ -125,7 +125,9 @@ def test_places_of_0_1_0_still_work_with_a_warning():
         exec("from factorgraph_loc.rig import Nothing", {})
     with pytest.raises(ImportError):
         exec("import factorgraph_loc.readers.nothing", {})
-    with pytest.raises(ImportError, match=r"is no longer installed: it is scripts/benchmarking/trials.py in the"):
+    with pytest.raises(
+        ImportError, match=r"is no longer installed: it is scripts/benchmarks/benchmarking/trials.py in the"
+    ):
         exec("from factorgraph_loc.experiments.trials import run_trials", {})
 
 

@@ -48,7 +48,9 @@ def prepare(recording: Recording, folder: Path, out: Path) -> Log:
     """The log of a recording with files in ``folder``, also written to ``out``. Raises InputError for damaged files."""
     paths = [folder / file.name for file in recording.files]
     if missing := [path for path in paths if not path.is_file()]:
-        raise InputError(f"{missing[0]}: is missing, scripts/bench_recordings --fetch prints how to fetch it")
+        raise InputError(
+            f"{missing[0]}: is missing, scripts/benchmarks/bench_recordings --fetch prints how to fetch it"
+        )
     if recording.kind == "bag":
         return _bag(recording, paths[0], out)
     log = KINDS[recording.kind](recording, paths)

@@ -1,6 +1,6 @@
 """A cart in a physics engine that is not ours: its wheels slip on an uneven floor, and what it films on two days is blurred.
 
-It is no real robot. The recording is made once, by scripts/record_physics, and is read by its manifest as that of a stranger.
+It is no real robot. The recording is made once, by record_physics, and is read by its manifest as that of a stranger.
 """
 
 from __future__ import annotations

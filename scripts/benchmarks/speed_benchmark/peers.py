@@ -20,7 +20,7 @@ from factorgraph_loc.io.readers import describe, load
 from speed_benchmark.ours import CONFIGS, LOG
 from speed_benchmark.problems import problem_of
 
-SCRIPTS = Path(__file__).parents[1]
+BENCHMARKS = Path(__file__).parents[1]
 _IMPORT = """
 import importlib, json, sys
 lacking = {}
@@ -75,7 +75,7 @@ def measure(commands: Sequence[Sequence[str]], rounds: int) -> list[dict[str, fl
     for _ in range(rounds):
         for i, command in enumerate(commands):
             environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-            path = [str(SCRIPTS), str(SCRIPTS.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+            path = [str(BENCHMARKS), str(BENCHMARKS.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
             environment["PYTHONPATH"] = os.pathsep.join(path)
             done = subprocess.run(
                 command, capture_output=True, text=True, check=False, env=environment, timeout=LONGEST

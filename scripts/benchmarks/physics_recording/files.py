@@ -52,7 +52,7 @@ reader = "mapped"
 path = "{name}"
 rig = "cart.rig.toml"
 licence = "none needed"
-origin = "scripts/record_physics"
+origin = "scripts/benchmarks/record_physics"
 
 [options.odometry]
 file = "encoders.csv"

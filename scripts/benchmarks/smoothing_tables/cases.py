@@ -31,7 +31,7 @@ SECTIONS: Mapping[str, Mapping[str, Mapping[str, str]]] = {
         "no_map_camera": {"odometry,sightings": "camera, no map"},
     },
 }
-FILES = Path(__file__).parents[1] / "experiments/smoothing"
+FILES = Path(__file__).parents[2] / "experiments/smoothing"
 
 
 @dataclass(frozen=True)

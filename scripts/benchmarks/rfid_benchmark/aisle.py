@@ -23,7 +23,7 @@ from factorgraph_loc.sensors.rfid.calibration.tempering import tempered
 RUNS = (13, 16)
 SEEDS = 3
 LEARNING_SEED = 100  # of the odometry of the log used for learning
-PLACES = Path(__file__).parents[2] / "datasets" / "rfid-aisle-places.rig.toml"
+PLACES = Path(__file__).parents[3] / "datasets" / "rfid-aisle-places.rig.toml"
 DETECTIONS = ("odometry", "rfid")
 SENSORS = {"detections": DETECTIONS, "+ RSSI": (*DETECTIONS, "rssi"), "+ phase": (*DETECTIONS, "phase")}
 ESTIMATORS = ("particle_filter", "smoother")

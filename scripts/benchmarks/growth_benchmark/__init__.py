@@ -1,0 +1,1 @@
+"""Sections of scripts/benchmarks/bench_growth."""
