@@ -7,12 +7,9 @@ their arguments and results, functions that read and write files, and the online
 from __future__ import annotations
 
 import importlib
-import sys
-import warnings
 from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc import builtin as builtin
-from factorgraph_loc.old_places import OldPlaces
 from factorgraph_loc.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -212,17 +209,10 @@ _MODULES = {
     "sensors.twist.measurement": ("Twist", "TwistStream"),
     "vision.frame": ("CameraFrame",),
 }
-sys.meta_path.insert(0, OldPlaces())  # first, because an upgrade may leave empty folders of old modules behind
 _PLACES = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
-_OLD = {"map": "build_map"}  # until version 2.0
 
 
 def __getattr__(name: str) -> Any:
-    if name in _OLD:
-        told = f"factorgraph_loc.{name} is deprecated, and will be removed in 2.0: use factorgraph_loc.{_OLD[name]}"
-        warnings.warn(told, DeprecationWarning, stacklevel=2)
-        globals()[name] = __getattr__(_OLD[name])  # so that it is told once
-        return globals()[name]
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_PLACES[name]), name)

@@ -7,7 +7,7 @@ Those of this project are listed in :mod:`factorgraph_loc.builtin`. Other packag
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from factorgraph_loc.errors import InputError
@@ -21,9 +21,6 @@ def load(place: Place) -> Any:
     module, _, name = place.partition(":")
     found = importlib.import_module(module)
     return getattr(found, name) if name else found
-
-
-MOVED: dict[str, Callable[..., Any]] = {}  # methods of the rig in version 0.1.0, as functions of the rig
 
 
 class Group(Mapping[str, Any]):

@@ -20,7 +20,7 @@ LAYERS = (
     ("exports", "simulation", "mapping", "slam"),
     ("planning",),
     ("experiments", "live"),
-    ("api", "cli", "old_places", "builtin", ""),
+    ("api", "cli", "builtin", ""),
 )
 HEIGHT = {package: height for height, packages in enumerate(LAYERS) for package in packages}
 MODULES = {

@@ -139,22 +139,6 @@ def test_map_writes_a_world(office, tmp_path):
         fgloc.build_map(office, tmp_path / "seen.world.toml", of="landmarks", estimator="ekf")
 
 
-def test_the_old_name_of_build_map_is_told_once():
-    code = (
-        "import warnings\n"
-        "warnings.simplefilter('always')\n"
-        "import factorgraph_loc as fgloc\n"
-        "with warnings.catch_warnings(record=True) as told:\n"
-        "    assert fgloc.map is fgloc.map is fgloc.build_map\n"
-        "print([f'{one.category.__name__}: {one.message}' for one in told])\n"
-        "from factorgraph_loc import *\n"
-        "assert list(map(abs, [-1])) == [1]"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    message = "factorgraph_loc.map is deprecated, and will be removed in 2.0: use factorgraph_loc.build_map"
-    assert done.stdout == f"['DeprecationWarning: {message}']\n"
-
-
 def test_another_rig_and_map_are_values_or_files(office, tmp_path):
     blind = office.rig.model_copy(update={"sensors": ("odometry",)})
     blind.write(tmp_path / "blind.rig.toml")

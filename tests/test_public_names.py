@@ -1,6 +1,5 @@
 """What scripts import from the package itself: every name is there, is documented, and does its work with nothing else imported."""
 
-import importlib
 import re
 import subprocess
 import sys
@@ -10,8 +9,6 @@ import numpy as np
 import pytest
 
 import factorgraph_loc as fgloc
-from factorgraph_loc import old_places
-from factorgraph_loc.plugins import MOVED
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = [*sorted((ROOT / "scripts").glob("example_*")), ROOT / "scripts/ros2_node_example"]
@@ -106,46 +103,3 @@ def test_several_logs_are_not_one():
     assert [log.name for log in fgloc.load("plaza2", options=both)] == ["plaza2-run1", "plaza2-run2"]
     with pytest.raises(fgloc.InputError, match="plaza2 refers to 2 logs, expected one: plaza2-run1, plaza2-run2"):
         fgloc.read_log("plaza2", options=both)
-
-
-def test_places_of_0_1_0_still_work_with_a_warning():
-    for place, name in (
-        ("rig", "Rig"),
-        ("rig", "read_rig"),
-        ("world", "Tag"),
-        ("readers", "manifests"),
-        ("readers.simulated_odometry", "wheel_odometry"),
-        ("estimators.base", "PoseEstimate"),
-        ("log", "RfidStream"),
-        ("measurements", "CameraFrame"),
-    ):
-        with pytest.warns(DeprecationWarning, match=f"factorgraph_loc.{place}.{name} is deprecated"):
-            exec(f"from factorgraph_loc.{place} import {name}", {})
-    with pytest.raises(ImportError):
-        exec("from factorgraph_loc.rig import Nothing", {})
-    with pytest.raises(ImportError):
-        exec("import factorgraph_loc.readers.nothing", {})
-    with pytest.raises(
-        ImportError, match=r"is no longer installed: it is scripts/benchmarks/benchmarking/trials.py in the"
-    ):
-        exec("from factorgraph_loc.experiments.trials import run_trials", {})
-
-
-@pytest.mark.parametrize("script", old_places._SCRIPTS.values())
-def test_what_is_not_installed_is_there_for_the_benchmarks(script):
-    assert (ROOT / "scripts" / script).is_file()
-
-
-def test_the_changes_list_every_name_that_changed():
-    table = (ROOT / "CHANGELOG.md").read_text().partition("### Changed names\n")[2].partition("\n### ")[0]
-    listed = set(re.findall(r"^\| `([\w.]+)` \|", table, re.MULTILINE))
-    rigs = {f"Rig.{name}" for name in MOVED}
-    old = {f"factorgraph_loc.{name}" for name in fgloc._OLD}
-    assert listed == {*old_places._MODULES, *old_places._SCRIPTS, *rigs, *old}
-    assert all(f"`factorgraph_loc.{new}`" in table for new in fgloc._OLD.values())
-
-
-@pytest.mark.parametrize("places", old_places._MODULES.values(), ids=old_places._MODULES)
-def test_places_are_there(places):
-    for place in places:
-        importlib.import_module(place)

@@ -22,7 +22,7 @@ from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult, Timings
-from factorgraph_loc.model.scoring import MAX_GAP, RULE
+from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory
 from factors import chi_squared, positive, se2
 from factors.se2 import Array, Integers
@@ -148,7 +148,7 @@ def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_G
 def score(result: RunResult, log: Log) -> dict[str, Any]:
     """All figures of a run, by dotted key; metres, radians, None where undefined.
 
-    ``scoring.rule`` and ``scoring.max_gap`` [s]: only runs with equal values are comparable. ``causal.*`` and ``final.*`` (see
+    ``scoring.max_gap`` [s]: only runs with equal values are comparable. ``causal.*`` and ``final.*`` (see
     :func:`accuracy`) are scored from the first localized causal estimate and, except for ``scored``, are None without a reference
     or with fewer than :data:`FEWEST_SCORED` scored poses. If the run was never localized, ``causal.*`` is None, and ``final.*``
     is scored from its beginning. ``causal.space_*`` and ``final.space_*`` (see
@@ -163,7 +163,7 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
     if causal is not None:
         final = since(final, float(causal.t[0]))
     gap = result.max_gap
-    scores: dict[str, Any] = {"scoring.rule": RULE, "scoring.max_gap": gap, WARNINGS: list(result.warnings)}
+    scores: dict[str, Any] = {"scoring.max_gap": gap, WARNINGS: list(result.warnings)}
     for kind, trajectory in (("causal", causal), ("final", final)):
         figures = dict.fromkeys(_ACCURACY) if trajectory is None else accuracy(trajectory, log.reference, gap)
         if (figures["scored"] or 0) < FEWEST_SCORED:

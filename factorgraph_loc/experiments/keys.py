@@ -1,4 +1,4 @@
-"""Keys of runs, digests of all that a result depends on (log, configuration, scoring rule, code, libraries); and cached facts about
+"""Keys of runs, digests of all that a result depends on (log, configuration, code, libraries); and cached facts about
 logs and estimators for planning, as obtaining them requires numerical libraries or reading the log."""
 
 import hashlib
@@ -20,7 +20,6 @@ from factorgraph_loc.experiments.experiment_file import canonical
 from factorgraph_loc.experiments.log_source import LogSource
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files.models import write_text
-from factorgraph_loc.model.scoring import RULE
 from factorgraph_loc.text import plain
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "numba")
@@ -76,7 +75,6 @@ def run_key(log_digest: str, config: Mapping[str, Any]) -> str:
         {
             "log": log_digest,
             "config": dict(config),
-            "scoring": RULE,
             "code": code_version(),
             "libraries": library_versions(),
         }

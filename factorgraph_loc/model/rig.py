@@ -6,8 +6,6 @@ radians, mm for m).
 
 from __future__ import annotations
 
-import warnings
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -15,7 +13,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, add_fields
 from factorgraph_loc.model.sections import sections, sections_of_channels
 from factorgraph_loc.model.settings import NOTHING, Estimated, SensorSettings
-from factorgraph_loc.plugins import FILES, MOVED, load
+from factorgraph_loc.plugins import FILES, load
 
 S = TypeVar("S", bound=FileModel)
 
@@ -33,14 +31,6 @@ class Rig(FileModel):
 
         def __init__(self, **values: Any) -> None: ...
         def __getattr__(self, section: str) -> Any: ...
-
-    else:
-
-        def __getattr__(self, name: str) -> Any:
-            if name not in MOVED:
-                return super().__getattr__(name)
-            warnings.warn(f"Rig.{name} is deprecated: see {MOVED[name].__doc__}", DeprecationWarning, stacklevel=2)
-            return partial(MOVED[name], self)
 
     @classmethod
     def read(cls, path: str | Path) -> Rig:

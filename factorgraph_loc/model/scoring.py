@@ -1,5 +1,7 @@
-"""The version of the scoring rule and the settings of scoring; the ticks of a run, a grid of 10 Hz from its start, except in long
-gaps between measurements. Importable without numerical libraries."""
+"""The settings of scoring, and the ticks of a run: a grid of 10 Hz from its start, except in long gaps between measurements.
+
+Importable without numerical libraries.
+"""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -7,7 +9,6 @@ from typing import Literal
 
 from factorgraph_loc.errors import InputError
 
-RULE = 2  # 2: estimates are interpolated at the reference's timestamps; 1: the reference at those of the estimates
 MAX_GAP = 0.5  # s between estimates across which scoring interpolates
 MAX_DIFF = 0.01  # s between stamps that are taken for one
 Alignment = Literal["none", "origin", "se2", "se3", "sim3"]

@@ -16,7 +16,7 @@ import pytest
 from scipy.signal import lfilter
 
 from factorgraph_loc.evaluation.report import RunFiles, Scene
-from factorgraph_loc.model.scoring import MAX_GAP, RULE
+from factorgraph_loc.model.scoring import MAX_GAP
 
 
 class Chromium:
@@ -209,7 +209,7 @@ def make_runs(sigmas, logs, seeds=1, *, count=400, sweep=None):
 
 
 def _row(key, log, label, seed, table):
-    scores = {"scoring.rule": RULE, "scoring.max_gap": MAX_GAP}
+    scores = {"scoring.max_gap": MAX_GAP}
     for kind in ("causal", "final"):
         of = table.filter(pl.col("kind") == kind)
         scores[f"{kind}.position_rmse"] = float(np.sqrt(np.mean(of["error_position"].to_numpy() ** 2)))

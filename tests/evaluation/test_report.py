@@ -163,30 +163,6 @@ def test_a_log_with_hardly_any_reference_is_not_scored(made, tmp_path):
     assert Results(some.rows).scores("causal.position_rmse", "a")["log1"] == {0: None}
 
 
-@pytest.mark.parametrize("old", [None, 1.0])
-def test_results_by_another_rule_of_scoring_are_not_compared(made, tmp_path, old):
-    some = made({"a": 0.1, "b": 0.2}, LOGS[:2], count=40)
-    words = words_of(page_of(some, tmp_path))
-    assert "another rule" not in words
-    by_other = (pl.col("log") == "log1") & (pl.col("label") == "b")
-    rule = pl.when(by_other).then(pl.lit(old, dtype=pl.Float64)).otherwise("scoring.rule")
-    some.rows = some.rows.with_columns(**{"scoring.rule": rule})
-    words = words_of(page_of(some, tmp_path))
-    told = "log1, b, seed 0 is scored by another rule than that of this version, and not compared: run the experiment again."
-    assert told in words
-    results = Results(some.rows)
-    assert results.scores("causal.position_rmse", "b")["log1"] == {0: None}
-    assert results.scores("causal.position_rmse", "a")["log1"][0] > 0.0
-    assert results.scores("timing.update_ms_median", "b")["log1"] == {0: 1.0}
-
-
-def test_results_that_are_all_by_another_rule_are_shown_and_said_to_be(made, tmp_path):
-    some = made({"a": 0.1}, ["one"], count=40)
-    some.rows = some.rows.drop("scoring.rule", "scoring.max_gap")
-    assert "is scored by another rule than that of this version: not comparable" in words_of(page_of(some, tmp_path))
-    assert Results(some.rows).scores("causal.position_rmse", "a")["one"][0] > 0.0
-
-
 def test_how_many_poses_were_scored_stands_in_the_tables(made, tmp_path):
     some = made({"a": 0.1, "b": 0.2}, LOGS[:2], count=40)
     some.rows = some.rows.with_columns(

@@ -13,7 +13,7 @@ def test_lists_are_no_cells_but_warnings_are_a_text():
         "warnings": "one\ntwo",
     }
     assert row_of({"a": 1.0, "warnings": []})["warnings"] is None
-    assert row_of({"a": 1.0})["warnings"] is None  # results of 0.1.0
+    assert row_of({"a": 1.0})["warnings"] is None  # of a run that failed
 
 
 def test_each_is_told_once_and_of_whom_where_not_of_all():

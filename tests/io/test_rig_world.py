@@ -42,20 +42,6 @@ def test_a_rig_needs_nothing_but_what_it_has(tmp_path):
     assert Rig().time_offset("bearing_range") == 0.0
 
 
-def test_methods_of_the_first_version_work_with_a_warning():
-    rig = Rig(odometry=OdometrySettings(delay=0.2, uncertainty={"scale_distance": 0.1}))
-    with pytest.warns(
-        DeprecationWarning, match=r"Rig\.odometry_model is deprecated: see factorgraph_loc\.sensors\.odometry"
-    ):
-        assert rig.odometry_model(use_gyro=True).delay == 0.2
-    with pytest.warns(
-        DeprecationWarning, match=r"Rig\.estimated_odometry is deprecated: see factorgraph_loc\.Rig\.est"
-    ):
-        assert rig.estimated_odometry().names == ("scale_distance",)
-    with pytest.raises(AttributeError):
-        rig.odometri  # noqa: B018
-
-
 def test_a_strong_wide_lens_is_a_camera():
     lens = {"fx": 300.0, "fy": 300.0, "cx": 320.0, "cy": 240.0, "distortion": (-0.3, 0.09, 0.0, 0.0)}
     assert Rig.model_validate({"camera": lens}).camera.model().distortion == lens["distortion"]

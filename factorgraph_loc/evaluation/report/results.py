@@ -26,7 +26,6 @@ from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.report.scene import Scene
 from factorgraph_loc.evaluation.report.tracks import KINDS, Series
 from factorgraph_loc.evaluation.warned import label_of
-from factorgraph_loc.model.scoring import RULE
 from factors.se2 import Array
 
 POSES = 200_000  # on the page, shared by all trajectories
@@ -36,7 +35,6 @@ _ESTIMATES, _CONFIG = "estimates.parquet", "config.toml"
 SWEEP = "sweep."
 SIMULATION = "simulation"  # first word of swept settings that change the log
 SCORED = 10  # least number of scored poses
-_SCORES = ("causal.", "final.", "aligned.")  # prefixes of errors with respect to the reference
 
 Row = Mapping[str, Any]
 
@@ -181,15 +179,11 @@ class Results:
     them, as dictionaries.
 
     For each value of a swept setting of the simulation, a simulated log is listed separately; intervals and tests count these as
-    one. ``outdated``: the runs that were scored by another version's rule; if mixed with current ones, their errors are ignored
-    as they cannot be compared.
+    one.
     """
 
     def __init__(self, rows: pl.DataFrame) -> None:
-        found = rows.to_dicts()
-        self.outdated = [_run_name(row) for row in found if _is_outdated(row)]
-        self.is_mixed = 0 < len(self.outdated) < sum(row["status"] == "ok" for row in found)
-        self.rows: Sequence[Row] = [_without_errors(r) if self.is_mixed and _is_outdated(r) else r for r in found]
+        self.rows: Sequence[Row] = rows.to_dicts()
         self.sweeps = [c for c in rows.columns if c.startswith(SWEEP) and rows[c].drop_nulls().n_unique() > 1]
         several = _labels_with_several_sensors(self.rows)
         self.variants: dict[str, Variant] = {}
@@ -292,18 +286,6 @@ def score(row: Row, metric: str) -> float | None:
     if row["status"] != "ok" or value is None or (scored is not None and scored < SCORED):
         return None
     return float(value)
-
-
-def _is_outdated(row: Row) -> bool:
-    return row["status"] == "ok" and row.get("scoring.rule") != RULE
-
-
-def _without_errors(row: Row) -> Row:
-    return {key: None if key.startswith(_SCORES) else value for key, value in row.items()}
-
-
-def _run_name(row: Row) -> str:
-    return f"{row['log']}, {label_of(row)}, seed {row['seed']}"
 
 
 def _best(metric: Metric, scores: Mapping[str, ByLog], found: Mapping[str, Pooled]) -> str | None:

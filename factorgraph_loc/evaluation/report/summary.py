@@ -80,10 +80,6 @@ def _trust(trust: Mapping[str, tuple[float, float, float]]) -> list[Html]:
 
 def _cautions(results: Results, comparisons: Sequence[MetricComparison]) -> list[Html]:
     told: list[tuple[object, ...]] = []
-    if outdated := results.outdated:
-        rule = f" {_is(outdated)} scored by another rule than that of this version"
-        mixed, alone = ", and not compared: run the experiment again.", ": not comparable with newer results."
-        told.append((_list(outdated), rule, mixed if results.is_mixed else alone))
     if poor := results.unscored():
         told.append((f"Fewer than {SCORED} poses of ", _list(poor), " have a reference: nothing is scored there."))
     found = [c for comparison in comparisons for c in comparison.contrasts.values()]
