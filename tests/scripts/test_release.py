@@ -14,7 +14,7 @@ from factorgraph_loc import InputError, write_log
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ADDRESS = PROJECT["urls"]["Repository"]
-CHANGES = "# Changes\n\n## [Unreleased]\n\n## [2.1.0] - 2027-03-01\n\n- New.\n\n## 0.1.0 - 2026-11-22\n"
+CHANGES = "# Changes\n\n## 2.1.0 (2027-03-01)\n\n- New.\n\n## 2.0.0 (2027-02-01)\n"
 
 
 @pytest.fixture
@@ -57,8 +57,8 @@ def test_a_tag_that_is_not_the_version_is_refused(check, tag):
 @pytest.mark.parametrize(
     ("path", "text", "told"),
     [
-        ("CHANGELOG.md", CHANGES.replace("2027-03-01", "unreleased"), "CHANGELOG.md has no section of this version"),
-        ("CHANGELOG.md", CHANGES.replace("]\n\n##", "]\n\n- Later.\n\n##"), "'## [Unreleased]' with nothing below it"),
+        ("CHANGELOG.md", CHANGES.replace("2027-03-01", "unreleased"), "begins with ## 2.1.0 (unreleased), expected"),
+        ("CHANGELOG.md", CHANGES.replace("## 2.1.0 (2027-03-01)", ""), "expected '## 2.1.0 (YYYY-MM-DD)'"),
         ("CITATION.cff", "repository-code: https://example.org\n", "CITATION.cff: repository-code is not that of"),
         ("factorgraph_loc/version.py", '__version__ = "2.1.0.dev1"\n', "the version is 2.1.0.dev1, expected three"),
     ],
@@ -73,9 +73,7 @@ def test_another_repository_does_not_publish(check):
 
 
 def test_the_project_names_one_address():
-    citation = (ROOT / "CITATION.cff").read_text()
-    assert f"repository-code: {ADDRESS}\n" in citation
-    assert f"[Unreleased]: {ADDRESS}/" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"repository-code: {ADDRESS}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 def test_messages_and_pages_name_extras_that_exist():
