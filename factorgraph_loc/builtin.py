@@ -25,17 +25,13 @@ ESTIMATORS.own |= {
 MAPPERS.own["points"] = "factorgraph_loc.slam.point_mapper:bind"
 READERS.own |= {
     "native": "factorgraph_loc.io.native.native",
-    "euroc": "factorgraph_loc.io.readers.euroc",
-    "kitti_odometry": "factorgraph_loc.io.readers.kitti_odometry",
     "mapped": "factorgraph_loc.io.readers.mapped",
     "mrclam": "factorgraph_loc.io.readers.mrclam",
     "plaza": "factorgraph_loc.io.readers.plaza",
     "rf_robot": "factorgraph_loc.io.readers.rf_robot",
     "rosbag": "factorgraph_loc.io.bags.rosbag",
     "sevenscenes": "factorgraph_loc.io.readers.sevenscenes",
-    "starry_night": "factorgraph_loc.io.readers.starry_night",
     "trajectory": "factorgraph_loc.io.readers.trajectory",
-    "tum_rgbd": "factorgraph_loc.io.readers.tum_rgbd",
     "utias_woods": "factorgraph_loc.io.readers.utias_woods",
 }
 FILES |= {

@@ -11,8 +11,8 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _NAMED = re.compile(r"# ([\w.-]+\.toml)\b")
 # data of the reader's own or of others, installations, windows
 _ELSEWHERE = re.compile(
-    r"\b(LOG|DATA|FOLDER)\b|(?<![\w/])(monday|tuesday|friday|another|hall)/(?!\S)|\b(sevenscenes|starry_night)\b"
-    r"|\b(MH_01_easy|dataset)\b|^(pip|rerun) |^fgloc view"
+    r"\b(LOG|DATA|FOLDER)\b|(?<![\w/])(monday|tuesday|friday|another|hall)/(?!\S)|\bsevenscenes\b"
+    r"|^(pip|rerun) |^fgloc view"
 )
 
 

@@ -156,66 +156,6 @@ def _picture(width: int, height: int, channels: int) -> np.ndarray:
     return picture
 
 
-def tum(folder: Path) -> None:
-    (folder / "rgb").mkdir()
-    names = [f"{1305031102 + 0.1 * i:.6f}" for i in range(3)]
-    for name in names:
-        cv2.imwrite(str(folder / "rgb" / f"{name}.png"), _picture(32, 24, 3))
-    rows = "".join(f"{name} rgb/{name}.png\n" for name in names)
-    (folder / "rgb.txt").write_text(f"# color images\n# file: 'x.bag'\n# timestamp filename\n{rows}")
-    poses = [f"{1305031102 + 0.02 * i:.4f} {0.01 * i:.4f} 0.1 1.2 0 0 0 1" for i in range(12)]
-    (folder / "groundtruth.txt").write_text("\n".join(["# ground truth", "# t tx ty tz qx qy qz qw", *poses, ""]))
-
-
-SENSOR = """\
-# General sensor definitions.
-sensor_type: camera
-T_BS:
-  cols: 4
-  rows: 4
-  data: [0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975,
-         0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768,
-        -0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949,
-         0.0, 0.0, 0.0, 1.0]
-rate_hz: 20
-resolution: [32, 24]
-camera_model: pinhole
-intrinsics: [45.8, 45.7, 16.7, 12.8] #fu, fv, cu, cv
-distortion_model: radial-tangential
-distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
-"""
-
-
-def euroc(folder: Path) -> None:
-    camera, truth = folder / "mav0/cam0", folder / "mav0/state_groundtruth_estimate0"
-    (camera / "data").mkdir(parents=True)
-    truth.mkdir()
-    stamps = [1403636579763555584 + i * 50_000_000 for i in range(3)]
-    for stamp in stamps:
-        cv2.imwrite(str(camera / "data" / f"{stamp}.png"), _picture(32, 24, 1))
-    (camera / "data.csv").write_text("#timestamp [ns],filename\n" + "".join(f"{s},{s}.png\n" for s in stamps))
-    (camera / "sensor.yaml").write_text(SENSOR)
-    head = (
-        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []" + ", v" * 9
-    )
-    rows = [f"{stamps[0] + i * 5_000_000},4.6,-1.7,0.{i:02d},1,0,0,0" + ",0" * 9 for i in range(25)]
-    (truth / "data.csv").write_text("\n".join([head, *rows, ""]))
-
-
-def kitti(folder: Path) -> None:
-    sequence = folder / "sequences/00"
-    (sequence / "image_0").mkdir(parents=True)
-    (folder / "poses").mkdir()
-    for i in range(4):
-        cv2.imwrite(str(sequence / "image_0" / f"{i:06d}.png"), _picture(32, 24, 1))
-    (sequence / "times.txt").write_text("".join(f"{0.1 * i:.6e}\n" for i in range(4)))
-    rows = [
-        f"P{j}: 7.188560000000e+02 0 6.07e+01 {-3.8e2 * j} 0 7.188560000000e+02 1.85e+01 0 0 0 1 0\n" for j in range(4)
-    ]
-    (sequence / "calib.txt").write_text("".join(rows))
-    (folder / "poses/00.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {0.5 * i}\n" for i in range(4)))
-
-
 POSES = ("a.tum", "b.csv", "c.kitti")
 
 
@@ -271,28 +211,6 @@ def woods(folder: Path) -> None:
     fields = {"t": 0.1 * np.arange(4.0)[:, None], "v": column + 0.25, "om": column, "r": r, "b": 0.5 * (r > 0)}
     fields |= {"l": np.arange(34.0).reshape(17, 2), "x_true": column, "y_true": column, "th_true": column + 4.0}
     _save(folder / "w.mat", fields | {"true_valid": np.array([[1], [0], [1], [1]], dtype=np.uint8)})
-
-
-def starry_night(folder: Path) -> None:
-    rng = np.random.default_rng(5)
-    seen = np.full((4, 3, 20), -1.0)
-    seen[:, :, ::2] = np.array((300.0, 200.0, 280.0, 200.0))[:, None, None]
-    column = np.full((3, 1), 0.01)
-    fields: dict[str, Any] = {
-        "t": np.array([[0.0, 0.1, 0.25]]),
-        "theta_vk_i": rng.normal(0, 0.1, (3, 3)),
-        "r_i_vk_i": rng.normal(0, 0.1, (3, 3)),
-        "w_vk_vk_i": np.ones((3, 3)),
-        "v_vk_vk_i": np.ones((3, 3)),
-        "rho_i_pj_i": rng.normal(0, 2, (3, 20)),
-        "y_k_j": seen,
-        "C_c_v": np.array(((0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0))),
-        "rho_v_c_v": np.array((-0.02, 0.1, 0.03))[:, None],
-        **dict.fromkeys(("v_var", "w_var"), column),
-        "y_var": np.full((4, 1), 4.0),
-        **{"cu": 320.0, "cv": 240.0, "fu": 480.0, "fv": 480.0, "b": 0.24},
-    }
-    _save(folder / "s.mat", fields)
 
 
 def sevenscenes(folder: Path) -> None:

@@ -97,7 +97,7 @@ def test_causal_estimates_do_not_know_what_comes(name, kind):
     check(log, RunConfig(name, SETTINGS.get(name, {}), **more), (first + last) / 2.0)
 
 
-@pytest.mark.parametrize("recorded", ["mrclam6-robot1", "woods-r1", "rfid-aisle-run13", "starry_night"])
+@pytest.mark.parametrize("recorded", ["mrclam6-robot1", "woods-r1", "rfid-aisle-run13"])
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_nor_on_recorded_logs(name, recorded, data_root):
     (log,) = load(recorded, data_root=data_root)

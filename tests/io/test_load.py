@@ -39,7 +39,7 @@ def test_shipped_manifests_are_right(name):
     manifest = read_manifest(manifests()[name])
     parse_model(reader(manifest.reader).options, manifest.options, name)
     if manifest.rig is None:
-        assert manifest.reader in {"sevenscenes", "starry_night"}
+        assert manifest.reader == "sevenscenes"
         return
     rig = read_rig(manifests()[name].parent / manifest.rig)
     assert all(getattr(rig, sensor) is not None for sensor in rig.sensors if sensor not in {"rssi", "phase"})

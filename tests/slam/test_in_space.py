@@ -6,7 +6,6 @@ from functools import cache
 import numpy as np
 import pytest
 import short_logs
-from camera_benchmark.reprojection import reprojection_residuals, spread_of
 from scipy.stats import chi2
 from space_world import POINTS, RIG, carried, with_features
 
@@ -16,9 +15,7 @@ from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import create, settings_of
-from factorgraph_loc.io.readers import load
 from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.world import World
@@ -326,19 +323,6 @@ def test_what_the_batch_refuses():
     planar = replace(log, reference=log.reference3.planar(), reference3=None)
     with pytest.raises(InputError, match="expected one in space"):
         estimated(planar, "space_batch")
-
-
-def test_recorded_starry_night(data_root):
-    """Its first 30 s. The estimated poses explain the pixels better than those of the motion capture do."""
-    (log,) = load("starry_night", data_root=data_root)
-    log = cut(log, 0.0, 30.0)
-    result, batch = estimated(log, "monoslam"), estimated(log, "space_batch")
-    figures = score(result, log)
-    assert figures["causal.space_position_rmse"] < 0.05
-    assert figures["final.space_position_rmse"] < 0.05
-    assert np.median(np.abs(space.pose_errors(result.final_space, batch.final_space)[:, 3:])) < 0.002
-    found = spread_of(reprojection_residuals(batch.final_space, log))
-    assert found["u_mad"] < 0.5 * spread_of(reprojection_residuals(log.reference3, log))["u_mad"]
 
 
 @pytest.mark.parametrize("name", ["monoslam", "space_batch", "space_smoother"])

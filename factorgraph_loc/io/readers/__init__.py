@@ -10,8 +10,6 @@ __all__ = [
     "Dataset",
     "Manifest",
     "describe",
-    "euroc",
-    "kitti_odometry",
     "load",
     "manifests",
     "mapped",
@@ -23,9 +21,7 @@ __all__ = [
     "reader",
     "rf_robot",
     "sevenscenes",
-    "starry_night",
     "trajectory",
-    "tum_rgbd",
     "utias_woods",
     "verify",
 ]

@@ -1,8 +1,9 @@
-"""Files of poses: numbers in whitespace-separated columns, quaternions in TUM and EuRoC files, 3x4 matrices in KITTI's, told apart
-by their first row; and lists of images."""
+"""Files of poses in TUM, EuRoC or KITTI format, recognized by their first row.
+
+Poses are quaternions in TUM and EuRoC files, and 3x4 matrices in KITTI files.
+"""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +14,6 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
 from factorgraph_loc.files.columns import POSES
 from factorgraph_loc.files.models import read_text
-from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.trajectory import read_tum_rows
 from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3
@@ -138,19 +138,6 @@ def read_poses(
     keep = checks.in_order(path, mapped.rows, t_ns, warnings)
     t_ns = t_ns[keep]
     return t_ns, Trajectory3((t_ns - t_ns[0]) / 1e9, positions[keep], rotations[keep])
-
-
-def read_image_list(path: Path, *, unit: str, separator: Literal[",", " "]) -> TableRows:
-    """The timestamps and names of images, as the table ``camera`` of the native format."""
-    columns = {"t": "1", "file": "2"}
-    told = ColumnMapping(file=path.name, columns=columns, units={"t": unit}, separator=separator, header=False)
-    mapped = read_mapped(path, told, (("t", "file"),))
-    return TableRows(path, mapped.rows, mapped.stamps("t"), {}, {"file": list(mapped.texts("file"))})
-
-
-def later(trajectory: Trajectory3, t_ns: Integers, t0_ns: int) -> Trajectory3:
-    """The trajectory with timestamps ``t_ns`` (N,), in seconds after ``t0_ns``."""
-    return replace(trajectory, t=checks.seconds(t_ns, t0_ns))
 
 
 def read_pose_file(path: Path) -> PosePath:

@@ -11,7 +11,6 @@ from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.simulation import preset, simulate
 from regression.scenarios import (
     FINDERS,
-    IN_SPACE,
     LAG,
     MAPPERS,
     ON_FLOOR,
@@ -58,7 +57,6 @@ LONG_SCENARIOS: Mapping[str, Scenario] = {
     "long-rfid-aisle-run13-unknown-start": recorded(
         "rfid-aisle-run13", START, 20.0, ("particle_filter", "smoother"), prior="unknown"
     ),
-    "long-starry_night": recorded("starry_night", START, SECONDS, IN_SPACE),
     "long-office": Scenario(office, (*READERS, LAG, MANY), ("odometry", "rfid", "rssi", "phase", "bearing_range")),
     "long-office-kidnapped": Scenario(office_kidnapped, READERS),
     "long-room": Scenario(room, (*WATCHERS, LAG, MANY)),

@@ -213,7 +213,6 @@ SCENARIOS: Mapping[str, Scenario | ActiveScenario] = {
     "recorded-tags": Scenario(
         logs.aisle, (*GRAPHS, "particle_filter"), (*TAGS, "rssi", "phase"), data="rfid-aisle-run13"
     ),
-    "recorded-space": recorded("starry_night", 5.0, 6.0, IN_SPACE),
     "active-tags": ActiveScenario("office", "information", ("active_mcl", "smoother")),
     "active-landmarks": ActiveScenario(
         "office", "nearest_tags", ("active_mcl", "smoother"), {"world": {"tags": 10, "landmarks": 20}}
