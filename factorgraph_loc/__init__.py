@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.api.running import Run, compare, run
     from factorgraph_loc.errors import FglocError, InputError, RunFailedError
     from factorgraph_loc.evaluation.inference import contrast
-    from factorgraph_loc.experiments.reporting import load_results
+    from factorgraph_loc.experiments.result_table import load_results
     from factorgraph_loc.experiments.trajectory_score import score
     from factorgraph_loc.io.native.native import write_native
     from factorgraph_loc.io.native.rig_file import read_rig, write_rig
@@ -170,7 +170,7 @@ _MODULES = {
     "api.running": ("Run", "compare", "run"),
     "errors": ("FglocError", "InputError", "RunFailedError"),
     "evaluation.inference": ("contrast",),
-    "experiments.reporting": ("load_results",),
+    "experiments.result_table": ("load_results",),
     "experiments.trajectory_score": ("score",),
     "io.native.native": ("write_native",),
     "io.native.rig_file": ("read_rig", "write_rig"),

@@ -8,6 +8,7 @@ from typing import Any
 from factorgraph_loc.api.given import LogLike, RigLike, Settings, WorldLike, every, one
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.aligned import score
+from factorgraph_loc.evaluation.plots import write_plots
 from factorgraph_loc.experiments import compare as comparing
 from factorgraph_loc.experiments import output
 from factorgraph_loc.experiments import run as running
@@ -64,7 +65,7 @@ def run(
     if out is None:
         return Run(result, score(result, loaded, align))
     scores = output.write_run(result, loaded, Path(out), align=align, overwrite=overwrite)
-    output.write_plots(result, loaded, Path(out))
+    write_plots(result, loaded, Path(out))
     return Run(result, scores)
 
 

@@ -83,9 +83,10 @@ def run(
     json: Json = False,
 ) -> None:
     """Run one estimator on one log; write trajectories, estimates, scores and plots."""
+    from factorgraph_loc.evaluation.plots import write_plots
     from factorgraph_loc.experiments import run as experiment
     from factorgraph_loc.experiments.learning import run_and_learn
-    from factorgraph_loc.experiments.output import MAP, check_free, write_plots, write_run
+    from factorgraph_loc.experiments.output import MAP, check_free, write_run
     from factorgraph_loc.fusion.registry import check_names, for_final_only
 
     check_names([estimator])

@@ -11,8 +11,10 @@ import numpy as np
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, styles
 from factorgraph_loc.evaluation.figures import Track, consistency, mark_events, way, with_pauses, write_picture
 from factorgraph_loc.evaluation.metrics import Errors, errors
+from factorgraph_loc.files.models import file_name
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.reliability import Reliability
+from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.interfaces import Marks, marks
 from factors.se2 import Array
@@ -53,6 +55,13 @@ def plot_run(log: Log, estimator: str, track: Track, folder: Path, name: str) ->
     """
     figures = {"trajectories": trajectories(log, {estimator: track}), **_of_one(log, estimator, track)}
     return _write(figures, folder, name)
+
+
+def write_plots(result: RunResult, log: Log, out: Path) -> None:
+    """Write the plots of a run into ``out/plots``, replacing those of a previous one."""
+    folder = out / "plots"
+    remove_plots(folder)
+    plot_run(log, str(result.config["estimator"]), Track.of(result), folder, file_name(log.name))
 
 
 def remove_plots(folder: Path) -> None:

@@ -14,6 +14,7 @@ __all__ = [
     "particles",
     "plan",
     "reporting",
+    "result_table",
     "run",
     "seeds",
     "store",

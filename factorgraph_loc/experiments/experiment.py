@@ -63,7 +63,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Done:
-    """The results: a row per run, see :func:`~factorgraph_loc.experiments.reporting.load_results`; a line for each failure, and
+    """The results: a row per run, see :func:`~factorgraph_loc.experiments.result_table.load_results`; a line for each failure, and
     each warning once."""
 
     rows: pl.DataFrame
@@ -143,7 +143,7 @@ def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
     """Estimated sum of the run times [s], from stored runs of the same estimator and the duration of the log, else a default."""
     import polars as pl  # noqa: PLC0415
 
-    from factorgraph_loc.experiments.reporting import load_results  # noqa: PLC0415
+    from factorgraph_loc.experiments.result_table import load_results  # noqa: PLC0415
 
     columns = {
         "label": "String",
@@ -171,7 +171,7 @@ def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
 
 
 def _write_rows(prepared: Prepared, states: dict[str, State]) -> pl.DataFrame:
-    from factorgraph_loc.experiments.reporting import collect, write_index  # noqa: PLC0415
+    from factorgraph_loc.experiments.result_table import collect, write_index  # noqa: PLC0415
 
     rows = collect((run for run in prepared.runs if states[run.key] in ("ok", "failed")), prepared.store)
     write_index(rows, prepared.folder)

@@ -23,24 +23,43 @@ from factorgraph_loc.files.models import write_text
 from factorgraph_loc.text import plain
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "numba")
-# parts of the package that runs do not use: a change of the report must not invalidate stored runs
-OUTSIDE = (
-    "api.py",
-    "cli",
-    "calibration",
-    "exports",
-    "live",
-    "mapping",
-    "planning",
-    "sensors/odometry/calibration",
-    "sensors/rfid/calibration",
-    "evaluation/inference.py",
-    "evaluation/report",
-    "experiments/cluster.py",
-    "experiments/maps.py",
-    "experiments/particles.py",
-    "experiments/reporting.py",
+PACKAGE = __name__.partition(".")[0]
+# the files and folders of the package that a run imports, from its log to its scores; tests compare them with the imports
+COUNTED = (
+    "builtin.py",
+    "errors.py",
+    "evaluation/aligned.py",
+    "evaluation/metrics.py",
+    "evaluation/pairing.py",
+    "evaluation/space.py",
+    "evaluation/trajectories/association.py",
+    "evaluation/trajectories/score.py",
+    "evaluation/warned.py",
+    "experiments/causal_estimates.py",
+    "experiments/doubts.py",
+    "experiments/garbage.py",
+    "experiments/log_source.py",
+    "experiments/output.py",
+    "experiments/preparation.py",
+    "experiments/run.py",
+    "files/",
+    "fitting/",
+    "fusion/",
+    "io/",
+    "mapping/point_maps.py",
+    "maps/",
+    "model/",
+    "plugins.py",
+    "processes.py",
+    "sensors/",
+    "simulation/",
+    "slam/",
+    "text.py",
+    "threads.py",
+    "version.py",
+    "vision/",
 )
+NOT_COUNTED = "sensors/rfid/calibration/"  # learns a rig before a run
 Kept = TypeVar("Kept", bound=BaseModel)
 _UNSETTLED = 2.0  # s: a younger file may change again without a new modification time
 
@@ -53,14 +72,24 @@ def digest_of(content: Any) -> str:
 @lru_cache
 def code_version() -> str:
     """A digest of the source files that runs use."""
-    package = Path(__file__).parents[1]
+    return digest_of_code(Path(__file__).parents[2])
+
+
+def digest_of_code(root: Path) -> str:
+    """The digest of the source files that runs use, of the packages in the folder ``root``: all of ``factors``, and the parts
+    :data:`COUNTED` of ``factorgraph_loc``."""
     total = hashlib.sha256()
-    for root in (package, package.parent / "factors"):
-        for file in sorted(root.rglob("*")):
-            name = file.relative_to(root).as_posix()
-            if file.suffix in (".py", ".npz") and not (root is package and name.startswith(OUTSIDE)):
-                total.update(f"{root.name}/{name}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
+    for package in (root / PACKAGE, root / "factors"):
+        for file in sorted(package.rglob("*")):
+            name = file.relative_to(package).as_posix()
+            if file.suffix in (".py", ".npz") and (package.name != PACKAGE or is_counted(name)):
+                total.update(f"{package.name}/{name}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
     return total.hexdigest()
+
+
+def is_counted(name: str) -> bool:
+    """Whether a file of ``factorgraph_loc``, by its path in the package, is among those that runs use."""
+    return name.startswith(COUNTED) and not name.startswith(NOT_COUNTED)
 
 
 @lru_cache

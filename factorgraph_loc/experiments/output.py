@@ -18,15 +18,12 @@ import polars as pl
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.aligned import score
-from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates
-from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.metrics import errors
-from factorgraph_loc.evaluation.plots import plot_run, remove_plots
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
-from factorgraph_loc.files.models import file_name, write_text, write_toml
+from factorgraph_loc.files.models import write_text, write_toml
 from factorgraph_loc.files.temporary import of_system, require_free, sweep, temporary_folder, writing
 from factorgraph_loc.io.native.world_file import write_world
-from factorgraph_loc.io.results import FILES, trajectory_of
+from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
@@ -100,13 +97,6 @@ def map_of(result: RunResult, log: Log) -> World | None:
 
         points, _ = merged(known, points)
     return log.world.model_copy(update={"name": f"{log.name}-map", "points": points})
-
-
-def write_plots(result: RunResult, log: Log, out: Path) -> None:
-    """Write the plots of a run into ``out/plots``, replacing those of a previous one."""
-    folder = out / "plots"
-    remove_plots(folder)
-    plot_run(log, str(result.config["estimator"]), Track.of(result), folder, file_name(log.name))
 
 
 def beside(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
@@ -237,17 +227,3 @@ def run_files(result: RunResult, log: Log, started: float) -> dict[str, bytes]:
 def timings_file(timings: Mapping[str, Any]) -> bytes:
     """The content of ``timings.json``; non-finite values are null."""
     return _json(timings).encode()
-
-
-def read_track(estimates: bytes) -> Track:
-    """The trajectories of an ``estimates.parquet``; see :meth:`~factorgraph_loc.experiments.store.Store.track`."""
-    table = parse_estimates(estimates, NAME)
-    t0_ns = int(table["t_ns"].to_numpy().min(initial=np.iinfo(np.int64).max))
-    causal = trajectory_of(table.filter((pl.col("kind") == "causal") & _from_localized(table)), t0_ns)
-    final = trajectory_of(table.filter(pl.col("kind") == "final"), t0_ns)
-    return Track(causal if len(causal) else None, final, np.empty(0))
-
-
-def _from_localized(table: pl.DataFrame) -> pl.Expr:
-    found = table.filter((pl.col("kind") == "causal") & (pl.col("status") == "localized"))["t_ns"]
-    return pl.col("t_ns") >= (found.min() if len(found) else np.iinfo(np.int64).max)

@@ -132,7 +132,7 @@ class _Pool:
         for w in self._workers:
             w.process.join()
         Store(self._folder).sweep()
-        sweep(of_system("").parent)
+        sweep(of_system("run").parent)
 
     def _start(self) -> _Worker:
         return _Worker(*start(worker.serve, self._folder, self._again))

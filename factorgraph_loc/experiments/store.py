@@ -187,10 +187,21 @@ class Store:
             raise DamagedError(f"{error}{_AGAIN}") from error
 
     def track(self, key: str) -> Track:
-        """The causal and the final trajectory of a run, with covariances, times [s] from its first estimate."""
-        from factorgraph_loc.experiments.output import read_track  # noqa: PLC0415
+        """The causal trajectory from the first localized estimate on, and the final one, with covariances, times [s] from the
+        first estimate."""
+        import numpy as np  # noqa: PLC0415
+        import polars as pl  # noqa: PLC0415
 
-        return read_track(self.read(key, "estimates.parquet"))
+        from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates  # noqa: PLC0415
+        from factorgraph_loc.evaluation.figures import Track  # noqa: PLC0415
+        from factorgraph_loc.io.results import trajectory_of  # noqa: PLC0415
+
+        table = parse_estimates(self.read(key, NAME), NAME)
+        causal, final = (table.filter(pl.col("kind") == kind) for kind in ("causal", "final"))
+        t0_ns = table["t_ns"].min() if len(table) else 0
+        localized = causal.filter(pl.col("status") == "localized")["t_ns"]
+        causal = causal.filter(pl.col("t_ns") >= localized.min()) if len(localized) else causal.clear()
+        return Track(trajectory_of(causal, t0_ns) if len(causal) else None, trajectory_of(final, t0_ns), np.empty(0))
 
     def put(self, key: str, files: Mapping[str, bytes]) -> None:
         """Write the files of a run atomically, replacing existing ones; its claim must be held."""
@@ -230,8 +241,9 @@ class Store:
         try:
             mine = _lock(handle, path)
             if mine:
-                os.truncate(handle, 0)
-                os.write(handle, f"{socket.gethostname()} {os.getpid()}\n".encode())
+                with self._writing():
+                    os.truncate(handle, 0)
+                    os.write(handle, f"{socket.gethostname()} {os.getpid()}\n".encode())
             try:
                 yield mine
             finally:

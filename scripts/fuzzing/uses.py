@@ -14,7 +14,8 @@ from numpy.random import Generator
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.experiments.experiment import prepare
-from factorgraph_loc.experiments.reporting import load_results, report_experiment
+from factorgraph_loc.experiments.reporting import report_experiment
+from factorgraph_loc.experiments.result_table import load_results
 from factorgraph_loc.exports.foxglove import write_mcap
 from factorgraph_loc.exports.rerun_scene import write_rrd
 from factorgraph_loc.exports.runs import find_runs, read_runs

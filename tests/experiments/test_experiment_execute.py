@@ -12,7 +12,7 @@ from factorgraph_loc.experiments import execute
 from factorgraph_loc.experiments.experiment import PACE, estimate_seconds, prepare, run_experiment
 from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.plan import plan
-from factorgraph_loc.experiments.reporting import load_results
+from factorgraph_loc.experiments.result_table import load_results
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.experiments.store import FAILURE, MANIFEST, TIMINGS, Store, StoreError
 from factorgraph_loc.io.native.native import write_native

@@ -270,18 +270,6 @@ def test_a_file_is_read_again_only_if_it_has_changed(tmp_path, monkeypatch):
     assert keys.FileDigests(cache).of_file(file) != first
 
 
-def test_parts_of_the_package_that_are_no_part_of_a_key_are_not_loaded_by_a_run():
-    script = (
-        "import sys, factorgraph_loc.experiments.output, factorgraph_loc.io.readers, factorgraph_loc.simulation\n"
-        "from factorgraph_loc.fusion import registry\n"
-        "for name in registry.ESTIMATORS: registry.estimator_type(name)\n"
-        "print(*sys.modules)"
-    )
-    loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
-    outside = tuple(f"factorgraph_loc.{part.removesuffix('.py').replace('/', '.')}" for part in keys.OUTSIDE)
-    assert [name for name in loaded if name.startswith(outside)] == []
-
-
 def test_a_cache_that_is_too_large_or_no_file_is_made_again(tmp_path):
     class Kept(BaseModel):
         one: int

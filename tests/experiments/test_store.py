@@ -270,6 +270,15 @@ def test_a_full_disk_is_told_and_the_store_stays_whole(small_disk):
     store.put(OTHER, FILES)
 
 
+def test_a_disk_that_is_full_at_a_claim_is_told_in_one_line(store, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(StoreError, match="cannot be written: No space left on device"), store.claim(KEY):
+        pass
+
+
 @pytest.mark.parametrize("folder", ["a file", "/proc"])  # neither of which root can write into
 def test_a_folder_that_cannot_be_written_is_told_in_one_line(tmp_path, folder):
     path = Path("/proc/nowhere")
