@@ -198,7 +198,7 @@ class Store:
 
         table = parse_estimates(self.read(key, NAME), NAME)
         causal, final = (table.filter(pl.col("kind") == kind) for kind in ("causal", "final"))
-        t0_ns = table["t_ns"].min() if len(table) else 0
+        t0_ns = int(table["t_ns"].to_numpy().min(initial=np.iinfo(np.int64).max))
         localized = causal.filter(pl.col("status") == "localized")["t_ns"]
         causal = causal.filter(pl.col("t_ns") >= localized.min()) if len(localized) else causal.clear()
         return Track(trajectory_of(causal, t0_ns) if len(causal) else None, trajectory_of(final, t0_ns), np.empty(0))
