@@ -1,10 +1,13 @@
-"""The long description: the README, with links and images that lead to the repository as it was tagged."""
+"""The packages, with the folder ``datasets`` as ``factorgraph_loc.datasets``, and the long description.
+
+The long description is the README, with links and images that lead to the repository as it was tagged.
+"""
 
 import re
 import tomllib
 from pathlib import Path
 
-from setuptools import setup
+from setuptools import find_packages, setup
 
 
 def text(path: str) -> str:
@@ -20,4 +23,9 @@ def long_description() -> str:
     return re.sub(r"((?<!!)\[[^\]]*\]\()(?!https?:)", rf"\g<1>{repository}/blob/v{version}/", with_images)
 
 
-setup(long_description=long_description(), long_description_content_type="text/markdown")
+setup(
+    packages=[*find_packages(include=["factorgraph_loc*", "factors*"]), "factorgraph_loc.datasets"],
+    package_dir={"factorgraph_loc.datasets": "datasets"},
+    long_description=long_description(),
+    long_description_content_type="text/markdown",
+)
