@@ -3,6 +3,7 @@ polars unpacks them."""
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import parquet_pages
 from factorgraph_loc.files.bounded import DATA, foreign, quiet, read_bytes, require_size
 from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table
-from factorgraph_loc.files.models import nearest, read_text, replacing
+from factorgraph_loc.files.models import Model, nearest, parse_model, read_text, replacing
 from factorgraph_loc.text import told
 from factors.se2 import Array, Integers
 
@@ -98,6 +99,31 @@ def shape_of(path: Path, header: Sequence[str], shapes: Sequence[Shape]) -> Shap
     hint = nearest(missing, [column for column in header if column not in meant])
     expected = " or ".join(",".join(shape) for shape in shapes)
     raise InputError(f"{path}:1: column {missing} is missing{hint if 'mean' in hint else ''}, expected {expected}")
+
+
+def rows_by_name(
+    kind: type[Model],
+    path: Path,
+    rows: Sequence[int],
+    column: Column,
+    names: Sequence[str],
+    numbers: Mapping[str, Array],
+) -> dict[str, Model]:
+    """The N rows of a table as models of ``kind`` by their ``names`` in ``column``.
+
+    ``rows``: N line numbers in ``path``; ``numbers``: values (N,) by field, NaN for the default of the field. InputError names file
+    and row of an empty or repeated name, and of an invalid value.
+    """
+    found: dict[str, Model] = {}
+    seen: dict[str, int] = {}
+    for i, (row, name) in enumerate(zip(rows, names, strict=True)):
+        if not name or name in seen:
+            expected = f"another name than in row {seen[name]}" if name else column.doc
+            raise bad_field(path, column.name, name, expected, row=row)
+        values = {field: float(cells[i]) for field, cells in numbers.items() if not math.isnan(cells[i])}
+        found[name] = parse_model(kind, values, f"{path}:{row}")
+        seen[name] = row
+    return found
 
 
 def read_parquet(path: Path) -> pl.DataFrame:

@@ -241,3 +241,63 @@ def test_a_folder_that_is_not_beside_its_manifest(hall, refused, monkeypatch):
     monkeypatch.delenv("FGLOC_DATA", raising=False)
     hall.write_text(MANIFEST.replace('"run"', '"rnu"'))
     refused(hall, "hall.toml (which has no rnu beside it): needs the data folder")
+
+
+NAMES = """
+[options.bearing_range]
+file = "seen.csv"
+columns = { t = "t", landmark = "code", range = "range" }
+units = { t = "s" }
+
+[options.bearing_range.names]
+file = "codes.csv"
+columns = { file_name = "code", name = "post" }
+where = { moves = "no" }
+
+[options.world]
+name = "yard"
+
+[options.world.landmarks]
+file = "posts.csv"
+columns = { landmark = "post", x = "x", y = "y", sigma_x = "sx", sigma_y = "sy" }
+units = { x = "cm", y = "cm", sigma_x = "mm", sigma_y = "mm" }
+"""
+
+
+@pytest.fixture
+def yard(hall, with_options):
+    """A manifest whose robot measures codes of posts; the tables of posts and codes lie in the folder of the log."""
+    folder = hall.parent / "run"
+    (folder / "seen.csv").write_text("t,code,range\n1,63,2.5\n1,5,1.0\n2,99,3.0\n2,81,1.5\n")
+    (folder / "codes.csv").write_text("code,post,moves\n63,A,no\n81,B,no\n5,cart,yes\n")
+    (folder / "posts.csv").write_text("post,x,y,sx,sy\nA,100,200,1,2\nB,-50,0,4,3\n")
+    with_options(WHEELS + NAMES)
+    return folder
+
+
+@pytest.mark.usefixtures("yard")
+def test_names_of_the_map_and_the_map_are_tables_of_the_folder(hall, one):
+    log = one(hall)
+    seen = log.streams["bearing_range"]
+    assert list(seen.landmark) == ["A", "B"]
+    np.testing.assert_array_equal(seen.range, (2.5, 1.5))
+    assert any("seen.csv: 2 rows have a landmark that codes.csv does not name" in told for told in log.warnings)
+    assert (log.world.name, list(log.world.landmarks)) == ("yard", ["A", "B"])
+    for name, expected in {"A": (1.0, 2.0, 0.002), "B": (-0.5, 0.0, 0.004)}.items():
+        landmark = log.world.landmarks[name]
+        np.testing.assert_allclose((landmark.x, landmark.y, landmark.sigma), expected)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "fragments"),
+    [
+        ("codes.csv", "code,post,moves\n63,A,no\n63,B,no\n", ("codes.csv:3: code is '63'", "each name once")),
+        ("codes.csv", "code,post,moves\n7,A,no\n", ("seen.csv: no row has a landmark", "codes.csv names, such as 7")),
+        ("codes.csv", "code,moves\n63,no\n", ("codes.csv:1: has no column 'post'",)),
+        ("posts.csv", "post,x,y,sx,sy\nA,1,2,1,1\nA,1,2,1,1\n", ("posts.csv:3: landmark is 'A'", "than in row 2")),
+        ("posts.csv", "post,x,y,sx,sy\nA,1,,1,1\n", ("posts.csv:2: y is ''", "a finite number of cm")),
+    ],
+)
+def test_wrong_tables_of_names_and_landmarks(hall, yard, refused, file, text, fragments):
+    (yard / file).write_text(text)
+    refused(hall, *fragments)

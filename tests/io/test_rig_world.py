@@ -166,7 +166,7 @@ def test_a_table_of_tags_by_hand(tmp_path):
 
 
 BAD_TAGS = {
-    "twice": ("E1,1,2,3,\nE2,1,2,3,\nE1,4,5,6,\n", ":4: epc is 'E1', expected another EPC than in row 2"),
+    "twice": ("E1,1,2,3,\nE2,1,2,3,\nE1,4,5,6,\n", ":4: epc is 'E1', expected another name than in row 2"),
     "no EPC": (",1,2,3,\n", ":2: epc is ''"),
     "no y": ("E1,1,,3,\n", ":2: y is '', expected a finite number of m"),
     "degrees": ("E1,1,2,3,90\n", ":2: facing is 90.0"),

@@ -4,17 +4,19 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, Unread, read_mapped
-from factorgraph_loc.files.columns import STAMPS, Table
+from factorgraph_loc.files.columns import ANGLE, STAMPS, Table, named
 from factorgraph_loc.files.models import FileModel, add_fields, inside
 from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
 from factorgraph_loc.io.native import native
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
+from factorgraph_loc.io.native.world_file import parse_world
 from factorgraph_loc.io.readers.mapped_poses import (
     OdometryFile,
     Offset,
@@ -28,15 +30,22 @@ from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_re
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Turned, about_z
-from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.tables import make_images
 from factorgraph_loc.sensors.odometry.tables import IMU
 from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, ReadsByRound, read_rounds
 from factorgraph_loc.sensors.tables import Reading, native_tables
+from factorgraph_loc.text import listed
+from factors import se2
 from factors.se2 import Array
 
 RATES = ("wx", "wy", "wz")
+FILE_NAME = named("file_name", "a name in the table of the sensor")
+MAP_NAME = named("name", "a name in the map")
 RATE = replace(IMU["w"], may_lack=True)  # about one of three axes, of which some may be missing
+
+
+class NamesFile(ColumnMapping):
+    """A table of names. ``columns``: ``file_name``, a name in the table of the sensor, and ``name``, that in the map."""
 
 
 class SensorFile(ColumnMapping):
@@ -44,6 +53,13 @@ class SensorFile(ColumnMapping):
 
     clock_offset: Offset = 0.0
     """added to all timestamps"""
+
+
+class NamedFile(SensorFile):
+    """A table of a sensor that names things of the map."""
+
+    names: NamesFile | None = None
+    """table of the names in the map by those in the file; rows with other names are skipped"""
 
 
 class ImuFile(SensorFile, Turned):
@@ -72,10 +88,20 @@ class Options(FileModel):
     inventories: InventoryFile | None = None
     camera: ImageFile | None = None
     reference: ReferenceFile | None = None
+    world: dict[str, Any] = Field(default_factory=dict)
+    """the map as in a world file, whose files are in the folder of the log"""
+
+
+def _has_names(tables: Sequence[Table]) -> bool:
+    return any(column.kind == "name" for table in tables for column in table.columns)
 
 
 OTHERS = [name for name in native_tables() if name not in Options.model_fields]  # tables that need a mapping only
-add_fields(Options, dict.fromkeys(OTHERS, (SensorFile | None, None)), after="camera")
+add_fields(
+    Options,
+    {name: ((NamedFile if _has_names(native_tables()[name][1]) else SensorFile) | None, None) for name in OTHERS},
+    after="camera",
+)
 
 
 def read(path: Path | None, options: Options) -> Log:
@@ -90,7 +116,7 @@ def read(path: Path | None, options: Options) -> Log:
     times = _times(path, options.odometry)
     odometry_t_ns, moves, increments = read_odometry(odometry_path, times, options.odometry, warnings, unread)
     tables = {
-        name: _table(inside(path, mapping.file, path), native_tables()[name][1], mapping, warnings, unread)
+        name: _table(path, native_tables()[name][1], mapping, warnings, unread)
         for name in ("imu", "camera", *OTHERS)
         if (mapping := getattr(options, name)) is not None
     }
@@ -116,7 +142,7 @@ def read(path: Path | None, options: Options) -> Log:
     return Log(
         name=name,
         rig=DEFAULT_RIG,
-        world=World(name=name),
+        world=parse_world({"name": name, **options.world}, path, path),
         streams=streams,
         reference=reference,
         t0_ns=t0_ns,
@@ -129,8 +155,11 @@ def _times(folder: Path, told: PosesFile) -> Path | None:
     return None if told.times is None else inside(folder, told.times, folder)
 
 
-def _table(path: Path, tables: Sequence[Table], mapping: SensorFile, warnings: list[str], unread: Unread) -> TableRows:
-    """A file as one of ``tables`` of the native format."""
+def _table(
+    folder: Path, tables: Sequence[Table], mapping: SensorFile, warnings: list[str], unread: Unread
+) -> TableRows:
+    """A file in ``folder`` as one of ``tables`` of the native format."""
+    path = inside(folder, mapping.file, folder)
     shapes = tuple(shape for table in tables for shape in _shapes(table))
     columns = {column.name: column for table in tables for column in table.columns}
     if isinstance(mapping, ImuFile):
@@ -146,9 +175,39 @@ def _table(path: Path, tables: Sequence[Table], mapping: SensorFile, warnings: l
     for column in known:
         if column.units is STAMPS:  # another time, by the same clock
             numbers[column.name] = numbers[column.name] + 1e9 * mapping.clock_offset
+        if column.units is ANGLE:
+            numbers[column.name] = se2.wrap(numbers[column.name])  # others count from 0 to 2 pi
     if isinstance(mapping, ImuFile):
         numbers = {"w": _about_z(mapped, mapping, numbers)}
-    return TableRows(path, mapped.rows, mapped.stamps("t", mapping.clock_offset), numbers, names)
+    rows = TableRows(path, mapped.rows, mapped.stamps("t", mapping.clock_offset), numbers, names)
+    if isinstance(mapping, NamedFile) and mapping.names is not None:
+        return _in_map(rows, folder, mapping.names, warnings)
+    return rows
+
+
+def _in_map(table: TableRows, folder: Path, told: NamesFile, warnings: list[str]) -> TableRows:
+    """The rows of a table with the names of the map, without the rows whose names the table of names lacks."""
+    path = inside(folder, told.file, folder)
+    known = _names(path, told)
+    ((column, names),) = table.names.items()
+    kept = np.flatnonzero([name in known for name in names])
+    if not len(kept):
+        raise InputError(f"{table.path}: no row has a {column} that {path.name} names, such as {listed(known)}")
+    if skipped := len(names) - len(kept):
+        warnings.append(f"{table.path}: {skipped} rows have a {column} that {path.name} does not name: skipped")
+    found = table.rows_at(kept)
+    return replace(found, names={column: [known[name] for name in found.names[column]]})
+
+
+def _names(path: Path, told: NamesFile) -> dict[str, str]:
+    """The names in the map by those in the table of a sensor; InputError if one occurs twice."""
+    mapped = read_mapped(path, told, (("file_name", "name"),))
+    known: dict[str, str] = {}
+    for row, name, meaning in zip(mapped.rows, mapped.names(FILE_NAME), mapped.names(MAP_NAME), strict=True):
+        if name in known:
+            raise bad_field(path, told.columns["file_name"], name, "each name once", row=int(row))
+        known[name] = meaning
+    return known
 
 
 def _shapes(table: Table) -> tuple[tuple[str, ...], ...]:

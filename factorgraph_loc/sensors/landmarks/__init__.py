@@ -17,7 +17,12 @@ SENSOR = SensorType(
         ),
     ),
     settings={"bearing_range": Section("factorgraph_loc.sensors.landmarks.settings:BearingRangeSettings")},
-    layers={"landmarks": Layer("factorgraph_loc.sensors.landmarks.settings:Landmark")},
+    layers={
+        "landmarks": Layer(
+            "factorgraph_loc.sensors.landmarks.settings:Landmark",
+            read="factorgraph_loc.sensors.landmarks.map:read_layer",
+        ),
+    },
     bind="factorgraph_loc.sensors.landmarks.bound:bind",
     summarize="factorgraph_loc.sensors.landmarks.summary:summarize",
     check="factorgraph_loc.sensors.landmarks.describe:check",

@@ -3,16 +3,15 @@
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
-from factorgraph_loc.errors import bad_field
 from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, in_case, read_mapped
 from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, inside, parse_model, write_text
-from factorgraph_loc.files.tables import read_cells
+from factorgraph_loc.files.tables import read_cells, rows_by_name
 from factorgraph_loc.model.settings import Covariance, spread_of
 from factorgraph_loc.sensors.rfid.columns import TAGS
 from factors.se2 import Array
@@ -71,27 +70,16 @@ def read_tags(path: Path) -> dict[str, Tag]:
     InputError names file, row and field of an invalid value, or of a duplicate EPC.
     """
     cells, shape = read_cells(path, (TAG_COLUMNS_WITH_SIGMA, TAG_COLUMNS))
-    return _tags(path, cells.rows, cells.columns["epc"], {name: cells.numbers(name, TAGS[name]) for name in shape[1:]})
+    numbers = {name: cells.numbers(name, TAGS[name]) for name in shape[1:]}
+    return rows_by_name(Tag, path, cells.rows, TAGS["epc"], cells.columns["epc"], numbers)
 
 
 def read_mapped_tags(path: Path, mapping: TagsFile) -> dict[str, Tag]:
     """Read a foreign table; InputError as in :func:`read_tags`."""
     mapped = read_mapped(path, mapping, (("epc", "x", "y"),), ("z", "facing", "sigma"))
     numbers = {name: mapped.numbers(name, TAGS[name]) for name in mapped.fields if name != "epc"}
-    return _tags(path, mapped.cells.rows, in_case(mapped.texts("epc"), mapping.epc_case), numbers)
-
-
-def _tags(path: Path, rows: Sequence[int], epcs: Sequence[str], numbers: Mapping[str, Array]) -> dict[str, Tag]:
-    tags: dict[str, Tag] = {}
-    found: dict[str, int] = {}
-    for i, (row, epc) in enumerate(zip(rows, epcs, strict=True)):
-        if not epc or epc in tags:
-            expected = f"another EPC than in row {found[epc]}" if epc else "the EPC of a tag"
-            raise bad_field(path, "epc", epc, expected, row=row)
-        values = {name: float(column[i]) for name, column in numbers.items() if not math.isnan(column[i])}
-        tags[epc] = parse_model(Tag, values, f"{path}:{row}")
-        found[epc] = row
-    return tags
+    epcs = in_case(mapped.texts("epc"), mapping.epc_case)
+    return rows_by_name(Tag, path, mapped.cells.rows, TAGS["epc"], epcs, numbers)
 
 
 def write_tags(tags: Mapping[str, Tag], path: Path) -> None:
