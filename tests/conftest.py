@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from factorgraph_loc.threads import use_one_thread
 
@@ -19,6 +19,8 @@ use_one_thread()
 gc.set_threshold(50_000)  # as the command does: a search through all that the tests import takes a third of a second
 # the same examples on each run; no deadline, as the first call of a compiled function takes seconds
 settings.register_profile("seeded", derandomize=True, deadline=None)
+# many other examples on each run, for `pytest tests/fuzz --hypothesis-profile=long`
+settings.register_profile("long", max_examples=10_000, deadline=None, suppress_health_check=list(HealthCheck))
 settings.load_profile("seeded")
 
 

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from factorgraph_loc.cli.stopping import Stop, stoppable
-
 COMMAND = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
 LINES = {signal.SIGINT: "interrupted\n", signal.SIGTERM: "terminated\n", signal.SIGHUP: "hung up\n"}
 
@@ -68,21 +66,47 @@ def test_a_killed_comparison_leaves_no_process_and_can_be_made_again(processes, 
     assert "holds results already" in other.stderr
 
 
-def test_a_signal_is_not_lost_in_a_destructor():
-    class Slow:
-        def __del__(self):
-            signal.raise_signal(signal.SIGTERM)
-            print("goes on")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_conversion_is_whole_or_not_there(how, processes, short_log, tmp_path, fgloc):
+    """A signal comes while it writes; the same command then gives what it gives undisturbed, and removes what was left."""
+    fgloc("convert", short_log, tmp_path / "expected")
+    running = processes.start(*COMMAND, "convert", short_log, tmp_path / "copy")
+    processes.wait_until(lambda: temporary(tmp_path) or running.poll() is not None)
+    os.killpg(running.pid, how)
+    running.wait()
+    if running.returncode == 130:
+        assert temporary(tmp_path) == []
+    if not (tmp_path / "copy").exists():
+        assert fgloc("convert", short_log, tmp_path / "copy").exit_code == 0
+    expected, copy = ({file.name: file.read_bytes() for file in (tmp_path / n).iterdir()} for n in ("expected", "copy"))
+    assert copy == expected
+    assert temporary(tmp_path) == []
 
-    def end_slowly():
+
+# in a process of its own: a test runner would take the exception for its own interrupt
+DESTRUCTOR = """
+import signal
+
+from factorgraph_loc.cli.stopping import Stop, stoppable
+
+class Slow:
+    def __del__(self):
+        signal.raise_signal(signal.SIGTERM)
+        print("goes on")
+
+try:
+    with stoppable():
         slow = Slow()
         del slow
         signal.pause()
+except Stop as stop:
+    print(stop.number.name, signal.getsignal(signal.SIGTERM).name)
+"""
 
-    with pytest.raises(Stop) as stopped, stoppable():
-        end_slowly()
-    assert stopped.value.number == signal.SIGTERM
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+def test_a_signal_is_not_lost_in_a_destructor(processes):
+    running = processes.start(sys.executable, "-c", DESTRUCTOR, stdout=subprocess.PIPE)
+    assert running.communicate(timeout=processes.PATIENCE)[0] == "SIGTERM SIG_DFL\n"
 
 
 IMPORTING = """
