@@ -23,5 +23,4 @@ __all__ = [
     "se2_kernels",
     "small_kernels",
     "update",
-    "walls",
 ]

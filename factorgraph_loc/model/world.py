@@ -6,51 +6,34 @@ A layer may be kept in a table next to the file, such as ``NAME.tags.csv``; poin
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field
 
-from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, add_fields
+from factorgraph_loc.files.models import Coordinate, FileModel, add_fields
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.sections import layers
 from factorgraph_loc.plugins import FILES, load
 from factors.se2 import Array
 
 L = TypeVar("L", bound=FileModel)
-Attenuation = Annotated[float, Field(ge=0.0, le=100.0), InUnit("dB")]
 
 
 class World(FileModel):
-    """A map. ``points``: points that cameras see. ``walls``: segments (x1, y1, x2, y2) [m]; ``wall_attenuation``: how much each, or
-    all of them, weaken radio waves [dB], None for not at all. Layers hold surveyed elements by name, for example ``landmarks``,
-    and RFID ``tags`` by EPC."""
+    """A map. ``points``: points that cameras see. ``walls``: segments (x1, y1, x2, y2) [m]. Layers hold surveyed
+    elements by name, for example ``landmarks``, and RFID ``tags`` by EPC."""
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
     name: str = "world"
     points: PointMap | None = None
     walls: tuple[tuple[Coordinate, Coordinate, Coordinate, Coordinate], ...] = ()
-    wall_attenuation: Attenuation | tuple[Attenuation, ...] | None = None
 
     if TYPE_CHECKING:
 
         def __init__(self, **values: Any) -> None: ...
         def __getattr__(self, layer: str) -> Any: ...
-
-    @model_validator(mode="after")
-    def _has_one_for_each(self) -> Self:
-        if isinstance(self.wall_attenuation, tuple) and len(self.wall_attenuation) != len(self.walls):
-            raise ValueError(
-                f"wall_attenuation has {len(self.wall_attenuation)} numbers, expected one or {len(self.walls)}, as there are walls"
-            )
-        return self
-
-    def attenuating(self) -> Array:
-        """The walls that attenuate radio waves, (W, 5): x1, y1, x2, y2 [m] and attenuation [dB]."""
-        walls = np.array(self.walls).reshape(-1, 4)
-        attenuation = np.broadcast_to(np.array(self.wall_attenuation or 0.0), len(walls))
-        return np.column_stack((walls, attenuation))[attenuation > 0.0]
 
     @classmethod
     def read(cls, path: str | Path) -> World:

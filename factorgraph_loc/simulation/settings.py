@@ -13,7 +13,6 @@ from factorgraph_loc.files.models import FileModel, InUnit, add_fields, inside, 
 from factorgraph_loc.io.native.rig_file import read_rig
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.settings import Hertz
-from factorgraph_loc.model.world import Attenuation
 from factorgraph_loc.plugins import load
 from factorgraph_loc.sensors.registry import functions, sensors
 from factorgraph_loc.text import quoted
@@ -46,8 +45,6 @@ class WorldSettings(FileModel):
     """number of landmarks on the walls"""
     points: Annotated[int, Field(ge=0, le=10_000)] = 0
     """number of named points on walls and furniture for a camera"""
-    wall_attenuation: Attenuation | None = None
-    """attenuation of reads by each wall, and by each side of furniture, none if omitted"""
 
     @model_validator(mode="after")
     def _has_one_number(self) -> WorldSettings:

@@ -201,7 +201,6 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
         landmarks={f"L{i:03d}": Landmark(x=x, y=y) for i, (x, y) in enumerate(landmarks)},
         points=_points(plan, walls, boxes, settings.points, rng) if settings.points else None,
         walls=tuple((a, b, c, d) for a, b, c, d in plan.segments().round(3).tolist()),
-        wall_attenuation=settings.wall_attenuation,
     )
 
 

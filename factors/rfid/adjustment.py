@@ -53,7 +53,6 @@ def adjusted(packed: Packed, parameters: Array) -> Packed:
         scale,
         rate,
         packed.peak,
-        packed.walls,
     )
 
 

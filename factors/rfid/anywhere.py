@@ -3,7 +3,7 @@
 For each pose only the tags in its reach are looked at, which a :class:`~factors.rfid.index.TagIndex` tells. Most of them were not
 read. What that tells is a function of the tag's place in the robot's frame, the same for all tags of one height; it is tabulated
 for all antennas together, as is what a read by each antenna adds, in the cells of :mod:`factors.rfid.tables`. Models that use the
-facing of tags have no such tables. Walls are those between the tag and the robot's middle.
+facing of tags have no such tables.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from factors.rfid.index import TagIndex, cells
 from factors.rfid.model import LOGISTIC, Packed, RfidModel
 from factors.rfid.tables import CELL, NEGLIGIBLE, Tables
 from factors.se2 import Array, Integers
-from factors.walls import Walls, farther
 
 MOST = 1 << 25  # numbers in the tables; more have none
 NO_MATTER = 1e-3  # of a log-likelihood: a silence that tells less is taken for one out of reach
@@ -38,14 +37,13 @@ class Antennas(NamedTuple):
 class PlaceTables(NamedTuple):
     """Of H heights: ``gain`` (A, H, S, S), log q - log(1 - q) of each antenna for a tag at a place in the robot's frame, and
     ``missed`` (A, H, S, S), log(1 - q) above that out of reach; ``level`` (T,): height of each tag; ``reach`` [m], from the
-    robot's middle; ``none`` (2,): log q and log(1 - q) out of reach; ``walls``: of the map."""
+    robot's middle; ``none`` (2,): log q and log(1 - q) out of reach."""
 
     gain: NDArray[np.float32]
     missed: NDArray[np.float32]
     level: Integers
     reach: float
     none: Array
-    walls: Walls | None
 
 
 class Heights(NamedTuple):
@@ -100,7 +98,7 @@ def place_tables(model: RfidModel, antennas: Antennas, heights: Heights) -> Plac
     q = packed.false_read + packed.span * tables.sigmoids[0]
     none = np.log(np.array((q, 1.0 - q)))
     _fill(packed, tables, logs, heights.columns, half, none, gain, missed)
-    return PlaceTables(gain, missed, heights.level, reach, none, packed.walls)
+    return PlaceTables(gain, missed, heights.level, reach, none)
 
 
 def silence(tables: PlaceTables, antennas: Integers, rounds: Integers, odds: float, tempering: float) -> TagSilence:
@@ -152,8 +150,6 @@ def log_likelihood(
                 w = listed.number[k]
                 if ex * ex + ey * ey >= (silent2 if w < 0 else reach2):
                     continue
-                factor = farther(tables.walls, px, py, points[k, 0], points[k, 1])
-                ex, ey = factor * ex, factor * ey
                 i = min(max(int((c * ex + s * ey) * inverse + middle), 0), size - 1)
                 j = min(max(int((c * ey - s * ex) * inverse + middle), 0), size - 1)
                 h = levels[k]

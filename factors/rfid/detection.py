@@ -27,7 +27,6 @@ from factors.rfid.near import MapTags
 from factors.rfid.places import Places, in_reach, is_wide, reach_of
 from factors.rfid.tables import Tables, make_tables
 from factors.se2 import Array, Integers
-from factors.walls import NO_WALLS, walls_around
 
 ROUNDING = 0.02, 0.05  # of the parameters of a detection model, in tables of places
 KEPT = 3  # such tables, those of the rig among them
@@ -35,12 +34,10 @@ KEPT = 3  # such tables, those of the rig among them
 
 @dataclass(frozen=True, eq=False)
 class TagArray:
-    """T tags: ``points`` (T, 3) [m] in the world and ``facing`` (T,) [rad], NaN if unknown. ``walls`` (W, 5): segments between
-    which they are, [m], with their attenuation [dB]."""
+    """T tags: ``points`` (T, 3) [m] in the world and ``facing`` (T,) [rad], NaN if unknown."""
 
     points: Array
     facing: Array
-    walls: Array = field(default_factory=NO_WALLS.copy)
 
     @cached_property
     def normals(self) -> Array:
@@ -87,9 +84,7 @@ class RfidLikelihood:
     _of_parameters: dict[tuple[float, ...], Places] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        packed = self.model.packed()
-        walls = walls_around(self.tags.walls, float(packed.reach.max(initial=0.0)))
-        object.__setattr__(self, "packed", packed._replace(walls=walls))
+        object.__setattr__(self, "packed", self.model.packed())
         object.__setattr__(self, "parameters", np.zeros(2 * len(self.model.models)))
         object.__setattr__(self, "_unadjusted", self)
 
@@ -165,7 +160,7 @@ class RfidLikelihood:
 
     @cached_property
     def _tables(self) -> Tables:
-        return make_tables(self.model, self.packed._replace(walls=None), self.tags.points[:, 2])
+        return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
     def work(self, looks: TagReadCounts) -> int:
         """How many tags are looked at, by all antennas, to tell the likelihood of one pose among poses that are far apart."""

@@ -9,7 +9,6 @@ from factors.compiled import compiled
 from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed, logit
 from factors.se2 import Array
 from factors.se2_kernels import wrapped
-from factors.walls import farther
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}  # fast-math flags that keep infinities
 
@@ -56,19 +55,17 @@ def of_tag(
     packed: Packed, antenna: int, x: float, y: float, c: float, s: float, point: Array, normal: Array
 ) -> tuple[float, float, float, float, float]:
     """Logit of one tag for an antenna at (x, y) that looks along (c, s), and its derivatives: by the tag's place along and across
-    the boresight, by the antenna's heading, and by the logarithm of the model's range. Beyond the reach it is constant.
-    Walls are as distance (:mod:`factors.walls`)."""
+    the boresight, by the antenna's heading, and by the logarithm of the model's range. Beyond the reach it is constant."""
     ex, ey = point[0] - x, point[1] - y
     m = packed.which[antenna]
     squared = ex * ex + ey * ey
-    factor = farther(packed.walls, x, y, point[0], point[1])
-    if factor * factor * squared >= packed.reach[m] ** 2:
+    if squared >= packed.reach[m] ** 2:
         return NEGLIGIBLE_LOGIT, 0.0, 0.0, 0.0, 0.0
     p, q = c * ex + s * ey, c * ey - s * ex
     nx, ny = c * normal[0] + s * normal[1], c * normal[1] - s * normal[0]
     distance = math.sqrt(squared + 1e-9)
     facing = -(nx * p + ny * q) / distance
-    unit = factor / packed.scale[m]
+    unit = 1.0 / packed.scale[m]
     height = point[2] - packed.antennas[antenna, 2]
     value, by_p, by_q, _, by_c = seen(packed, antenna, unit * p, unit * q, height, facing)
     by_p, by_q = unit * by_p, unit * by_q

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from factors.compiled import compiled
 from factors.se2 import Array
-from factors.walls import Walls
 
 BEAM, LOGISTIC, GRID = 0, 1, 2
 FEATURES = ("1", "r", "r^2", "w", "w^2", "r w", "|z|", "c", "c^2", "r c", "w c")
@@ -144,8 +143,7 @@ class Packed(NamedTuple):
     """A :class:`RfidModel` as compiled code takes it. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw and pitch;
     ``which`` (A,): their models; ``kinds`` (M,); ``parameters`` (M, 12); ``shapes`` (M, 5): H, F, NX, NY and the first place in
     ``knots``; ``reach`` (M,); ``span``: what the floor leaves to the model. ``scale`` and ``rate`` (M,): factors of each model's
-    ranges and probabilities (:mod:`factors.rfid.adjustment`); ``peak`` (M,): its largest probability.
-    ``walls``: those of the map that attenuate."""
+    ranges and probabilities (:mod:`factors.rfid.adjustment`); ``peak`` (M,): its largest probability."""
 
     antennas: Array
     which: NDArray[np.int64]
@@ -159,7 +157,6 @@ class Packed(NamedTuple):
     scale: Array
     rate: Array
     peak: Array
-    walls: Walls | None = None
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from factors.rfid.index import TagIndex, cells
 from factors.rfid.kernels import FAST
 from factors.rfid.tables import row_of
 from factors.se2 import Array, Integers
-from factors.walls import farther
 
 
 class Looked(NamedTuple):
@@ -84,8 +83,7 @@ def log_likelihood(
                 for k in range(looks):
                     antenna = looked.antennas[k]
                     x, y = points[t, 0] - at[k, 0], points[t, 1] - at[k, 1]
-                    factor = farther(packed.walls, at[k, 0], at[k, 1], points[t, 0], points[t, 1])
-                    along, across = factor * (at[k, 2] * x + at[k, 3] * y), factor * (at[k, 2] * y - at[k, 3] * x)
+                    along, across = at[k, 2] * x + at[k, 3] * y, at[k, 2] * y - at[k, 3] * x
                     facing = -(normals[t, 0] * x + normals[t, 1] * y) / math.sqrt(x * x + y * y + 1e-9)
                     row = _row(model, antenna, along, across, points[t, 2], facing, levels[antenna, t])
                     if row == 0 and w < 0:

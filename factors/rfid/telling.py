@@ -32,7 +32,7 @@ def telling(
     tempering: float,
 ) -> NDArray[np.bool_]:
     """Which looks at which tags (K, T) tell something of some of the poses (N, 3) with ``parameters`` (N or 1, 2 M): those at tags
-    that are ``near`` (T,), and were read or, as blocks of the tables tell, might have been. With walls, all at near tags."""
+    that are ``near`` (T,), and were read or, as blocks of the tables tell, might have been."""
     offsets, antennas, rounds = looks
     points, _, levels, hits = tags
     out = np.zeros(hits.shape, np.bool_)
@@ -49,7 +49,7 @@ def telling(
         unit = 0.5 * (small + large)
         least = NO_MATTER * min(packed.peak[m], MOST_CERTAIN) / (tempering * rounds[k] * packed.span)
         for t in range(len(near)):
-            if hits[k, t] > 0 or packed.kinds[m] == LOGISTIC or packed.walls is not None:
+            if hits[k, t] > 0 or packed.kinds[m] == LOGISTIC:
                 out[k, t] = near[t]
             elif near[t]:
                 ex, ey = points[t, 0] - x, points[t, 1] - y

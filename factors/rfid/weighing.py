@@ -19,7 +19,6 @@ from factors.rfid.near import MapTags, NearTags, Seen, near_tags, reach_of
 from factors.rfid.tables import CELL, Tables, row_of
 from factors.rfid.telling import Looks, Tags, telling
 from factors.se2 import Array, Integers
-from factors.walls import Walls, around, crosses
 
 BLOCK = 512  # poses at a time, so that what is needed of them stays in the cache
 FARTHEST = 20.0  # log of the ratio of two likelihoods of which the smaller one does not count
@@ -27,7 +26,6 @@ LEAST = 1e-12  # probability of a read, and of a miss
 PRODUCT = 20  # factors of at least LEAST, of which a product is no underflow
 SHIFT = 0.05  # of the logit of a model's peak, to which it is rounded, as in tables of places
 MIXED = 500  # factors up to two, of which a product is no overflow
-_WHERE_IT_IS = np.zeros((1, 2))
 
 _MANTISSA, _HALF = 0x000FFFFFFFFFFFFF, 0x3FE0000000000000  # bits of a number, and of 0.5
 
@@ -61,7 +59,6 @@ def log_likelihood(
     size = min(BLOCK, len(poses))
     at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
     own, product, room, mixed = np.empty(size), np.empty(size), np.empty(size), np.ones(size)
-    where_it_is = _WHERE_IT_IS.copy()  # as a constant is another type, for which all is compiled once more
     for first in range(0, len(poses), size):
         count = min(size, len(poses) - first)
         found = out[first : first + count]
@@ -71,7 +68,7 @@ def log_likelihood(
         for t in range(len(odds)):
             if not near_enough[t]:
                 continue
-            _of_tag(packed, tables, at, models, count, looks, tags, t, matters[:, t], where_it_is, own, product, room)
+            _of_tag(packed, tables, at, models, count, looks, tags, t, matters[:, t], own, product, room)
             if odds[t] == -np.inf or elsewhere[t] == -np.inf:
                 for n in range(count):
                     found[n] += tempering * own[n]
@@ -129,7 +126,7 @@ def displaced(
     _place(packed, moved, looks, parameters.reshape(1, -1), at, models)
     matters = np.ones(len(looks[1]), np.bool_)
     for u in range(len(found)):
-        _of_tag(packed, tables, at, models, size, looks, tags, found[u], matters, shifts, own, product, room)
+        _of_tag(packed, tables, at, models, size, looks, tags, found[u], matters, own, product, room)
         for i in range(len(shifts)):
             most = own[i * each]
             for n in range(i * each + 1, (i + 1) * each):
@@ -230,13 +227,11 @@ def _of_tag(
     tags: Tags,
     t: int,
     matters: NDArray[np.bool_],
-    shifts: Array,
     own: Array,
     product: Array,
     room: Array,
 ) -> None:
-    """The log-likelihood ``own`` (N,) of one tag above that of a silence out of reach, by those looks that matter (K,). ``shifts``
-    (S, 2): how much tag and antenna have been moved to where the walls are, N / S poses each."""
+    """The log-likelihood ``own`` (N,) of one tag above that of a silence out of reach, by those looks that matter (K,)."""
     points, normals, levels, hits = tags
     _, antennas, rounds = looks
     silent, factors = -_silence(packed, rounds[matters]), 0
@@ -247,7 +242,7 @@ def _of_tag(
             continue
         level = levels[antennas[k], t]
         model = models[packed.which[antennas[k]]]
-        unit, rate = _attenuated(packed.walls, at[k], points[t], shifts, model[0], count), model[1]
+        unit, rate = model[0], model[1]
         _chances(packed, tables, at[k], unit, count, antennas[k], level, points[t], normals[t], room)
         for i in range(rounds[k]):
             if i < hits[k, t]:
@@ -260,32 +255,6 @@ def _of_tag(
             if factors % PRODUCT == 0:
                 _add_logs(product, count, own)
     _add_logs(product, count, own)
-
-
-@compiled(error_model="numpy", fastmath=FAST)
-def _attenuated(walls: Walls | None, at: Array, point: Array, shifts: Array, unit: Array, count: int) -> Array:
-    """``unit`` (N,) times the factors of the walls between one antenna and one tag, see :func:`factors.walls.farther`."""
-    if walls is None:
-        return unit
-    each, all_ = count // len(shifts), unit[:count].copy()
-    for i in range(len(shifts)):
-        dx, dy, poses = shifts[i, 0], shifts[i, 1], slice(i * each, (i + 1) * each)
-        tx, ty, x, y, out = point[0] + dx, point[1] + dy, at[0, poses], at[1, poses], all_[poses]
-        low_x, high_x, low_y, high_y = x.min() + dx, x.max() + dx, y.min() + dy, y.max() + dy
-        first, end = around(walls, tx, ty)
-        for k in range(first, end):
-            line, factor = walls.lines[walls.order[k]], walls.factor[walls.order[k]]
-            # whether the tag and all poses are on one side of it
-            ax, bx = (low_x, high_x) if line[3] < 0.0 else (high_x, low_x)
-            ay, by = (low_y, high_y) if line[2] > 0.0 else (high_y, low_y)
-            side = line[2] * (ty - line[1]) - line[3] * (tx - line[0])
-            least = line[2] * (ay - line[1]) - line[3] * (ax - line[0])
-            most = line[2] * (by - line[1]) - line[3] * (bx - line[0])
-            if side * least >= 0.0 and side * most >= 0.0:
-                continue
-            for n in range(each):
-                out[n] *= factor if crosses(line, x[n] + dx, y[n] + dy, tx, ty) else 1.0
-    return all_
 
 
 @compiled(error_model="numpy", fastmath=FAST)

@@ -104,11 +104,6 @@ BAD_WORLDS = {
     "misspelt": ("[landmarks.A]\nx = 1\ny = 2\nsigm = 3\n", "unknown key landmarks.A.sigm: did you mean sigma?"),
     "infinite": ("[landmarks.A]\nx = inf\ny = 2\n", "landmarks.A.x is inf"),
     "wall of three": ("walls = [[0, 1, 2]]\n", "walls.0"),
-    "attenuations of other walls": (
-        "walls = [[0, 1, 2, 3]]\nwall_attenuation = [3.0, 6.0]\n",
-        "2 numbers, expected one or 1",
-    ),
-    "a wall that amplifies": ("walls = [[0, 1, 2, 3]]\nwall_attenuation = -3.0\n", "wall_attenuation"),
     "tag in degrees": ("[tags.E1]\nx = 1\ny = 2\nfacing = 90\n", "tags.E1.facing is 90"),
     "tag's covariance": ("[tags.E1]\nx = 1\ny = 2\ncovariance = [1, 2, 1]\n", "positive semi-definite"),
     "table outside": ('tags = "../a.tags.csv"\n', "leaves its folder"),
@@ -139,16 +134,6 @@ def test_tags_and_walls_come_back(tmp_path):
         "E1,1.0,0.3333333333333333,0.5,-1.5,0.0",
     ]
     assert read_world(tmp_path / "a.world.toml") == world
-
-
-@pytest.mark.parametrize("attenuation", [3.5, (0.0, 12.0), None])
-def test_attenuations_of_walls_come_back(tmp_path, attenuation):
-    world = World(walls=((0.0, 1.0, 2.0, 3.0), (2.0, 3.0, -4.0, 5.5)), wall_attenuation=attenuation)
-    write_world(world, tmp_path / "a.world.toml")
-    assert ("wall_attenuation" in (tmp_path / "a.world.toml").read_text()) == (attenuation is not None)
-    assert read_world(tmp_path / "a.world.toml") == world
-    told = {3.5: [3.5, 3.5], (0.0, 12.0): [12.0], None: []}[attenuation]
-    assert world.attenuating()[:, 4].tolist() == told
 
 
 def test_tags_with_covariances_stay_in_the_map(tmp_path):

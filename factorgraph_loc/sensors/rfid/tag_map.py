@@ -8,7 +8,7 @@ import numpy as np
 
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
-from factors import se2, walls
+from factors import se2
 from factors.rfid.detection import TagArray
 from factors.se2 import Array
 
@@ -25,13 +25,13 @@ class TagMap:
 
 
 def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None = None) -> TagMap:
-    """The tags of a map, or those of them in ``names``, between the walls that attenuate, which are surveyed with them."""
+    """The tags of a map, or those of them in ``names``."""
     chosen = {name: tag for name, tag in world.tags.items() if names is None or name in names}
     points = np.array([(tag.x, tag.y, tag.z) for tag in chosen.values()]).reshape(-1, 3)
     facing = np.array([np.nan if tag.facing is None else tag.facing for tag in chosen.values()])
     transform = survey.transform()
     points[:, :2] = se2.transform_from(transform, points[:, :2])
-    tags = TagArray(points, facing + transform[2], walls.moved(world.attenuating(), transform))
+    tags = TagArray(points, facing + transform[2])
     sigmas = np.array([math.sqrt(np.trace(tag.spread()) / 2.0) for tag in chosen.values()])
     return TagMap(tuple(chosen), tags, {name: i for i, name in enumerate(chosen)}, sigmas)
 

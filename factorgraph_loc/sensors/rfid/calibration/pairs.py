@@ -13,7 +13,6 @@ from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factors import se2
 from factors.rfid.model import NEGLIGIBLE_LOGIT, DetectionModel, logits
 from factors.se2 import Array
-from factors.walls import all_farther
 
 REACH = 8.0  # m in the plane; the range of a logistic model
 BLOCK = 20.0  # s; reads within a block may be correlated
@@ -97,8 +96,7 @@ def stretches(t: Array) -> Integers:
 
 
 def local(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> tuple[Array, Array, Array]:
-    """Tags in the antennas' frames (K, T, 3), cosines of their facing (K, T), and distances in the plane (K, T), as seen through
-    walls."""
+    """Tags in the antennas' frames (K, T, 3), cosines of their facing (K, T), and distances in the plane (K, T)."""
     transform = survey.transform()
     tags = se2.transform_from(transform, log.tags.points[:, :2])
     mounted = np.array([(a.x, a.y, a.yaw, a.z, a.pitch) for a in settings.all_antennas().values()])[log.antenna]
@@ -108,8 +106,6 @@ def local(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> tuple[
     known = np.isfinite(log.tags.facing)
     angle = np.where(known, log.tags.facing, 0.0) + transform[2]
     facing = -(np.cos(angle) * away[..., 0] + np.sin(angle) * away[..., 1]) / np.sqrt(distance**2 + 1e-9) * known
-    factor = all_farther(log.walls, se2.transform_to(transform, antennas[:, :2]), log.tags.points[:, :2])
-    away, distance = factor[..., None] * away, factor * distance
     c, s = np.cos(antennas[:, 2:]), np.sin(antennas[:, 2:])
     along, across = c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0]
     height = log.tags.points[None, :, 2] - mounted[:, 3:4]

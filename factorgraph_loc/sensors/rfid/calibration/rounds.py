@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +19,11 @@ from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factors import se2
 from factors.rfid.detection import TagArray
 from factors.se2 import Array
-from factors.walls import Walls, walls_around
 
 NEAR = 0.05  # m; closer rounds of an antenna are merged
 TURNED = 0.05  # rad
 MOST_ROUNDS = 20.0  # weight limit per pose; otherwise a robot at rest would outweigh its whole drive
 MIN_ROUNDS = 100
-FARTHEST = 11.0  # m between an antenna and a tag, over which walls are looked at
 
 Integers = NDArray[np.int64]
 
@@ -49,11 +46,6 @@ class Rounds:
     tags: TagArray
     names: tuple[str, ...]
     silent: tuple[str, ...]
-
-    @cached_property
-    def walls(self) -> Walls | None:
-        """The walls between antennas and tags, as surveyed."""
-        return walls_around(self.tags.walls, FARTHEST)
 
     def part(self, keep: NDArray[np.bool_]) -> Rounds:
         """The selected poses."""
@@ -108,7 +100,6 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
         TagArray(
             np.array([(tag.x, tag.y, tag.z) for tag in tags]),
             np.array([np.nan if tag.facing is None else tag.facing for tag in tags]),
-            log.world.attenuating(),
         ),
         names,
         tuple(name for name in log.world.tags if name not in seen),

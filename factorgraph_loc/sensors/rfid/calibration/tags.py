@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import scipy
@@ -22,7 +21,6 @@ from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factors import chi_squared, se2
 from factors.rfid.model import DetectionModel, logits
 from factors.se2 import Array
-from factors.walls import Walls, all_farther, moved, walls_around
 
 FAMILY = 0.01  # probability of any false alarm in a correct map
 FARTHEST = 2.5  # m
@@ -86,8 +84,7 @@ def _tags(logs: Sequence[Rounds]) -> dict[str, tuple[list[Rounds], str]]:
 @dataclass(frozen=True, eq=False)
 class _TagReads:
     """The data of one tag: ``hits`` of ``count`` rounds (K,) of antennas at (K, 3) poses in the world; ``antenna`` (K,), ``height``
-    (K,) of the tag above it and ``pitch`` (K,); ``place`` (2,) of the tag and direction (2,) that it faces, zero if unknown;
-    ``walls`` (W, 5) in the world."""
+    (K,) of the tag above it and ``pitch`` (K,); ``place`` (2,) of the tag and direction (2,) that it faces, zero if unknown."""
 
     hits: Array
     count: Array
@@ -97,11 +94,6 @@ class _TagReads:
     pitch: Array
     place: Array
     normal: Array
-    walls: Array
-
-    @cached_property
-    def _walls(self) -> Walls | None:
-        return walls_around(self.walls, REACH + FARTHEST)
 
     def thinned(self, most: int) -> _TagReads:
         step = 1 + len(self.hits) // most
@@ -110,8 +102,7 @@ class _TagReads:
     def nll(self, shift: Array, models: Sequence[DetectionModel], which: Sequence[int], floor: Floor) -> float:
         away = self.place + shift - self.poses[:, :2]
         c, s = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
-        factor = all_farther(self._walls, self.poses[:, :2], (self.place + shift)[None])[:, 0]
-        along, across = factor * (c * away[:, 0] + s * away[:, 1]), factor * (c * away[:, 1] - s * away[:, 0])
+        along, across = c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]
         facing = -(away @ self.normal) / np.sqrt(np.sum(away**2, axis=1) + 1e-9)
         cp, sp = np.cos(self.pitch), np.sin(self.pitch)
         points = np.column_stack((cp * along + sp * self.height, across, cp * self.height - sp * along))
@@ -125,7 +116,6 @@ class _TagReads:
 def _reads(logs: Sequence[Rounds], name: str, settings: RfidSettings, survey: SurveySettings) -> _TagReads:
     antennas = np.array([(a.x, a.y, a.yaw, a.z, a.pitch) for a in settings.all_antennas().values()])
     transform = survey.transform()
-    walls = moved(logs[0].tags.walls, transform)
     parts = []
     for log in logs:
         column = log.names.index(name)
@@ -138,7 +128,7 @@ def _reads(logs: Sequence[Rounds], name: str, settings: RfidSettings, survey: Su
         height = log.tags.points[column, 2] - mounted[:, 3]
         hits, pitch = log.hits[near, column], mounted[near, 4]
         parts.append(
-            _TagReads(hits, log.count[near], poses[near], log.antenna[near], height[near], pitch, place, normal, walls)
+            _TagReads(hits, log.count[near], poses[near], log.antenna[near], height[near], pitch, place, normal)
         )
     return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS})
 
