@@ -5,8 +5,11 @@ import html
 import io
 import json
 import re
+import shutil
+import subprocess
 from base64 import b64encode
 from html.parser import HTMLParser
+from importlib import resources
 
 import numpy as np
 import polars as pl
@@ -266,18 +269,33 @@ def test_a_run_without_a_scene_is_drawn(made, tmp_path):
     assert data_of((tmp_path / "report.html").read_text(), "track-0")["scene"] is None
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (0.29381, "0.294"),
-        (31.49, "31.5"),
-        (1234567.0, "1\u202f234\u202f567"),
-        (-0.00012345, "\u22120.000123"),
-        (0.0, "0"),
-    ],
-)
+NUMBERS = {
+    0.29381: "0.294",
+    31.49: "31.5",
+    4321.0: "4\u202f321",
+    1234567.0: "1\u202f234\u202f567",
+    -9876543210.0: "\u22129\u202f876\u202f543\u202f210",
+    -0.00012345: "\u22120.000123",
+    0.0: "0",
+}
+
+
+@pytest.mark.parametrize(("value", "text"), NUMBERS.items())
 def test_numbers_have_three_digits(value, text):
     assert number(value) == text
+
+
+def test_numbers_of_charts_are_those_of_tables():
+    """The script of the charts, run by Node.js, formats numbers as Python does."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("there is no Node.js (node) to run the script of the charts")
+    script = resources.files("factorgraph_loc.evaluation.report") / "assets" / "charts.js"
+    page = "const document = { createElement: () => ({ setAttribute() {} }) };"  # of which the script makes one element
+    asked = f"console.log(JSON.stringify([{list(NUMBERS)}.map(number), [0.5, 500, 2000, 40000].map(tickText)]))"
+    code = f"{page}\n{script.read_text(encoding='utf-8')}\n{asked}"
+    done = subprocess.run([node, "-"], input=code.encode(), capture_output=True, check=True, timeout=60)
+    assert json.loads(done.stdout) == [list(NUMBERS.values()), ["0.5", "500", "2\u202f000", "40\u202f000"]]
 
 
 def test_units_of_metrics():

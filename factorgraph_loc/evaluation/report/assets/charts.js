@@ -19,19 +19,23 @@ function element(name, attributes, parent, text) {
   return made;
 }
 
+// whole numbers in groups of three digits, as in the tables
+function grouped(text) {
+  return /^\d+$/.test(text) ? text.replace(/\B(?=(\d{3})+$)/g, "\u202f") : text;
+}
+
 // three digits that say something
 function number(value) {
   if (value === null || !isFinite(value)) return "–";
   if (value === 0) return "0";
   const digits = Math.min(6, Math.max(0, 2 - Math.floor(Math.log10(Math.abs(value)))));
-  const text = Math.abs(value).toFixed(digits).replace(/\B(?=(\d{3})+$)/, digits ? "$&" : "\u202f");
-  return (value < 0 ? "\u2212" : "") + text;
+  return (value < 0 ? "\u2212" : "") + grouped(Math.abs(value).toFixed(digits));
 }
 
 function tickText(value) {
   if (value === 0) return "0";
   const size = Math.abs(value);
-  const text = size >= 1e5 || size < 1e-4 ? size.toExponential(0).replace("e", "·10^") : String(+size.toPrecision(4));
+  const text = size >= 1e5 || size < 1e-4 ? size.toExponential(0).replace("e", "·10^") : grouped(String(+size.toPrecision(4)));
   return (value < 0 ? "\u2212" : "") + text;
 }
 
