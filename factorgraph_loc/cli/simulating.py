@@ -11,7 +11,7 @@ from factorgraph_loc.cli import completion, show
 from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, key_and_value
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.seeds import parse_seeds
-from factorgraph_loc.text import quoted
+from factorgraph_loc.text import plain, quoted
 
 if TYPE_CHECKING:
     from factorgraph_loc.simulation import SimulationSettings
@@ -109,9 +109,12 @@ def nested_changes(named: dict[str, float | None], texts: list[str]) -> dict[str
     for name, value in pairs:
         *tables, key = name.split(".")
         inner = changes
-        for table in tables:
+        for i, table in enumerate(tables, start=1):
             inner = inner.setdefault(table, {})
             if not isinstance(inner, dict):
-                raise InputError(f"--set is {name}={value}, but {table} is set to {quoted(inner)} already")
+                above = plain(".".join(tables[:i]))
+                raise InputError(
+                    f"--set is {above}={quoted(inner)}, expected a key below {above}, such as {plain(name)}"
+                )
         inner[key] = value
     return changes

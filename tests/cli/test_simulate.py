@@ -98,7 +98,15 @@ def test_nothing_is_rendered_for_a_folder_that_holds_something(fgloc, tmp_path):
         (("office", "--duration", 0), "drive.duration is 0"),
         (("office", "--set", "world.tgas=3"), "unknown key world.tgas: did you mean tags?"),
         (("office", "--set", "world.tags"), "expected KEY=VALUE"),
-        (("office", "--set", "world=3", "--set", "world.tags=3"), "world is set to 3 already"),
+        (
+            ("office", "--set", "world=3", "--set", "world.tags=3"),
+            "--set is world=3, expected a key below world, such as",
+        ),
+        (
+            ("office", "--set", "drive=3", "--duration", 5),
+            "--set is drive=3, expected a key below drive, such as drive",
+        ),
+        (("office", "--set", "a.b=x", "--set", "a.b.c=3"), "--set is a.b='x', expected a key below a.b, such as a.b.c"),
         (
             ("office", "--set", "drive.clearance=2.0", "--set", "world.plan=hall", "--set", "world.depth=3"),
             "no place that",
