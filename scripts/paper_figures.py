@@ -1,4 +1,4 @@
-"""Figures 4 and 5 of the paper (Raoui, Bouyakhf, Devy, ICINCO 2011), for any log."""
+"""Figure 5 of the paper (Raoui, Bouyakhf, Devy, ICINCO 2011), for any log."""
 
 from __future__ import annotations
 
@@ -16,31 +16,6 @@ from factorgraph_loc.sensors.rfid.tag_map import tag_map
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-DEVIATIONS = (("x", "m"), ("y", "m"), ("heading", "rad"))
-
-
-def deviations(log: Log, tracks: Mapping[str, Track]) -> Figure:
-    """Figure 4: localization along a run, and the standard deviations of x, y and heading over time, of causal estimates."""
-    figure = empty(8.0, f"{log.name}: where the robot is, and how well that is known (causal)")
-    axes = figure.subplot_mosaic([["map", name] for name, _ in DEVIATIONS], width_ratios=(1.1, 1.0))
-    dress(axes.values())
-    _map(axes["map"], log)
-    for (name, track), style in zip(tracks.items(), styles(), strict=False):
-        if track.causal is None:
-            continue
-        axes["map"].plot(*way(track.causal).T, label=name, linewidth=1.3, zorder=3, **style)
-        assert track.causal.covariances is not None, "what is estimated has a covariance"
-        deviations = np.sqrt(np.diagonal(track.causal.covariances, axis1=1, axis2=2))
-        t, sigmas = with_pauses(track.causal.t, deviations)
-        for row, (what, _) in enumerate(DEVIATIONS):
-            axes[what].plot(t, sigmas[:, row], linewidth=1.2, **style)
-    for what, unit in DEVIATIONS:
-        axes[what].set_ylabel(f"std of {what} [{unit}]")
-        axes[what].set_ylim(bottom=0.0)
-    axes[DEVIATIONS[-1][0]].set_xlabel("time [s]")
-    legend(figure, [axes["map"]])
-    return figure
 
 
 def fusion(log: Log, tracks: Mapping[str, Track]) -> Figure:

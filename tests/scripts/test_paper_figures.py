@@ -1,10 +1,10 @@
-"""Figures 4 and 5: what must be in them is there, also where an estimator has no causal estimate."""
+"""Figure 5: what must be in them is there, also where an estimator has no causal estimate."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from paper_figures import deviations, fusion
+from paper_figures import fusion
 
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.model.log import Log
@@ -32,15 +32,6 @@ def labels(figure):
     return {text.get_text() for text in figure.legends[0].get_texts()}
 
 
-def test_deviations_show_each_axis_with_its_unit(log):
-    figure = deviations(log, {"smoother": track(log, 0.1), "batch": track(log, 0.2, causal=False)})
-    assert labels(figure) == {"walls", "tags", "reference", "smoother"}
-    found = {axis.get_ylabel(): axis for axis in figure.axes}
-    for label, sigma in (("std of x [m]", 0.1), ("std of y [m]", 0.2), ("std of heading [rad]", 0.05)):
-        (line,) = found[label].lines
-        np.testing.assert_allclose(line.get_ydata(), sigma)
-
-
 def test_fusion_shows_errors_and_says_what_is_final(log):
     figure = fusion(log, {"ekf": track(log, 0.1), "batch": track(log, 0.3, causal=False)})
     assert {"ekf", "batch (final)"} < labels(figure)
@@ -53,12 +44,11 @@ def test_fusion_without_reference_has_the_trajectories(log):
     assert labels(figure) == {"walls", "tags", "ekf"}
 
 
-@pytest.mark.parametrize("draw", [fusion, deviations])
-def test_no_line_is_drawn_across_a_gap(log, draw):
+def test_no_line_is_drawn_across_a_gap(log):
     once = log.reference
     t = np.concatenate((once.t, once.t + 3600.0))
     twice = Trajectory(t, np.tile(once.poses, (2, 1)), np.tile(0.01 * np.eye(3), (len(t), 1, 1)))
-    figure = draw(replace(log, reference=twice), {"ekf": Track(twice, twice, np.array([0.1]))})
+    figure = fusion(replace(log, reference=twice), {"ekf": Track(twice, twice, np.array([0.1]))})
     lines = [line for axis in figure.axes for line in axis.lines if len(line.get_xdata()) > 50]
     assert len(lines) >= 3
     for line in lines:

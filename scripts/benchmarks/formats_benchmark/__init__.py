@@ -1,1 +1,0 @@
-"""The sections of scripts/benchmarks/bench_formats."""

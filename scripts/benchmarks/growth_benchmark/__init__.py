@@ -1,1 +1,0 @@
-"""Sections of scripts/benchmarks/bench_growth."""
