@@ -23,6 +23,7 @@ from factorgraph_loc.cli import (
 )
 from factorgraph_loc.cli.stopping import OutputError, end, standard_streams, unwrapped
 from factorgraph_loc.errors import FglocError, unusable
+from factorgraph_loc.files.bounded import limit_memory
 from factorgraph_loc.text import MESSAGE, plain
 from factorgraph_loc.threads import use_one_thread
 from factorgraph_loc.version import __version__
@@ -120,6 +121,7 @@ def fgloc(
 def run() -> None:
     """Run the command with the arguments of this process, then exit."""
     use_one_thread()
+    limit_memory()
     try:
         with unwrapped(), standard_streams():
             app()

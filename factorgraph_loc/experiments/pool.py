@@ -18,6 +18,7 @@ from factorgraph_loc.experiments.experiment_file import Limits
 from factorgraph_loc.experiments.log_source import LogSource
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.store import Store
+from factorgraph_loc.files.bounded import resident_memory
 from factorgraph_loc.files.temporary import of_system, sweep
 from factorgraph_loc.processes import Child, ProcessDiedError, start
 
@@ -181,18 +182,10 @@ class _Pool:
             return None
         if time.monotonic() - w.since > self._time:
             return "timeout", f"it took more than {self._time:g} s"
-        if _resident(w.process.pid) > self._memory:
+        if resident_memory(w.process.pid) > self._memory:
             return "memory", f"its process held more than {self._memory / 1e6:.0f} MB"
         return None
 
 
 def _machine_memory() -> float:
     return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
-
-
-def _resident(pid: int | None) -> float:
-    """Resident memory of a process in bytes; 0 if unknown."""
-    try:
-        return float(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, IndexError):
-        return 0.0

@@ -7,7 +7,6 @@ __all__ = [
     "columns",
     "images",
     "models",
-    "npz",
     "settings",
     "shipped",
     "tables",

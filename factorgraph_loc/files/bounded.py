@@ -26,10 +26,12 @@ DATA = 2**30  # bytes of a table, a text or a MATLAB file, packed and unpacked
 IMAGE = 2**28  # bytes of an image's file
 GRID = 2**26  # bytes of a grid, unpacked
 PIXELS = 2**26  # of an image; the limit of OpenCV is 2^30
-CELLS = 2**27  # rows times columns of a Parquet file
+CELLS = 2**27  # rows times columns that a Parquet file declares
+MEMORY, MEMORY_PER_BYTE = 2**30, 32  # bytes that reading a file may take, and in addition for each byte of the file
+LOOK = 0.01  # s between checks of the memory
 LARGEST_POINTER = 1024  # bytes, as its specification says
-RATIO = 1000  # maximum cells per byte of a Parquet file
 
+_limited = threading.Event()  # whether this process limits the memory that reading a file takes
 POINTER = b"version https://git-lfs.github.com/spec/v1"  # first line of what Git LFS leaves in place of a file
 _FICLONE = 0x40049409  # Linux ioctl: share the content of another file until either is written
 _KINDS = {
@@ -135,6 +137,50 @@ def foreign(source: object, what: str) -> Iterator[None]:
         if not isinstance(error, Exception) and type(error).__module__ != "pyo3_runtime":
             raise  # a signal
         raise InputError(f"{plain(source)}: {what}: {told(error)}") from error
+
+
+def limit_memory() -> None:
+    """From now on, end this process where reading a file takes too much memory; see :func:`limited_memory`. For commands."""
+    _limited.set()
+
+
+@contextmanager
+def limited_memory(source: object, size: int) -> Iterator[None]:
+    """End a command with one line if this block, which reads ``source`` of ``size`` bytes, takes more than :data:`MEMORY`.
+
+    A few kilobytes may unpack to gigabytes, and polars does not tell how much before. A limit set for the operating system would
+    be no help, as compiled parsers abort without a message where memory is refused.
+    """
+    if not _limited.is_set():
+        yield
+        return
+    most = MEMORY + MEMORY_PER_BYTE * size
+    limit = resident_memory(os.getpid()) + most
+    done, errors = threading.Event(), os.dup(2)
+
+    def watch() -> None:
+        while not done.wait(LOOK):
+            if resident_memory(os.getpid()) > limit:
+                text = f"error: {plain(source)}: reading it takes more than {most / 1e6:,.0f} MB of memory\n"
+                os.write(errors, text.encode(errors="backslashreplace"))
+                os._exit(InputError.exit_code)
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+        os.close(errors)
+
+
+def resident_memory(pid: int | None) -> float:
+    """Resident memory of a process in bytes; 0 if unknown."""
+    try:
+        return float(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, IndexError):
+        return 0.0
 
 
 def _kind(found: os.stat_result) -> str:

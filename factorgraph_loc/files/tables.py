@@ -1,5 +1,4 @@
-"""The tables of the native format: CSV with a header, or Parquet with the same columns, whose declared sizes are checked before
-polars unpacks them."""
+"""The tables of the native format: CSV with a header, or Parquet with the same columns."""
 
 import csv
 import io
@@ -13,8 +12,7 @@ import numpy as np
 import polars as pl
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import parquet_pages
-from factorgraph_loc.files.bounded import DATA, foreign, quiet, read_bytes, require_size
+from factorgraph_loc.files.bounded import CELLS, DATA, foreign, limited_memory, quiet, read_bytes, require_size
 from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table
 from factorgraph_loc.files.models import Model, nearest, parse_model, read_text, replacing
 from factorgraph_loc.text import told
@@ -133,8 +131,10 @@ def read_parquet(path: Path) -> pl.DataFrame:
 
 def parse_parquet(content: bytes, source: object, columns: Sequence[str] | None = None) -> pl.DataFrame:
     """The table, or some ``columns`` of it, in the bytes of a Parquet file; InputError as in :func:`read_parquet`."""
-    with foreign(source, "is not a Parquet file that can be read"), quiet():
-        parquet_pages.check(content, source)
+    with foreign(source, "is not a Parquet file that can be read"), limited_memory(source, len(content)), quiet():
+        declared = pl.scan_parquet(io.BytesIO(content))
+        rows = declared.select(pl.len()).collect().item()
+        require_size(source, "its number of values", rows * len(declared.collect_schema()), CELLS)
         return pl.read_parquet(io.BytesIO(content), columns=None if columns is None else list(columns))
 
 
@@ -184,7 +184,9 @@ def read_table(path: Path, tables: Sequence[Table]) -> TableRows:
     """
     shapes = [shape for table in tables for shape in table.shapes]
     columns = {column.name: column for table in tables for column in table.columns}
-    return _read_parquet(path, columns, shapes) if path.suffix == ".parquet" else _read_csv(path, columns, shapes)
+    read = _read_parquet if path.suffix == ".parquet" else _read_csv
+    with limited_memory(path, path.stat().st_size if path.is_file() else 0):
+        return read(path, columns, shapes)
 
 
 def write_parquet(frame: pl.DataFrame, path: Path) -> None:

@@ -2,11 +2,11 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.bounded import IMAGE, opened
@@ -23,11 +23,6 @@ TOLERANCE = 0.75  # cells between a wall and the cell centres: half a cell for a
 MIN_EXTENT = 2.0  # cells; smaller groups are noise of the mapping sensor
 
 
-def _zero_or_one(value: Any) -> Any:
-    """Accept true and false for ``negate``, as Nav2 does."""
-    return {"false": 0, "true": 1}.get(value.lower(), value) if isinstance(value, str) else value
-
-
 class MapFile(FileModel):
     """The YAML file of map_server (ROS or Nav2). ``origin``: x, y [m] and yaw [rad] of the lower left corner of the image."""
 
@@ -36,7 +31,7 @@ class MapFile(FileModel):
     origin: tuple[Coordinate, Coordinate, Yaw]
     occupied_thresh: Share = 0.65
     free_thresh: Share = 0.196
-    negate: Annotated[Literal[0, 1], BeforeValidator(_zero_or_one)] = 0
+    negate: bool = False
     mode: Literal["trinary", "scale", "raw"] = "trinary"
     map_type: Literal["occupancy"] = "occupancy"
 

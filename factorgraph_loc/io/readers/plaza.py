@@ -1,6 +1,8 @@
 """The Plaza logs (Djugash, Hamner, Roth, JFR 26(9), 2009) from the gtsam wheel: odometry and ranges to beacons."""
 
+import io
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -8,11 +10,10 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files import checks
+from factorgraph_loc.files import bounded, checks
 from factorgraph_loc.files.models import FileModel, parse_model
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.io.readers.left_out import not_read
-from factorgraph_loc.io.readers.matlab import read_matlab
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
@@ -22,7 +23,7 @@ from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factors import se2
 from factors.se2 import Array, Integers
 
-FIELDS = {"DR": 3, "TD": 4, "GT": 4, "TL": 3}
+FIELDS = {"DR": 3, "TD": 4, "GT": 4, "TL": 3}  # columns
 
 # added to the reference's heading, so that positive distances are forward
 HEADING_OFFSET = {1: 0.0, 2: math.pi}
@@ -63,6 +64,30 @@ def read(path: Path | None, options: Options) -> Log:
         warnings=tuple(warnings),
         metadata=not_read([*others, "TD: column 2"]),
     )
+
+
+def read_matlab(path: Path, fields: Mapping[str, int]) -> tuple[dict[str, Array], list[str]]:
+    """The arrays (N, K) of ``fields`` (name -> K) in a MATLAB file of version 5 to 7, and the names of all others.
+
+    The sizes that the file declares are checked before it is unpacked. InputError names file and field of a missing or invalid
+    array.
+    """
+    from scipy.io import loadmat, whosmat  # noqa: PLC0415 - slow to import
+
+    content = bounded.read_bytes(path, bounded.DATA)
+    with bounded.foreign(path, "is not a MATLAB file (of version 5 to 7)"):
+        declared = {name: (shape, kind) for name, shape, kind in whosmat(io.BytesIO(content))}
+        sizes = [math.prod(declared[name][0]) * 8 for name in fields if name in declared]
+        bounded.require_size(path, "its size in bytes when unpacked", sum(sizes), bounded.DATA)
+        arrays = loadmat(io.BytesIO(content), variable_names=list(fields))
+    for name, columns in fields.items():
+        if name not in arrays:
+            raise InputError(f"{path}: {name} is missing")
+        if not isinstance(arrays[name], np.ndarray) or arrays[name].dtype.kind not in "fiu":
+            raise InputError(f"{path}: {name} is of type {declared[name][1]}, expected rows of {columns} real numbers")
+        if arrays[name].ndim != 2 or arrays[name].shape[1] != columns or not len(arrays[name]):
+            raise InputError(f"{path}: {name} has shape {arrays[name].shape}, expected rows of {columns} numbers")
+    return {name: arrays[name].astype(float) for name in fields}, [name for name in declared if name not in fields]
 
 
 def shipped(run: int) -> Path:

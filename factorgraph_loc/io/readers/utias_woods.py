@@ -11,7 +11,7 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, InUnit, parse_model
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.io.readers.left_out import not_read
-from factorgraph_loc.io.readers.matlab import read_matlab
+from factorgraph_loc.io.readers.plaza import read_matlab
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.trajectory import Trajectory

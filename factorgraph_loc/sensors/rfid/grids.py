@@ -1,15 +1,17 @@
 """Files of learnt detection grids: ``.npz`` without pickles."""
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.bounded import GRID
+from factorgraph_loc.files.bounded import GRID, foreign, opened, require_size
 from factorgraph_loc.files.models import replacing
-from factorgraph_loc.files.npz import read_npz
 from factors.rfid.model import GridModel
+from factors.se2 import Array
 
+ARRAYS = ("logits", "origin", "cell", "heights")
 FARTHEST = 1000.0  # m from the antenna
 FINEST = 1e-3  # m; minimum distance of knots
 LARGEST = 20.0  # of a logit; the probability is 0 or 1 to nine digits
@@ -17,10 +19,7 @@ LARGEST = 20.0  # of a logit; the probability is 0 or 1 to nine digits
 
 def read_grid(path: str | Path) -> GridModel:
     """Read a grid; infinite logits are clipped. InputError names what is missing or has a wrong shape."""
-    found = {name: np.asarray(values, dtype=float) for name, values in read_npz(Path(path), GRID).items()}
-    for name in ("logits", "origin", "cell", "heights"):
-        if name not in found:
-            raise InputError(f"{path}: {name} is missing, expected logits, origin, cell, heights")
+    found = _read_arrays(Path(path))
     logits, origin, heights = found["logits"], found["origin"], np.atleast_1d(found["heights"])
     if logits.ndim != 4 or min(logits.shape[2:]) < 2 or min(logits.shape) < 1 or logits.shape[0] != len(heights):
         raise bad_field(path, "logits", f"an array of shape {logits.shape}", "(heights, facings, x, y)")
@@ -38,6 +37,18 @@ def read_grid(path: str | Path) -> GridModel:
         raise bad_field(path, "logits", "NaN", "numbers")
     bounded = np.clip(logits, -LARGEST, LARGEST)
     return GridModel(bounded, float(origin[0]), float(origin[1]), float(cell.item()), heights)
+
+
+def _read_arrays(path: Path) -> dict[str, Array]:
+    """The arrays of a grid by name; the unpacked size that the archive declares is checked first."""
+    with opened(path, GRID) as file, foreign(path, "is not a file of arrays (.npz)"):
+        with zipfile.ZipFile(file) as archive:
+            require_size(path, "its size in bytes when unpacked", sum(m.file_size for m in archive.infolist()), GRID)
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as stored:
+            if missing := [name for name in ARRAYS if name not in stored]:
+                raise InputError(f"{path}: {missing[0]} is missing, expected {', '.join(ARRAYS)}")
+            return {name: stored[name].astype(float, casting="same_kind") for name in ARRAYS}
 
 
 def write_grid(grid: GridModel, path: str | Path) -> None:
