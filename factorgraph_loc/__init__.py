@@ -46,8 +46,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.model.trajectory3 import Trajectory3
     from factorgraph_loc.model.world import World
     from factorgraph_loc.sensors.camera.measurement import PixelSightings
-    from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream, RightSightingStream, SightingStream
-    from factorgraph_loc.sensors.inertial.measurement import Inertial, InertialStream
+    from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream, SightingStream
     from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeStream
     from factorgraph_loc.sensors.landmarks.settings import Landmark
     from factorgraph_loc.sensors.loops.measurement import Loops, LoopStream
@@ -65,7 +64,6 @@ if TYPE_CHECKING:
     from factorgraph_loc.sensors.rfid.measurement import RfidScan
     from factorgraph_loc.sensors.rfid.pushed import RfidRead
     from factorgraph_loc.sensors.rfid.stream import RfidStream
-    from factorgraph_loc.sensors.twist.measurement import Twist, TwistStream
     from factorgraph_loc.vision.frame import CameraFrame
 
 __all__ = [
@@ -78,8 +76,6 @@ __all__ = [
     "ImageStream",
     "IncrementOdometry",
     "IncrementStream",
-    "Inertial",
-    "InertialStream",
     "InputError",
     "Landmark",
     "Localizer",
@@ -95,7 +91,6 @@ __all__ = [
     "RfidScan",
     "RfidStream",
     "Rig",
-    "RightSightingStream",
     "Run",
     "RunFailedError",
     "SightingStream",
@@ -104,8 +99,6 @@ __all__ = [
     "Tick",
     "Trajectory",
     "Trajectory3",
-    "Twist",
-    "TwistStream",
     "VelocityOdometry",
     "VelocityStream",
     "World",
@@ -189,10 +182,9 @@ _MODULES = {
     "model.trajectory3": ("Trajectory3",),
     "model.world": ("World",),
     "sensors.camera.measurement": ("PixelSightings",),
-    "sensors.camera.stream": ("FeatureStream", "ImageStream", "RightSightingStream", "SightingStream"),
+    "sensors.camera.stream": ("FeatureStream", "ImageStream", "SightingStream"),
     "sensors.landmarks.settings": ("Landmark",),
     "sensors.landmarks.measurement": ("BearingRange", "BearingRangeStream"),
-    "sensors.inertial.measurement": ("Inertial", "InertialStream"),
     "sensors.loops.measurement": ("LoopStream", "Loops"),
     "sensors.odometry.measurement": (
         "IncrementOdometry",
@@ -206,7 +198,6 @@ _MODULES = {
     "sensors.rfid.map": ("Tag",),
     "sensors.rfid.measurement": ("RfidScan",),
     "sensors.rfid.stream": ("RfidStream",),
-    "sensors.twist.measurement": ("Twist", "TwistStream"),
     "vision.frame": ("CameraFrame",),
 }
 _PLACES = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}

@@ -6,8 +6,6 @@ SENSORS.own |= {
     "odometry": "factorgraph_loc.sensors.odometry:SENSOR",
     "landmarks": "factorgraph_loc.sensors.landmarks:SENSOR",
     "rfid": "factorgraph_loc.sensors.rfid:SENSOR",
-    "twist": "factorgraph_loc.sensors.twist:SENSOR",
-    "inertial": "factorgraph_loc.sensors.inertial:SENSOR",
     "camera": "factorgraph_loc.sensors.camera:SENSOR",
     "loops": "factorgraph_loc.sensors.loops:SENSOR",
 }
@@ -19,8 +17,6 @@ ESTIMATORS.own |= {
     "monoslam": "factorgraph_loc.slam.monoslam:Monoslam",
     "smoother": "factorgraph_loc.fusion.smoother:Smoother",
     "batch": "factorgraph_loc.fusion.batch:Batch",
-    "space_batch": "factorgraph_loc.slam.space_batch:SpaceBatch",
-    "space_smoother": "factorgraph_loc.slam.space_smoother:SpaceSmoother",
 }
 MAPPERS.own["points"] = "factorgraph_loc.slam.point_mapper:bind"
 READERS.own |= {

@@ -38,20 +38,12 @@ if TYPE_CHECKING:
 
 SHOWN_CONSTANTS, SHOWN_EVENTS = 10, 5  # the others are in the files
 
-# table of a planar run; column: key of the scores, digits
+# table of a run; column: key of the scores, digits
 COLUMNS = {
     "position RMSE [m]": ("position_rmse", 3),
     "95 % [m]": ("position_p95", 3),
     "max [m]": ("position_max", 3),
     "heading RMSE [rad]": ("heading_rmse", 4),
-    "ANEES": ("anees", 2),
-    "poses scored": ("scored", 0),
-}
-# table of a three-dimensional run
-SPACE_COLUMNS = {
-    "position RMSE [m]": ("position_rmse", 3),
-    "max [m]": ("position_max", 3),
-    "rotation RMSE [rad]": ("rotation_rmse", 4),
     "ANEES": ("anees", 2),
     "poses scored": ("scored", 0),
 }
@@ -191,21 +183,6 @@ def compare(
         raise typer.Exit(1)
 
 
-def _print_space(scores: Mapping[str, Any]) -> bool:
-    """Print the accuracy of three-dimensional estimates; False if there are none."""
-    kinds = [kind for kind in ("causal", "final") if scores[f"{kind}.space_position_rmse"] is not None]
-    if kinds:
-        rows = [
-            (
-                kind,
-                *(show.number(scores[f"{kind}.space_{figure}"], digits) for figure, digits in SPACE_COLUMNS.values()),
-            )
-            for kind in kinds
-        ]
-        show.table(("in space", *SPACE_COLUMNS), rows)
-    return bool(kinds)
-
-
 def _print_accuracy(scores: Mapping[str, Any]) -> None:
     if scores["causal.position_rmse"] is not None or scores["final.position_rmse"] is not None:
         rows = [
@@ -213,7 +190,7 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
             for kind in ("causal", "final")
         ]
         show.table(("", *COLUMNS), rows)
-    elif not _print_space(scores):
+    else:
         hardly = f", or too little: {scored} poses scored" if (scored := scores["final.scored"]) is not None else ""
         show.line(f"there is no reference to score against{hardly}")
     if scores["aligned.position_rmse"] is not None:

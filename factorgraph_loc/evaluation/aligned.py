@@ -10,7 +10,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import Alignment
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
+from factorgraph_loc.model.trajectory3 import path_of
 
 FIGURES = ("aligned_position_rmse", "aligned_rotation_rmse")
 
@@ -19,8 +19,8 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
     """The figures of :func:`factorgraph_loc.evaluation.metrics.score`, and with ``align`` those after that alignment.
 
     These are ``scoring.align``, and ``causal.*`` and ``final.*`` of :data:`FIGURES` [m, rad], at the same stamps, as
-    :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths` has them; for estimators of poses in space they are of those.
-    They are None without a reference, and where the poses do not determine the alignment, of which ``warnings`` says why.
+    :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths` has them. They are None without a reference, and where the
+    poses do not determine the alignment; ``warnings`` says why.
     """
     scores = metrics.score(result, log)
     if align == "none":
@@ -29,7 +29,7 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
     causal, final = result.causal(), result.final
     if causal is not None:
         final = metrics.since(final, float(causal.t[0]))
-    for kind, trajectory in (("causal", result.causal_space or causal), ("final", result.final_space or final)):
+    for kind, trajectory in (("causal", causal), ("final", final)):
         figures: dict[str, float | None] = dict.fromkeys(FIGURES)
         try:
             figures |= _aligned(trajectory, log, align, result.max_gap)
@@ -39,12 +39,9 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
     return scores
 
 
-def _aligned(
-    trajectory: Trajectory | Trajectory3 | None, log: Log, align: Alignment, max_gap: float
-) -> dict[str, float | None]:
-    reference = log.reference3 if isinstance(trajectory, Trajectory3) else log.reference
-    if trajectory is None or reference is None or not len(trajectory):
+def _aligned(trajectory: Trajectory | None, log: Log, align: Alignment, max_gap: float) -> dict[str, float | None]:
+    if trajectory is None or log.reference is None or not len(trajectory):
         return {}
-    paths = path_of(trajectory, log.name), path_of(reference, "the reference")
+    paths = path_of(trajectory, log.name), path_of(log.reference, "the reference")
     found = score_paths(*paths, align, "interpolate", max_gap=max_gap).figures
     return {name: found[f"ape.{name.removeprefix('aligned_')}"] for name in FIGURES}

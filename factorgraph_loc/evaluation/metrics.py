@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.evaluation import pairing, space
+from factorgraph_loc.evaluation import pairing
 from factorgraph_loc.evaluation.pairing import TOLERANCE, pairs, pauses, rms
 from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.model.belief import Learnt
@@ -151,9 +151,7 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
     ``scoring.max_gap`` [s]: only runs with equal values are comparable. ``causal.*`` and ``final.*`` (see
     :func:`accuracy`) are scored from the first localized causal estimate and, except for ``scored``, are None without a reference
     or with fewer than :data:`FEWEST_SCORED` scored poses. If the run was never localized, ``causal.*`` is None, and ``final.*``
-    is scored from its beginning. ``causal.space_*`` and ``final.space_*`` (see
-    :func:`~factorgraph_loc.evaluation.space.accuracy`) are None except for estimators of poses in space. ``time_to_localized``
-    [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
+    is scored from its beginning. ``time_to_localized`` [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
     :func:`~factorgraph_loc.evaluation.pairing.free_map_figures`) are None unless the map was estimated. ``learnt.NAME.value``
     and ``learnt.NAME.sigma`` exist for each learnt constant. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
     ``timing.*`` always exist, as do ``warnings``, a list of texts.
@@ -168,9 +166,6 @@ def score(result: RunResult, log: Log) -> dict[str, Any]:
         figures = dict.fromkeys(_ACCURACY) if trajectory is None else accuracy(trajectory, log.reference, gap)
         if (figures["scored"] or 0) < FEWEST_SCORED:
             figures = dict.fromkeys(_ACCURACY) | {"scored": figures["scored"]}
-        scores |= {f"{kind}.{name}": value for name, value in figures.items()}
-    for kind, in_space in (("causal", result.causal_space), ("final", result.final_space)):
-        figures = space.accuracy(in_space, log.reference3, gap)
         scores |= {f"{kind}.{name}": value for name, value in figures.items()}
     scores["time_to_localized"] = None if causal is None else float(causal.t[0] - result.t[0])
     if result.config.get("settings", {}).get("landmarks") == FREE_MAP:

@@ -39,15 +39,6 @@ RELATIVE = {
     for per in ("m", "s")
     for what, unit, key in (("pos", "m", "position"), ("head", "rad", "heading"))
 }
-IN_SPACE = {
-    f"{kind} {what}": (f"{kind}.space_{key}", digits, pooled)
-    for kind in KINDS
-    for what, key, digits, pooled in (
-        ("pos [m]", "position_rmse", 3, True),
-        ("rot [rad]", "rotation_rmse", 4, True),
-        ("ANEES", "anees", 2, False),
-    )
-}
 SCORED = "poses scored"
 BASELINE = "dead_reckoning"
 ALIKE = 0.01  # relative difference of errors within which estimators are equally good
@@ -57,11 +48,9 @@ Columns = Mapping[str, tuple[str, int, bool]]
 
 
 def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, Columns]:
-    """The columns of each table that not all comparisons have, by its title: errors in space, if runs have no others, errors after
-    an alignment, if the runs have one, and relative errors, if they are asked for."""
+    """The columns of each table that not all comparisons have, by its title: errors after an alignment, if the runs have one, and
+    relative errors, if they are asked for."""
     found: dict[str, Columns] = {}
-    if any(_is_known(row, "space_position_rmse") and not _is_known(row, "position_rmse") for row in rows):
-        found["errors in space"] = IN_SPACE
     aligned = dict.fromkeys(row["scoring.align"] for row in rows if row.get("scoring.align"))
     if aligned:
         found[f"errors after alignment by {', '.join(aligned)}"] = ALIGNED
@@ -120,7 +109,7 @@ def unscored(rows: Sequence[Row]) -> list[str]:
     lines = []
     for log in dict.fromkeys(row["log"] for row in rows):
         runs = [row for row in rows if row["log"] == log and row["status"] == "ok"]
-        without = [row for row in runs if not any(_is_known(row, f"{k}position_rmse") for k in ("", "space_"))]
+        without = [row for row in runs if not _is_known(row, "position_rmse")]
         if without and (count := max(scored_of(row) or 0 for row in without)):
             lines.append(f"{log}: too little of the reference to score against: {count:.0f} poses")
         elif without and all(scored_of(row) is None for row in runs):
@@ -172,7 +161,7 @@ def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 def scored_of(row: Row) -> float | None:
     """Number of scored poses of a run's causal trajectory, else of the final one; None without a reference."""
-    found = (row.get(f"{kind}.{what}") for kind in KINDS for what in ("scored", "space_scored"))
+    found = (row.get(f"{kind}.scored") for kind in KINDS)
     return next((count for count in found if count is not None), None)
 
 

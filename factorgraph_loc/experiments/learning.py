@@ -55,7 +55,6 @@ def run_and_learn(log: Log, config: RunConfig, progress: Callable[[float], None]
             given,
             config={**given.config, "learnt_rig": rig.model_dump(mode="json", exclude_none=True)},
             final=again.final,
-            final_space=again.final_space,
             timings=replace(given.timings, final_seconds=perf_counter() - started),
             warnings=(*given.warnings, *turns.doubts),
         ),

@@ -46,7 +46,7 @@ def write_run(
     ``heading`` [rad], covariances in the world frame; ``error_position`` [m], ``error_heading`` [rad, absolute] and ``nees`` at
     the stamp of the reference nearest to the tick (null if another tick is nearer); ``update_ms`` (causal: the slowest update
     since the previous tick, null if there was none) and ``status`` (of the causal estimate). ``causal.tum`` contains the
-    estimates from the first localized one on; of a robot in space both TUM files have height and rotation. ``learnt.json``:
+    estimates from the first localized one on. ``learnt.json``:
     ``constants`` by name with ``value`` and ``sigma``, ``landmarks`` by name with ``x``, ``y`` [m] and ``covariance`` (xx, xy,
     yy) [m^2] in the world frame. ``events.csv``: ``t_ns`` (absolute), ``t`` [s from the log's start] and the event.
     ``map.world.toml``, with its points beside it: the map with the points that were found, if any were; see :func:`map_of`.
@@ -76,8 +76,8 @@ def write_run(
 def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: Path) -> None:
     """Write the files of a run with these scores into an empty folder; see :func:`write_run`."""
     causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
-    (result.final_space or result.final).write(folder / "final.tum", log.t0_ns)
-    (result.causal_space or causal).write(folder / "causal.tum", log.t0_ns)
+    result.final.write(folder / "final.tum", log.t0_ns)
+    causal.write(folder / "causal.tum", log.t0_ns)
     table = io.BytesIO()  # polars reports a full disk as a file out of specification
     estimates(result, log).write_parquet(table)
     (folder / "estimates.parquet").write_bytes(table.getvalue())

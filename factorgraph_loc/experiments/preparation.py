@@ -12,9 +12,8 @@ import numpy as np
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.files.models import FARTHEST, FileModel, nearest
 from factorgraph_loc.fusion import registry
-from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, PosePrior, SpacePose
+from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, PosePrior
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.trajectory3 import Trajectory3, planar_estimate
 from factorgraph_loc.sensors.interfaces import PreparedLog, Use, lacking_section
 from factorgraph_loc.sensors.registry import channels, functions, moving, sensor_of
 from factorgraph_loc.text import listed, quoted
@@ -39,8 +38,7 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
     Raises InputError if the log lacks what is requested, or ``prior`` is none of these.
     """
     if prior is None:
-        has_reference = log.reference is not None or log.reference3 is not None
-        prior = "log" if log.start is not None else "reference" if has_reference else "unknown"
+        prior = "log" if log.start is not None else "unknown" if log.reference is None else "reference"
     if prior == "unknown":
         return None, prior
     if prior == "log":
@@ -77,8 +75,6 @@ def first_odometry(log: Log) -> float:
 
 
 def _from_reference(log: Log) -> PosePrior:
-    if log.reference is None and log.reference3 is not None:
-        return _in_space(log.reference3)
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference to start from, expected a prior {EXPECTED}")
     start = first_odometry(log)
@@ -92,14 +88,6 @@ def _from_reference(log: Log) -> PosePrior:
     if not log.reference.has_heading:
         return PosePrior.at_position(t, pose[:2], covariance[:2, :2])
     return PosePrior(t, pose, covariance)
-
-
-def _in_space(reference: Trajectory3) -> PosePrior:
-    """The first pose of a robot in space."""
-    covariance = np.diag(np.repeat(np.square((REFERENCE_HEADING_SIGMA, REFERENCE_POSITION_SIGMA)), 3))
-    pose = SpacePose(reference.positions[0], reference.rotations[0], covariance)
-    seen = planar_estimate(float(reference.t[0]), pose)
-    return PosePrior(seen.t, seen.pose, seen.covariance, pose)
 
 
 def _covariance(position_sigma: float, heading_sigma: float) -> np.typing.NDArray[np.float64]:
@@ -162,7 +150,7 @@ def unused(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
     for section in dict.fromkeys(lacking.values()):
         names = ", ".join(name for name, of in lacking.items() if of == section)
         doubts.append(f"{log.name}: {names} left out, as the rig {log.rig.name} has no [{section}]")
-    if not moving(sensors, "floor", "space"):
+    if not moving(sensors, "floor"):
         doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
     return tuple(doubts)
 

@@ -33,8 +33,8 @@ from factorgraph_loc.experiments.preparation import (
 )
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fusion import registry
-from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, SpaceEstimator, finds_heading
-from factorgraph_loc.fusion.guarded import Guard, sound, sound_space, sound_trajectory
+from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, finds_heading
+from factorgraph_loc.fusion.guarded import Guard, sound, sound_trajectory
 from factorgraph_loc.fusion.map_frame import MapFrame
 from factorgraph_loc.io.checks import require_bounds, require_one_span
 from factorgraph_loc.model import setup as model_setup
@@ -108,11 +108,6 @@ def run(
     guard = Guard(f"{config.estimator} on {log.name}")
     with guard:
         estimator = registry.create(config.estimator, setup, settings)
-    if not moving(log.streams, "floor") and log.reference3 is not None and not isinstance(estimator, SpaceEstimator):
-        raise InputError(
-            f"{log.name}: {config.estimator} works for a robot on a floor only, this one moves in space, "
-            f"expected one of {', '.join(registry.in_space())}"
-        )
     unstated: tuple[str, ...] = ()
     if prior is None and config.prior is None and not findable(log, tuple(log.streams)):
         prior, prior_source = at_origin(log), "origin"
@@ -148,12 +143,9 @@ def run(
     with guard.quiet(), only_new_searched():
         loop.run()
     started = perf_counter()
-    in_space = None
     with guard.telling("the final trajectory"):
         final = frame.trajectory(sound_trajectory(estimator.trajectory()))
         final_seconds = perf_counter() - started
-        if isinstance(estimator, SpaceEstimator):
-            in_space = frame.in_space(sound_space(estimator.space_trajectory()))
         diagnostics, learnt = estimator.diagnostics, estimator.learnt()
         if isinstance(estimator, ConcludingEstimator):
             diagnostics = estimator.final_diagnostics()
@@ -197,8 +189,6 @@ def run(
             *in_bent_map(log, frame, final),
             *with_pauses(log, ticks.skipped, config.tick_gap),
         ),
-        causal_space=loop.told.in_space(),
-        final_space=in_space,
         reliability=reliability,
     )
 
@@ -214,7 +204,7 @@ def _rehearse(
         return
     _REHEARSED.add(kind)
     begin = _begin(log, setup.sensors, prior)
-    moves = moving(log.streams, "floor", "space", "turn")
+    moves = moving(log.streams, "floor", "turn")
     observes = [s for s in log.streams if s in setup.sensors and s not in moves]
     seen = [log.streams[s].t + log.rig.time_offset(s) for s in observes]
     first = min((float(t[t >= begin].min(initial=math.inf)) for t in seen), default=begin)

@@ -61,13 +61,6 @@ def within(where: str, column: Column, value: object, shape: tuple[int, ...]) ->
     return found if shape else float(found)
 
 
-def truth(where: str, field: str, value: object) -> bool:
-    """True or False; InputError if it is neither."""
-    if not isinstance(value, (bool, np.bool_)):
-        raise bad_field(where, field, value, "True or False")
-    return bool(value)
-
-
 def names(where: str, field: str, value: object) -> tuple[str, ...]:
     """A tuple of names; InputError if ``value`` is not a list of names."""
     if isinstance(value, str) or not isinstance(value, Sequence) or not all(isinstance(name, str) for name in value):

@@ -10,7 +10,6 @@ __all__ = [
     "graph_parts",
     "guarded",
     "kld",
-    "least_squares",
     "map_frame",
     "mapping",
     "marginals",

@@ -7,7 +7,6 @@ from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
 
 
 class _Every:
@@ -53,14 +52,6 @@ class Estimator(Protocol):
 
     def trajectory(self) -> Trajectory:
         """The best estimate of the whole past, with covariances, at the stamps of the ticks."""
-
-
-@runtime_checkable
-class SpaceEstimator(Protocol):
-    """An estimator of a robot that need not be on a floor: its causal estimates hold ``space``."""
-
-    def space_trajectory(self) -> Trajectory3:
-        """:meth:`Estimator.trajectory` in space, with covariances (N, 6, 6)."""
 
 
 @runtime_checkable

@@ -20,7 +20,6 @@ from factorgraph_loc.fusion.base import Estimator
 from factorgraph_loc.model.belief import Belief, PoseEstimate
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.text import plain
 from factors.compiled import compiled
 from factors.se2 import Array
@@ -111,11 +110,6 @@ def sound(estimate: PoseEstimate) -> PoseEstimate:
     is_finite, is_clear = _judged(estimate.pose, estimate.covariance)
     if not is_finite:
         raise ValueError("the pose is not finite")
-    if (space := estimate.space) is not None:
-        if not (np.all(np.isfinite(space.position)) and np.all(np.isfinite(space.rotation))):
-            raise ValueError("the pose in space is not finite")
-        _positive(space.covariance)
-        return estimate
     if is_clear:
         return estimate
     covariance = _positive(estimate.covariance)
@@ -147,14 +141,6 @@ def sound_trajectory(trajectory: Trajectory) -> Trajectory:
     for i in doubtful:
         covariances[i] = _positive(covariances[i], f" at {trajectory.t[i]:.3f} s")
     return replace(trajectory, covariances=covariances)
-
-
-def sound_space(trajectory: Trajectory3) -> Trajectory3:
-    """A trajectory in space, if all its numbers are finite; else a ValueError."""
-    for values in (trajectory.positions, trajectory.rotations, trajectory.covariances):
-        if values is not None and not np.all(np.isfinite(values)):
-            raise ValueError("the trajectory in space is not finite")
-    return trajectory
 
 
 def _positive(covariance: Array, where: str = "") -> Array:

@@ -10,16 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Container
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, SpacePose
+from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.registry import functions
 from factors.se2 import Array
-
-PLANAR = (3, 4, 2)  # x, y and heading among the perturbations of a pose in space
 
 
 @dataclass(frozen=True)
@@ -38,15 +33,13 @@ class MapFrame:
         """A start in the world, as one in the map."""
         if self.error is None:
             return prior
-        space = None if prior.space is None else self._space(prior.space, prior.pose)
-        return replace(prior, covariance=prior.covariance + self.error(prior.pose[None])[0], space=space)
+        return replace(prior, covariance=prior.covariance + self.error(prior.pose[None])[0])
 
     def estimate(self, estimate: PoseEstimate) -> PoseEstimate:
         """An estimate in the map, as one in the world."""
         if self.error is None or estimate.status == "unlocalized":
             return estimate
-        space = None if estimate.space is None else self._space(estimate.space, estimate.pose)
-        return replace(estimate, covariance=estimate.covariance + self.error(estimate.pose[None])[0], space=space)
+        return replace(estimate, covariance=estimate.covariance + self.error(estimate.pose[None])[0])
 
     def belief(self, belief: Belief) -> Belief:
         """The same of a belief; particles stay in the map."""
@@ -60,24 +53,3 @@ class MapFrame:
         if self.error is None or trajectory.covariances is None or not len(trajectory):
             return trajectory
         return replace(trajectory, covariances=trajectory.covariances + self.error(trajectory.poses))
-
-    def in_space(self, trajectory: Trajectory3) -> Trajectory3:
-        """The same of a trajectory in space."""
-        if self.error is None or trajectory.covariances is None or not len(trajectory):
-            return trajectory
-        added = _lifted(self.error(trajectory.planar().poses), trajectory.rotations)
-        return replace(trajectory, covariances=trajectory.covariances + added)
-
-    def _space(self, space: SpacePose, pose: Array) -> SpacePose:
-        assert self.error is not None
-        added = _lifted(self.error(pose[None]), space.rotation[None])[0]
-        return replace(space, covariance=space.covariance + added)
-
-
-def _lifted(covariances: Array, rotations: Array) -> Array:
-    """``covariances`` (N, 3, 3) of (x, y, heading) in the world, as (N, 6, 6) of poses in space in their own frames."""
-    full = np.zeros((len(covariances), 6, 6))
-    full[np.ix_(range(len(covariances)), PLANAR, PLANAR)] = covariances
-    back = np.zeros_like(full)
-    back[:, :3, :3] = back[:, 3:, 3:] = rotations.transpose(0, 2, 1)
-    return np.asarray(back @ full @ back.transpose(0, 2, 1))

@@ -7,7 +7,7 @@ from typing import Any, cast
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, nearest, parse_model
 from factorgraph_loc.files.settings import Setting, first_sentence, settings_in
-from factorgraph_loc.fusion.base import EVERY, Estimator, SpaceEstimator
+from factorgraph_loc.fusion.base import EVERY, Estimator
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.plugins import ESTIMATORS, load
 from factorgraph_loc.sensors.registry import Channel, channels
@@ -68,8 +68,6 @@ def describe(name: str) -> Description:
 
 
 def _takes(kind: type[Any], channel: Channel) -> bool:
-    if channel.in_space and not issubclass(kind, SpaceEstimator):
-        return False
     modalities = getattr(kind, "modalities", EVERY)
     return bool(channel.motion) or any(modality in modalities for modality in _modalities(channel))
 
@@ -85,11 +83,6 @@ def check_names(names: Sequence[str]) -> None:
     for name in names:
         if name not in ESTIMATORS:
             raise InputError(f"no estimator is called {quoted(name)}{nearest(name, list(ESTIMATORS))}")
-
-
-def in_space() -> list[str]:
-    """The names of those for a robot that need not be on a floor."""
-    return [name for name in ESTIMATORS if issubclass(estimator_type(name), SpaceEstimator)]
 
 
 def estimator_type(name: str) -> type[Any]:

@@ -13,7 +13,7 @@ from factorgraph_loc.files.checks import ROUNDING
 from factorgraph_loc.files.columns import MAX_SPAN, POSES, Column
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.registry import channels, moving
+from factorgraph_loc.sensors.registry import channels
 from factorgraph_loc.sensors.tables import columns_of
 from factors.se2 import Array
 
@@ -74,10 +74,9 @@ def require_one_span(log: Log) -> None:
 
 
 def look_over(log: Log) -> list[str]:
-    """Warnings about a whole log; InputError if it has no odometry, which only a robot in space and a bare trajectory lack."""
+    """Warnings about a whole log; InputError if it has no odometry, which only a bare trajectory lacks."""
     odometry = log.streams.get("odometry")
-    in_space = log.reference3 is not None or bool(moving(log.streams, "space"))
-    if odometry is None and (in_space or (log.reference is not None and not log.streams)):
+    if odometry is None and (log.reference3 is not None or (log.reference is not None and not log.streams)):
         return []
     if odometry is None or len(odometry.t) == 0:
         raise InputError(f"{log.name}: has no odometry, which every estimator needs")

@@ -48,9 +48,9 @@ class Localizer:
     """An estimator for online use; any number of threads may push measurements and pull estimates.
 
     ``rig`` and ``world``: robot and map. ``estimator``: its name; ``settings``: overrides of its settings. The smoother has a
-    fixed lag of 10 s unless ``settings`` change it; with ``lag = None`` it keeps the whole past, as ``batch``, ``space_batch`` and
-    ``space_smoother`` do. ``sensors``: the channels to use, by default the rig's; measurements of others are counted as ignored.
-    ``history`` [s]: length of the past that :meth:`trajectory` returns, which bounds the memory. ``seed``: of the random generator.
+    fixed lag of 10 s unless ``settings`` change it; with ``lag = None`` it keeps the whole past, as ``batch`` does.
+    ``sensors``: the channels to use, by default the rig's; measurements of others are counted as ignored. ``history`` [s]:
+    length of the past that :meth:`trajectory` returns, which bounds the memory. ``seed``: of the random generator.
 
     Call :meth:`initialize` first, and again to restart; there is nothing to close. Timestamps are seconds of any clock that all
     sensors share; the time offsets of the rig are added here. A lock guards the estimator: a push waits while another measurement
@@ -105,10 +105,6 @@ class Localizer:
             new = registry.create(self._name, setup, self._settings)
         if start is None and not getattr(new, "supports_unknown_start", False):
             raise InputError(f"{self._name} cannot start from an unknown pose with this rig and map, expected a pose")
-        if start is not None and getattr(new, "starts_in_space", False):
-            raise InputError(
-                f"{self._name} starts from a three-dimensional pose, expected an estimator for planar poses"
-            )
         if start is not None and not start.has_heading and not finds_heading(new):
             raise InputError(f"{self._name} cannot find an unknown heading with this rig and map, expected a heading")
         if start is not None and not math.isnan(start.t):
@@ -303,7 +299,7 @@ class Localizer:
 
 def _copied(e: PoseEstimate, t: float) -> PoseEstimate:
     """The estimate with the time ``t``, and arrays of its own."""
-    return PoseEstimate(t, np.array(e.pose), np.array(e.covariance), e.status, copy.deepcopy(e.space))
+    return PoseEstimate(t, np.array(e.pose), np.array(e.covariance), e.status)
 
 
 def _moved(m: Measurement, offset: float) -> Measurement:

@@ -23,15 +23,13 @@ Status = Literal["unlocalized", "ambiguous", "localized"]
 class PosePrior:
     """Gaussian prior of the start pose.
 
-    ``pose`` (3,) is (x, y, heading) at ``t`` with ``covariance`` (3, 3), in the world frame. ``space``: the pose of a robot that
-    moves in three dimensions. ``has_heading`` is False if the heading is unknown: it is 0 then, with the variance of a uniform
-    distribution.
+    ``pose`` (3,) is (x, y, heading) at ``t`` with ``covariance`` (3, 3), in the world frame. ``has_heading`` is False if the
+    heading is unknown: it is 0 then, with the variance of a uniform distribution.
     """
 
     t: float
     pose: Array
     covariance: Array
-    space: SpacePose | None = None
     has_heading: bool = True
 
     @staticmethod
@@ -43,25 +41,13 @@ class PosePrior:
 
 
 @dataclass(frozen=True)
-class SpacePose:
-    """A pose in three dimensions: ``position`` (3,) [m] and ``rotation`` (3, 3) in the world frame, and the ``covariance`` (6, 6)
-    of a perturbation in the robot frame, rotation before translation as in ``gtsam.Pose3``."""
-
-    position: Array
-    rotation: Array
-    covariance: Array
-
-
-@dataclass(frozen=True)
 class PoseEstimate:
-    """A causal estimate: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world frame; ``space``: the
-    three-dimensional pose, if the estimator has one."""
+    """A causal estimate: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world frame."""
 
     t: float
     pose: Array
     covariance: Array
     status: Status
-    space: SpacePose | None = None
 
 
 @dataclass(frozen=True)

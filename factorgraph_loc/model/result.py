@@ -11,7 +11,6 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.reliability import Reliability
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
 from factors.se2 import Array
 
 
@@ -42,8 +41,7 @@ class RunResult:
 
     ``config``: the effective configuration, enough to repeat the run. ``t`` (N,), ``poses`` (N, 3), ``covariances`` (N, 3, 3) in
     the world frame and ``status`` (N) are the causal estimates at the ticks; ``final`` is the estimate from the whole log.
-    ``causal_space``, ``final_space``: the same in three dimensions, if the estimator has them. ``reliability``: of the sensors'
-    models on this log, by sensor.
+    ``reliability``: of the sensors' models on this log, by sensor.
     """
 
     log: str
@@ -58,8 +56,6 @@ class RunResult:
     timings: Timings
     versions: Mapping[str, str]
     warnings: tuple[str, ...] = ()
-    causal_space: Trajectory3 | None = None
-    final_space: Trajectory3 | None = None
     reliability: Mapping[str, Reliability] = field(default_factory=dict)
 
     def __repr__(self) -> str:

@@ -5,7 +5,6 @@ __all__ = [
     "binding",
     "calibrating",
     "camera",
-    "inertial",
     "interfaces",
     "known_position",
     "landmarks",
@@ -17,5 +16,4 @@ __all__ = [
     "rfid",
     "smoothed",
     "tables",
-    "twist",
 ]

@@ -1,13 +1,11 @@
 """Unions of the measurement types of this project's sensors."""
 
 from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.sensors.inertial.measurement import Inertial
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factorgraph_loc.sensors.loops.measurement import Loops
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.twist.measurement import Twist
 from factorgraph_loc.vision.frame import CameraFrame
 
-Odometry = VelocityOdometry | IncrementOdometry | YawRate | Twist | Inertial
+Odometry = VelocityOdometry | IncrementOdometry | YawRate
 Exteroceptive = BearingRange | RfidScan | PixelSightings | CameraFrame | Loops  # of the robot's surroundings

@@ -26,7 +26,7 @@ class Channel:
     ``streams``, ``measurements``: the classes of its streams and measurements. Both are empty for a channel that selects columns
     of another one (``column_of``), as ``rssi`` and ``phase`` do for ``rfid``. ``rows``: a plural for its rows. ``section``: the
     rig's section with the ``time_offset``; ``needs_section``: whether the channel is useless without it. ``motion``: whether it
-    measures motion on a floor or in space, or rotation.
+    measures motion on the floor, or rotation alone.
 
     ``tables``: the descriptions (:class:`~factorgraph_loc.files.columns.Table`) of its tables in a log; ``described``: of further
     tables, for measurements that differ from those. If stream fields are not columns: ``assemble``: ``(rows by table, reading) ->
@@ -42,18 +42,13 @@ class Channel:
     needs_section: bool = False
     column_of: str = ""
     rows: str = "rows"
-    motion: Literal["", "floor", "space", "turn"] = ""
+    motion: Literal["", "floor", "turn"] = ""
     tables: tuple[Place, ...] = ()
     described: tuple[Place, ...] = ()
     assemble: Place = ""
     disassemble: Place = ""
     check: Place = ""
     sequence: Place = ""
-
-    @property
-    def in_space(self) -> bool:
-        """Whether only robots in space use it: it measures their motion, or a log of a robot on a floor has no table for it."""
-        return self.motion == "space" or (bool(self.described) and not self.tables)
 
 
 @dataclass(frozen=True)
@@ -151,7 +146,7 @@ def sensor_of(channel: str) -> SensorType:
 
 
 def moving(names: Iterable[str], *motions: str) -> tuple[str, ...]:
-    """The channels among ``names`` that measure motion on the ``floor`` or in ``space``, or rotation (``turn``)."""
+    """The channels among ``names`` that measure motion on the ``floor``, or rotation alone (``turn``)."""
     known = channels()
     return tuple(name for name in names if name in known and known[name].motion in motions)
 

@@ -146,9 +146,7 @@ def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str,
         if table.stream and isinstance(stream, load(table.stream)):
             fields = {c.name: getattr(stream, c.field or c.name) for c in table.columns if c is not STAMP}
             return {table.name: {STAMP.name: checks.absolute(stream.t, writing.t0_ns), **fields}}
-    raise InputError(
-        f"{writing.log}: {channel.name} has no table in this format, expected the log of a robot on a floor"
-    )
+    raise InputError(f"{writing.log}: {channel.name} has no table in this format")
 
 
 def rows_of(table: Table, stream: Stream) -> Iterator[dict[str, Any]]:

@@ -1,3 +1,3 @@
-"""Localization and mapping at once: unknown landmarks and points, loop closure, and robots in space."""
+"""Localization and mapping at once: unknown landmarks and points, and loop closure."""
 
-__all__ = ["monoslam", "point_mapper", "space_batch", "space_smoother"]
+__all__ = ["monoslam", "point_mapper"]

@@ -2,13 +2,12 @@
 al., 2007.
 
 The state has 13 values: position r^W and orientation q^WR of the robot's frame R, its velocity v^W in the world frame and its
-turn rate w^R in its own frame; points that are not in the map follow. The error state has 12 values, as an orientation has three
+turn rate w^R in its own frame. Points that are not in the map follow. The error state has 12 values, as an orientation has three
 degrees of freedom. The camera is mounted on R by the rig's extrinsics, so R replaces the paper's camera frame.
 
-Odometry replaces the constant-velocity prediction of x, y and heading; height, roll and pitch stay near those of a robot on the
-floor. A motion measured in space (``twist``) replaces all six; an inertial unit tells how velocity and orientation change, and its
-biases are states. Without either, velocity is constant up to random impulses. Map points are searched where they are predicted
-(:mod:`.monoslam_search`); others enter the state by inverse depth (:mod:`.monoslam_map`). RFID is ignored.
+The robot has wheels: odometry replaces the constant-velocity prediction of x, y and heading; height, roll and pitch stay near
+those of a robot on the floor. Map points are searched where they are predicted (:mod:`.monoslam_search`); others enter the state
+by inverse depth (:mod:`.monoslam_map`). RFID is ignored.
 """
 
 import math
@@ -20,19 +19,30 @@ from pydantic import Field
 
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion.timeline import Filter, FilterSettings
-from factorgraph_loc.model.belief import Learnt, LearntPoint, PoseEstimate, PosePrior, SpacePose
-from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.belief import Learnt, LearntPoint, PoseEstimate, PosePrior
 from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3, planar_estimate, planar_trajectory
 from factorgraph_loc.sensors.camera.sensor import CAMERAS, Pixels
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.turn_check import TurnCheck
 from factorgraph_loc.sensors.registry import moving
-from factorgraph_loc.slam.inertial_motion import measured_motion
 from factorgraph_loc.slam.monoslam_invariance import carried
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
+from factorgraph_loc.slam.monoslam_motion import (
+    PLANAR,
+    ROBOT,
+    UPRIGHT,
+    Origin,
+    RobotState,
+    Step,
+    about_z,
+    measured,
+    on_the_floor,
+    planar,
+    seen_from_above,
+    standstill,
+)
 from factorgraph_loc.slam.monoslam_past import UpdateRecord, smoothed
 from factorgraph_loc.slam.monoslam_sighting import FeatureMatcher, Match
 from factorgraph_loc.slam.monoslam_state import (
@@ -47,22 +57,6 @@ from factorgraph_loc.slam.monoslam_state import (
     widened,
     with_floor,
 )
-from factorgraph_loc.slam.space_motion import (
-    PLANAR,
-    ROBOT,
-    UPRIGHT,
-    Origin,
-    RobotState,
-    Step,
-    about_z,
-    constant_velocity,
-    measured,
-    on_the_floor,
-    planar,
-    standstill,
-    unobservable,
-)
-from factorgraph_loc.slam.space_motion_models import KnownState
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import FLOATS, TILTS
 from factors import se2
@@ -72,12 +66,9 @@ from factors.robust import huber_weight
 from factors.se2 import Array
 
 SETTLED = 1e-3  # m, rad: step of the iterated update below which it has converged
-HORIZON = 5.0  # s of measured motion that are kept
 LATELY = 5.0  # s: a point in the state that was not seen since may be hidden
 LOST_AFTER = 5  # consecutive images without a match, after which the filter is lost
 SCALE = "scale_distance"  # the constant of the odometry
-UNSCALED = 1.0  # standard deviation of the scale of a world that one camera alone tells, relative to it
-NO_SCALE = "camera: one camera without a map and without measured motion tells no distances: their scale is unknown"
 VAGUE = 0.5  # m, rad: standard deviations beyond which the pose is unknown
 
 
@@ -85,12 +76,6 @@ class MonoslamSettings(FilterSettings):
     """Settings of the monoSLAM filter. With points in the state the update is never iterated, which would make the filter
     inconsistent, and the final trajectory is the causal one."""
 
-    planar: bool | None = None
-    """whether the robot is on a floor; by default if its start is a pose on one, or unknown with wheels"""
-    acceleration: Annotated[float, Field(ge=1e-3, le=100.0), InUnit("m/s^2")] = 4.0
-    """standard deviation of the constant-velocity model, as published"""
-    angular_acceleration: Annotated[float, Field(ge=1e-3, le=100.0), InUnit("rad/s^2")] = 6.0
-    """standard deviation of the constant-velocity model, as published"""
     height_sigma: Annotated[float, Field(ge=1e-5, le=1.0), InUnit("m")] = 0.005
     """standard deviation of the height of a robot on a floor"""
     tilt_sigma: Annotated[float, Field(ge=1e-5, le=0.5), InUnit("rad")] = 0.005
@@ -108,7 +93,7 @@ class MonoslamSettings(FilterSettings):
 
 
 class Monoslam(Filter):
-    """The EKF of the paper: a camera in space, with points that it maps on the way. See the module."""
+    """The EKF of the paper: one camera on a robot with wheels, with points that it maps on the way. See the module."""
 
     modalities = frozenset({"camera"})
     estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
@@ -119,18 +104,10 @@ class Monoslam(Filter):
         self._settings = settings
         self.supports_unknown_start = settings.landmarks == "known"
         self._looker = FeatureMatcher(setup, self.diagnostics, settings.landmarks)
-        self._wheels = bool(moving(setup.sensors, "floor"))
-        self._planar = self._wheels if settings.planar is None else settings.planar
-        # one eye begins points at depths so vague that this filter would mistake how far a known acceleration led
-        clear = settings.landmarks != "unknown" or self._looker.two_eyes
-        inertial = clear and not (self._wheels and self._planar)
-        self._chain, self._measured = measured_motion(setup, HORIZON, inertial=inertial)
-        self._inertial = self._measured is not None and self._measured.by_velocity  # it tells how the velocity changes
-        self._constants = self._motion.constants if self._measured is None else self._measured.constants
+        self._constants = self._motion.constants
         camera = setup.rig.find(CameraSettings) if any(name in setup.sensors for name in CAMERAS) else None
         self._scale = self._constants.names.index(SCALE) if SCALE in self._constants.names else None
-        self._told = False  # whether it was said that the scale is unknown
-        turns = camera.model() if camera is not None and self._wheels and self._planar else None
+        turns = camera.model() if camera is not None and moving(setup.sensors, "floor") else None
         self._check = TurnCheck(turns, self._motion, self.diagnostics, NOTHING)
         self._mounting = np.zeros((6, 6)) if camera is None else of_mounting(camera)
         self._step: Step | None = None
@@ -146,18 +123,8 @@ class Monoslam(Filter):
         else:
             self._wait(prior.t)
 
-    def process(self, measurement: Measurement) -> None:
-        """Process one measurement, in order or late by at most ``max_delay``."""
-        taken = None if self._chain is None else self._chain.take(measurement)
-        if taken is None:
-            super().process(measurement)
-            return
-        self._ahead = None
-        if not taken:
-            self.diagnostics.drop_late(measurement.modality)
-
     def learnt(self) -> Learnt:
-        """The constants of what measures motion, and the points in the state, seen from above, without those of unknown depth."""
+        """The constants of the odometry, and the points in the state, seen from above, without those of unknown depth."""
         state: SlamState | None = self._state
         if state is None:
             return Learnt()
@@ -175,53 +142,38 @@ class Monoslam(Filter):
         return Learnt(values, points)
 
     def trajectory(self) -> Trajectory:
-        """The best estimate of the whole past, seen from above; see :meth:`space_trajectory`."""
-        return planar_trajectory(self.space_trajectory())
-
-    def space_trajectory(self) -> Trajectory3:
-        """The poses in space at the ticks: smoothed (Rauch, Tung, Striebel, 1965) in a known map, else, or without ``smooth``,
-        the causal ones.
-        """
+        """The poses at the ticks, seen from above: smoothed (Rauch, Tung, Striebel, 1965) in a known map, else, or without
+        ``smooth``, the causal ones."""
         found = self._past()
         ticks = np.unique(np.array(self._ticks))
         chosen = [found[i] for i in np.searchsorted([r.t for r in found], ticks, side="right") - 1]
-        return Trajectory3(
-            ticks,
-            np.array([r.robot.position for r in chosen]).reshape(-1, 3),
-            np.array([r.robot.rotation for r in chosen]).reshape(-1, 3, 3),
-            np.array([self._spread(r.robot, r.covariance) for r in chosen]).reshape(-1, 6, 6),
-        )
+        seen = [seen_from_above(r.robot, self._spread(r.robot, r.covariance)) for r in chosen]
+        poses, covariances = np.array([p for p, _ in seen]), np.array([c for _, c in seen])
+        return Trajectory(ticks, poses.reshape(-1, 3), covariances.reshape(-1, 3, 3))
 
     def _past(self) -> list[UpdateRecord]:
         """The records, smoothed in a known map."""
         if self._smooth and self._settings.landmarks == "known":
-            return smoothed(self._records, by_velocity=self._by_velocity)
+            return smoothed(self._records)
         return self._records
 
     def _start(self, prior: PosePrior) -> SlamState:
         s = self._settings
         covariance = starting(self._constants.sigmas)
-        if s.planar is None:
-            self._planar = prior.space is None
-        if prior.space is not None:
-            position, rotation = prior.space.position, prior.space.rotation
-            covariance[:6, :6] = prior.space.covariance
-        else:
-            position, rotation = np.array((*prior.pose[:2], 0.0)), about_z(float(prior.pose[2]))
-            covariance[np.ix_(PLANAR, PLANAR)] = se2.world_to_body(prior.pose, prior.covariance)
-            covariance[UPRIGHT, UPRIGHT] = np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
+        position, rotation = np.array((*prior.pose[:2], 0.0)), about_z(float(prior.pose[2]))
+        covariance[np.ix_(PLANAR, PLANAR)] = se2.world_to_body(prior.pose, prior.covariance)
+        covariance[UPRIGHT, UPRIGHT] = np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
         if s.landmarks == "unknown":
-            free = unobservable(robot, floor=self._planar, gravity=self._inertial)
-            told, pose = np.eye(6) - free, covariance[:6, :6]
-            scaled = self._inertial or not self._by_velocity or self._looker.two_eyes
-            self._origin = Origin(robot, free @ pose @ free, 0.0 if scaled else UNSCALED)
-            covariance[:6, :6] = told @ pose @ told
-        floor = TiltScale.guessed(s.tilt_sigma) if self._planar and s.landmarks != "known" else None
+            pose = covariance[:6, :6].copy()
+            covariance[PLANAR], covariance[:, PLANAR] = 0.0, 0.0
+            pose[UPRIGHT], pose[:, UPRIGHT] = 0.0, 0.0
+            self._origin = Origin(robot, pose)
+        floor = TiltScale.guessed(s.tilt_sigma) if s.landmarks != "known" else None
         return SlamState(robot, np.zeros(len(self._constants.names)), covariance, floor=floor)
 
     def _seek(self, m: Pixels) -> SlamState | None:
-        eye = self._looker.eye(m)
+        eye = self._looker.eye
         camera = None if eye is None else self._looker.relocated(m, eye)
         if eye is None or camera is None:
             return None
@@ -229,42 +181,23 @@ class Monoslam(Filter):
         nowhere = RobotState(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
         return self._standing(camera, eye, SlamState(nowhere, np.zeros(len(sigmas)), starting(sigmas)))
 
-    @property
-    def _by_velocity(self) -> bool:
-        """Whether the motion is predicted from the velocity."""
-        return self._inertial or (self._measured is None and not (self._planar and self._wheels))
-
     def _predict(self, t: float) -> None:
         increment = self._travelled(t)
         s, robot, dt = self._settings, self._state.robot, increment.duration
-        if self._measured is not None:
-            known = KnownState(self._t, robot, self._state.covariance, self._state.constants)
-            step = self._measured.step(known, self._t + dt)
-        elif not self._by_velocity:
-            delta, by_constants = self._motion.changed(increment, self._state.constants)
-            step = measured(robot, planar(delta, increment.covariance, by_constants), dt)
-        else:
-            free = np.ones(3)
-            impulse, turning = s.acceleration * dt * free, s.angular_acceleration * dt * free
-            if self._planar:
-                impulse[2] = turning[0] = turning[1] = 0.0
-            step = constant_velocity(robot, dt, impulse, turning)
-        if self._planar:
-            step = on_the_floor(step, dt, s.height_sigma, *self._state.sway(s.tilt_sigma))
-        self._step = step
-        self._state = self._state.moved(step)
+        delta, by_constants = self._motion.changed(increment, self._state.constants)
+        step = measured(robot, planar(delta, increment.covariance, by_constants), dt)
+        self._step = on_the_floor(step, dt, s.height_sigma, *self._state.sway(s.tilt_sigma))
+        self._state = self._state.moved(self._step)
         self._predicted = self._kept(self._state)
 
     def _uses(self, modality: str) -> bool:
         return modality in self.modalities
 
     def _see(self, m: Pixels) -> None:
-        eye = self._looker.eye(m)
+        eye = self._looker.eye
         if eye is None:
             self.diagnostics.ignore("camera", len(m.pixels))
             return
-        if self._origin is not None and m.frame is not None and m.frame.depths is not None:
-            self._origin = replace(self._origin, scale=0.0)
         self._check.add(m)
         state, match = self._found(m, self._state, eye)
         self._matched(m, match, eye)
@@ -276,8 +209,8 @@ class Monoslam(Filter):
         self._state = replace(state, seen=self._odometry)
 
     def _found(self, m: Pixels, state: SlamState, eye: Eye) -> tuple[SlamState, Match]:
-        """What is found in an image, and the state before it; without a map images tell whether wheels slipped since the last."""
-        if self._settings.landmarks == "known" or self._measured is not None or self._by_velocity or state.seen is None:
+        """What is found in an image, and the state before it. Without a map, images tell whether wheels slipped between them."""
+        if self._settings.landmarks == "known" or state.seen is None:
             return state, self._looker.match(m, state, eye)
         slip = self._motion.slip(self._motion.relative(state.seen, self._odometry))
         return self._looker.unless_slipped(m, state, eye, *slip)
@@ -316,12 +249,11 @@ class Monoslam(Filter):
         return replace(with_floor(prior, after, self._t), covariance=carried(prior, after, self._scale))
 
     def _report(self, m: Pixels, match: Match, residual: Array, innovation: Innovation, noise: Array) -> None:
-        sensor = "camera_right" if m.right else "camera"
         whitened = np.linalg.solve(innovation.root(noise), residual.ravel())
         missing = 0 if match.depths is None else int(np.count_nonzero(np.isnan(match.depths)))
-        self.diagnostics.innovation(sensor, m.t, float(whitened @ whitened), len(whitened) - missing)
+        self.diagnostics.innovation("camera", m.t, float(whitened @ whitened), len(whitened) - missing)
         for i, name in enumerate("uv"):
-            self.diagnostics.add_residuals(f"{sensor}.{name}", residual[:, i].tolist())
+            self.diagnostics.add_residuals(f"camera.{name}", residual[:, i].tolist())
 
     def _relocated(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> tuple[SlamState, bool]:
         """Relocalize in the whole map if several images had no matches, or if the pose is hardly known; whether that succeeded.
@@ -340,7 +272,7 @@ class Monoslam(Filter):
         return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > VAGUE**2)
 
     def _standing(self, camera: CameraPose, eye: Eye, before: SlamState) -> SlamState | None:
-        """The state of a robot with the relocalized ``camera``; None if it would float or tilt on a floor."""
+        """The state of a robot with the relocalized ``camera``; None if it would float or tilt."""
         s = self._settings
         position, rotation = carrier(eye.model, camera.position, camera.rotation)
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
@@ -348,10 +280,9 @@ class Monoslam(Filter):
         covariance[ROBOT:, ROBOT:] = before.covariance[ROBOT : before.base, ROBOT : before.base]
         back = np.linalg.inv(eye.lift)
         covariance[:6, :6] = back @ camera.covariance @ back.T
-        if self._planar:
-            if abs(position[2]) > FLOATS or rotation[2, 2] < math.cos(TILTS):
-                return None
-            covariance[UPRIGHT, UPRIGHT] += np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
+        if abs(position[2]) > FLOATS or rotation[2, 2] < math.cos(TILTS):
+            return None
+        covariance[UPRIGHT, UPRIGHT] += np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
         return SlamState(robot, before.constants, covariance, floor=before.floor)
 
     def _managed(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> SlamState:
@@ -364,9 +295,6 @@ class Monoslam(Filter):
             name = f"met{state.met}" if m.names is None else m.names[row]
             descriptor = None if frame is None else frame.descriptors[row]
             depth = math.nan if frame is None or frame.depths is None else float(frame.depths[row])
-            if self._origin is not None and self._origin.scale and not self._told:
-                self.diagnostics.events.append((m.t, NO_SCALE))
-                self._told = True
             grown = with_point(state, MapPoint(name, True, descriptor, m.t), eye, m.pixels[row], depth)
             state = replace(grown, met=state.met + 1)
         state, failed = pruned(state, self._settings.max_points)
@@ -378,9 +306,8 @@ class Monoslam(Filter):
 
     def _estimate(self) -> PoseEstimate:
         robot = self._state.robot
-        spread = self._spread(robot, self._state.covariance)
-        found = planar_estimate(self._t, SpacePose(robot.position, robot.rotation, spread))
-        return replace(found, status="ambiguous") if self._check.told else found
+        pose, covariance = seen_from_above(robot, self._spread(robot, self._state.covariance))
+        return PoseEstimate(self._t, pose, covariance, "ambiguous" if self._check.told else "localized")
 
     def _spread(self, robot: RobotState, covariance: Array) -> Array:
         """The covariance (6, 6) of a pose, including that of the start without a map, or of the camera's mounting in one."""

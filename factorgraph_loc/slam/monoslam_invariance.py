@@ -9,8 +9,8 @@ before an update and back after it is a linear map of the covariance, applied by
 
 import numpy as np
 
+from factorgraph_loc.slam.monoslam_motion import ROBOT, SHIFT, TURN, VELOCITY, cross
 from factorgraph_loc.slam.monoslam_state import POSE, SlamState
-from factorgraph_loc.slam.space_motion import ROBOT, SHIFT, TURN, VELOCITY, cross
 from factors.camera import inverse_depth
 from factors.se2 import Array
 

@@ -1,6 +1,6 @@
 """Management of the points in the state of the monoSLAM filter: initialization, conversion to x, y, z, and deletion.
 
-Davison et al., 2007 (see :mod:`~factorgraph_loc.slam.space_motion`), section III.G: a point that is often not found is deleted.
+Davison et al., 2007 (see :mod:`~factorgraph_loc.slam.monoslam_motion`), section III.G: a point that is often not found is deleted.
 Civera, Davison, Montiel, 2008: new points are initialized by inverse depth (:mod:`factors.camera.inverse_depth`).
 """
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_loc.slam.monoslam_motion import ROBOT, RobotState, Step
 from factorgraph_loc.slam.monoslam_state import POSE
-from factorgraph_loc.slam.space_motion import ROBOT, RobotState, Step
 from factors import positive
 from factors.se2 import Array
 
@@ -28,23 +28,21 @@ class UpdateRecord:
     anew: bool = False
 
 
-def smoothed(records: Sequence[UpdateRecord], *, by_velocity: bool) -> list[UpdateRecord]:
-    """The records given all that came later. ``by_velocity``: the motion is predicted from the velocity, which is smoothed too;
-    otherwise velocity and turn rate have no influence later and stay as they are.
-    """
+def smoothed(records: Sequence[UpdateRecord]) -> list[UpdateRecord]:
+    """The records given all that came later. Velocity and turn rate have no influence later and stay as they are."""
     found = list(records[-1:])
     for after, here in zip(records[:0:-1], records[-2::-1], strict=True):
-        found.append(here if after.anew else _smoothed(here, after, found[-1], by_velocity))
+        found.append(here if after.anew else _smoothed(here, after, found[-1]))
     return found[::-1]
 
 
-def _smoothed(here: UpdateRecord, after: UpdateRecord, later: UpdateRecord, by_velocity: bool) -> UpdateRecord:
+def _smoothed(here: UpdateRecord, after: UpdateRecord, later: UpdateRecord) -> UpdateRecord:
     """The record ``here`` given ``later``, which is the smoothed ``after``."""
     total = len(here.covariance)
     known = after.step.transition.shape[1]
     transition = np.eye(total)
     transition[:ROBOT, :known] = after.step.transition
-    kept = np.r_[0 : ROBOT if by_velocity else POSE, ROBOT:total]
+    kept = np.r_[0:POSE, ROBOT:total]
     block = np.ix_(kept, kept)
     own, predicted = here.covariance[block], after.predicted[block]
     gain = positive.solve(predicted, transition[block] @ own).T

@@ -1,6 +1,6 @@
 """Active search: matching of an image's features to the points that the filter predicts.
 
-Davison et al., 2007 (see :mod:`~factorgraph_loc.slam.space_motion`), section III.E: a point is searched in the 99 % ellipse of
+Davison et al., 2007 (see :mod:`~factorgraph_loc.slam.monoslam_motion`), section III.E: a point is searched in the 99 % ellipse of
 its innovation. Outliers are rejected by consensus: each match alone corrects the prediction, and the correction that most others
 agree with defines the inliers (Civera, Grasa, Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal of Field Robotics
 27(5), 2010). The corrected pixels follow from the innovation covariance, so that all matches are tried, not a random sample. Of

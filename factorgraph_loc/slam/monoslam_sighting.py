@@ -11,10 +11,10 @@ from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.sensors.camera.sensor import DISAGREES, EXACT, MOST, Pixels
+from factorgraph_loc.slam.monoslam_motion import PLANAR
 from factorgraph_loc.slam.monoslam_search import agreeing, find
 from factorgraph_loc.slam.monoslam_state import Eye, Innovation, Integers, Sights, SlamState, Truths
 from factorgraph_loc.slam.slipping import ENOUGH, more_probable
-from factorgraph_loc.slam.space_motion import PLANAR
 from factorgraph_loc.vision import consensus
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose
@@ -61,29 +61,18 @@ class FeatureMatcher:
         self._diagnostics = diagnostics
         sensors, rig = setup.sensors, setup.rig
         used = "camera" in sensors or "sightings" in sensors
-        self._left_eye = Eye.of(rig.camera.model()) if used and rig.camera else None
-        right = rig.camera_right if "sightings_right" in sensors else None
-        self._right_eye = Eye.of(right.model()) if right else None
+        self.eye = Eye.of(rig.camera.model()) if used and rig.camera else None  # the camera; None if the run uses none
         self._grows = use != "known"
         nothing = PointMap.of((), np.empty((0, 3)))
         known = nothing if use == "unknown" or setup.world.points is None else setup.world.points
         self._map = without_common(known)
         self._associator: Associator | None = None
-        if self._left_eye is not None and "camera" in sensors and len(self._map.owners):
-            self._associator = Associator(self._map, self._left_eye.model)
+        if self.eye is not None and "camera" in sensors and len(self._map.owners):
+            self._associator = Associator(self._map, self.eye.model)
         self._spreads_matter = False
-        if self._left_eye is not None and len(self._map):
+        if self.eye is not None and len(self._map):
             worst = float(np.trace(self._map.covariances, axis1=1, axis2=2).max())
-            self._spreads_matter = worst > (EXACT * self._left_eye.model.sigma / self._left_eye.model.fx) ** 2
-
-    @property
-    def two_eyes(self) -> bool:
-        """Whether two cameras see, whose distance is known."""
-        return self._left_eye is not None and self._right_eye is not None
-
-    def eye(self, m: Pixels) -> Eye | None:
-        """The camera of an image."""
-        return self._right_eye if m.right else self._left_eye
+            self._spreads_matter = worst > (EXACT * self.eye.model.sigma / self.eye.model.fx) ** 2
 
     def match(self, m: Pixels, state: SlamState, eye: Eye) -> Match:
         """The pixels that belong to points; outliers are removed and counted as rejected."""

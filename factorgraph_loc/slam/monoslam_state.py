@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.slam.space_motion import (
+from factorgraph_loc.slam.monoslam_motion import (
     PLANAR,
     ROBOT,
     SETTLING,

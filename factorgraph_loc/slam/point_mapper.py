@@ -58,7 +58,7 @@ class PointMapper:
 
     def is_due(self, m: Pixels) -> bool:
         # estimated points need keyframes of their own
-        if self._unknown is None or not self._maps(m):
+        if self._unknown is None or m.modality != self._camera.modality:
             return False
         return m.t - self._taken >= self._interval or self._loses(m)
 
@@ -72,7 +72,7 @@ class PointMapper:
     def take(
         self, m: Pixels, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition, *, is_new: bool
     ) -> Guess:
-        if not self._maps(m):
+        if m.modality != self._camera.modality:
             return guess
         points = self._camera.points
         if m.frame is None:
@@ -101,10 +101,6 @@ class PointMapper:
             if node is not None:
                 addition.hang(keyframe, node)
         return guess
-
-    def _maps(self, m: Pixels) -> bool:
-        """Whether points that are not in the map are taken from an image: it is of the first camera."""
-        return m.modality == self._camera.modality and not m.right
 
     def is_astray(self, node: Node, values: Values) -> bool:
         factor = node.factor

@@ -21,7 +21,6 @@ class CameraFrame:
     sensor: ClassVar[str] = "camera"
     modality: ClassVar[str] = "camera"
     is_motion: ClassVar[bool] = False
-    right: ClassVar[bool] = False
     names: ClassVar[None] = None
     t: float
     feature: str

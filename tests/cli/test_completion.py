@@ -57,7 +57,7 @@ def test_the_settings_are_those_of_the_models(name):
         ("fgloc run plaza2 -e sm", ["smoother"]),
         (
             "fgloc compare plaza2 -e ekf,smoother,s",
-            ["ekf,smoother,switching", "ekf,smoother,space_batch", "ekf,smoother,space_smoother"],
+            ["ekf,smoother,switching"],
         ),
         ("fgloc simulate c", ["corridor"]),
         ("fgloc run plaza2 -e ekf --prior u", ["unknown"]),

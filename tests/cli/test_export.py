@@ -7,17 +7,10 @@ import numpy as np
 import pytest
 from evo.tools import file_interface
 
-from factorgraph_loc.cli.options import LogOptions
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.readers import load
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import read_tum
-from factorgraph_loc.model.trajectory3 import Trajectory3
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.twist.measurement import TwistStream
-from factorgraph_loc.sensors.twist.settings import TwistSettings
 
 
 @pytest.fixture(scope="module")
@@ -53,19 +46,6 @@ def test_the_reference_of_a_log(fgloc, short_log, tmp_path):
     assert fgloc("export", short_log, "-o", tmp_path / "truth.tum").exit_code == 0
     (log,) = load(str(short_log))
     assert np.allclose(read_tum(tmp_path / "truth.tum", log.t0_ns).poses[:, :2], log.reference.poses[:, :2], atol=1e-8)
-
-
-def test_a_reference_in_space(fgloc, tmp_path, monkeypatch):
-    t = np.array((0.0, 1.0))
-    space = Trajectory3(t, np.array(((0.0, 0.0, 1.0), (1.0, 2.0, 3.0))), np.tile(np.eye(3), (2, 1, 1)))
-    twist = TwistStream(t, np.zeros((2, 3)), np.zeros((2, 3)))
-    rig = Rig(sensors=("twist",), twist=TwistSettings(shift=(0.1, 0.1, 0.1), turn=(0.1, 0.1, 0.1)))
-    log = Log("carried", rig, World(), {"twist": twist}, reference3=space)
-    monkeypatch.setattr(LogOptions, "load_one", lambda *_: log)  # the native format has no logs in space
-    assert fgloc("export", "carried", "-o", tmp_path / "a.kitti").exit_code == 0
-    assert np.loadtxt(tmp_path / "a.kitti")[1].tolist() == [1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 3]
-    assert fgloc("export", "carried", "-o", tmp_path / "a.tum").exit_code == 0
-    assert np.loadtxt(tmp_path / "a.tum")[1].tolist() == [1, 1, 2, 3, 0, 0, 0, 1]
 
 
 def test_a_pose_graph(fgloc, short_log, ekf, tmp_path):

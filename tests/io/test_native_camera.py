@@ -10,7 +10,6 @@ import pytest
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream, SightingStream
-from factorgraph_loc.sensors.twist.measurement import TwistStream
 
 CAMERA = "t_ns,file\n1100000000,a.png\n1300000000,b.png\n1500000000,c.png\n"
 PIXELS = "t_ns,landmark,u,v\n1200000000,door,10.5,20\n1200000000,lamp,-3,400.25\n1400000000,door,11,21\n"
@@ -126,14 +125,6 @@ def test_features_cannot_be_written(seen, one, tmp_path):
     features = replace(log, streams=dict(log.streams) | {"camera": FeatureStream(np.empty(0), [])})
     with pytest.raises(InputError, match="hall: camera holds features, expected the images they were computed from"):
         write_native(features, tmp_path / "copy")
-
-
-def test_motion_in_space_cannot_be_written(seen, one, tmp_path):
-    log = one(seen)
-    twists = TwistStream(np.array([0.0]), np.zeros((1, 3)), np.zeros((1, 3)))
-    with pytest.raises(InputError, match="hall: twist has no table in this format, expected the log of a robot on a"):
-        write_native(replace(log, streams=dict(log.streams) | {"twist": twists}), tmp_path / "copy")
-    assert not (tmp_path / "copy").exists()
 
 
 def test_missing_images_are_left_out_with_a_warning(seen, one):

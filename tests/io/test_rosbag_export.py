@@ -23,7 +23,6 @@ from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.twist.measurement import TwistStream
 
 T0 = 1_700_000_000_123_456_789
 SUFFIXES = [".bag", ".mcap", ".db3"]
@@ -163,7 +162,6 @@ def test_a_native_log_by_its_bag(native, tmp_path):
 def test_what_a_bag_cannot_hold(log, tmp_path):
     t = np.zeros(1)
     for streams, words in (
-        ({"twist": TwistStream(t, np.zeros((1, 3)), np.zeros((1, 3)))}, "has no message for TwistStream"),
         ({"odometry": VelocityStream(t - 2e9, t, t)}, "expected one from 1970 to 2038"),
         ({"camera": ImageStream(t, [tmp_path / "gone.png"])}, "gone.png: cannot be read"),
     ):

@@ -69,16 +69,6 @@ def test_the_gyro(maker, read_drive):
     assert "imu" in log.rig.sensors
 
 
-def test_an_inertial_unit(maker, read_drive):
-    """Any sensor's columns can be fields of messages."""
-    add_imu(maker, [(0.1 * i, 0.2, -0.3) for i in range(COUNT)])
-    fields = {f"a{axis}": f"linear_acceleration.{axis}" for axis in "xyz"}
-    fields |= {f"w{axis}": f"angular_velocity.{axis}" for axis in "xyz"}
-    rows = read_drive(maker, inertial={"topic": "/imu", "fields": fields}).streams["inertial"]
-    np.testing.assert_allclose((rows.wx, rows.ax), np.tile(0.1 * np.arange(COUNT), (2, 1)))
-    np.testing.assert_allclose(rows.az, -0.3)
-
-
 @pytest.mark.parametrize(
     ("options", "axis"),
     [

@@ -8,7 +8,6 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-import space_world
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import (
@@ -25,7 +24,6 @@ from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.ekf import Ekf
 from factorgraph_loc.model.log import cut
-from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factors import se2
 
@@ -358,26 +356,3 @@ def test_a_long_pause_holds_no_ticks(log):
     expected = run(replace(log, streams={"odometry": odometry}), RunConfig("ekf", prior="0,0,0", sensors=("odometry",)))
     assert localizer.trajectory().t.tolist() == expected.final.t.tolist()[:-1]
     assert np.diff(expected.final.t).max() > 2800.0
-
-
-@pytest.mark.parametrize("name", ["monoslam", "space_smoother"])
-@pytest.mark.parametrize("drive", [space_world.carried, space_world.swayed])
-def test_a_camera_in_space_begins_where_an_image_tells(name, drive):
-    log = drive(1)
-    localizer = fgloc.Localizer(log.rig, log.world, estimator=name)
-    localizer.initialize()
-    for measurement in log.measurements(log.rig.sensors):
-        localizer.push(measurement)
-    found, sigmas = localizer.estimate(), np.sqrt(np.diag(localizer.estimate().space.covariance))[3:]
-    off = log.reference3.rotations[-1].T @ (found.space.position - log.reference3.positions[-1])
-    assert found.status == "localized"
-    np.testing.assert_array_less(np.abs(off) / sigmas, 4.0)
-
-
-def test_an_estimator_in_space_begins_on_no_floor():
-    """It is refused at once, and what went on before goes on."""
-    camera = CameraSettings(fx=500.0, fy=500.0, cx=320.0, cy=240.0)
-    localizer = fgloc.Localizer(Rig(sensors=("twist", "sightings"), camera=camera), estimator="space_batch")
-    with pytest.raises(InputError, match="space_batch starts from a three-dimensional pose, expected an estimator"):
-        localizer.initialize((0.0, 0.0, 0.0))
-    assert localizer.estimate().status == "unlocalized"

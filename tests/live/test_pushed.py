@@ -16,7 +16,6 @@ from factorgraph_loc import (
     RfidScan,
     Rig,
     Tick,
-    Twist,
     VelocityOdometry,
 )
 from factorgraph_loc.sensors.rfid.pushed import scan_of
@@ -41,7 +40,6 @@ BAD = [
     (VelocityOdometry("1", 0.0, 0.0), r"VelocityOdometry: t is '1', expected a finite number of seconds"),
     (VelocityOdometry(1.0, "fast", 0.0), r"v is 'fast', expected numbers"),
     (IncrementOdometry(1.0, 0.0, math.inf, 0.0), r"dy is inf, expected a finite number"),
-    (Twist(1.0, np.zeros(2), np.zeros(3)), r"Twist at 1.000 s: v has shape \(2,\), expected \(3,\)"),
     (
         BearingRange(1.0, ("a",), -ONE, ONE),
         r"range is -1.0, expected a finite number of m in 0.001 to 100000, or NaN where",

@@ -21,7 +21,6 @@ from factorgraph_loc import (
     RfidRead,
     RfidScan,
     Rig,
-    Twist,
     VelocityOdometry,
     YawRate,
 )
@@ -33,14 +32,12 @@ from factorgraph_loc.sensors.odometry.tables import IMU, INCREMENTS, VELOCITIES
 from factorgraph_loc.sensors.pushed import checked
 from factorgraph_loc.sensors.rfid.columns import READS
 from factorgraph_loc.sensors.rfid.pushed import scan_of
-from factorgraph_loc.sensors.twist.measurement import TWIST
 
 ONE = np.ones(1)
 SOUND = [
     VelocityOdometry(1.0, 0.5, 0.1),
     IncrementOdometry(1.0, 0.5, 0.0, 0.1),
     YawRate(1.0, 0.1),
-    Twist(1.0, np.zeros(3), np.zeros(3)),
     BearingRange(1.0, ("a",), ONE, ONE),
     RfidScan(1.0, ("left",), np.zeros(1, dtype=np.int64), ("e1",), ONE, -60.0 * ONE, ONE, 9e8 * ONE),
     PixelSightings(1.0, ("a",), np.ones((1, 2))),
@@ -51,7 +48,6 @@ COLUMNS = {
     VelocityOdometry: VELOCITIES.columns[1:],
     IncrementOdometry: INCREMENTS.columns[1:],
     YawRate: IMU.columns[1:],
-    Twist: TWIST.columns[1:],
     BearingRange: [column.measured for column in BEARING_RANGE.columns[2:]],
     RfidScan: READS.columns,
     PixelSightings: [PIXELS],

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.slam.monoslam_invariance import carried
+from factorgraph_loc.slam.monoslam_motion import ROBOT, RobotState, exp
 from factorgraph_loc.slam.monoslam_state import MapPoint, SlamState
-from factorgraph_loc.slam.space_motion import ROBOT, RobotState, exp
 from factors.camera import inverse_depth
 
 CONSTANTS = 2

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from factorgraph_loc.slam.monoslam_motion import ROBOT, UNEVEN, RobotState, exp, on_the_floor, standstill, tilt_of
 from factorgraph_loc.slam.monoslam_state import SlamState, with_floor
-from factorgraph_loc.slam.space_motion import ROBOT, UNEVEN, RobotState, exp, on_the_floor, standstill, tilt_of
 from factors.camera.floor import TiltScale
 from factors.motion import ChainState
 

@@ -47,9 +47,9 @@ def metric_of(key: str) -> Metric:
 
 def _of_trajectory(key: str, kind: str, what: str) -> Metric:
     sort, _, how = what.rpartition("_")
-    if sort in ("position", "space_position", "aligned_position"):
+    if sort in ("position", "aligned_position"):
         return Metric(key, f"{kind} {sort.replace('_', ' ')} {_HOW.get(how, how)}", "m", rms=how == "rmse")
-    if sort in ("heading", "space_rotation", "aligned_rotation"):
+    if sort in ("heading", "aligned_rotation"):
         title = f"{kind} {sort.replace('_', ' ')} {_HOW.get(how, how)}"
         return Metric(key, title, "°", _DEGREES, rms=how == "rmse")
     if what in _DRIFTS:

@@ -47,8 +47,8 @@ Message = tuple[int, str, str, Any]  # time of receipt [ns], topic, type, conten
 def write_bag(log: Log, path: Path, *, overwrite: bool = False) -> list[Path]:
     """Write a log as a bag atomically, with its rig and map next to it; returns the files.
 
-    InputError if a file exists that is not to ``overwrite``, and for what a bag cannot hold: timestamps before 1970, features, and
-    motion in space. Covariances of a reference are not written.
+    InputError if a file exists that is not to ``overwrite``, and for what a bag cannot hold: timestamps before 1970, and features.
+    Covariances of a reference are not written.
     """
     require_rosbags()
     if path.suffix not in SUFFIXES:

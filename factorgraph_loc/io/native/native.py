@@ -24,7 +24,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.sections import layers
 from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows, write_tum
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.registry import Channel, channel, moving
+from factorgraph_loc.sensors.registry import Channel, channel
 from factorgraph_loc.sensors.tables import Reading, Writing, assemble, disassemble, native_tables
 from factorgraph_loc.text import listed
 
@@ -59,7 +59,7 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     run = parse_model(RunFile, read_toml(run_path), run_path)
     warnings: list[str] = []
     tables = read_tables(path, warnings)
-    if "odometry" not in tables and not moving(tables, "space"):
+    if "odometry" not in tables:
         if not run_path.read_text(encoding="utf-8").strip():
             raise InputError(f"{run_path}: is empty, expected a manifest, or odometry.csv beside it")
         raise InputError(f"{path}: has no odometry, which every estimator needs, expected rows in odometry.csv")
@@ -144,8 +144,8 @@ def write_native(
     """Write a log as a new folder atomically; InputError if ``folder`` is not empty, unless it holds a log to ``overwrite``.
 
     Timestamps are exact to the nanosecond, numbers to the last digit. Not written: covariances of the reference, and the smaller
-    one of a start's standard deviations in x and y. Images are copied. InputError for features of images, motion in space, a second
-    camera, and a log without any measurements.
+    one of a start's standard deviations in x and y. Images are copied. InputError for features of images, and for a log
+    without any measurements.
     """
     folder = Path(folder)
     if not log.streams:

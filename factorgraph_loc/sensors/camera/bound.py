@@ -140,8 +140,7 @@ class CameraSensor(Sensor):
         self._check.add(m)
         twist = self._motion.twist(m.t) if self.points.needs_twist else None
         predicted, values, spreads = Predicted(view.pose, view.covariance), {}, {}
-        shared = () if m.right else self._shared
-        for name in shared:
+        for name in self._shared:
             value = view.value(name)
             values[name] = np.zeros(len(self._uncertain.names)) if value is None else value
             spreads[name] = np.diag(self._uncertain.sigmas**2) if value is None else view.spread(name)
@@ -168,7 +167,7 @@ class CameraSensor(Sensor):
         moving = tuple(dict.fromkeys(filter(None, names)))
         if moving:
             factor = displaced_by(factor, [moving.index(name) if name else -1 for name in names])
-        seen = PixelObservation.of(m.t, factor, (*shared, *moving), view.pose)
+        seen = PixelObservation.of(m.t, factor, (*self._shared, *moving), view.pose)
         yield seen if self.constants.names or moving else seen.on_pose(values, spreads)
 
     def _looks_now(self, name: str, t: float) -> int:

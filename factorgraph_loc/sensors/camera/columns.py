@@ -1,7 +1,5 @@
 """The tables of cameras."""
 
-from dataclasses import replace
-
 from factorgraph_loc.files.columns import LARGEST_PIXEL, PIXELS, PURE, STAMP, Column, Table, named, number, within
 
 CAMERA = Table("camera", (STAMP, named("file", "the name of an image", "file")), "one each")
@@ -15,9 +13,6 @@ SIGHTINGS = Table(
     ),
     "one measurement",
     stream="factorgraph_loc.sensors.camera.stream:SightingStream",
-)
-SIGHTINGS_RIGHT = replace(
-    SIGHTINGS, name="sightings_right", stream="factorgraph_loc.sensors.camera.stream:RightSightingStream"
 )
 # features of images, as pushed by a program
 FEATURES = Table(

@@ -8,21 +8,15 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, slots=True)
 class PixelSightings:
-    """Named points seen in one image: ``points``: K names; ``pixels`` (K, 2) [px], x right, y down; ``right``: whether the second
-    camera of a stereo pair saw them."""
+    """Named points seen in one image: ``points``: K names; ``pixels`` (K, 2) [px], x right, y down."""
 
+    sensor: ClassVar[str] = "sightings"
     modality: ClassVar[str] = "camera"
     is_motion: ClassVar[bool] = False
     frame: ClassVar[None] = None  # there are no features
     t: float
     points: tuple[str, ...]
     pixels: Array
-    right: bool = False
-
-    @property
-    def sensor(self) -> str:
-        """The channel."""
-        return "sightings_right" if self.right else "sightings"
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.values import integers, names, numbers, truth, within
+from factorgraph_loc.files.values import integers, names, numbers, within
 from factorgraph_loc.model.measurement import Measurement, named
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
@@ -22,11 +22,7 @@ BYTE = replace(FEATURES["descriptors"], kind="whole", low=0.0, high=255.0)
 def check_sightings(m: PixelSightings, where: str) -> dict[str, Any]:
     """The fields of named points; InputError names the first invalid one."""
     points = names(where, "points", m.points)
-    return {
-        "points": points,
-        "pixels": within(where, PIXELS, m.pixels, (len(points), 2)),
-        "right": truth(where, "right", m.right),
-    }
+    return {"points": points, "pixels": within(where, PIXELS, m.pixels, (len(points), 2))}
 
 
 def check_frame(m: CameraFrame, where: str) -> dict[str, Any]:

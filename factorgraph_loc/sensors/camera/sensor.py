@@ -75,8 +75,6 @@ class KnownPoints:
         used = any(sensor in setup.sensors for sensor in CAMERAS)
         settings = setup.rig.camera if used else None
         self.model: CameraModel | None = None if settings is None else replace(settings.model(), tempering=1.0)
-        second = setup.rig.camera_right if used and "sightings_right" in setup.sensors else None
-        self._second: CameraModel | None = None if second is None else replace(second.model(), tempering=1.0)
         self.floor = None if self.model is None else TiltScale.guessed(self.model.tilt)
         self._tempering = 1.0 if settings is None else settings.tempering  # for matched points
         self.map = PointMap.of((), np.empty((0, 3)))
@@ -125,19 +123,18 @@ class KnownPoints:
 
     def named(self, m: PixelSightings) -> ReprojectionFactor | None:
         """All named points of the map without outlier rejection, on the pose at their time."""
-        model = self._model_of(m)
-        if model is None:
+        if self.model is None:
             self._diagnostics.ignore("camera", len(m.pixels))
             return None
         places = [self.map.index.get(name, -1) for name in m.points]
         pixels = m.pixels
         if -1 in places:
             rows = [i for i, place in enumerate(places) if place >= 0]
-            if m.right or not self._others_matter:
+            if not self._others_matter:
                 self._diagnostics.ignore("point not in the map", len(places) - len(rows))
             places, pixels = [places[i] for i in rows], pixels[rows]
         self.names = tuple(self.map.names[place] for place in places)
-        return self._factor(model, places, pixels) if places else None
+        return self._factor(self.model, places, pixels) if places else None
 
     def factor(
         self,
@@ -165,7 +162,7 @@ class KnownPoints:
             factor = replace(factor, point_covariances=spreads)
         if offset is not None:
             factor = replace(factor, offset=offset.delta, offset_covariance=offset.covariance)
-        if self._estimated.indices and not m.right:
+        if self._estimated.indices:
             factor = replace(factor, estimated=self._estimated.indices, twist=twist)
         here = factor.fixed([] if predicted.constants is None else [predicted.constants], moved)
         camera = self._camera(here, predicted)
@@ -189,7 +186,7 @@ class KnownPoints:
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
         """The pose of an image without a prediction, or None, and the number of points that it seemed to show."""
-        model = self._model_of(m)
+        model = self.model
         if model is None or not self.known:
             return None, 0
         if isinstance(m, PixelSightings):
@@ -212,10 +209,6 @@ class KnownPoints:
         u, v = (-factor.model.sigma * update.residual.T).tolist()
         self._diagnostics.add_residuals("camera.u", u)
         self._diagnostics.add_residuals("camera.v", v)
-
-    def _model_of(self, m: Pixels) -> CameraModel | None:
-        """Of the camera that took an image. The constants of the second one are not estimated."""
-        return self._second if m.right else self.model
 
     def _factor(self, model: CameraModel, points: list[int], pixels: Array) -> ReprojectionFactor:
         spreads = self.map.covariances[points] if self._map_matters else None

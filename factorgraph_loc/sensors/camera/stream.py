@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -23,19 +22,11 @@ class SightingStream(Stream):
     point: Sequence[str]
     u: Array
     v: Array
-    right: ClassVar[bool] = False
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         for i, j in self.scans():
             pixels = np.column_stack((self.u[i:j], self.v[i:j]))
-            yield PixelSightings(float(self.t[i]) + offset, tuple(self.point[i:j]), pixels, self.right)
-
-
-@dataclass(frozen=True)
-class RightSightingStream(SightingStream):
-    """The same for the second camera of a stereo pair (``rig.camera_right``)."""
-
-    right: ClassVar[bool] = True
+            yield PixelSightings(float(self.t[i]) + offset, tuple(self.point[i:j]), pixels)
 
 
 @dataclass(frozen=True)

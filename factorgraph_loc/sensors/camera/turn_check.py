@@ -60,9 +60,9 @@ class TurnCheck:
         self._focal = np.zeros(4)  # number, and moments of the error of the focal length with their weight
 
     def add(self, m: Pixels) -> None:
-        """Add an image; one of a second camera and a late one are left out."""
+        """Add an image; a late one is left out."""
         model, last, t = self._model, self._last, m.t
-        if model is None or m.right or not self._open or not self._left:
+        if model is None or not self._open or not self._left:
             return
         if last is not None and t < last.t + SHORTEST:
             return

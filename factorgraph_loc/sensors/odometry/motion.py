@@ -33,8 +33,6 @@ from factors.se2 import Array
 # m, rad, s: over which the error of a constant accumulates before other sensors correct it
 WAY, TURN, TIME = 4.0, 4.0, 8.0
 HORIZON = 5.0  # s of odometry that are kept
-# reason why rows of an unused sensor are ignored
-UNUSED = {"imu": "yaw rate", "twist": "motion in space", "inertial": "inertial unit"}
 TWIST_TIME = 0.1  # s over which the velocity is averaged
 
 
@@ -116,7 +114,7 @@ class OdometryMotion:
             case IncrementOdometry() if self._use_wheels:
                 kept = self._chain.add_increment(m.t, m.dx, m.dy, m.dtheta)
             case _:
-                self._diagnostics.ignore(UNUSED.get(m.sensor, m.sensor), m.count)
+                self._diagnostics.ignore("yaw rate" if isinstance(m, YawRate) else m.sensor, m.count)
                 return
         if kept < m.count:
             self._diagnostics.drop_late("odometry", m.count - kept)

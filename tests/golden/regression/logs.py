@@ -13,7 +13,6 @@ import camera_world
 import landmark_world
 import numpy as np
 import short_logs
-import space_world
 from absurd_logs import rows, with_stream
 from camera_world import with_camera, with_frames, with_sightings
 
@@ -23,9 +22,7 @@ from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
-from factorgraph_loc.sensors.camera.stream import FeatureStream, RightSightingStream
-from factorgraph_loc.sensors.twist.measurement import TwistStream
-from factorgraph_loc.sensors.twist.settings import TwistSettings
+from factorgraph_loc.sensors.camera.stream import FeatureStream
 from factorgraph_loc.simulation import preset, simulate
 
 SECONDS = 12.0  # of a drive among landmarks
@@ -162,16 +159,6 @@ def points_by_unknown_camera() -> Log:
     )
 
 
-def points_by_two_cameras() -> Log:
-    """A robot on a floor with a second camera beside the first."""
-    log, camera = room(), camera_world.CAMERA.model_copy(update={"y": -0.1})
-    t = np.arange(0.13, log.reference.t[-1], 0.2)
-    seen = camera_world.sightings(log.reference, log.world.points, t, np.random.default_rng(7), camera)
-    rig = log.rig.model_copy(update={"camera_right": camera, "sensors": ("odometry", "sightings", "sightings_right")})
-    right = RightSightingStream(seen.t, seen.point, seen.u, seen.v)
-    return replace(log, rig=rig, streams={**log.streams, "sightings_right": right})
-
-
 def markers() -> Log:
     """Corners of markers on the four walls of the room."""
     half, log = camera_world.HALF, room()
@@ -190,35 +177,6 @@ def markers() -> Log:
     t = np.arange(0.13, log.reference.t[-1], 0.2)
     seen = camera_world.sightings(log.reference, points, t, np.random.default_rng(8))
     return replace(log, world=World(points=points), streams={**log.streams, "sightings": seen})
-
-
-@cache
-def space() -> Log:
-    """The first 4 s of a vehicle with two cameras that moves in space."""
-    log = space_world.carried(0)
-    for name, stream in log.streams.items():
-        log = rows(log, name, np.flatnonzero(stream.t < 4.0))
-    return log
-
-
-def space_features() -> Log:
-    return space_world.with_features(space(), 0.05)
-
-
-def space_late() -> Log:
-    return short_logs.late(space(), "sightings_right")
-
-
-def floor_by_twist() -> Log:
-    """A robot on a floor whose motion is measured as that of a vehicle in space."""
-    log = room()
-    odometry = log.streams["odometry"]
-    nothing = np.zeros_like(odometry.v)
-    v, w = np.column_stack((odometry.v, nothing, nothing)), np.column_stack((nothing, nothing, odometry.w))
-    twist = TwistStream(odometry.t, v, w)
-    settings = TwistSettings(shift=(0.02, 0.01, 0.005), turn=(0.005, 0.005, 0.03))
-    rig = log.rig.model_copy(update={"twist": settings, "sensors": ("twist", "sightings")})
-    return replace(log, rig=rig, streams={"twist": twist, "sightings": log.streams["sightings"]})
 
 
 def fault(name: str) -> Log:

@@ -21,14 +21,13 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.planning.closed_loop import ActiveRun
 from factors.se2 import Array
 
-CAUSAL, FINAL, IN_SPACE, SUMS, LEARNT = 10, 6, 4, 4, 12  # rows that are held, at most
+CAUSAL, FINAL, SUMS, LEARNT = 10, 6, 4, 12  # rows that are held, at most
 BELIEFS = 50  # ticks from one belief that is looked at to the next
 DIGITS = 7  # of numbers in files that are compared to 1e-6
-RMSE = ("causal.position_rmse", "final.position_rmse", "causal.space_position_rmse", "final.space_position_rmse")
+RMSE = ("causal.position_rmse", "final.position_rmse")
 
 
 @dataclass(frozen=True)
@@ -169,9 +168,6 @@ def _of_result(result: RunResult) -> tuple[dict[str, Any], dict[str, Array]]:
     }
     numbers = _of_trajectory("causal", Trajectory(result.t, result.poses, result.covariances), CAUSAL)
     numbers |= _of_trajectory("final", result.final, FINAL)
-    for kind, in_space in (("causal", result.causal_space), ("final", result.final_space)):
-        if in_space is not None:
-            numbers |= _of_space(kind, in_space)
     return exact, numbers
 
 
@@ -181,14 +177,6 @@ def _of_trajectory(kind: str, trajectory: Trajectory, most: int) -> dict[str, Ar
     if trajectory.covariances is not None:
         found[f"{kind}.covariances"] = _upper(trajectory.covariances[rows])
     return found
-
-
-def _of_space(kind: str, trajectory: Trajectory3) -> dict[str, Array]:
-    found = trajectory.rows(_some(len(trajectory), IN_SPACE))
-    numbers = {f"{kind}.space.positions": found.positions, f"{kind}.space.rotations": found.rotations.reshape(-1, 9)}
-    if found.covariances is not None:
-        numbers[f"{kind}.space.covariances"] = _upper(found.covariances)
-    return numbers
 
 
 def _of_beliefs(beliefs: Sequence[Belief]) -> tuple[dict[str, Any], dict[str, Array]]:

@@ -31,8 +31,6 @@ RUNS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "batch": ("batch", {}),
     "switching": ("switching", {"particles": 300}),
     "monoslam": ("monoslam", {}),
-    "space_batch": ("space_batch", {}),
-    "space_smoother": ("space_smoother", {}),
 }
 LAG = "smoother_lag"
 GRAPHS = ("smoother", LAG, "batch")
@@ -41,7 +39,6 @@ MAPPERS = ("ekf", *GRAPHS)
 ON_FLOOR = ("dead_reckoning", *FINDERS, "switching")
 READERS = ("particle_filter", "smoother", "batch", "switching")
 WATCHERS = (*FINDERS, "monoslam")
-IN_SPACE = ("monoslam", "space_batch", "space_smoother")
 
 LANDMARKS = ("odometry", "bearing_range")
 TAGS = ("odometry", "rfid")
@@ -117,9 +114,7 @@ def recorded(name: str, start: float, seconds: float, labels: tuple[str, ...], *
 
 
 SCENARIOS: Mapping[str, Scenario | ActiveScenario] = {
-    "landmarks": Scenario(
-        logs.landmarks, (*ON_FLOOR, LAG, "ekf_iterated", "particle_filter_kld", "monoslam", "space_batch")
-    ),
+    "landmarks": Scenario(logs.landmarks, (*ON_FLOOR, LAG, "ekf_iterated", "particle_filter_kld", "monoslam")),
     "landmarks-increments": Scenario(short_logs.office, ON_FLOOR, LANDMARKS),
     "landmarks-gyro": Scenario(
         lambda: short_logs.with_gyro(short_logs.office()), (*ON_FLOOR, "monoslam"), ("odometry", "imu", "bearing_range")
@@ -176,7 +171,6 @@ SCENARIOS: Mapping[str, Scenario | ActiveScenario] = {
     "points-gap": Scenario(logs.points_with_gap, WATCHERS),
     "points-uncertain-map": Scenario(logs.points_of_uncertain_map, WATCHERS),
     "points-self-calibration": Scenario(logs.points_by_unknown_camera, (*WATCHERS, LAG)),
-    "points-two-cameras": Scenario(logs.points_by_two_cameras, (*WATCHERS, "switching")),
     "points-slam": Scenario(logs.room, (*GRAPHS, "monoslam"), settings=UNKNOWN),
     "points-extended-map": Scenario(
         logs.points_half_known, ("smoother", "batch", "monoslam"), settings={"landmarks": "extended"}
@@ -186,13 +180,6 @@ SCENARIOS: Mapping[str, Scenario | ActiveScenario] = {
     "features-unknown-start": Scenario(logs.frames, WATCHERS, prior="unknown"),
     "features-slam": Scenario(logs.followed_frames, ("smoother", "batch", "monoslam"), settings=UNKNOWN),
     "features-visual-odometry": Scenario(logs.frames_without_map, GRAPHS, settings={"visual_odometry": True}),
-    "space": Scenario(logs.space, IN_SPACE),
-    "space-one-camera": Scenario(logs.space, ("monoslam", "space_batch"), ("twist", "sightings")),
-    "space-without-twist": Scenario(logs.space, IN_SPACE, ("sightings", "sightings_right")),
-    "space-late": Scenario(logs.space_late, IN_SPACE),
-    "space-features": Scenario(logs.space_features, IN_SPACE),
-    "space-slam": Scenario(logs.space, ("monoslam",), settings=UNKNOWN),
-    "floor-twist": Scenario(logs.floor_by_twist, (*WATCHERS, "dead_reckoning")),
     **{
         f"fault-{name.replace('_', '-')}": _faulty(name)
         for name in (
