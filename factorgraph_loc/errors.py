@@ -31,3 +31,9 @@ def bad_field(file: object, field: str, value: object, expected: str, *, row: in
 def unusable(error: OSError) -> InputError:
     """The error for a file or folder that cannot be read or written."""
     return InputError(told(error) if error.filename is None else f"{plain(error.filename)}: {told(error)}")
+
+
+def unencodable(error: UnicodeEncodeError) -> str:
+    """The problem with a text that cannot be written in the encoding of the system, and what to type."""
+    text = quoted(error.object[error.start : error.end])
+    return f"{text} cannot be written in {error.encoding}, the encoding of this system: set PYTHONUTF8=1"

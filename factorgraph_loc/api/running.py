@@ -64,7 +64,7 @@ def run(
     result = run_and_learn(loaded, config, progress).result if learn else running.run(loaded, config, progress)
     if out is None:
         return Run(result, score(result, loaded, align))
-    scores = output.write_run(result, loaded, Path(out), align=align, overwrite=overwrite)
+    scores = output.save_run(result, loaded, Path(out), align=align, overwrite=overwrite)
     write_plots(result, loaded, Path(out))
     return Run(result, scores)
 

@@ -22,7 +22,7 @@ from factorgraph_loc.cli import (
     viewing,
 )
 from factorgraph_loc.cli.stopping import OutputError, end, standard_streams, unwrapped
-from factorgraph_loc.errors import FglocError, unusable
+from factorgraph_loc.errors import FglocError, unencodable, unusable
 from factorgraph_loc.files.bounded import limit_memory
 from factorgraph_loc.text import MESSAGE, plain
 from factorgraph_loc.threads import use_one_thread
@@ -62,6 +62,11 @@ class Commands(TyperGroup):
             if ctx.params.get("debug"):
                 raise
             show.note(f"error: {unusable(error)}")
+            raise typer.Exit(FglocError.exit_code) from error
+        except UnicodeEncodeError as error:
+            if ctx.params.get("debug") or error.encoding == "utf-8":
+                raise
+            show.note(f"error: {unencodable(error)}")
             raise typer.Exit(FglocError.exit_code) from error
         except KeyboardInterrupt as stop:
             raise typer.Exit(end(stop)) from stop

@@ -78,7 +78,7 @@ def run(
     from factorgraph_loc.evaluation.plots import write_plots
     from factorgraph_loc.experiments import run as experiment
     from factorgraph_loc.experiments.learning import run_and_learn
-    from factorgraph_loc.experiments.output import MAP, check_free, write_run
+    from factorgraph_loc.experiments.output import MAP, check_free, save_run
     from factorgraph_loc.fusion.registry import check_names, for_final_only
 
     check_names([estimator])
@@ -97,7 +97,7 @@ def run(
             result, learnt = learning.result, learning.turns.knowledge.constants
         else:
             result, learnt = experiment.run(loaded, config, lambda share: report(share, 1.0)), ()
-    scores = write_run(result, loaded, out, align=align, overwrite=overwrite)
+    scores = save_run(result, loaded, out, align=align, overwrite=overwrite)
     write_plots(result, loaded, out)
     show.warnings(scores["warnings"])
     if json:

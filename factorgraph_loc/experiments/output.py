@@ -6,6 +6,8 @@ Times aside, all files of a run are reproducible to the byte.
 import io
 import json
 import math
+import shutil
+import tempfile
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
@@ -71,6 +73,34 @@ def write_run(
         else:
             content.replace(out)
     return scores
+
+
+def save_run(
+    result: RunResult, log: Log, out: Path, *, align: Alignment = "none", overwrite: bool = False
+) -> dict[str, Any]:
+    """Write a run as :func:`write_run` does. If that fails, the files go to a new folder in the system's temporary folder, and the
+    InputError names it."""
+    try:
+        with writing(out):
+            return write_run(result, log, out, align=align, overwrite=overwrite)
+    except InputError as error:
+        folder = _keep(result, log, align)
+        if folder is None:
+            raise
+        raise InputError(f"{error}; the results are in {folder}") from error
+
+
+def _keep(result: RunResult, log: Log, align: Alignment) -> Path | None:
+    """Write a run into a new folder in the system's temporary folder; None if that fails too."""
+    folder = None
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="fgloc-run-"))
+        write_run(result, log, folder, align=align)
+    except (InputError, OSError):
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        return None
+    return folder
 
 
 def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: Path) -> None:

@@ -4,21 +4,24 @@ Their names consist of a dot, the target's name, :data:`MARK` and eight digits. 
 releases when the process ends. Unlocked ones are removed when a command that writes to the same folder starts.
 """
 
+import errno
 import fcntl
 import os
 import re
 import secrets
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc.errors import InputError, unencodable
 
 MARK = ".fgloc-"
 _NAME = re.compile(rf"\..*{re.escape(MARK)}[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
 _NAMED, _SUFFIX = 150, 60  # bytes used of a name and of a suffix; file systems allow 255 in total
+ATTEMPTS = 20  # to create a file whose name another process may take or remove at that moment
 _swept: set[Path] = set()  # folders that this process has cleaned up
 _own: set[Path] = set()  # paths created by this process and not yet removed
 
@@ -62,39 +65,49 @@ def _held(path: Path, name: str, suffix: str, *, folder: bool) -> Iterator[Path]
     if path.parent not in _swept:
         _swept.add(path.parent)
         sweep(path.parent)
-    start = "." + os.fsencode(name)[:_NAMED].decode(errors="ignore") + MARK
+    start = "." + os.fsencode(name)[:_NAMED].decode(sys.getfilesystemencoding(), errors="ignore") + MARK
     ending = suffix if len(os.fsencode(suffix)) <= _SUFFIX else ""
-    made, handle = None, None
-    while handle is None:
-        made = path.parent / f"{start}{secrets.token_hex(4)}{ending}"
-        handle = _make(made, folder=folder)
-    assert made is not None
+    names = (path.parent / f"{start}{secrets.token_hex(4)}{ending}" for _ in range(ATTEMPTS))
+    made, handle = _make_one(names, path, folder=folder)
     try:
         yield made
+    except OSError as error:
+        if error.errno is not None and str(error.filename) in ("None", str(made)):
+            error.filename = str(path)  # the user knows the target only
+        raise
     finally:
         _remove(made)
         os.close(handle)
 
 
-def _make(path: Path, *, folder: bool) -> int | None:
-    """A handle on a new file or folder; None if the name exists, or another process removed it before it was locked."""
-    _own.add(path)
-    try:
-        if folder:
-            path.mkdir(mode=0o700)
-            handle = os.open(path, os.O_RDONLY)
-        else:
-            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-    except OSError as error:
-        _own.discard(path)
-        if isinstance(error, FileExistsError) or (isinstance(error, FileNotFoundError) and path.parent.is_dir()):
-            return None
-        raise
-    if _lock(handle) is not False and _is(handle, path):
-        return handle
-    os.close(handle)
-    _remove(path)
-    return None
+def _make_one(names: Iterable[Path], target: Path, *, folder: bool) -> tuple[Path, int]:
+    """The first of ``names`` that could be made, a file or a folder, with a handle on it. OSError that names the ``target`` if none
+    could."""
+    failure: OSError = FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(target))
+    for path in names:
+        _own.add(path)
+        try:
+            handle = _make(path, folder=folder)
+        except OSError as error:
+            _own.discard(path)
+            failure = OSError(error.errno, error.strerror, str(target))
+            # the name exists, or another process removed it before it was locked; or the folder does not exist
+            if not isinstance(error, FileExistsError | FileNotFoundError):
+                break
+            continue
+        if _lock(handle) is not False and _is(handle, path):
+            return path, handle
+        os.close(handle)
+        _remove(path)
+    raise failure
+
+
+def _make(path: Path, *, folder: bool) -> int:
+    """A handle on a new file or folder."""
+    if not folder:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+    path.mkdir(mode=0o700)
+    return os.open(path, os.O_RDONLY)
 
 
 @contextmanager
@@ -147,11 +160,13 @@ def _remove(path: Path) -> None:
 
 @contextmanager
 def writing(path: object) -> Iterator[None]:
-    """Context in which an OSError is raised as an InputError that names ``path``."""
+    """Context that turns an OSError, or a name that cannot be encoded, into an InputError with ``path``."""
     try:
         yield
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+    except UnicodeEncodeError as error:
+        raise InputError(f"{path}: cannot be written: {unencodable(error)}") from error
 
 
 def require_free(out: Path, names: Iterable[str], *, overwrite: bool, folders: Iterable[Path] = ()) -> None:

@@ -1,15 +1,17 @@
 """The files of a run."""
 
 import json
+import tempfile
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.output import write_run
+from factorgraph_loc.experiments.output import save_run, write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.belief import LearntPoint
@@ -124,4 +126,31 @@ def test_nothing_is_left_half_written(result, log, tmp_path, monkeypatch):
     monkeypatch.setattr("factorgraph_loc.experiments.output.write_toml", fail)
     with pytest.raises(OSError, match="no space"):
         write_run(result, log, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_cannot_be_written_is_kept_elsewhere(result, log, tmp_path, monkeypatch):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "deleted").mkdir()
+    monkeypatch.chdir(tmp_path / "deleted")
+    (tmp_path / "deleted").rmdir()
+    with pytest.raises(
+        InputError, match="out: cannot be written: No such file or directory; the results are in "
+    ) as caught:
+        save_run(result, log, Path("out"))
+    (folder,) = (tmp_path / "temporary").iterdir()
+    assert str(caught.value).endswith(f" {folder}")
+    assert {path.name for path in folder.iterdir()} == set(FILES)
+
+
+def test_a_run_that_can_be_written_nowhere_leaves_nothing(result, log, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("factorgraph_loc.experiments.output.write_toml", fail)
+    with pytest.raises(InputError, match=r"out: cannot be written: No space left on device$"):
+        save_run(result, log, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []

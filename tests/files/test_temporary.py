@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -113,3 +114,73 @@ def test_a_lock_lets_one_process_in_at_a_time(tmp_path, processes):
     assert (tmp_path / "count").read_text() == "150"
     with locked(tmp_path / "lock"):
         pass
+
+
+@pytest.fixture
+def deleted(tmp_path, monkeypatch):
+    """The working folder, which no longer exists."""
+    folder = tmp_path / "deleted"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+
+
+@pytest.mark.usefixtures("deleted")
+@pytest.mark.parametrize("make", [temporary_file, temporary_folder])
+@pytest.mark.parametrize("path", ["a.txt", "/proc/a.txt"])
+def test_a_folder_that_holds_no_files_is_told_by_the_name_of_the_target(make, path):
+    with pytest.raises(FileNotFoundError) as caught, make(Path(path)):
+        pass
+    assert caught.value.filename == path
+
+
+@pytest.mark.parametrize("failure", [FileExistsError, FileNotFoundError])
+def test_a_name_that_another_process_takes_or_removes_is_replaced_by_another(tmp_path, monkeypatch, failure):
+    names = []
+
+    def make(path, *, folder):
+        names.append(path)
+        if len(names) < 3:
+            raise failure(2, "raced", str(path))
+        return make_one(path, folder=folder)
+
+    make_one = temporary._make
+    monkeypatch.setattr(temporary, "_make", make)
+    with temporary_file(tmp_path / "a.txt") as file:
+        assert file == names[2]
+    assert len(set(names)) == 3
+    assert temporary._own == set()
+
+
+def test_an_error_without_a_file_gets_the_name_of_the_target(tmp_path):
+    with pytest.raises(OSError, match="No space left") as caught, replacing(tmp_path / "a.txt"):
+        raise OSError(28, "No space left on device")
+    assert caught.value.filename == str(tmp_path / "a.txt")
+
+
+IN_ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+WRITER = """
+import os, sys
+from pathlib import Path
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.models import write_text
+from factorgraph_loc.files.temporary import writing
+
+write_text(Path(sys.argv[1]), "whole")
+try:
+    with writing("out"):
+        write_text(Path(os.path.dirname(sys.argv[1]), "\\xe4.txt"), "")
+except InputError as error:
+    print(ascii(str(error)))
+"""
+
+
+def test_names_beyond_ascii_in_a_system_without_them(tmp_path):
+    path = tmp_path / "büro" / "ü.txt"
+    path.parent.mkdir()
+    command = [sys.executable, "-c", WRITER, path]
+    done = subprocess.run(command, env=os.environ | IN_ASCII, capture_output=True, check=True)
+    told = "out: cannot be written: 'ä' cannot be written in ascii, the encoding of this system: set PYTHONUTF8=1"
+    assert done.stdout.decode().strip() == ascii(told)
+    assert path.read_text() == "whole"
