@@ -31,7 +31,6 @@ COUNTED = (
     "evaluation/aligned.py",
     "evaluation/metrics.py",
     "evaluation/pairing.py",
-    "evaluation/space.py",
     "evaluation/trajectories/association.py",
     "evaluation/trajectories/score.py",
     "evaluation/warned.py",
