@@ -24,11 +24,9 @@ READERS.own |= {
     "mapped": "factorgraph_loc.io.readers.mapped",
     "mrclam": "factorgraph_loc.io.readers.mrclam",
     "plaza": "factorgraph_loc.io.readers.plaza",
-    "rf_robot": "factorgraph_loc.io.readers.rf_robot",
     "rosbag": "factorgraph_loc.io.bags.rosbag",
     "sevenscenes": "factorgraph_loc.io.readers.sevenscenes",
     "trajectory": "factorgraph_loc.io.readers.trajectory",
-    "utias_woods": "factorgraph_loc.io.readers.utias_woods",
 }
 FILES |= {
     "read_rig": "factorgraph_loc.io.native.rig_file:read_rig",

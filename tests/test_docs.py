@@ -11,16 +11,13 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from page_commands import commands, not_as_shown, runnable, tables
 from typer.main import get_command
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.cli.app import app
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "scripts"))
-
-from page_commands import commands, not_as_shown, runnable, tables  # noqa: E402
-
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 
 

@@ -37,7 +37,7 @@ def test_help_does_not_load_numerical_libraries(args):
 def test_datasets(fgloc):
     result = fgloc("datasets")
     assert result.exit_code == 0
-    for name in ("plaza2", "mrclam6-robot1", "woods-r3"):
+    for name in ("plaza2", "mrclam6-robot1"):
         assert name in result.stdout
     names = [entry["name"] for entry in json.loads(fgloc("datasets", "--json").stdout)]
     assert "plaza2" in names

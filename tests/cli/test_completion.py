@@ -53,7 +53,7 @@ def test_the_settings_are_those_of_the_models(name):
     [
         ("fgloc simu", ["simulate"]),
         ("fgloc run plaza", ["plaza1", "plaza2"]),
-        ("fgloc compare plaza2 woods-r", ["woods-r1", "woods-r3", "woods-r5"]),
+        ("fgloc compare plaza2 mrclam6-robot", ["mrclam6-robot1", "mrclam6-robot3", "mrclam6-robot5"]),
         ("fgloc run plaza2 -e sm", ["smoother"]),
         (
             "fgloc compare plaza2 -e ekf,smoother,s",

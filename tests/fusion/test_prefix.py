@@ -6,12 +6,12 @@ from itertools import compress
 import cv2
 import numpy as np
 import pytest
+from recorded_logs import recorded_log
 from short_logs import frames, late, office, plaza, room, with_gyro
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import ESTIMATORS
-from factorgraph_loc.io.readers import load
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.world import World
@@ -94,7 +94,7 @@ def test_causal_estimates_do_not_know_what_comes(name, kind):
 @pytest.mark.parametrize("recorded", ["mrclam6-robot1", "woods-r1", "rfid-aisle-run13"])
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_nor_on_recorded_logs(name, recorded, data_root):
-    (log,) = load(recorded, data_root=data_root)
+    log = recorded_log(recorded, data_root)
     first, _ = log.span()
     check(prefix(log, first + 8.0), RunConfig(name, SETTINGS.get(name, {})), first + 4.0)
 

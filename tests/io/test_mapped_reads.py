@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from mapped_hall import MANIFEST, READS, WHEELS
+from recorded_logs import recorded_log
 
 
 def test_events_of_an_r700_as_json_lines(hall, with_options, one):
@@ -233,7 +234,7 @@ units = {{ t = "us", frequency = "MHz", phase = "deg" }}
 
 
 def test_three_readers_of_a_recorded_robot(data_root, tmp_path, one):
-    """The same reads as the reader that was written for this data set gives within its span, to the last digit."""
+    """The same reads as the converter of this data set gives within its span, to the last digit."""
     (tmp_path / "aisle.toml").write_text(
         MANIFEST.partition("[options")[0].replace('"run"', '"rfid_aisle/run13"')
         + '[options.odometry]\nfile = "reference_pose.txt"\nseparator = " "\nheader = false\nunits = { t = "s" }\n'
@@ -241,7 +242,7 @@ def test_three_readers_of_a_recorded_robot(data_root, tmp_path, one):
         + READERS
     )
     log = one(tmp_path / "aisle.toml", data_root=data_root)
-    expected = one("rfid-aisle-run13", data_root=data_root)
+    expected = recorded_log("rfid-aisle-run13", data_root)
     theirs, ours = expected.streams["rfid"], log.streams["rfid"]
     shift = (log.t0_ns - expected.t0_ns) / 1e9
     begin = np.searchsorted(ours.t + shift, theirs.t[0] - 1e-6)

@@ -1,4 +1,4 @@
-"""The readers of MATLAB files: Plaza, which is there wherever gtsam is, and the woods."""
+"""The reader of the Plaza logs, which are there wherever gtsam is."""
 
 import gtsam
 import numpy as np
@@ -22,40 +22,11 @@ def plaza(**changes):
     return {name: value for name, value in {**fields, **changes}.items() if value is not None}
 
 
-def woods(**changes):
-    """A tiny file of the woods: three rows, landmark 1 seen at 0.5 m and landmark 17 at 2 m in the first of them."""
-    r = np.zeros((3, 17))
-    r[0, 0], r[0, 16] = 0.5, 2.0
-    column = np.zeros((3, 1))
-    fields = {
-        "t": np.array([[0.0], [0.1], [0.2]]),
-        "v": column + 0.25,
-        "om": column,
-        "r": r,
-        "b": np.where(r > 0.0, 0.5, 0.0),
-        "l": np.arange(34.0).reshape(17, 2),
-        "x_true": column,
-        "y_true": column,
-        "th_true": column + 4.0,
-        "true_valid": np.array([[1], [0], [1]], dtype=np.uint8),
-    }
-    return {name: value for name, value in {**fields, **changes}.items() if value is not None}
-
-
 @pytest.fixture
 def read_plaza(tmp_path, one):
     def call(run=1, **changes):
         savemat(tmp_path / "small.mat", plaza(**changes))
         return one(tmp_path / "small.mat", reader="plaza", options={"run": run})
-
-    return call
-
-
-@pytest.fixture
-def read_woods(tmp_path, one):
-    def call(max_range=5.0, **changes):
-        savemat(tmp_path / "small.mat", woods(**changes))
-        return one(tmp_path / "small.mat", reader="utias_woods", options={"max_range": max_range})
 
     return call
 
@@ -91,10 +62,8 @@ def test_plaza_odometry_of_one_stamp_is_one_motion(read_plaza):
     assert ":DR: 1 increments have the timestamp of the row before them" in log.warnings[0]
 
 
-def test_arrays_that_are_not_read_are_told(read_plaza, read_woods):
+def test_arrays_that_are_not_read_are_told(read_plaza):
     assert read_plaza(DRp=np.zeros((2, 3))).metadata["not read"] == "DRp, TD: column 2"
-    assert read_woods(v_var=0.01).metadata["not read"] == "v_var"
-    assert "not read" not in read_woods().metadata
 
 
 PLAZA_BAD = {
@@ -178,44 +147,3 @@ def test_recorded_plaza_ranges_match_the_beacons():
     points = np.array([log.world.position(name) for name in stream.landmark])
     distance = np.hypot(*(points - log.reference.at(stream.t)[:, :2]).T)
     assert np.nanmedian(stream.range / distance) == pytest.approx(1.07, abs=0.005)
-
-
-def test_woods(read_woods):
-    log = read_woods()
-    assert log.streams["bearing_range"].landmark == ["1", "17"]
-    np.testing.assert_array_equal(log.streams["bearing_range"].range, (0.5, 2.0))
-    np.testing.assert_array_equal(log.reference.t, (0.0, 0.2))  # the gap stays
-    assert log.reference.poses[0, 2] == pytest.approx(4.0 - 2 * np.pi)
-    assert log.world.position("2").tolist() == [2.0, 3.0]
-
-
-def test_woods_keep_what_is_near(read_woods):
-    assert read_woods(max_range=2.0).streams["bearing_range"].landmark == ["1"]
-    log = read_woods(max_range=0.5)
-    assert "bearing_range" not in log.streams
-    assert "no landmark is nearer than max_range" in log.warnings[0]
-
-
-WOODS_BAD = {
-    "nan": ({"v": np.array([[0.0], [np.nan], [0.0]])}, ":2: v is nan"),
-    "infinite range": ({"r": np.full((3, 17), np.inf)}, ":1: r is inf"),
-    "negative range": ({"r": np.full((3, 17), -1.0)}, ":1: r of landmark 1 is -1.0"),
-    "time going back": ({"t": np.array([[0.0], [0.2], [0.1]])}, ":3: time"),
-    "lengths differ": ({"om": np.zeros((2, 1))}, "om has 2 rows, expected 3"),
-    "field missing": ({"true_valid": None}, "true_valid is missing"),
-    "a landmark short": ({"l": np.zeros((16, 2))}, "l is '16 rows'"),
-    "nan in the truth": ({"x_true": np.array([[0.0], [0.0], [np.nan]])}, ":3: x_true is nan"),
-}
-
-
-@pytest.mark.parametrize(("changes", "fragment"), WOODS_BAD.values(), ids=list(WOODS_BAD))
-def test_bad_woods(tmp_path, refused, changes, fragment):
-    savemat(tmp_path / "small.mat", woods(**changes))
-    refused(tmp_path / "small.mat", "small.mat", fragment, reader="utias_woods")
-
-
-@pytest.mark.parametrize(("name", "sightings"), [("woods-r1", 7598), ("woods-r3", 40118), ("woods-r5", 58135)])
-def test_recorded_woods(data_root, name, sightings):
-    (log,) = load(name, data_root=data_root)
-    assert (len(log.streams["bearing_range"].t), len(log.world.landmarks)) == (sightings, 17)
-    assert (len(log.reference), log.rig.name) == (12278, "woods")

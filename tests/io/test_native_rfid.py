@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from recorded_logs import recorded_log
 
 from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.io.readers import load
@@ -188,7 +189,7 @@ def test_what_is_written_comes_back(tmp_path_factory, stream, format, t0_ns):
 
 
 def test_a_recorded_run_comes_back(data_root, tmp_path):
-    (log,) = load("rfid-aisle-run16", data_root=data_root)
+    log = recorded_log("rfid-aisle-run16", data_root)
     log = cut(log, 0.0, 60.0)
     write_native(log, tmp_path / "out")
     (back,) = load(str(tmp_path / "out"))

@@ -6,6 +6,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 from in_short import runs_here  # noqa: F401 - a fixture
+from recorded_logs import CONVERTED
 from scripts_here import run_script
 
 from factorgraph_loc.experiments.experiment_file import SIMULATION, nested, read_experiment
@@ -32,7 +33,7 @@ def test_an_experiment_file_is_valid_down_to_its_settings(file):
             settings_of(entry.name, settings)
         for log in experiment.logs:
             if log.log is not None:
-                assert any(Path(name).match(log.log) for name in manifests()), log.log
+                assert any(Path(name).match(Path(log.log).name) for name in (*manifests(), *CONVERTED)), log.log
                 continue
             settings = dict(log.settings)
             for key, value in point.items():

@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from recorded_logs import recorded_log
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.readers import load
 from factorgraph_loc.sensors.rfid.recorded import FAR, SCALES
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.simulation import preset, recorded_looks, simulate
@@ -80,7 +80,7 @@ def test_a_recording_without_what_it_takes_is_an_error(office):
 
 
 def test_the_aisle_recording_makes_a_log(data_root):
-    looks = recorded_looks(load("rfid-aisle-run13", data_root=data_root))
+    looks = recorded_looks([recorded_log("rfid-aisle-run13", data_root)])
     log = simulate(preset("warehouse", {"drive": {"duration": 60.0}}), 0, looks)
     assert len(log.rig.rfid.all_antennas()) == 3
     assert sum(map(bool, log.streams["rfid"].epc)) > 50

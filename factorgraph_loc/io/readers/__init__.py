@@ -19,9 +19,7 @@ __all__ = [
     "read_log",
     "read_manifest",
     "reader",
-    "rf_robot",
     "sevenscenes",
     "trajectory",
-    "utias_woods",
     "verify",
 ]

@@ -13,7 +13,6 @@ __all__ = [
     "measurement",
     "pushed",
     "recorded",
-    "rounds",
     "settings",
     "stream",
     "tables",

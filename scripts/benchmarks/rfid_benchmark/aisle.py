@@ -10,10 +10,10 @@ from benchmarking.ensemble import RunErrors, run_errors, series
 from benchmarking.report import Options, Report, pooled, spread_cell
 from benchmarking.statistics import first_held
 from benchmarking.trials import HOLD, POSITION
+from recorded_logs import recorded_log
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.native.rig_file import read_rig, write_rig
-from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
@@ -114,7 +114,7 @@ def unknown_starts(report: Report, outcomes: list[tuple[Test, Tested]]) -> None:
 
 def aisle(number: int, seed: int, data_root: Path | None) -> Log:
     """The recording with one odometry seed."""
-    return load(f"rfid-aisle-run{number}", data_root=data_root, options={"odometry_seed": seed})[0]
+    return recorded_log(f"rfid-aisle-run{number}", data_root, seed)
 
 
 def learnt_on(job: Learning) -> Rig:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from benchmarking.report import Options, Report
+from recorded_logs import recorded_log
 
 from factorgraph_loc.experiments.maps import MapOptions, make_map
-from factorgraph_loc.io.readers import load
 from factorgraph_loc.mapping.tag_mapping import MadeTags
 from rfid_benchmark.aisle import RUNS
 
@@ -40,7 +40,7 @@ def section(options: Options) -> Report:
 
 def made(job: Job) -> tuple[np.ndarray, int]:
     """The distances of the located tags, and the number of those in the survey."""
-    (log,) = load(f"rfid-aisle-run{job.run}", data_root=job.options.data_root)
+    log = recorded_log(f"rfid-aisle-run{job.run}", job.options.data_root)
     if not job.phases:
         assert log.rig.rfid is not None
         log = replace(log, rig=log.rig.model_copy(update={"rfid": log.rig.rfid.model_copy(update={"phase": None})}))

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from factorgraph_loc.io.readers import describe
+from recorded_logs import present_logs
+
 from regression.differences import Difference
 from regression.records import DIGITS, Record, read_records, write_records
 from regression.scenarios import SCENARIOS, ActiveScenario, Scenario
@@ -83,7 +84,7 @@ def described(case: str, found: list[Difference], old: Record, new: Record) -> s
 
 def is_present(scenario: Scenario | ActiveScenario) -> bool:
     """Whether the recorded log of a scenario is here."""
-    return scenario.data is None or any(known.present for known in describe() if known.name == scenario.data)
+    return scenario.data is None or scenario.data in present_logs()
 
 
 def _present(scenarios: Scenarios) -> Scenarios:

@@ -15,8 +15,8 @@ import numpy as np
 import short_logs
 from absurd_logs import rows, with_stream
 from camera_world import with_camera, with_frames, with_sightings
+from recorded_logs import recorded_log
 
-from factorgraph_loc.io.readers import load
 from factorgraph_loc.maps.markers import Marker, corner_points
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import Log, cut, join
@@ -187,7 +187,7 @@ def fault(name: str) -> Log:
 @cache
 def recorded(name: str, start: float, seconds: float) -> Log:
     """A part of a recorded log; it begins ``start`` [s] after the log."""
-    (log,) = load(name)
+    log = recorded_log(name)
     first = log.span()[0] + start
     return cut(log, first, first + seconds)
 

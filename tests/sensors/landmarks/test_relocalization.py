@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 from landmark_world import dirty, simulate, swapped, with_sightings
+from recorded_logs import recorded_log
 
-from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.landmarks.finder import Relocalizer, TrackMonitor, _apart, _insert, _thinned
@@ -159,7 +159,7 @@ def test_swapped_landmarks_do_not_refute_the_right_track(log):
 
 @pytest.mark.parametrize("name", ["mrclam6-robot3", "woods-r5"])
 def test_recorded_starts(name, data_root):
-    (log,) = load(name, data_root=data_root)
+    log = recorded_log(name, data_root)
     for start in (20.0, 300.0, 600.0):
         found = Seeker(log, start).until_clear()
         position, heading, _ = error(log, found)

@@ -1,0 +1,38 @@
+"""Recorded logs by name: those of ``fgloc datasets``, and those of the converters, which are not written to a folder here."""
+
+import re
+from pathlib import Path
+
+from rfid_aisle_log import read_rfid_aisle
+from woods_log import read_woods
+
+from factorgraph_loc.io.readers import describe, read_log
+from factorgraph_loc.io.readers.manifests import find_data_root
+from factorgraph_loc.model.log import Log
+
+WOODS, AISLE = "utias/dataset2.mat", "rfid_aisle"  # in the data folder
+CONVERTED = {
+    **{f"woods-r{max_range}": WOODS for max_range in (1, 3, 5)},
+    **{f"rfid-aisle-run{run}": AISLE for run in (13, 16)},
+}
+
+
+def recorded_log(name: str, data_root: Path | None = None, odometry_seed: int = 0) -> Log:
+    """The log ``name``. ``data_root``: the data folder, by default the environment's FGLOC_DATA; ``odometry_seed``: of the
+    simulated odometry of the aisle's runs."""
+    if name not in CONVERTED:
+        return read_log(name, data_root=data_root)
+    path = find_data_root(data_root, name) / CONVERTED[name]
+    number = int(re.findall(r"\d+$", name)[0])
+    if CONVERTED[name] == WOODS:
+        return read_woods(path, float(number))
+    return read_rfid_aisle(path, number, odometry_seed)
+
+
+def present_logs(data_root: Path | None = None) -> set[str]:
+    """The names of the logs whose files are in the data folder."""
+    known = {dataset.name for dataset in describe(data_root) if dataset.present}
+    if "mrclam6-robot1" not in known:
+        return known
+    root = find_data_root(data_root, "recorded logs")
+    return known | {name for name, path in CONVERTED.items() if (root / path).exists()}
