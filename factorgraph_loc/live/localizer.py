@@ -131,12 +131,11 @@ class Localizer:
         reads, as missing reads are informative too. InputError as in :meth:`push`."""
         self.push(scan_of(t, antennas, reads))
 
-    def push_image(self, t: float, image: object, depth: object = None) -> None:
-        """Process an image, (H, W) or (H, W, 3) BGR, with the size of the rig's camera. ``depth``: its depth image, an array
-        (H, W) of uint16 in the unit of the rig.
+    def push_image(self, t: float, image: object) -> None:
+        """Process an image, (H, W) or (H, W, 3) BGR, with the size of the rig's camera.
 
         Features are detected in the calling thread while other measurements are processed, so the image arrives late by that
-        time. InputError as in :meth:`push`, or if these are no such arrays.
+        time. InputError as in :meth:`push`, or if it is no such array.
         """
         t = seconds_of("image", t)
         if self._rig.find(CameraSettings) is None:
@@ -152,8 +151,8 @@ class Localizer:
                 from factorgraph_loc.sensors.camera.live import LiveFrontend  # noqa: PLC0415
 
                 camera = self._rig.of(CameraSettings)
-                self._frontend = LiveFrontend(frontend_of(self._rig, self._world), camera.model(), camera.depth)
-            frame = self._frontend.frame(t, image, depth)
+                self._frontend = LiveFrontend(frontend_of(self._rig, self._world), camera.model())
+            frame = self._frontend.frame(t, image)
         self.push(frame)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:

@@ -16,8 +16,7 @@ import numpy as np
 import scipy.sparse
 from gtsam.symbol_shorthand import K, L, X
 
-from factorgraph_loc.mapping.triangulation import NEAREST, Cameras, Integers, Tracks, Truths, depth_errors, reproject
-from factors.camera.depth import lifted
+from factorgraph_loc.mapping.triangulation import NEAREST, Cameras, Integers, Tracks, Truths, reproject
 from factors.camera.model import CameraModel
 from factors.se2 import Array
 
@@ -111,11 +110,7 @@ def adjust(
         model, cameras, points = _optimized(model, fixed, known, cameras, tracks, points, constants=focal or lens)
         least = np.full(len(points), 2)
         least[known.points] = 1
-        limit = LOOSE if i == 0 else OUTLIER
-        right = agreeing(model, cameras, tracks, points, limit, least)
-        if tracks.depths is not None:
-            wrong = np.abs(depth_errors(model, cameras, points, tracks)[0]) > limit
-            tracks = replace(tracks, depths=np.where(wrong, np.nan, tracks.depths))
+        right = agreeing(model, cameras, tracks, points, LOOSE if i == 0 else OUTLIER, least)
         progress((i + 1) / ROUNDS)
         if right.all() and i > 0:
             break
@@ -150,9 +145,7 @@ def marginals(
     """
     count, total = len(cameras), tracks.count
     _, by_camera, by_point, _ = reproject(model, cameras, points, tracks)
-    _, camera_by_depth, point_by_depth = depth_errors(model, cameras, points, tracks)
-    by_camera = np.concatenate((by_camera / model.sigma, camera_by_depth[:, None]), axis=1)
-    by_point = np.concatenate((by_point / model.sigma, point_by_depth[:, None]), axis=1)
+    by_camera, by_point = by_camera / model.sigma, by_point / model.sigma
     of_points = np.repeat(SOMEWHERE**-2 * np.eye(3)[None], total, axis=0)
     np.add.at(of_points, tracks.track, np.einsum("nij,nik->njk", by_point, by_point))
     if known is not None:
@@ -225,7 +218,6 @@ def _optimized(
     else:
         for i, k, pixel in rows:
             graph.add(gtsam.GenericProjectionFactorCal3DS2(pixel, noise, X(i), L(k), calibration, False, False))
-    graph.push_back(_depth_factors(model, tracks))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(ITERATIONS)
     parameters.setRelativeErrorTol(RELATIVE)
@@ -237,22 +229,6 @@ def _optimized(
     poses = [found.atPose3(X(i)) for i in range(len(cameras))]
     adjusted = Cameras(np.array([p.translation() for p in poses]), np.array([p.rotation().matrix() for p in poses]))
     return model, adjusted, np.array([found.atPoint3(L(k)) for k in range(len(points))]).reshape(-1, 3)
-
-
-def _depth_factors(model: CameraModel, tracks: Tracks) -> gtsam.NonlinearFactorGraph:
-    """The measured depths, as ranges along the rays of their pixels."""
-    graph = gtsam.NonlinearFactorGraph()
-    if tracks.depths is None:
-        return graph
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(model.robust)
-    rows = np.flatnonzero(np.isfinite(tracks.depths))
-    depths = tracks.depths[rows]
-    ranges = np.linalg.norm(lifted(model, tracks.pixels[rows], depths), axis=1)
-    sigmas = model.depth_sigma * depths * ranges  # of a range, if an inverse depth has depth_sigma
-    for i, k, away, sigma in zip(tracks.frame[rows].tolist(), tracks.track[rows].tolist(), ranges, sigmas, strict=True):
-        noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(1, sigma))
-        graph.add(gtsam.RangeFactor3D(X(i), L(k), away, noise))
-    return graph
 
 
 def _sparse(blocks: Array, rows: Integers, columns: Integers, shape: tuple[int, int]) -> Any:

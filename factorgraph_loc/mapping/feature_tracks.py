@@ -131,16 +131,7 @@ def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Int
     frame = frame_of[nodes]
     pixels = np.concatenate([frame.pixels for frame in frames])[nodes] if len(nodes) else np.empty((0, 2))
     feature = nodes - starts[frame]
-    return Tracks(track, frame, feature, pixels, depths_of(frames, frame, feature))
-
-
-def depths_of(frames: Sequence[CameraFrame], frame: Integers, feature: Integers) -> Array | None:
-    """The depths (N,) [m] of the features ``feature`` (N,) of the frames ``frame`` (N,); None if no frame has any."""
-    if all(one.depths is None for one in frames):
-        return None
-    depths = [np.full(len(one.pixels), np.nan) if one.depths is None else one.depths for one in frames]
-    starts = np.cumsum([0, *(len(one) for one in depths)])
-    return np.asarray(np.concatenate(depths)[starts[frame] + feature])
+    return Tracks(track, frame, feature, pixels)
 
 
 def _angles(rotations: Array, other: Array) -> Array:

@@ -17,7 +17,7 @@ from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.mapping import bundle
 from factorgraph_loc.mapping.bundle import Bundle, Known
 from factorgraph_loc.mapping.camera_poses import PosedFrames
-from factorgraph_loc.mapping.feature_tracks import chained, depths_of, matched_pairs, overlapping_pairs
+from factorgraph_loc.mapping.feature_tracks import chained, matched_pairs, overlapping_pairs
 from factorgraph_loc.mapping.point_mapping import PointSettings, map_points
 from factorgraph_loc.mapping.steady_motion import SteadyMotion
 from factorgraph_loc.mapping.triangulation import Cameras, Integers, Tracks, triangulate
@@ -169,13 +169,11 @@ class ImageLocalizer:
         good = found.good(new, replace(model, sigma=2.0 * model.sigma))
         new, old = new.kept(good[new.track])
         count = len(shown)
-        frame, feature = np.concatenate((of_map.frame, new.frame)), np.concatenate((of_map.feature, new.feature))
         both = Tracks(
             np.concatenate((of_map.track, new.track + count)),
-            frame,
-            feature,
+            np.concatenate((of_map.frame, new.frame)),
+            np.concatenate((of_map.feature, new.feature)),
             np.concatenate((of_map.pixels, new.pixels)),
-            depths_of(frames, frame, feature),
         )
         positions = np.concatenate((self._points.positions[shown], found.positions[old]))
         known = Known(np.arange(count), self._points.positions[shown], self._points.covariances[shown])

@@ -209,7 +209,7 @@ def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Arr
     angles = parallax(adjusted.cameras, points, tracks)
     good = (
         (tracks.lengths() >= settings.observations)
-        & tracks.determined(angles, settings.parallax)
+        & (angles >= settings.parallax)
         & (_worst(covariances) <= settings.sigma)
     )
     if not good.any():

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera.depth import lifted, linearize_inverse_depth
 from factors.camera.model import CameraModel, linearize_in_space, undistorted
 from factors.robust import huber_weight
 from factors.se2 import Array
@@ -42,14 +41,13 @@ class Cameras:
 @dataclass(frozen=True, eq=False)
 class Tracks:
     """N observations of T points: the point ``track`` (N,) in 0 .. T - 1 is feature ``feature`` (N,) of frame ``frame`` (N,),
-    at ``pixels`` (N, 2), and perhaps at ``depths`` (N,) [m], NaN where none was measured.
+    at ``pixels`` (N, 2).
     """
 
     track: Integers
     frame: Integers
     feature: Integers
     pixels: Array
-    depths: Array | None = None
 
     def __len__(self) -> int:
         return len(self.track)
@@ -66,21 +64,8 @@ class Tracks:
     def kept(self, observations: Truths) -> tuple[Tracks, Integers]:
         """The tracks with the selected ``observations`` (N,), renumbered, and the old indices (T',) of the remaining points."""
         old, track = np.unique(self.track[observations], return_inverse=True)
-        left = Tracks(
-            track.astype(np.int64),
-            self.frame[observations],
-            self.feature[observations],
-            self.pixels[observations],
-            None if self.depths is None else self.depths[observations],
-        )
-        return left, old
-
-    def determined(self, parallax: Array, least: float) -> Truths:
-        """Whether the distances of the points (T,) are determined, by a ``parallax`` (T,) [rad] of ``least`` or by depths."""
-        deep = np.zeros(self.count, dtype=bool)
-        if self.depths is not None:
-            deep[self.track[np.isfinite(self.depths)]] = True
-        return np.asarray(deep | (parallax >= least))
+        left = (self.frame[observations], self.feature[observations], self.pixels[observations])
+        return Tracks(track.astype(np.int64), *left), old
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +81,13 @@ class Triangulated:
     parallax: Array
 
     def good(self, tracks: Tracks, model: CameraModel, parallax: float = PARALLAX) -> Truths:
-        """Which points (T,) have two or more observations, lie in front of all their cameras, and have enough parallax or a
-        depth, and small errors.
+        """Which points (T,) have two or more observations, lie in front of all their cameras, and have enough parallax
+        and small errors.
         """
         behind = (self.depths < NEAREST) | (self.depths > FARTHEST)
         square = np.bincount(tracks.track, np.sum(self.errors**2, axis=1), minlength=tracks.count)
         rms = np.sqrt(square / np.maximum(tracks.lengths(), 1))
-        good = tracks.determined(self.parallax, parallax) & (tracks.lengths() >= 2) & (rms <= 4.0 * model.sigma)
+        good = (self.parallax >= parallax) & (tracks.lengths() >= 2) & (rms <= 4.0 * model.sigma)
         good[tracks.track[behind]] = False
         return np.asarray(good & np.isfinite(self.positions).all(axis=1))
 
@@ -124,46 +109,20 @@ def reproject(model: CameraModel, cameras: Cameras, points: Array, tracks: Track
     return pixels - tracks.pixels, by_camera, by_local @ rotations.transpose(0, 2, 1), local[:, 2]
 
 
-def depth_errors(model: CameraModel, cameras: Cameras, points: Array, tracks: Tracks) -> tuple[Array, Array, Array]:
-    """The errors (N,) of the inverse depths, predicted minus measured, in standard deviations, and their Jacobians with respect to
-    the camera (N, 6) and the point (N, 3), as in :func:`reproject`; zeros where no depth was measured."""
-    if tracks.depths is None:
-        return np.zeros(len(tracks)), np.zeros((len(tracks), 6)), np.zeros((len(tracks), 3))
-    rotations = cameras.rotations[tracks.frame]
-    local = np.einsum("nj,njk->nk", points[tracks.track] - cameras.positions[tracks.frame], rotations)
-    inverse, by_camera, by_point = linearize_inverse_depth(rotations, local)
-    measured = np.isfinite(tracks.depths)
-    scale = measured / model.depth_sigma
-    error = inverse - 1.0 / np.where(measured, tracks.depths, 1.0)
-    return scale * error, scale[:, None] * by_camera, scale[:, None] * by_point
-
-
 def triangulate(model: CameraModel, cameras: Cameras, tracks: Tracks) -> Triangulated:
     """Triangulate the points of ``tracks``, with exact camera poses."""
     rays = directions(model, cameras.rotations[tracks.frame], tracks.pixels)
-    points = _with_depths(model, cameras, tracks, _nearest_to_rays(cameras.positions[tracks.frame], rays, tracks))
+    points = _nearest_to_rays(cameras.positions[tracks.frame], rays, tracks)
     for _ in range(ITERATIONS):
         error, _, by_point, _ = reproject(model, cameras, points, tracks)
         weight = huber_weight(np.sum(error**2, axis=1) / model.sigma**2, model.robust) / model.sigma**2
-        deep, _, by_depth = depth_errors(model, cameras, points, tracks)
-        trust = huber_weight(np.square(deep), model.robust)  # of its own: at an edge a depth is wrong, its pixel is not
-        information = _summed(
-            np.einsum("n,nij,nik->njk", weight, by_point, by_point)
-            + np.einsum("n,ni,nj->nij", trust, by_depth, by_depth),
-            tracks,
-        )
-        gradient = _summed(
-            np.einsum("n,nij,ni->nj", weight, by_point, error) + (trust * deep)[:, None] * by_depth, tracks
-        )
+        information = _summed(np.einsum("n,nij,nik->njk", weight, by_point, by_point), tracks)
+        gradient = _summed(np.einsum("n,nij,ni->nj", weight, by_point, error), tracks)
         step = -np.einsum("tij,tj->ti", _inverse(information), gradient)
         # a point of undetermined depth may jump: limit the step to a metre
         points = points + step * np.minimum(1.0, 1.0 / np.maximum(np.linalg.norm(step, axis=1), 1e-12))[:, None]
     error, _, by_point, depth = reproject(model, cameras, points, tracks)
-    by_depth = depth_errors(model, cameras, points, tracks)[2]
-    information = _summed(
-        np.einsum("nij,nik->njk", by_point, by_point) / model.sigma**2 + by_depth[:, :, None] * by_depth[:, None],
-        tracks,
-    )
+    information = _summed(np.einsum("nij,nik->njk", by_point, by_point) / model.sigma**2, tracks)
     return Triangulated(points, _inverse(information), error, depth, parallax(cameras, points, tracks))
 
 
@@ -175,19 +134,6 @@ def parallax(cameras: Cameras, points: Array, tracks: Tracks) -> Array:
     bounds = np.cumsum(tracks.lengths())[:-1]
     least = [float((one @ one.T).min(initial=1.0)) for one in np.split(rays[order], bounds)]
     return np.asarray(np.arccos(np.clip(least, -1.0, 1.0)))
-
-
-def _with_depths(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array) -> Array:
-    """``points`` (T, 3), those with depths where these have them on average."""
-    if tracks.depths is None:
-        return points
-    rows = np.flatnonzero(np.isfinite(tracks.depths))
-    frame, track = tracks.frame[rows], tracks.track[rows]
-    local = lifted(model, tracks.pixels[rows], tracks.depths[rows])
-    there = cameras.positions[frame] + np.einsum("nij,nj->ni", cameras.rotations[frame], local)
-    total, count = np.zeros_like(points), np.bincount(track, minlength=len(points))
-    np.add.at(total, track, there)
-    return np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], points)
 
 
 def _nearest_to_rays(positions: Array, rays: Array, tracks: Tracks) -> Array:

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.processes import run_each
-from factorgraph_loc.sensors.camera.settings import CameraSettings, DepthSettings
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.sensors.interfaces import times as times_of
 from factorgraph_loc.simulation.renderer import Image, Renderer
@@ -35,7 +34,6 @@ JPEG = (
 )
 MOMENT = 0.02  # s before and after, over which the robot's velocity is averaged
 PERIODS = (8.0, 13.0, 29.0)  # s, periods of the brightness variation
-DEPTH_SUFFIX, NO_DEPTH = ".png", np.iinfo(np.uint16).max
 FEW = 40  # images for which starting processes does not pay
 
 
@@ -71,18 +69,6 @@ class Film:
         """Iterate over stamps and images."""
         for i, stamp in enumerate(self.stamps.tolist()):
             yield stamp, self[i]
-
-    def depths(self, i: int, settings: DepthSettings) -> NDArray[np.uint16]:
-        """The depth image (H, W) that belongs to image ``i``, without blur, with the noise of the ``settings``."""
-        position, rotation = reprojection.camera_pose(self.renderer.model, self.truth.at(self.times[i : i + 1])[0])
-        depths = self.renderer.depths(position, rotation)
-        noise = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(12, i)))
-        with np.errstate(divide="ignore"):
-            measured = (
-                1.0 / (1.0 / depths + settings.inverse_sigma * noise.standard_normal(depths.shape)) / settings.unit
-            )
-        seen = (measured >= 0.5) & (measured < NO_DEPTH - 0.5)
-        return np.where(seen, np.rint(measured), 0.0).astype(np.uint16)
 
     def _velocity(self, t: float) -> Array:
         """Velocity in the world frame (3,) [m/s, m/s, rad/s]."""
@@ -124,8 +110,7 @@ def with_images(
     workers: int = 1,
     tell: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> Log:
-    """Write images to ``folder`` for ``log``, simulated with the same settings and seed, and return the log with them; with depth
-    images, if the camera has them.
+    """Write images to ``folder`` for ``log``, simulated with the same settings and seed, and return the log with them.
 
     ``workers``: number of processes for many images; ``tell``: called with the number of images done and of all. Raises InputError
     as :func:`film` does.
@@ -138,8 +123,7 @@ def with_images(
     else:
         _write_in_parallel(settings, seed, folder, count, workers, tell)
     offset, names = log.rig.time_offset("camera"), [folder / _name(i) for i in range(count)]
-    depths = [] if log.rig.of(CameraSettings).depth is None else [name.with_suffix(DEPTH_SUFFIX) for name in names]
-    streams = {**log.streams, "camera": ImageStream(times - offset, names, depth=depths)}
+    streams = {**log.streams, "camera": ImageStream(times - offset, names)}
     return replace(log, streams=streams, rig=with_sensors(log.rig, streams))
 
 
@@ -167,13 +151,10 @@ def _write(
     tell: Callable[[float], None] = lambda _done: None,
 ) -> None:
     cv2.setNumThreads(1)
-    images, depth = film(settings, seed), settings.rig.of(CameraSettings).depth
+    images = film(settings, seed)
     for done, i in enumerate(indices):
         _, content = cv2.imencode(".jpg", images[i], JPEG)
         (folder / _name(i)).write_bytes(content.tobytes())
-        if depth is not None:
-            _, content = cv2.imencode(DEPTH_SUFFIX, images.depths(i, depth))
-            (folder / _name(i)).with_suffix(DEPTH_SUFFIX).write_bytes(content.tobytes())
         tell(done + 1)
 
 

@@ -74,12 +74,6 @@ class Renderer:
         distance[np.isinf(distance)] = np.nan
         return np.asarray(position + distance[:, None] * rays)
 
-    def depths(self, position: Array, rotation: Array) -> Array:
-        """Depth of each pixel (H, W) [m] along the optical axis, infinite where there is none."""
-        directions = self._directions.reshape(-1, 2)
-        rays = np.column_stack((directions, np.ones(len(directions)))) @ rotation.T
-        return np.asarray(self._distances(position, rays).reshape(self._directions.shape[:2]))
-
     def _moments(self, position: Array, rotation: Array, velocity: Array, turn: Array) -> Array:
         """Times (M,) of the sub-images, about the middle of the exposure."""
         exposure = self.settings.exposure

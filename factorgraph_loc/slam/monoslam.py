@@ -50,8 +50,8 @@ from factorgraph_loc.slam.monoslam_state import (
     Innovation,
     MapPoint,
     SlamState,
-    each_squared,
     of_mounting,
+    squared,
     starting,
     weighted,
     widened,
@@ -220,11 +220,11 @@ class Monoslam(Filter):
 
     def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
         """The iterated Kalman update; beyond the gate the noise of a pixel is widened, and Huber weights are applied."""
-        known = match.mapped, match.points, match.spreads, match.depths
+        known = match.mapped, match.points, match.spreads
         zero = np.zeros(len(prior.covariance))
         sights = eye.all(prior, *known)
         innovation = Innovation.of(sights, prior.covariance)
-        residual = match.measured - sights.pixels
+        residual = match.pixels - sights.pixels
         noise = widened(sights.noise, residual, innovation)
         self._report(m, match, residual, innovation, sights.noise)
         tempering = np.ones(len(residual))
@@ -235,8 +235,8 @@ class Monoslam(Filter):
                 moved = prior.plus(delta, prior.covariance)
                 sights = eye.all(moved, *known)
                 innovation = Innovation.of(sights, prior.covariance)
-                residual = match.measured - sights.pixels
-                weight = huber_weight(each_squared(residual, sights.noise), eye.model.robust)
+                residual = match.pixels - sights.pixels
+                weight = huber_weight(squared(residual, sights.noise), eye.model.robust)
                 noise = weighted(sights.noise, 1.0 / weight)
             root, spread = innovation.gain(noise / tempering[:, None, None])
             whitened = np.linalg.solve(root, residual.ravel() + innovation.jacobian @ delta[innovation.columns])
@@ -250,8 +250,7 @@ class Monoslam(Filter):
 
     def _report(self, m: Pixels, match: Match, residual: Array, innovation: Innovation, noise: Array) -> None:
         whitened = np.linalg.solve(innovation.root(noise), residual.ravel())
-        missing = 0 if match.depths is None else int(np.count_nonzero(np.isnan(match.depths)))
-        self.diagnostics.innovation("camera", m.t, float(whitened @ whitened), len(whitened) - missing)
+        self.diagnostics.innovation("camera", m.t, float(whitened @ whitened), len(whitened))
         for i, name in enumerate("uv"):
             self.diagnostics.add_residuals(f"camera.{name}", residual[:, i].tolist())
 
@@ -294,8 +293,7 @@ class Monoslam(Filter):
         for row in self._looker.new(m, state, eye, match, state.tracks)[:room]:
             name = f"met{state.met}" if m.names is None else m.names[row]
             descriptor = None if frame is None else frame.descriptors[row]
-            depth = math.nan if frame is None or frame.depths is None else float(frame.depths[row])
-            grown = with_point(state, MapPoint(name, True, descriptor, m.t), eye, m.pixels[row], depth)
+            grown = with_point(state, MapPoint(name, True, descriptor, m.t), eye, m.pixels[row])
             state = replace(grown, met=state.met + 1)
         state, failed = pruned(state, self._settings.max_points)
         if failed:

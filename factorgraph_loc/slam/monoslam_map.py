@@ -4,7 +4,6 @@ Davison et al., 2007 (see :mod:`~factorgraph_loc.slam.monoslam_motion`), section
 Civera, Davison, Montiel, 2008: new points are initialized by inverse depth (:mod:`factors.camera.inverse_depth`).
 """
 
-import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
@@ -12,23 +11,18 @@ import numpy as np
 
 from factorgraph_loc.slam.monoslam_state import Eye, Integers, MapPoint, SlamState
 from factors.camera import inverse_depth
-from factors.camera.depth import lifted
 from factors.se2 import Array
 
 INVERSE_DEPTH, INVERSE_DEPTH_SIGMA = 0.3, 1.0  # 1/m, of a new point: so vague that many of them do not give the scale
 TRIED, FOUND = 8, 0.5  # a point that was predicted this often is kept if this fraction was found
 
 
-def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array, depth: float = math.nan) -> SlamState:
-    """The state with a new point, seen at ``pixel`` (2,) and at ``depth`` [m] if that was measured."""
+def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> SlamState:
+    """The state with a new point, seen at ``pixel`` (2,)."""
     position, rotation = eye.pose(state.robot)
-    inverse, sigma = INVERSE_DEPTH, INVERSE_DEPTH_SIGMA
-    if not math.isnan(depth):  # along the optical axis; the distance is that along the ray
-        away = float(np.linalg.norm(lifted(eye.model, pixel[None], np.array((depth,)))))
-        inverse, sigma = 1.0 / away, eye.model.depth_sigma * depth / away
-    ray, by_camera, by_seen = inverse_depth.begin(eye.model, position, rotation, pixel, inverse)
+    ray, by_camera, by_seen = inverse_depth.begin(eye.model, position, rotation, pixel, INVERSE_DEPTH)
     by_pose = by_camera @ eye.lift
-    noise = np.diag((eye.model.sigma, eye.model.sigma, sigma)) ** 2
+    noise = np.diag((eye.model.sigma, eye.model.sigma, INVERSE_DEPTH_SIGMA)) ** 2
     size, more = len(state.covariance), inverse_depth.SIZE
     carried = by_pose @ state.covariance[:6]
     covariance = np.empty((size + more, size + more))

@@ -22,7 +22,6 @@ from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.relocalization import located
 from factorgraph_loc.vision.spread import spread_out
 from factors.camera import inverse_depth
-from factors.camera.depth import with_inverse
 from factors.se2 import Array
 
 APART = 15.0  # px between a new point and all others
@@ -32,7 +31,7 @@ FEWEST_FOUND, SHARE_FOUND = 5, 0.5  # named points that must agree in relocaliza
 @dataclass(frozen=True)
 class Match:
     """The inlier pixels (K, 2), of points ``mapped`` in the state, then of ``points`` (P, 3) of the map with covariances
-    ``spreads`` (P, 3, 3). ``depths`` (K,) [m] of the latter, NaN where none was measured, or None.
+    ``spreads`` (P, 3, 3).
 
     ``tempering``: exponent of the likelihood. ``taken``: their rows of the image, including rejected ones. ``expected``: points
     of the state that should have been found. ``wanted``: 0 if too few were predicted to conclude anything from missing matches.
@@ -46,12 +45,6 @@ class Match:
     expected: tuple[int, ...]
     wanted: int
     tempering: float = 1.0
-    depths: Array | None = None
-
-    @property
-    def measured(self) -> Array:
-        """The pixels, with inverse depths if there are any (K, 2 or 3)."""
-        return with_inverse(self.pixels, self.depths)
 
 
 class FeatureMatcher:
@@ -140,10 +133,7 @@ class FeatureMatcher:
         ours = self._agreeing(m.pixels, ours, state, eye)
         in_map = {f for f, _ in known}
         match = self._match(m.pixels, [pair for pair in ours if pair[0] not in in_map], known, tuple(which), wanted)
-        depths = None
-        if m.depths is not None:
-            depths = np.concatenate((np.full(len(match.mapped), np.nan), m.depths[[f for f, _ in known]]))
-        return replace(match, tempering=eye.model.tempering, depths=depths)
+        return replace(match, tempering=eye.model.tempering)
 
     def relocated(self, m: Pixels, eye: Eye) -> CameraPose | None:
         """The camera pose from this image and the map alone; None if they do not determine it."""

@@ -30,12 +30,11 @@ from factorgraph_loc.slam.monoslam_motion import (
 )
 from factors import positive
 from factors.camera import inverse_depth
-from factors.camera.depth import linearize_with_depth
 from factors.camera.floor import TiltScale
 from factors.camera.model import CameraModel, linearize_in_space, mounted
 from factors.motion import ChainState
 from factors.se2 import Array
-from factors.update import GATE, GATES
+from factors.update import GATE
 
 Integers = NDArray[np.int64]
 Truths = NDArray[np.bool_]
@@ -141,8 +140,6 @@ class Sights:
     """K predicted pixels: ``pixels`` (K, 2), ``depths`` (K,), and Jacobians with respect to the robot's pose (K, 2, 6) and the
     point's own values (K, 2, 6), of which the first ``sizes`` (K,) are used; 0 for a map point, which is not in the state.
     ``starts`` (K,): index of the point's values in the error state. ``noise`` (K, 2, 2) [px^2]: of pixel and map.
-
-    Where depths were measured, the inverse depth [1/m] is the third value of each pixel (:mod:`factors.camera.depth`).
     """
 
     pixels: Array
@@ -180,14 +177,6 @@ class Sights:
             jacobian[k, :, offsets[w] : offsets[w + 1]] = self.by_point[k, :, : sizes[w]]
         return chosen.astype(np.int64), jacobian.reshape(-1, len(chosen))
 
-    def without_depths(self) -> Sights:
-        """These with a third value that nothing depends on."""
-        pad = ((0, 0), (0, 1), (0, 0))
-        noise = np.pad(self.noise, ((0, 0), (0, 1), (0, 1)))
-        noise[:, 2, 2] = 1.0
-        by_pose, by_point = np.pad(self.by_pose, pad), np.pad(self.by_point, pad)
-        return replace(self, pixels=np.pad(self.pixels, pad[:2]), by_pose=by_pose, by_point=by_point, noise=noise)
-
 
 @dataclass(frozen=True)
 class Eye:
@@ -211,19 +200,12 @@ class Eye:
         """The covariance (6, 6) of the camera's perturbation, from that of the error state."""
         return self.lift @ covariance[:POSE, :POSE] @ self.lift.T
 
-    def known(self, robot: RobotState, points: Array, spreads: Array | None, measured: Array | None = None) -> Sights:
-        """Predicted pixels of map ``points`` (K, 3) with covariances ``spreads`` (K, 3, 3); None: exact. ``measured`` (K,): the
-        depths that were, if any."""
+    def known(self, robot: RobotState, points: Array, spreads: Array | None) -> Sights:
+        """Predicted pixels of map ``points`` (K, 3) with covariances ``spreads`` (K, 3, 3); None: exact."""
         position, rotation = self.pose(robot)
-        sigmas = np.full(2, self.model.sigma)
-        if measured is None:
-            pixels, by_camera, by_point = linearize_in_space(self.model, position, rotation, points)
-        else:
-            deep = np.isfinite(measured)
-            pixels, by_camera, by_point = linearize_with_depth(self.model, position, rotation, points, deep)
-            sigmas = np.append(sigmas, self.model.depth_sigma)
+        pixels, by_camera, by_point = linearize_in_space(self.model, position, rotation, points)
         depths = (points - position) @ rotation[:, 2]
-        noise = np.broadcast_to(np.diag(np.square(sigmas)), (len(points), len(sigmas), len(sigmas)))
+        noise = np.broadcast_to(self.model.sigma**2 * np.eye(2), (len(points), 2, 2))
         if spreads is not None:
             noise = noise + by_point @ spreads @ by_point.transpose(0, 2, 1)
         nothing = np.zeros(len(points), dtype=np.int64)
@@ -252,20 +234,9 @@ class Eye:
         sizes = np.where(rays, inverse_depth.SIZE, 3)
         return Sights(pixels, depths, by_camera @ self.lift, by_point, starts + state.base, sizes, noise)
 
-    def all(
-        self,
-        state: SlamState,
-        which: Sequence[int],
-        points: Array,
-        spreads: Array | None,
-        measured: Array | None = None,
-    ) -> Sights:
-        """Predicted pixels (K, 2) of points of the state, then of the map; with the depths of the latter if any of all (K,) were
-        ``measured``."""
-        mapped = self.mapped(state, which)
-        if measured is not None:
-            mapped, measured = mapped.without_depths(), measured[len(which) :]
-        return joined(mapped, self.known(state.robot, points, spreads, measured))
+    def all(self, state: SlamState, which: Sequence[int], points: Array, spreads: Array | None) -> Sights:
+        """Predicted pixels (K, 2) of points of the state, then of the map."""
+        return joined(self.mapped(state, which), self.known(state.robot, points, spreads))
 
 
 def joined(first: Sights, second: Sights) -> Sights:
@@ -278,7 +249,7 @@ def joined(first: Sights, second: Sights) -> Sights:
 @dataclass(frozen=True)
 class Innovation:
     """``carried`` (12 + D, 2K): covariance of state and predicted pixels; ``jacobian`` (2K, C) with respect to the ``columns``
-    (C,) of the error state; ``covariance`` (2K, 2K) of the innovation, without noise. With depths, 3K instead of 2K.
+    (C,) of the error state; ``covariance`` (2K, 2K) of the innovation, without noise.
     """
 
     carried: Array
@@ -323,15 +294,6 @@ def squared(residual: Array, covariance: Array) -> Array:
     return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))
 
 
-def each_squared(residual: Array, covariance: Array) -> Array:
-    """Squared Mahalanobis distances (K, D) of the values of ``residual`` (K, D) with ``covariance`` (K, D, D): of the pixel for the
-    first two, and of the depth for a third, since where a depth is wrong the pixel is not."""
-    found = np.repeat(squared(residual, covariance)[:, None], residual.shape[1], axis=1)
-    if found.shape[1] > 2:  # given the pixel
-        found[:, 2] = np.maximum(0.0, positive.squared(residual, covariance) - found[:, 1])
-    return found
-
-
 def starting(sigmas: Array) -> Array:
     """The covariance (12 + P, 12 + P) of a start, except for the pose; ``sigmas`` (P,): of the constants."""
     motion = np.array([0.0] * POSE + [VELOCITY_SIGMA] * 3 + [RATE_SIGMA] * 3)
@@ -339,11 +301,10 @@ def starting(sigmas: Array) -> Array:
 
 
 def weighted(noise: Array, factors: Array) -> Array:
-    """The ``noise`` (K, D, D) of values whose variances are multiplied by ``factors`` (K, D)."""
-    return noise * np.sqrt(factors[:, :, None] * factors[:, None, :])
+    """The ``noise`` (K, 2, 2) of pixels whose variances are multiplied by ``factors`` (K,)."""
+    return noise * factors[:, None, None]
 
 
 def widened(noise: Array, residual: Array, innovation: Innovation) -> Array:
-    """The ``noise`` (K, D, D), widened beyond the gate by the squared excess."""
-    gates = (GATE, GATE, GATES[1])[: residual.shape[1]]
-    return weighted(noise, np.maximum(1.0, each_squared(residual, innovation.each(noise)) / gates) ** 2)
+    """The ``noise`` (K, 2, 2), widened beyond the gate by the squared excess."""
+    return weighted(noise, np.maximum(1.0, squared(residual, innovation.each(noise)) / GATE) ** 2)

@@ -1,7 +1,7 @@
 """Delayed initialization of points that the map lacks: sightings are collected until they determine the point.
 
-This needs sightings from :data:`FEWEST` keyframes with enough parallax for the errors of pixels and poses, unless a depth was
-measured; rays that intersect in front of the camera, and small residuals. A sighting that contradicts the others is dropped.
+This needs sightings from :data:`FEWEST` keyframes with enough parallax for the errors of pixels and poses,
+rays that intersect in front of the camera, and small residuals. A sighting that contradicts the others is dropped.
 """
 
 from __future__ import annotations
@@ -29,26 +29,18 @@ ORIGIN, UNTURNED, UPRIGHT = np.zeros(3), np.eye(3), np.zeros(2)
 
 @dataclass(frozen=True, slots=True)
 class PointSighting:
-    """A point seen from keyframe ``keyframe`` at ``pixel`` (2,), in the direction ``ray`` (3,) of the camera frame; the ``inverse``
-    of its depth [1/m] is NaN where none was measured."""
+    """A point seen from keyframe ``keyframe`` at ``pixel`` (2,), in the direction ``ray`` (3,) of the camera frame."""
 
     keyframe: int
     pixel: Array
     ray: Array
-    inverse: float = math.nan
-
-    @property
-    def seen(self) -> Array:
-        """What was measured: (2,), or (3,) with a depth."""
-        return self.pixel if math.isnan(self.inverse) else np.append(self.pixel, self.inverse)
 
 
-def sightings_of(model: CameraModel, keyframe: int, pixels: Array, depths: Array | None = None) -> list[PointSighting]:
-    """The sightings at ``pixels`` (K, 2) from a keyframe, with ``depths`` (K,) [m] that are NaN where none was measured."""
+def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[PointSighting]:
+    """The sightings at ``pixels`` (K, 2) from a keyframe."""
     rays = reprojection.rays(model, pixels)
     rays /= np.linalg.norm(rays, axis=1)[:, None]
-    inverses = np.full(len(pixels), np.nan) if depths is None else 1.0 / depths
-    return list(map(PointSighting, repeat(keyframe), pixels, rays, inverses.tolist()))
+    return list(map(PointSighting, repeat(keyframe), pixels, rays))
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,9 +136,7 @@ def apart(
     last: PointSighting,
     there: KeyframeCamera,
 ) -> bool:
-    """Cheap test whether two rays alone nearly determine the point; true with a depth."""
-    if not math.isnan(first.inverse) or not math.isnan(last.inverse):
-        return True
+    """Cheap test whether two rays alone nearly determine the point."""
     sigma = math.hypot(model.sigma, max(here.slack, there.slack)) / model.fx
     angle = max(MIN_PARALLAX, min(sigma / MAX_SPREAD, 0.5))
     return float((here.rotation @ first.ray) @ (there.rotation @ last.ray)) < math.cos(angle)
@@ -177,7 +167,7 @@ def agreed(
 
 def _fits(point: TriangulatedPoint, seen: Sequence[PointSighting]) -> bool:
     """Whether all that is ``seen`` of a point is as far from it as noise may be."""
-    return bool(point.squared.sum() < chi_squared.quantile(GATE, sum(len(s.seen) for s in seen) - 3))
+    return bool(point.squared.sum() < chi_squared.quantile(GATE, 2 * len(seen) - 3))
 
 
 def triangulate(
@@ -202,16 +192,10 @@ def _triangulate(
         np.array([p.centre for p in places]),
         np.array([p.rotation for p in places]),
         np.array([s.ray for s in seen]),
-        np.array([(*s.pixel, s.inverse) for s in seen]),
-        np.array([_sigmas(model, s, p) for s, p in zip(seen, places, strict=True)]),
+        np.array([s.pixel for s in seen], dtype=float),
+        np.array([math.hypot(model.sigma, p.slack) for p in places]),
         spread,
     )
     if ended == kernels.BEHIND:
         return TriangulatedPoint(ORIGIN, UNTURNED, np.full(len(seen), np.inf))
     return TriangulatedPoint(*found) if ended == kernels.FOUND else None
-
-
-def _sigmas(model: CameraModel, seen: PointSighting, place: KeyframeCamera) -> tuple[float, float]:
-    """Standard deviations of each pixel coordinate, and of the inverse depth [1/m], which an error of the place changes, too."""
-    inverse = 0.0 if math.isnan(seen.inverse) else seen.inverse
-    return math.hypot(model.sigma, place.slack), math.hypot(model.depth_sigma, place.slack / model.fx * inverse)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 
-import numpy as np
-
 from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe
 from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.fusion.variables import Node, Values, gather
@@ -44,7 +42,6 @@ class PointMapper:
         self._things = MovingThings(model)
         self._pairs = FramePairs(model) if settings.visual_odometry else None
         self._taken = -math.inf
-        self._has_depths = False
         self._tracks: set[Hashable] = set()  # of the last keyframe, without those on things that move
 
     @property
@@ -54,7 +51,7 @@ class PointMapper:
 
     @property
     def knows_scale(self) -> bool:
-        return self._unknown is None or self._has_depths or len(self._camera.points.map) > 0
+        return self._unknown is None or len(self._camera.points.map) > 0
 
     def is_due(self, m: Pixels) -> bool:
         # estimated points need keyframes of their own
@@ -80,7 +77,6 @@ class PointMapper:
             used = {i for i, name in enumerate(m.names) if name in points.map.index}
         else:
             names, used = m.frame.tracks.tolist(), set(points.used.tolist())
-            self._has_depths |= m.frame.depths is not None and bool(np.isfinite(m.frame.depths).any())
         self._things.look(keyframe, names, m.pixels, graph)
         moving = self._things.moving()
         used |= {i for i, name in enumerate(names) if name in moving}

@@ -121,8 +121,7 @@ class UnknownPoints:
         pixels = np.asarray(m.pixels[rows], dtype=float)
         chosen = spread_out(pixels, PER_KEYFRAME + WAITING, priority).tolist()
         rows, names, pixels = [rows[i] for i in chosen], [names[i] for i in chosen], pixels[chosen]
-        depths = None if m.frame is None or m.frame.depths is None else m.frame.depths[rows]
-        sightings = sightings_of(self.model, keyframe.index, pixels, depths)
+        sightings = sightings_of(self.model, keyframe.index, pixels)
         old = [i for i, name in enumerate(names) if name in self._points]
         old = [old[i] for i in spread_out(pixels[old], PER_KEYFRAME).tolist()]
         points = [self._points[names[i]] for i in old]
@@ -354,8 +353,8 @@ class UnknownPoints:
     def _hang(self, keyframe: Keyframe, key: int, seen: PointSighting, graph: GraphView, addition: Addition) -> None:
         keys = (keyframe.key, *graph.shared, tilt_key(keyframe.index), key)
         twist = self._times.twists.get(keyframe.index)
-        factor = PointFactor(self.model, self._lens, seen.seen, self.estimated.indices, twist)
-        addition.hang(keyframe, Node(keys, factor, factor.rows))
+        factor = PointFactor(self.model, self._lens, seen.pixel, self.estimated.indices, twist)
+        addition.hang(keyframe, Node(keys, factor, 2))
 
     def _places(
         self, newest: Keyframe, pose: Array, names: Sequence[Hashable], graph: GraphView, things: MovingThings

@@ -3,7 +3,6 @@
 __all__ = [
     "association",
     "consensus",
-    "depth",
     "feature_cache",
     "features",
     "fiducials",

@@ -14,8 +14,7 @@ class CameraFrame:
     """The features of one image, empty if it could not be read.
 
     ``pixels`` (K, 2) [px], x right, y down, (0, 0) at the centre of the upper left pixel; ``sizes`` (K,) [px] and ``descriptors``
-    (K, D) of the kind ``feature``. ``tracks`` (K,): numbers of the tracks that features belong to. ``depths`` (K,) [m] along the
-    optical axis, NaN where none was measured; None without a depth image.
+    (K, D) of the kind ``feature``. ``tracks`` (K,): numbers of the tracks that features belong to.
     """
 
     sensor: ClassVar[str] = "camera"
@@ -28,7 +27,6 @@ class CameraFrame:
     sizes: Array
     descriptors: NDArray[Any]
     tracks: NDArray[np.int64]
-    depths: Array | None = None
 
     @property
     def frame(self) -> "CameraFrame":

@@ -2,7 +2,6 @@
 
 __all__ = [
     "bundle_kernels",
-    "depth",
     "factor",
     "floor",
     "inverse_depth",

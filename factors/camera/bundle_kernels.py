@@ -88,12 +88,11 @@ def _looked(
     jacobian: Array,
 ) -> float:
     """The cost; what is seen, linearised in place."""
-    cost, squared = 0.0, np.zeros(2)
+    cost = 0.0
     for p in range(len(points)):
         for m in range(starts[p], starts[p + 1]):
             at = poses[frames[m]], tilts[frames[m]], points[p], pixels[m]
-            see(camera, at, noise[:1], noise[1], residual[m], jacobian[m], squared)
-            cost += huber_loss(squared[0], noise[1])
+            cost += huber_loss(see(camera, at, noise[0], noise[1], residual[m], jacobian[m]), noise[1])
     for i in range(len(poses)):
         cost += 0.5 * (tilts[i, 0] ** 2 + tilts[i, 1] ** 2) / noise[2] ** 2
     for i in range(len(deltas)):

@@ -60,13 +60,6 @@ def pixel(
 
 
 @compiled(inline="always")
-def inverse_depth(p2: float) -> tuple[float, tuple[float, float, float]]:
-    """The inverse depth [1/m] of a point and its gradient, as in :mod:`factors.camera.depth`."""
-    inverse = 1.0 / max(p2, NEAREST)
-    return inverse, (0.0, 0.0, -inverse * inverse)
-
-
-@compiled(inline="always")
 def mounting(position: Array, rotation: Array) -> Place:
     """The camera's pose in the robot frame as numbers: position and axes."""
     p, r = position, rotation

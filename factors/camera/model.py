@@ -43,7 +43,7 @@ class CameraModel:
     (3,) [m] and ``rotation`` (3, 3) of the camera in the robot frame. ``sigma`` [px] in u and in v; ``robust``: scale of Huber's
     loss in standard deviations. ``tempering``: exponent of the likelihood, below 1 if errors are correlated between images.
     ``tilt``: standard deviation [rad] of the robot's roll and pitch, which all points of an image have in common: no floor is level
-    to a pixel. ``depth_sigma`` [1/m]: of the inverse of a depth, where pixels have one (:mod:`factors.camera.depth`).
+    to a pixel.
     """
 
     fx: float
@@ -59,7 +59,6 @@ class CameraModel:
     robust: float = 2.0
     tempering: float = 1.0
     tilt: float = 0.005
-    depth_sigma: float = 0.003
 
     def intrinsics(self) -> Array:
         """(fx, fy, cx, cy, k1, k2, p1, p2) as an array (8,)."""

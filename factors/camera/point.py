@@ -1,5 +1,4 @@
-"""A point of unknown position seen in an image, perhaps with its depth (:mod:`.depth`): a factor on a planar pose, the tilt of the
-robot there, and the point."""
+"""A point of unknown position seen in an image: a factor on a planar pose, the tilt of the robot there, and the point."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, slots=True)
 class PointFactor:
-    """A point ``seen`` (2,) at a pixel, or (3,) with the inverse of its depth [1/m]. ``lens``: of the ``model``, for compiled code.
+    """A point ``seen`` at a pixel (2,). ``lens``: of the ``model``, for compiled code.
 
     The values of the factor are the robot's pose (3,); corrections (P,) of the constants with indices ``estimated`` in
     :data:`~factors.camera.model.PARAMETERS`, if any; the robot's roll and pitch (2,) [rad]; and the point (3,). ``twist`` (3,): the
@@ -36,23 +35,18 @@ class PointFactor:
 
     @property
     def alike(self) -> Hashable:
-        """The camera, and whether there is a depth."""
-        return id(self.model), self.rows
-
-    @property
-    def rows(self) -> int:
-        """Number of residuals R."""
-        return len(self.seen)
+        """The camera."""
+        return id(self.model)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened, robustly weighted residual (R,) and its Jacobian (R, d) by each value. A point behind the camera has a constant
+        """Whitened, robustly weighted residual (2,) and its Jacobian (2, d) by each value. A point behind the camera has a constant
         residual, as no gradient leads to its true position."""
         residuals, blocks = self.linearize_all([self], [values])
         return residuals[0], [block[0] for block in blocks]
 
     @staticmethod
     def linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, list[Array]]:
-        """:meth:`linearize` of N factors with the same camera and constants: residuals (N, R) and Jacobians (N, R, d)."""
+        """:meth:`linearize` of N factors with the same camera and constants: residuals (N, 2) and Jacobians (N, 2, d)."""
         estimated, constants = factors[0].estimated, values[0][1]
         residual, jacobian, _ = _seen(factors, values)
         if TIME_OFFSET in estimated:
@@ -72,11 +66,11 @@ class PointFactor:
 
     def cost(self, values: Sequence[Array]) -> float:
         """The robust loss."""
-        return float(huber_loss(_seen([self], [values])[2][0], self.model.robust).sum())
+        return float(huber_loss(_seen([self], [values])[2], self.model.robust).sum())
 
     def is_astray(self, values: Sequence[Array]) -> bool:
         """Whether the point cannot be what the robot saw: it is behind the camera, or :data:`BEHIND` standard deviations away."""
-        return bool(_seen([self], [values])[2][0, 0] >= BEHIND**2)
+        return bool(_seen([self], [values])[2][0] >= BEHIND**2)
 
 
 def _seen(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array, Array]:
@@ -95,8 +89,7 @@ def _seen(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> 
     )
     if TIME_OFFSET in first.estimated:
         poses = se2.compose(poses, _later(factors, values)[1])
-    camera, sigmas = (lens, model.position, model.rotation), np.array((model.sigma, model.depth_sigma), dtype=float)
-    return kernels.seen(*camera, poses, tilts, points, seen, sigmas, model.robust)
+    return kernels.seen(lens, model.position, model.rotation, poses, tilts, points, seen, model.sigma, model.robust)
 
 
 def _later(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array]:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from factors.camera.kernels import NEAREST, Lens, inverse_depth, pixel
+from factors.camera.kernels import NEAREST, Lens, pixel
 from factors.compiled import compiled
 from factors.robust import huber_weight
 from factors.se2 import Array
@@ -23,20 +23,19 @@ def seen(
     tilts: Array,
     points: Array,
     measured: Array,
-    sigmas: Array,
+    sigma: float,
     robust: float,
 ) -> tuple[Array, Array, Array]:
-    """Of N points (N, 3), each seen from a pose (N, 3) by a robot with a tilt (N, 2): whitened, robustly weighted residuals (N, R),
-    their Jacobian (N, R, WIDTH), and the squared residuals (N, 2) of pixels and depths without weight.
+    """Of N points (N, 3), each seen from a pose (N, 3) by a robot with a tilt (N, 2): whitened, robustly weighted residuals (N, 2),
+    their Jacobian (N, 2, WIDTH), and the squared residuals (N,) without weight.
 
-    ``measured`` (N, R): pixels, and with R = 3 inverse depths [1/m]. ``sigmas`` (2,): standard deviations of each pixel coordinate
-    and of the inverse depth.
+    ``measured`` (N, 2): pixels. ``sigma``: standard deviation of each of their coordinates.
     """
-    n, rows = measured.shape
-    residual, jacobian, squared = np.empty((n, rows)), np.empty((n, rows, WIDTH)), np.zeros((n, 2))
+    n = len(measured)
+    residual, jacobian, squared = np.empty((n, 2)), np.empty((n, 2, WIDTH)), np.zeros(n)
     for i in range(n):
         at = poses[i], tilts[i], points[i], measured[i]
-        see((k, position, rotation), at, sigmas, robust, residual[i], jacobian[i], squared[i])
+        squared[i] = see((k, position, rotation), at, sigma, robust, residual[i], jacobian[i])
     return residual, jacobian, squared
 
 
@@ -56,13 +55,12 @@ def turned(roll: float, pitch: float) -> Array:
 def see(
     camera: tuple[Lens, Array, Array],
     at: tuple[Array, Array, Array, Array],
-    sigmas: Array,
+    sigma: float,
     robust: float,
     residual: Array,
     jacobian: Array,
-    squared: Array,
-) -> None:
-    """One of :func:`seen`, in place. ``at``: pose, tilt, point and what is measured."""
+) -> float:
+    """One of :func:`seen`: the squared residual; ``residual`` and ``jacobian`` in place. ``at``: pose, tilt, point and pixel."""
     (k, position, rotation), (pose, tilt, point, measured) = camera, at
     turn, c, s = turned(tilt[0], tilt[1]), math.cos(pose[2]), math.sin(pose[2])
     dx, dy, z = point[0] - pose[0], point[1] - pose[1], point[2]
@@ -79,28 +77,16 @@ def see(
         rotation[0, 1] * ax + rotation[1, 1] * ay + rotation[2, 1] * az,
         depth,
     )
-    residual[0], residual[1] = (u - measured[0]) / sigmas[0], (v - measured[1]) / sigmas[0]
-    squared[0] = residual[0] * residual[0] + residual[1] * residual[1]
-    scale = math.sqrt(huber_weight(squared[0], robust)) / sigmas[0]
-    inverse, by_inverse = inverse_depth(depth)
-    deep = 0.0
-    if len(residual) == 3:
-        # where a depth is wrong, as at an edge, the pixel is not
-        residual[2] = (inverse - measured[2]) / sigmas[1]
-        squared[1] = residual[2] * residual[2]
-        weight = math.sqrt(huber_weight(squared[1], robust))
-        residual[2] *= weight
-        deep = weight / sigmas[1]
+    residual[0], residual[1] = (u - measured[0]) / sigma, (v - measured[1]) / sigma
+    squared: float = residual[0] * residual[0] + residual[1] * residual[1]
+    scale = math.sqrt(huber_weight(squared, robust)) / sigma
     if depth < NEAREST:
-        squared[0], squared[1], scale, deep = 2.0 * BEHIND * BEHIND, 0.0, 0.0, 0.0
-        residual[:] = 0.0
+        squared, scale = 2.0 * BEHIND * BEHIND, 0.0
         residual[0] = residual[1] = BEHIND
-    weight = math.sqrt(huber_weight(squared[0], robust))
+    weight = math.sqrt(huber_weight(squared, robust))
     residual[0], residual[1] = weight * residual[0], weight * residual[1]
-    for r in range(len(residual)):
+    for r in range(2):
         d = by_u if r == 0 else by_v
-        if r == 2:
-            d, scale = by_inverse, deep
         g0 = scale * (rotation[0, 0] * d[0] + rotation[0, 1] * d[1] + rotation[0, 2] * d[2])
         g1 = scale * (rotation[1, 0] * d[0] + rotation[1, 1] * d[1] + rotation[1, 2] * d[2])
         g2 = scale * (rotation[2, 0] * d[0] + rotation[2, 1] * d[1] + rotation[2, 2] * d[2])
@@ -117,7 +103,7 @@ def see(
         jacobian[r, CONSTANTS + 3] = g1 * az - g2 * ay
         jacobian[r, CONSTANTS + 4] = g2 * ax - g0 * az
         jacobian[r, CONSTANTS + 5] = g0 * ay - g1 * ax
-        jacobian[r, CONSTANTS + 6] = jacobian[r, CONSTANTS + 7] = 0.0
         # a longer focal length
-        if r < 2:
-            jacobian[r, CONSTANTS + 6] = scale * (u - k[2] if r == 0 else v - k[3])
+        jacobian[r, CONSTANTS + 6] = scale * (u - k[2] if r == 0 else v - k[3])
+        jacobian[r, CONSTANTS + 7] = 0.0
+    return squared

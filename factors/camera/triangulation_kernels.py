@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from factors.camera.kernels import Lens, inverse_depth, pixel
+from factors.camera.kernels import Lens, pixel
 from factors.compiled import compiled
 from factors.se2 import Array
 from factors.small_kernels import inverse, product, product_by_transpose, solved
@@ -18,30 +18,25 @@ FOUND, NONE, BEHIND = 0, 1, 2
 
 @compiled(error_model="numpy")
 def triangulated(
-    k: Lens, centres: Array, turns: Array, rays: Array, seen: Array, sigmas: Array, spread: float
+    k: Lens, centres: Array, turns: Array, rays: Array, pixels: Array, sigmas: Array, spread: float
 ) -> tuple[int, Array, Array, Array]:
     """How it ends, a point (3,), its covariance (3, 3) and squared whitened residuals (M,), seen by cameras at ``centres`` (M, 3)
     with rotations ``turns`` (M, 3, 3).
 
-    ``rays`` (M, 3): its directions in their frames; ``seen`` (M, 3): its pixels and inverses of its depths [1/m], NaN where none
-    was measured; ``sigmas`` (M, 2): standard deviations of each pixel coordinate and of the inverse depth. ``spread``: the largest
-    one of the point that is allowed, relative to its least depth. Without any depth, rays must not be nearly parallel.
+    ``rays`` (M, 3): its directions in their frames; ``pixels`` (M, 2) with standard deviations ``sigmas`` (M,) of each coordinate.
+    ``spread``: the largest standard deviation of the point that is allowed, relative to its least depth.
     """
     ways = np.empty_like(rays)
     for m in range(len(rays)):
         way = product(turns[m], rays[m].reshape(3, 1))
         ways[m, 0], ways[m, 1], ways[m, 2] = way[0, 0], way[1, 0], way[2, 0]
     covariance, squared = np.zeros((3, 3)), np.full(len(rays), np.inf)
-    point, is_deep = np.zeros(3), False
-    for m in range(len(rays)):
-        if seen[m, 2] > 0.0:
-            point, is_deep = centres[m] + ways[m] / (seen[m, 2] * rays[m, 2]), True
-    if not is_deep:
-        if product_by_transpose(ways, ways).min() > math.cos(MIN_PARALLAX):
-            return NONE, point, covariance, squared
-        point = _nearest(centres, ways)
+    point = np.zeros(3)
+    if product_by_transpose(ways, ways).min() > math.cos(MIN_PARALLAX):
+        return NONE, point, covariance, squared
+    point = _nearest(centres, ways)
     for iteration in range(ITERATIONS + 1):
-        told, pull, depth = _told(k, centres, turns, seen, sigmas, point, squared)
+        told, pull, depth = _told(k, centres, turns, pixels, sigmas, point, squared)
         if not depth > NEAREST:
             return BEHIND, point, covariance, squared
         covariance = inverse(told)
@@ -71,26 +66,22 @@ def _nearest(centres: Array, ways: Array) -> Array:
 
 @compiled(error_model="numpy")
 def _told(
-    k: Lens, centres: Array, turns: Array, seen: Array, sigmas: Array, point: Array, squared: Array
+    k: Lens, centres: Array, turns: Array, pixels: Array, sigmas: Array, point: Array, squared: Array
 ) -> tuple[Array, Array, float]:
     """The information (3, 3) on a point and its gradient (3, 1), and the least depth; ``squared`` residuals (M,) in place."""
-    told, pull, depth, row, error = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3), np.empty(3)
+    told, pull, depth, row, error = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3), np.empty(2)
     for m in range(len(centres)):
         local = product((point - centres[m]).reshape(1, 3), turns[m])
         depth = min(depth, local[0, 2])
         u, v, by_u, by_v = pixel(k, local[0, 0], local[0, 1], local[0, 2])
-        inverse, by_inverse = inverse_depth(local[0, 2])
-        error[0], error[1], error[2] = u - seen[m, 0], v - seen[m, 1], inverse - seen[m, 2]
+        error[0], error[1] = u - pixels[m, 0], v - pixels[m, 1]
         squared[m] = 0.0
-        for r in range(3 if seen[m, 2] > 0.0 else 2):
-            sigma = sigmas[m, 0] if r < 2 else sigmas[m, 1]
+        for r in range(2):
             d = by_u if r == 0 else by_v
-            if r == 2:
-                d = by_inverse
-            error[r] /= sigma
+            error[r] /= sigmas[m]
             squared[m] += error[r] ** 2
             for j in range(3):
-                row[j] = (turns[m, j, 0] * d[0] + turns[m, j, 1] * d[1] + turns[m, j, 2] * d[2]) / sigma
+                row[j] = (turns[m, j, 0] * d[0] + turns[m, j, 1] * d[1] + turns[m, j, 2] * d[2]) / sigmas[m]
             for i in range(3):
                 pull[i, 0] -= row[i] * error[r]
                 for j in range(3):

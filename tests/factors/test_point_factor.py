@@ -43,27 +43,9 @@ def test_it_is_gtsam_s_factor_of_a_robot_in_space(error, tilt):
     np.testing.assert_allclose(residual, -linear.jacobian()[1], atol=1e-6)
 
 
-def deep(error=0.0, pixel=(0.0, 0.0)):
-    """The same with its depth; errors of the inverse depth [1/m] and of the pixel."""
-    position, rotation = camera_pose(MODEL, POSE, TILT)
-    flat = seen(pixel)
-    return replace(flat, seen=np.append(flat.seen, 1.0 / ((POINT - position) @ rotation[:, 2]) + error))
-
-
-@pytest.mark.parametrize("error", [0.002, -0.05])
-def test_a_depth_counts_by_itself(error):
-    """Its loss is added, Huber's where it is wrong, and it takes nothing from that of the pixel."""
-    flat, with_depth = seen((3.0, -4.0)), deep(error, (3.0, -4.0))
-    values = [POSE, TILT, POINT]
-    loss = huber_loss((error / MODEL.depth_sigma) ** 2, MODEL.robust)
-    assert with_depth.cost(values) - flat.cost(values) == pytest.approx(loss)
-    np.testing.assert_allclose(with_depth.linearize(values)[0][:2], flat.linearize(values)[0])
-
-
 @pytest.mark.parametrize("estimated", [(), ESTIMATED])
-@pytest.mark.parametrize("there", [seen((0.5, -0.4)), deep(0.002), deep(0.02)], ids=["pixel", "depth", "wrong depth"])
-def test_its_jacobians_are_the_numerical_ones(there, estimated):
-    factor = replace(there, estimated=estimated, twist=TWIST)
+def test_its_jacobians_are_the_numerical_ones(estimated):
+    factor = replace(seen((0.5, -0.4)), estimated=estimated, twist=TWIST)
     values = [POSE, *([CHANGES] if estimated else []), TILT, POINT]
     residual, blocks = factor.linearize(values)
     for place, block in enumerate(blocks):
@@ -81,7 +63,6 @@ def test_its_jacobians_are_the_numerical_ones(there, estimated):
 def test_many_are_linearised_as_each_by_itself(estimated):
     rng = np.random.default_rng(0)
     pixels = seen().seen + rng.normal(0.0, 5.0, (4, 2))
-    pixels = [*pixels[:2], *(np.append(pixel, 0.2) for pixel in pixels[2:])]
     factors = [
         PointFactor(MODEL, lens_of(MODEL), pixel, estimated, (1.0 + i) * TWIST) for i, pixel in enumerate(pixels)
     ]

@@ -54,25 +54,6 @@ def test_what_is_written_comes_back(seen, one, tmp_path, format):
     assert copy.streams["sightings"].point == ["door", "lamp", "door"]
 
 
-@pytest.mark.parametrize("format", ["csv", "parquet"])
-def test_depth_images_have_the_names_of_images(seen, one, tmp_path, format):
-    assert one(seen).streams["camera"].depth == [None] * 3
-    (seen / "depth").mkdir()
-    for name in ("a", "c"):
-        (seen / "depth" / f"{name}.png").write_bytes(name.encode())
-    log = one(seen)
-    write_native(log, tmp_path / "copy", format=format)
-    for found in (log, one(tmp_path / "copy")):
-        depths = found.streams["camera"].depth
-        assert [file and file.read_bytes() for file in depths] == [b"a", None, b"c"]
-    assert sorted(file.name for file in (tmp_path / "copy" / "depth").iterdir()) == ["000000.png", "000002.png"]
-
-
-def test_depth_images_in_a_folder_that_links_outside_are_refused(seen, refused):
-    (seen / "depth").symlink_to("/etc")
-    refused(seen, "camera.csv: path 'depth' leaves its folder")
-
-
 def test_an_image_that_is_edited_in_a_copy_stays_as_it_was_in_the_original(seen, one, tmp_path):
     write_native(one(seen), tmp_path / "copy")
     with one(tmp_path / "copy").streams["camera"].file[0].open("r+b") as file:

@@ -5,7 +5,6 @@ import tracemalloc
 
 import cv2
 import numpy as np
-import pytest
 from rosbag_drive import MS, T0, add_frames, transform
 
 from factorgraph_loc.io.bags.camera import Images
@@ -53,34 +52,6 @@ def test_images_without_loss(maker, read_drive, one):
     assert [file.stat().st_mtime_ns for file in again.file] == before  # were not written again
     images.file[2].unlink()
     assert one(maker.path, reader="rosbag", options=options).streams["camera"].file[2].is_file()
-
-
-@pytest.mark.parametrize(
-    ("name", "place", "expected"),
-    [("metres", 0, [[500, 0, 2000], [0, 0, 0]]), ("aligned", 1, [[1234] * 3] * 2), ("packed", 3, [[7] * 3] * 2)],
-)
-def test_depth_images_belong_to_the_images_nearest_in_time(name, place, expected, maker, read_drive):
-    for i in range(4):
-        add_image(maker, T0 + 100 * i * MS, np.zeros((2, 3)), "mono8")
-    metres = np.array(((0.5, np.nan, 2.0004), (np.inf, 65.6, -1.0)))
-    add_image(maker, T0 + 5 * MS, metres, "32FC1", kind=np.float32, topic="/depth/metres")
-    add_image(maker, T0 + 90 * MS, np.full((2, 3), 1234), "16UC1", kind=np.uint16, topic="/depth/aligned")
-    add_image(maker, T0 + 230 * MS, np.full((2, 3), 1235), "16UC1", kind=np.uint16, topic="/depth/aligned")
-    packed = bytes(12) + cv2.imencode(".png", np.full((2, 3), 7, dtype=np.uint16))[1].tobytes()
-    maker.write(
-        "/depth/packed",
-        T0 + 300 * MS,
-        "sensor_msgs/msg/CompressedImage",
-        header=maker.header(T0 + 300 * MS, "camera"),
-        format="16UC1; compressedDepth png",
-        data=np.frombuffer(packed, dtype=np.uint8),
-    )
-    log = read_drive(maker, camera={"topic": "/camera/image_raw", "depth": f"/depth/{name}"})
-    files = log.streams["camera"].depth
-    assert [i for i, file in enumerate(files) if file is not None] == [place]
-    found = cv2.imread(str(files[place]), cv2.IMREAD_UNCHANGED)
-    assert found.dtype == np.uint16
-    np.testing.assert_array_equal(found, expected)
 
 
 def test_images_that_another_process_has_written_meanwhile_are_left_as_they_are(maker, read_drive, one, monkeypatch):

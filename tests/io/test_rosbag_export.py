@@ -115,7 +115,7 @@ def test_all_measurements_come_back(tmp_path_factory, log, suffix):
 
 @pytest.fixture
 def log(tmp_path):
-    """Velocities, two images with one depth image, a start, a reference, a rig and a map."""
+    """Velocities, two images, a start, a reference, a rig and a map."""
     files = []
     for i, content in enumerate((b"\xff\xd8\xff one", b"\x89PNG two")):
         files.append(tmp_path / f"{i}.{'jpg' if i == 0 else 'png'}")
@@ -125,7 +125,7 @@ def log(tmp_path):
         "drive",
         Rig(name="cart"),
         World(name="hall", tags={"E1": Tag(x=1.0, y=2.0)}),
-        {"odometry": VelocityStream(t, t, t), "camera": ImageStream(t + 0.1, files, depth=[None, files[1]])},
+        {"odometry": VelocityStream(t, t, t), "camera": ImageStream(t + 0.1, files)},
         reference=Trajectory(t, np.array(((1.0, 2.0, 3.0), (1.5, 2.0, -3.1)))),
         start=StartPose(0.25, np.array((1.0, 2.0, 3.0)), np.array((0.1, 0.2, 0.3))),
         t0_ns=T0,
@@ -139,8 +139,6 @@ def test_images_start_reference_rig_and_map_come_back(log, tmp_path, suffix, mon
     assert [path.name for path in written] == [f"drive{suffix}", "drive.rig.toml", "drive.world.toml"]
     found = back(tmp_path / f"drive{suffix}")
     assert [file.read_bytes() for file in found.streams["camera"].file] == [b"\xff\xd8\xff one", b"\x89PNG two"]
-    nothing, deep = found.streams["camera"].depth
-    assert (nothing, deep.read_bytes()) == (None, b"\x89PNG two")
     np.testing.assert_allclose(found.streams["camera"].t, (0.1, 0.6), atol=1e-9)
     np.testing.assert_allclose(found.reference.poses, log.reference.poses, atol=1e-12)
     np.testing.assert_allclose(found.start.pose, log.start.pose, atol=1e-12)

@@ -181,20 +181,16 @@ def test_usual_names_of_ranges(paths, expected):
     assert range_fields(paths) == expected
 
 
-@pytest.mark.parametrize("deep", ["/front/depth/compressed", "/front/aligned_depth_to_color/compressed"])
-def test_images_and_what_tells_of_their_camera(deep, proposal):
+def test_images_and_what_tells_of_their_camera(proposal):
     def fill(made):
         made.odometry("/odom", T0, (0.0, 0.0, 0.0))
-        for topic in ("/front/image_raw/compressed", deep):
+        for topic in ("/front/image_raw/compressed", "/front/depth/compressed"):
             kind = "sensor_msgs/msg/CompressedImage"
             made.write(topic, T0, kind, header=made.header(T0), format="jpeg", data=np.zeros(3, dtype=np.uint8))
 
     found, _, text = proposal(fill)
-    is_aligned = "aligned" in deep
-    depth = {"depth": deep} if is_aligned else {}
-    assert found.options["camera"] == {"topic": "/front/image_raw/compressed", **depth}
+    assert found.options["camera"] == {"topic": "/front/image_raw/compressed"}
     assert "no CameraInfo belongs to the images" in text
-    assert (f"{deep} is not used: if its depth images are as seen by the camera" in text) != is_aligned
 
 
 def test_what_is_proposed_of_odometry_and_a_gyro_is_used_by_a_run(proposal, tmp_path):

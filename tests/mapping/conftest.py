@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.mapping.feature_tracks import depths_of
 from factorgraph_loc.mapping.triangulation import Cameras, Tracks
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera.model import CameraModel, project
@@ -30,7 +29,7 @@ class Sight:
         point = np.concatenate(self.shown)
         pixels = np.concatenate([f.pixels for f in self.frames])
         feature = np.concatenate([np.arange(len(s)) for s in self.shown])
-        every = Tracks(point, frame, feature, pixels, depths_of(self.frames, frame, feature))
+        every = Tracks(point, frame, feature, pixels)
         return every.kept(np.bincount(point)[point] >= 2)
 
     def moved(self, rng: np.random.Generator, turn: float, shift: float) -> Cameras:
@@ -53,7 +52,6 @@ def look() -> Callable[..., Sight]:
         points: int = 150,
         noise: float = 1.0,
         arc: float = 0.6,
-        depth: bool = False,
     ) -> Sight:
         model = CameraModel(
             525.0, 520.0, 320.0, 240.0, 640, 480, distortion=(0.05, -0.02, 0.001, 0.0), sigma=max(noise, 0.1)
@@ -70,12 +68,10 @@ def look() -> Callable[..., Sight]:
             local = (cloud - positions[i]) @ rotations[i]
             pixels = project(model, local) + noise * rng.standard_normal((points, 2))
             seen = rng.permutation(np.flatnonzero(model.contains(pixels) & (local[:, 2] > 0.1)))
-            noisy = 1.0 / local[seen, 2] + model.depth_sigma * rng.standard_normal(len(seen)) if depth else None
             descriptors = looks[seen] + 0.1 * rng.standard_normal((len(seen), 16)).astype(np.float32)
             numbers = np.arange(len(seen))
-            deep = None if noisy is None else 1.0 / noisy
             sizes = np.full(len(seen), 4.0)
-            frames.append(CameraFrame(0.1 * i, "sift", pixels[seen], sizes, descriptors, numbers, deep))
+            frames.append(CameraFrame(0.1 * i, "sift", pixels[seen], sizes, descriptors, numbers))
             shown.append(seen)
         return Sight(model, cloud, cameras, frames, shown)
 

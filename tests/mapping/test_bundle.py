@@ -9,8 +9,7 @@ from gtsam.symbol_shorthand import L, X
 from scipy.stats import chi2
 
 from factorgraph_loc.mapping.bundle import Known, adjust, marginals, pose3
-from factorgraph_loc.mapping.triangulation import Cameras, Tracks, triangulate
-from factors.camera.depth import linearize_inverse_depth
+from factorgraph_loc.mapping.triangulation import Tracks, triangulate
 from factors.camera.model import project, recalibrated
 
 
@@ -23,20 +22,6 @@ def offsets(sight, cameras):
     true = sight.cameras
     pairs = zip(true.positions, true.rotations, cameras.positions, cameras.rotations, strict=True)
     return np.array([gtsam.Pose3.Logmap(pose3(p, r).between(pose3(q, s))) for p, r, q, s in pairs])
-
-
-def inverse_depth(sight, i, k):
-    """The inverse depth of a point of a camera, as a factor of its own."""
-
-    def error(_, values, jacobians):
-        pose = values.atPose3(X(i))
-        rotation, local = pose.rotation().matrix(), pose.transformTo(values.atPoint3(L(k)))
-        _, by_camera, by_point = linearize_inverse_depth(rotation[None], local[None])
-        if jacobians is not None:
-            jacobians[0], jacobians[1] = by_camera, by_point
-        return np.zeros(1)
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, sight.model.depth_sigma), [X(i), L(k)], error)
 
 
 def test_wrong_poses_are_mended(look):
@@ -67,9 +52,8 @@ def test_outliers_are_left_out(look):
     assert np.median(np.linalg.norm(made.points - sight.points[old[made.old]], axis=1)) < 0.01
 
 
-@pytest.mark.parametrize("depth", [False, True])
-def test_covariances_are_those_of_gtsam(look, depth):
-    sight = look(np.random.default_rng(2), count=5, points=20, depth=depth)
+def test_covariances_are_those_of_gtsam(look):
+    sight = look(np.random.default_rng(2), count=5, points=20)
     tracks, old = sight.tracks()
     points, covariances = sight.points[old], prior(5, 0.01, 0.02)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -84,9 +68,6 @@ def test_covariances_are_those_of_gtsam(look, depth):
     calibration = sight.model.calibration()
     for k, i, pixel in zip(tracks.track.tolist(), tracks.frame.tolist(), tracks.pixels, strict=True):
         graph.add(gtsam.GenericProjectionFactorCal3DS2(pixel, noise, X(i), L(k), calibration))
-    if depth:
-        for k, i in zip(tracks.track.tolist(), tracks.frame.tolist(), strict=True):
-            graph.add(inverse_depth(sight, i, k))
     expected = gtsam.Marginals(graph, values)
     known = Known(np.zeros(1, dtype=int), points[:1], 1e-4 * np.eye(3)[None])
     of_cameras, of_points = marginals(sight.model, sight.cameras, np.linalg.inv(covariances), tracks, points, known)
@@ -110,24 +91,6 @@ def test_covariances_are_right(look):
         squared.append(error @ np.linalg.solve(made.camera_covariances[0], error))
     low, high = chi2.ppf((0.0005, 0.9995), 6 * len(squared))
     assert low < np.sum(squared) < high
-
-
-def test_depths_tell_the_scale(look):
-    """All that is known of the cameras is 2 % too large; an outlier of a depth in twenty changes nothing."""
-    rng = np.random.default_rng(6)
-    sight = look(rng, noise=0.5, depth=True)
-    tracks, old = sight.tracks()
-    tracks.depths[rng.random(len(tracks)) < 0.05] *= 1.3
-    middle = sight.points.mean(axis=0)
-    larger = Cameras(middle + 1.02 * (sight.cameras.positions - middle), sight.cameras.rotations)
-    start = middle + 1.02 * (sight.points[old] - middle)
-    weak = prior(len(larger), 0.05, 0.2)
-    made = adjust(sight.model, larger, weak, tracks, start)
-    without = adjust(sight.model, larger, weak, replace(tracks, depths=None), start)
-    for found, low, high in ((made, 0.998, 1.002), (without, 1.015, 1.025)):
-        size, true = (np.linalg.norm(p - p.mean(axis=0)) for p in (found.points, sight.points[old[found.old]]))
-        assert low < size / true < high
-    assert 0.02 < np.mean(np.isnan(made.tracks.depths)) < 0.06
 
 
 def test_the_focal_length_can_be_found(look):

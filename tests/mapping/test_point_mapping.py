@@ -51,24 +51,6 @@ def test_points_are_where_they_are_and_known_so_well(look):
     assert low < np.mean(scaled) < high
 
 
-def test_depths_make_a_map_where_rays_are_nearly_parallel(look):
-    """Squared errors in units of their covariances, as above: 1 false alarm in 1000."""
-    scaled = []
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        sight = look(rng, noise=0.8, points=120, arc=0.01, count=6, depth=True)
-        given = posed(sight, sight.moved(rng, 0.005, 0.01), 0.005, 0.01)
-        made = map_points(sight.model, given, ALL)
-        assert len(made.points) > 60
-        error = made.points.positions - sight.points[nearest(sight, made)]
-        scaled.append(np.mean(np.einsum("pi,pij,pj->p", error, np.linalg.inv(made.points.covariances), error)))
-    low, high = chi2.ppf((0.0005, 0.9995), 3 * len(scaled)) / len(scaled)
-    assert low < np.mean(scaled) < high
-    flat = replace(given, frames=[replace(frame, depths=None) for frame in given.frames])
-    with pytest.raises(RunFailedError):
-        map_points(sight.model, flat, ALL)
-
-
 def test_the_report_tells_what_was_done(look):
     rng = np.random.default_rng(1)
     sight = look(rng, noise=0.6)

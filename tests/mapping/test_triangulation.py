@@ -30,29 +30,6 @@ def test_covariances_tell_how_far_points_are_off(look):
     assert 0.96 * low < np.mean(squared) < 1.04 * high
 
 
-def test_covariances_tell_how_far_points_with_depths_are_off(look):
-    """The same with depths, most of the information where rays are nearly parallel."""
-    squared = []
-    for seed in range(5):
-        sight = look(np.random.default_rng(seed), noise=0.8, arc=0.01, count=4, depth=True)
-        tracks, old = sight.tracks()
-        found = triangulate(sight.model, sight.cameras, tracks)
-        assert found.good(tracks, sight.model).all()
-        error = found.positions - sight.points[old]
-        squared += np.einsum("ti,tij,tj->t", error, np.linalg.inv(found.covariances), error).tolist()
-    low, high = chi2.ppf((0.0005, 0.9995), 3 * len(squared)) / len(squared)
-    assert 0.96 * low < np.mean(squared) < 1.04 * high
-
-
-def test_a_wrong_depth_pulls_little(look):
-    sight = look(np.random.default_rng(1), noise=0.5, points=40, depth=True)
-    tracks, old = sight.tracks()
-    first = np.unique(tracks.track, return_index=True)[1]
-    tracks.depths[first] *= 1.5
-    found = triangulate(sight.model, sight.cameras, tracks)
-    assert np.median(np.linalg.norm(found.positions - sight.points[old], axis=1)) < 0.01  # m
-
-
 def test_a_wrong_observation_pulls_little(look):
     sight = look(np.random.default_rng(1), noise=0.5, points=40)
     tracks, old = sight.tracks()

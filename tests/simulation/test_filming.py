@@ -84,24 +84,6 @@ def test_a_log_gets_its_images(tmp_path, made):
         assert np.abs(read - made[i]).mean() < 4.0  # what the file's compression takes
 
 
-def test_a_camera_that_measures_depths_gets_depth_images_too(tmp_path):
-    """Of half a millimetre a value, with the noise of the rig: a mean square within 1 % of it has a standard deviation of 0.3 %."""
-    unit, sigma = 0.0005, 0.01
-    settings = preset(
-        "office",
-        {**SETTINGS, "drive": {"duration": 1.0}, "rig": {"camera": {"depth": {"unit": unit, "inverse_sigma": sigma}}}},
-    )
-    log, made = with_images(simulate(settings, 6), settings, 6, tmp_path), film(settings, 6)
-    stream = log.streams["camera"]
-    read = cv2.imread(str(stream.depth[1]), cv2.IMREAD_UNCHANGED)
-    pose = made.truth.at(made.times[1:2])[0]
-    true = made.renderer.depths(*reprojection.camera_pose(made.renderer.model, pose))
-    assert (read.shape, read.dtype) == (true.shape, np.uint16)
-    assert np.all(read > 0)
-    errors = 1.0 / (unit * read) - 1.0 / true
-    assert np.mean(np.square(errors)) == pytest.approx(sigma**2, rel=0.01)
-
-
 def test_several_processes_write_the_same_files(tmp_path, monkeypatch):
     monkeypatch.setattr("factorgraph_loc.simulation.filming.FEW", 0)
     settings = preset("office", {**SETTINGS, "drive": {"duration": 2.0}})

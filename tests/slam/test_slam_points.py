@@ -18,9 +18,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
 from factorgraph_loc.sensors.camera.stream import FeatureStream, SightingStream
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
-from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factors import se2
-from factors.camera.model import predict
 
 UNKNOWN = {"landmarks": "unknown"}
 CONFIGS = {
@@ -225,37 +223,6 @@ def with_features(log, lifetime, seed=5, points=None):
     streams = {"odometry": log.streams["odometry"], "camera": FeatureStream(times, frames)}
     rig = log.rig.model_copy(update={"sensors": ("odometry", "camera")})
     return replace(log, rig=rig, streams=streams, world=World())
-
-
-def with_depths(film, wrong=0.0, seed=7):
-    """The features with depths, of which a share is 1 m too large; one in ten is missing."""
-    rng, model, points = np.random.default_rng(seed), film.rig.camera.model(), camera_world.room().positions
-    stream = film.streams["camera"]
-    frames = []
-    for found, pose in zip(stream.frame, film.reference.at(stream.t), strict=True):
-        pixels, depths = predict(model, pose, points)
-        off = np.linalg.norm(found.pixels[:, None] - pixels, axis=2)
-        shown = off.argmin(axis=1)
-        noise = model.depth_sigma * rng.standard_normal(len(shown))
-        measured = 1.0 / (1.0 / depths[shown] + noise) + (rng.random(len(shown)) < wrong)
-        seen = (off.min(axis=1) < 5.0) & (rng.random(len(shown)) < 0.9)
-        frames.append(replace(found, depths=np.where(seen, measured, np.nan)))
-    return replace(film, streams={**film.streams, "camera": replace(stream, frame=frames)})
-
-
-@pytest.mark.parametrize(("name", "wrong"), [("smoother", 0.1), ("batch", 0.0)])
-def test_depths_tell_the_scale(log, name, wrong):
-    """The wheels report 8 % too much, which the rig allows for."""
-    wheels = log.streams["odometry"]
-    film = with_features(log, 4.0)
-    odometry = film.rig.odometry.model_copy(update={"uncertainty": OdometryUncertainty(scale_distance=0.1)})
-    rig = film.rig.model_copy(update={"odometry": odometry})
-    film = replace(film, rig=rig, streams={**film.streams, "odometry": replace(wheels, v=1.08 * wheels.v)})
-    flat, deep = (run(one, CONFIGS[name]) for one in (film, with_depths(film, wrong)))
-    value, sigma = deep.learnt.values["scale_distance"]
-    assert value == pytest.approx(1.0 / 1.08 - 1.0, abs=0.02)
-    assert sigma < 0.3 * flat.learnt.values["scale_distance"][1]
-    assert rmse(deep, log) < rmse(flat, log)
 
 
 @pytest.mark.parametrize("name", ["smoother", "batch"])

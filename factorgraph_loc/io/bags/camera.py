@@ -1,6 +1,6 @@
 """Images in a bag, which are extracted to the user's cache folder, as a log refers to files.
 
-Compressed images are written unchanged, others as PGM or PPM without loss, depths in metres in millimetres.
+Compressed images are written unchanged, others as PGM or PPM without loss.
 """
 
 import csv
@@ -31,20 +31,13 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png", b"RIFF": ".webp", b"BM": ".bmp", b"P5": ".pgm", b"P6": ".ppm"}
 INDEX = "images.csv"
-PACKED = 12  # bytes before a depth image that `compressed_depth_image_transport` compressed as PNG
 LOCK = ".lock"  # held while a folder of images is moved into place
 COLUMNS = ("row", "header", "received", "file")
 Pixels = NDArray[Any]
 _Row = tuple[int, int, int, str]  # number, timestamp of the header [ns], time of receipt [ns], file
 
 
-def _millimetres(metres: Pixels) -> Pixels:
-    """Depths of 16 bits, 0 where there is none or it is too large."""
-    depths = np.rint(1e3 * metres)
-    return np.where((depths > 0) & (depths < np.iinfo(np.uint16).max), depths, 0).astype(np.uint16)
-
-
-# conversion of channels to red, green, blue, or of depths
+# conversion of channels to red, green, blue
 ENCODINGS: dict[str, tuple[type, int, Callable[[Pixels], Pixels]]] = {
     "mono8": (np.uint8, 1, lambda p: p),
     "8UC1": (np.uint8, 1, lambda p: p),
@@ -59,7 +52,6 @@ ENCODINGS: dict[str, tuple[type, int, Callable[[Pixels], Pixels]]] = {
     "bayer_bggr8": (np.uint8, 1, lambda p: cv2.cvtColor(p, cv2.COLOR_BayerBGGR2RGB)),
     "bayer_gbrg8": (np.uint8, 1, lambda p: cv2.cvtColor(p, cv2.COLOR_BayerGBRG2RGB)),
     "bayer_grbg8": (np.uint8, 1, lambda p: cv2.cvtColor(p, cv2.COLOR_BayerGRBG2RGB)),
-    "32FC1": (np.float32, 1, _millimetres),
 }
 
 
@@ -70,8 +62,6 @@ class CameraTopic(FileModel):
     """name of the topic"""
     info: str | None = None
     """topic with lens, size and frame of the camera"""
-    depth: str | None = None
-    """topic with depth images of the same size, as seen by the same camera, in millimetres; as 32FC1 in metres"""
     clock: Clock | None = None
     """timestamps of message headers or of receipt; by default as for the bag"""
 
@@ -103,8 +93,6 @@ class Images:
         where = f"{self._source}:{item.row}"
         if self._compressed:
             content = item.message.data.tobytes()
-            if str(item.message.format).startswith("16UC1; compressedDepth"):
-                content = content[PACKED:]
             suffix = next((suffix for magic, suffix in MAGIC.items() if content.startswith(magic)), None)
             if suffix is None:
                 raise InputError(f"{where}: format is {quoted(item.message.format)}, expected JPEG, PNG, WebP or BMP")

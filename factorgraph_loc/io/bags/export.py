@@ -35,7 +35,6 @@ from factors.se2 import Array
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-DEPTHS = "/camera/aligned_depth/image/compressed"
 MAP, ODOM, BASE, CAMERA = "map", "odom", "base_link", "camera"
 FRAMES = {"sightings": CAMERA}  # frames of tables, if not the robot frame
 PNG_OR_JPEG = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
@@ -98,11 +97,6 @@ def _write(log: Log, folder: Path, suffix: str) -> Path:
 def _sources(log: Log, build: _Builder) -> list[Iterator[Message]]:
     """The messages of each stream in order of arrival."""
     sources = [_arriving(_of_stream(name, stream, log, build)) for name, stream in log.streams.items()]
-    sources += [
-        _arriving(_of_depths(stream, log.t0_ns, build))
-        for stream in log.streams.values()
-        if isinstance(stream, ImageStream)
-    ]
     if log.reference is not None:
         sources.append(_arriving(_of_reference(log.reference, log.t0_ns, build)))
     if log.start is not None:
@@ -217,13 +211,6 @@ def _imu(stream: YawRateStream, build: _Builder) -> Iterator[dict[str, Any]]:
             "linear_acceleration": build.vector(0.0, 0.0, 0.0),
             "linear_acceleration_covariance": unknown,
         }
-
-
-def _of_depths(stream: ImageStream, t0_ns: int, build: _Builder) -> Iterator[Message]:
-    there = [i for i, file in enumerate(stream.depth) if file is not None]
-    files = [file for file in stream.depth if file is not None]
-    t_ns = absolute(stream.t[there], t0_ns).tolist()
-    return _stamped(DEPTHS, COMPRESSED, t_ns, _images(files), CAMERA, build)
 
 
 def _images(files: Iterable[Path]) -> Iterator[dict[str, Any]]:

@@ -19,7 +19,6 @@ from factorgraph_loc.text import listed
 TRUTH = re.compile(
     r"truth|(^|[/_])gt($|[/_])|reference|mocap|vicon|optitrack|qualisys|total_station|leica", re.IGNORECASE
 )
-ALIGNED = re.compile("aligned|registered", re.IGNORECASE)  # depth images as the camera sees them
 LEFT, RIGHT = re.compile("left", re.IGNORECASE), re.compile("right", re.IGNORECASE)
 WHEEL, SPEED = re.compile("wheel", re.IGNORECASE), re.compile("speed|vel|rate|rpm", re.IGNORECASE)
 SCALARS = {f"std_msgs/msg/{name}" for name in ("Float32", "Float64", "Int8", "Int16", "Int32", "Int64")}
@@ -201,8 +200,7 @@ def _reference(out: Proposal, topics: Sequence[Topic], tree: Tree) -> None:
 
 def _camera(out: Proposal, topics: Sequence[Topic]) -> None:
     found = [topic for topic in topics if topic.type in {COMPRESSED, RAW}]
-    deep = [topic for topic in found if "depth" in topic.name.lower()]
-    images = [topic for topic in found if topic not in deep]
+    images = [topic for topic in found if "depth" not in topic.name.lower()]
     if not images:
         return
     infos = {topic.name.rsplit("/", 1)[0]: topic for topic in topics if topic.type == INFO}
@@ -217,14 +215,6 @@ def _camera(out: Proposal, topics: Sequence[Topic]) -> None:
     else:
         out.notes.append("no CameraInfo belongs to the images: the rig has to describe the camera")
     _others(out, "camera", images[1:])
-    aligned = [topic for topic in deep if ALIGNED.search(topic.name)]
-    if aligned:
-        out.options["camera"]["depth"] = aligned[0].name
-        out.uses[aligned[0].name] = "camera: depth"
-    elif deep:
-        out.notes.append(
-            f"{deep[0].name} is not used: if its depth images are as seen by the camera, name it as `depth` of the camera"
-        )
 
 
 def _tables(out: Proposal, topics: Sequence[Topic]) -> None:

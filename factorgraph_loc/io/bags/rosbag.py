@@ -31,7 +31,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import PosePath
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.settings import CameraSettings, DepthSettings
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.text import listed, plain, told
@@ -168,7 +168,6 @@ class Gathered:
     rfid: Reads | None = None
     bearing_range: Landmarks | None = None
     camera: Images | None = None
-    depth: Images | None = None
     info: Info | None = None
     sightings: PixelsOfPoints | None = None
     reference: Poses | FrameReference | None = None
@@ -193,8 +192,8 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     if isinstance(motion, WheelMotion) and motion.right is not None:
         listeners.add(motion.right.topic, motion.right, listeners.stamper(motion.right.topic, options.odometry.clock))
     gathered = _listen(listeners, options)
-    for images in filter(None, (gathered.camera, gathered.depth)):
-        stack.callback(images.discard)
+    if gathered.camera:
+        stack.callback(gathered.camera.discard)
     listeners.run()
 
     clock, warnings = bag_clock.report(listeners.stampers, options.clock)
@@ -208,8 +207,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     if gathered.bearing_range:
         streams["bearing_range"] = gathered.bearing_range.stream(frames, options.base_frame, t0_ns, warnings)
     if gathered.camera:
-        seen = gathered.camera.stream(t0_ns, warnings)
-        streams["camera"] = seen.with_depths(gathered.depth.stream(t0_ns, warnings)) if gathered.depth else seen
+        streams["camera"] = gathered.camera.stream(t0_ns, warnings)
     if gathered.sightings:
         streams["sightings"] = gathered.sightings.stream(t0_ns, warnings)
     streams |= {name: rows.stream(t0_ns, warnings) for name, rows in gathered.others.items()}
@@ -276,8 +274,6 @@ def _listen(listeners: Listeners, options: Options) -> Gathered:
 
 def _listen_to_camera(listeners: Listeners, options: CameraTopic, out: Gathered) -> None:
     out.camera = _listen_to_images(listeners, options.topic, options.clock)
-    if options.depth:
-        out.depth = _listen_to_images(listeners, options.depth, options.clock)
     if options.info:
         out.info = Info(listeners.bag, options.info)
         listeners.add(options.info, out.info, listeners.stamper(options.info, None), timed=False)
@@ -311,8 +307,6 @@ def _rig(
     """The rig from the bag; a rig in the manifest replaces it."""
     base = options.base_frame
     camera = camera_of(gathered.info, frames, base, notes) if gathered.info else None
-    if camera is not None and gathered.depth:
-        camera = camera.model_copy(update={"depth": DepthSettings()})
     reads = streams.get("rfid")
     rfid = None
     if options.rfid and isinstance(reads, RfidStream) and reads.antenna:

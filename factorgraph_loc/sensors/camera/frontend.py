@@ -22,7 +22,6 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.processes import ProcessDiedError, run_each
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
-from factorgraph_loc.vision.depth import depths_at
 from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder
 from factorgraph_loc.vision.features import Extractor, extractor
 from factorgraph_loc.vision.found import ImageFeatures, decode, encode
@@ -32,7 +31,6 @@ from factorgraph_loc.vision.keypoints import Integers
 from factorgraph_loc.vision.settings import FrontendSettings
 from factorgraph_loc.vision.tracks import follow
 from factors.camera.model import CameraModel
-from factors.se2 import Array
 
 # what features depend on, and what tracks depend on in addition
 FEATURE_CODE = (
@@ -87,38 +85,14 @@ def with_features(
     images = _features(stream.file, settings, (camera.width, camera.height), kept, progress or (lambda _: None))
     _require_calibrated(log, images, camera)
     found = [image.found or _nothing(settings) for image in images]
-    depths, faults = _depths(log, stream, found)
     tracks = _tracks(stream, images, found, settings, camera, kept)
     frames = [
-        CameraFrame(t, settings.feature, f.pixels, f.sizes, f.descriptors, numbers, depth)
-        for t, f, numbers, depth in zip(stream.t.tolist(), found, tracks, depths, strict=True)
+        CameraFrame(t, settings.feature, f.pixels, f.sizes, f.descriptors, numbers)
+        for t, f, numbers in zip(stream.t.tolist(), found, tracks, strict=True)
     ]
     streams = dict(log.streams) | {"camera": FeatureStream(stream.t, frames)}
     unkept = (f"features are not cached, {kept.fault}",) if kept.fault else ()
-    return replace(log, streams=streams), (*_doubts(log, images), *faults, *unkept)
-
-
-def _depths(
-    log: Log, stream: ImageStream, found: Sequence[ImageFeatures]
-) -> tuple[list[Array | None], tuple[str, ...]]:
-    """The depths of each image's features, None without a depth image, and warnings."""
-    camera = log.rig.of(CameraSettings)
-    depths: list[Array | None] = [None] * len(found)
-    if camera.depth is None:
-        unused = sum(file is not None for file in stream.depth)
-        told = f"{log.name}: {unused} depth images are not used, as the rig {log.rig.name} has no [camera.depth]"
-        return depths, (told,) if unused else ()
-    faults = []
-    for i, (file, features) in enumerate(zip(stream.depth, found, strict=True)):
-        if file is None:
-            continue
-        try:
-            depths[i] = depths_at(file, features.pixels, (camera.width, camera.height), camera.depth.unit)
-        except InputError as error:
-            faults.append(str(error))
-    if not faults:
-        return depths, ()
-    return depths, (f"{log.name}: {len(faults)} depth images cannot be used, the first is {faults[0]}",)
+    return replace(log, streams=streams), (*_doubts(log, images), *unkept)
 
 
 def _features(

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.sensors.camera.settings import DepthSettings
-from factorgraph_loc.vision.depth import depths_in
 from factorgraph_loc.vision.features import extractor
 from factorgraph_loc.vision.found import ImageFeatures, decode, encode
 from factorgraph_loc.vision.frame import CameraFrame
@@ -32,31 +30,26 @@ class _RecentImage:
 class LiveFrontend:
     """Detects and tracks features, keeping the last two images. Not thread-safe."""
 
-    def __init__(self, settings: FrontendSettings, camera: CameraModel, depth: DepthSettings | None = None) -> None:
-        self._feature, self._camera, self._depth = settings.feature, camera, depth
+    def __init__(self, settings: FrontendSettings, camera: CameraModel) -> None:
+        self._feature, self._camera = settings.feature, camera
         self._extractor = extractor(settings.feature, settings.count, everywhere=settings.everywhere)
         self._last: deque[_RecentImage] = deque(maxlen=2)
         self._following = 0
 
-    def frame(self, t: float, image: object, depth: object = None) -> CameraFrame:
-        """The features of an image taken at ``t`` [s], an array as in :func:`~factorgraph_loc.vision.images.as_image`; with their
-        depths, if there is a ``depth`` image.
+    def frame(self, t: float, image: object) -> CameraFrame:
+        """The features of an image taken at ``t`` [s], an array as in :func:`~factorgraph_loc.vision.images.as_image`.
 
-        InputError if these are not such arrays, or have another size than the camera is calibrated for, or it measures no depths.
+        InputError if it is no such array, or has another size than the camera is calibrated for.
         """
-        if depth is not None and self._depth is None:
-            raise InputError(f"depth image at {t:.3f} s: the rig has no [camera.depth] with the unit of its values")
         pixels = as_image(image, f"image at {t:.3f} s")
         height, width = pixels.shape[:2]
         if (width, height) != (self._camera.width, self._camera.height):
             raise InputError(
                 f"image at {t:.3f} s: has {width} x {height} px, expected {self._camera.width} x {self._camera.height}"
             )
-        found, depths = decode(encode(*self._extractor.detectAndCompute(pixels))), None
-        if depth is not None and self._depth is not None:
-            depths = depths_in(depth, found.pixels, (width, height), self._depth.unit, f"depth image at {t:.3f} s")
+        found = decode(encode(*self._extractor.detectAndCompute(pixels)))
         numbers = self._follow(found)
-        return CameraFrame(t, self._feature, found.pixels, found.sizes, found.descriptors, numbers, depths)
+        return CameraFrame(t, self._feature, found.pixels, found.sizes, found.descriptors, numbers)
 
     def _follow(self, found: ImageFeatures) -> Integers:
         """Track numbers (K,) of the features of the next image; see :func:`~factorgraph_loc.vision.tracks.follow`."""

@@ -44,15 +44,6 @@ class CameraUncertainty(FileModel):
     """standard deviation of the constant"""
 
 
-class DepthSettings(FileModel):
-    """Depth images beside the images, of the same size and as seen by the same camera: the depth along the optical axis."""
-
-    unit: Annotated[float, Field(gt=0.0, le=1.0), InUnit("m")] = 0.001
-    """depth that a value of 1 stands for; 0 and 65535 stand for none"""
-    inverse_sigma: Annotated[float, Field(ge=1e-6, le=10.0), InUnit("1/m")] = 0.003
-    """standard deviation of the inverse of a depth: 3 mm at 1 m, 27 mm at 3 m"""
-
-
 class CameraSettings(SensorSettings):
     """A camera. See :class:`factors.camera.model.CameraModel` for the model."""
 
@@ -91,8 +82,6 @@ class CameraSettings(SensorSettings):
     """exponent of the likelihood of features matched with a map, whose errors are correlated between images"""
     exact_survey: Annotated[float, Field(ge=0.0, le=10.0)] = 0.2
     """named points whose survey has a sigma below this share of what pixel_sigma is at 3 m are not estimated"""
-    depth: DepthSettings | None = None
-    """depth images"""
     frontend: FrontendSettings = FrontendSettings()
     """features that are detected in images"""
     uncertainty: CameraUncertainty = CameraUncertainty()
@@ -122,5 +111,4 @@ class CameraSettings(SensorSettings):
             sigma=self.pixel_sigma,
             robust=self.robust,
             tempering=self.tempering,
-            depth_sigma=(self.depth or DepthSettings()).inverse_sigma,
         )

@@ -12,8 +12,6 @@ from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.se2 import Array
 
-APART = 0.02  # s between an image and its depth image
-
 
 @dataclass(frozen=True)
 class SightingStream(Stream):
@@ -31,24 +29,9 @@ class SightingStream(Stream):
 
 @dataclass(frozen=True)
 class ImageStream(Stream):
-    """Image files (N,), and the depth image (N,) of each, or None; by default all None.
-    :mod:`factorgraph_loc.sensors.camera.frontend` turns them into features."""
+    """Image files (N,). :mod:`factorgraph_loc.sensors.camera.frontend` turns them into features."""
 
     file: Sequence[Path]
-    depth: Sequence[Path | None] = ()
-
-    def __post_init__(self) -> None:
-        if not self.depth:
-            object.__setattr__(self, "depth", [None] * len(self.file))
-
-    def with_depths(self, depths: "ImageStream") -> "ImageStream":
-        """The images with the depth image of each: the one nearest in time, at most :data:`APART` from it."""
-        near = [int(np.abs(depths.t - t).argmin()) if len(depths.t) else -1 for t in self.t]
-        files = [
-            depths.file[i] if i >= 0 and abs(depths.t[i] - t) <= APART else None
-            for i, t in zip(near, self.t, strict=True)
-        ]
-        return replace(self, depth=files)
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         raise InputError("images have no measurements before feature detection")

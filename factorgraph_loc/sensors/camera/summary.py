@@ -22,11 +22,10 @@ SHOWN = 5  # names in a line
 
 @dataclass(frozen=True)
 class ImageSummary:
-    """The images: their number, and that of ``depths`` images; of the ``looked_at`` examined ones how many are ``readable``, their
-    ``sizes`` (WIDTHxHEIGHT: count), the median number of ``features``, and the first ``fault``."""
+    """The images: their number; of the ``looked_at`` examined ones how many are ``readable``, their ``sizes`` (WIDTHxHEIGHT:
+    count), the median number of ``features``, and the first ``fault``."""
 
     images: int
-    depths: int
     looked_at: int
     readable: int
     sizes: Mapping[str, int]
@@ -52,9 +51,9 @@ def summarize(log: Log) -> Summary:
     images, pixels = summarize_images(log), summarize_pixels(log)
     text = []
     if images is not None:
-        sizes, deep = ", ".join(images.sizes) or "unknown", ", with depth images" if images.depths else ""
+        sizes = ", ".join(images.sizes) or "unknown"
         text.append(
-            f"images: {images.images}{deep}, of {sizes} px; {images.readable} of the {images.looked_at} examined can be read, "
+            f"images: {images.images}, of {sizes} px; {images.readable} of the {images.looked_at} examined can be read, "
             f"with {images.features:.0f} {images.feature} features (median)"
         )
     if pixels is not None:
@@ -86,8 +85,7 @@ def summarize_images(log: Log) -> ImageSummary | None:
         sizes[f"{image.shape[1]}x{image.shape[0]}"] += 1
         counts.append(len(finder.detect(image)))
     median = float(np.median(counts)) if counts else 0.0
-    depths = sum(file is not None for file in stream.depth)
-    return ImageSummary(len(stream.file), depths, len(chosen), len(counts), dict(sizes), wanted[0], median, fault)
+    return ImageSummary(len(stream.file), len(chosen), len(counts), dict(sizes), wanted[0], median, fault)
 
 
 def summarize_pixels(log: Log) -> PixelSummary | None:
@@ -117,11 +115,6 @@ def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary 
         there = [name for name, found in (("images", images), ("identified pixels", pixels)) if found is not None]
         out += [f"the log has {name}, but its rig has no [camera]: they are not used" for name in there]
     if images is not None:
-        camera = log.rig.find(CameraSettings)
-        if images.depths and camera is not None and camera.depth is None:
-            out.append(
-                f"the log has {images.depths} depth images, but its rig has no [camera.depth]: they are not used"
-            )
         if images.fault is not None:
             lost = images.looked_at - images.readable
             out.append(f"{lost} of the {images.looked_at} examined images cannot be read: {images.fault}")

@@ -1,11 +1,9 @@
-"""Images in the native format: ``camera.csv`` and the folder ``camera``; depth images have their names in the folder ``depth``.
+"""Images in the native format: ``camera.csv`` and the folder ``camera``.
 
 Images are decoded and checked later, by :mod:`factorgraph_loc.sensors.camera.frontend`.
 """
 
-import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from factorgraph_loc.errors import InputError
@@ -17,7 +15,7 @@ from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.sensors.tables import Columns, Reading, Writing
 
-FOLDER, DEPTH = "camera", "depth"
+FOLDER = "camera"
 
 
 def make_images(table: TableRows, t0_ns: int, warnings: list[str], folder: Path | None = None) -> ImageStream:
@@ -41,22 +39,14 @@ def make_images(table: TableRows, t0_ns: int, warnings: list[str], folder: Path 
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> ImageStream:
-    """The images in a log's folder, with the depth images that have their names."""
-    table = rows["camera"]
-    images = make_images(table, reading.t0_ns, reading.warnings)
-    folder = inside(table.path.parent, DEPTH, table.path)
-    if not folder.is_dir():
-        return images
-    within = inside(table.path.parent, FOLDER, table.path)
-    names = [Path(os.path.relpath(file, within)).with_suffix(".png") for file in images.file]
-    return replace(images, depth=[_image(folder, str(table.path), str(name)) for name in names])
+    """The images in a log's folder."""
+    return make_images(rows["camera"], reading.t0_ns, reading.warnings)
 
 
 def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
     """The rows of images, which are copied to the folder; InputError for features, which cannot be written."""
     if not isinstance(stream, ImageStream):
         raise InputError(f"{writing.log}: camera holds features, expected the images they were computed from")
-    _copy_depths(stream.depth, writing.folder)
     return {
         "camera": {"t_ns": checks.absolute(stream.t, writing.t0_ns), "file": write_images(stream.file, writing.folder)}
     }
@@ -71,15 +61,6 @@ def write_images(files: Sequence[Path], folder: Path) -> list[str]:
     for file, name in zip(files, names, strict=True):
         _copy(file, target / name)
     return names
-
-
-def _copy_depths(files: Sequence[Path | None], folder: Path) -> None:
-    """Copy depth images into the new folder ``depth``, with the names of their images; InputError if one is missing."""
-    there = [(i, file) for i, file in enumerate(files) if file is not None]
-    if there:
-        (folder / DEPTH).mkdir()
-    for i, file in there:
-        _copy(file, folder / DEPTH / f"{i:06d}.png")
 
 
 def _copy(file: Path, target: Path) -> None:

@@ -16,9 +16,8 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera import frontend
 from factorgraph_loc.sensors.camera.frontend import with_features
-from factorgraph_loc.sensors.camera.settings import CameraSettings, DepthSettings
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
-from factorgraph_loc.sensors.camera.summary import summarize
 from factorgraph_loc.vision.feature_cache import FeatureCache
 from factorgraph_loc.vision.features import EXTRACTORS, extractor
 from factorgraph_loc.vision.settings import FrontendSettings
@@ -88,30 +87,6 @@ def test_what_is_found_is_what_the_extractor_finds(log, feature):
     np.testing.assert_array_equal(found[3].descriptors, descriptors)
     assert found[3].descriptors.dtype == descriptors.dtype
     assert {frame.feature for frame in found} == {feature}
-
-
-def test_features_have_depths_where_the_rig_has_depth_images(log, tmp_path):
-    stream = log.streams["camera"]
-    files = [None, *(tmp_path / f"depth{k}.png" for k in range(1, 10))]
-    for file in files[1:]:
-        cv2.imwrite(str(file), np.full(SIZE[::-1], 4000, dtype=np.uint16))
-    files[9].unlink()
-    cv2.imwrite(str(files[8]), np.full(SIZE, 4000, dtype=np.uint16))
-    log = replace(log, streams={"camera": replace(stream, depth=files)})
-    assert all(frame.depths is None for frame in frames(log)[0])
-    (told,) = frames(log)[1]
-    assert "9 depth images are not used, as the rig" in told
-    assert "9 depth images, but its rig has no [camera.depth]" in " ".join(summarize(log).problems)
-    camera = log.rig.of(CameraSettings).model_copy(update={"depth": DepthSettings(unit=0.0005)})
-    found, warnings = frames(replace(log, rig=Rig(camera=camera)))
-    for k, frame in enumerate(found):
-        if k in (0, 8, 9):
-            assert frame.depths is None
-        else:
-            np.testing.assert_allclose(frame.depths, np.full(len(frame.pixels), 2.0))
-    (told,) = warnings
-    assert "2 depth images cannot be used, the first is" in told
-    assert "depth8.png: has 120 x 160 px of uint16, expected 160 x 120 px of uint16" in told
 
 
 def test_tracks_follow_the_picture(log):

@@ -5,7 +5,7 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.sensors.camera.live import LiveFrontend
-from factorgraph_loc.sensors.camera.settings import CameraSettings, DepthSettings
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.settings import FrontendSettings
 from factorgraph_loc.vision.tracks import follow
 
@@ -22,24 +22,6 @@ def test_tracks_are_those_of_a_log(picture, feature):
     assert [f.tracks.tolist() for f in frames] == [numbers.tolist() for numbers in expected]
     assert len(set(frames[2].tracks) & set(frames[4].tracks)) > 20
     assert [f.t for f in frames] == [0.1 * k for k in range(6)]
-
-
-def test_features_have_the_depths_of_a_depth_image(picture):
-    deep = np.full((120, 160), 4000, dtype=np.uint16)
-    deep[:, :80] = 0
-    live = LiveFrontend(FrontendSettings(feature="orb", count=100), CAMERA, DepthSettings(unit=0.0005))
-    frame = live.frame(0.0, picture[20:140, :160], deep)
-    assert np.any(np.isnan(frame.depths))
-    np.testing.assert_array_equal(frame.depths, np.where(frame.pixels[:, 0] < 80.5, np.nan, 2.0))
-    assert live.frame(0.1, picture[20:140, :160]).depths is None
-    for wrong, message in ((deep[1:], "160 x 119 px of uint16"), (deep / 1.0, "float64"), ("deep.png", "is str")):
-        with pytest.raises(
-            InputError, match=rf"^depth image at 0\.200 s: .*{message}, expected 160 x 120 px of uint16"
-        ):
-            live.frame(0.2, picture[20:140, :160], wrong)
-    blind = LiveFrontend(FrontendSettings(feature="orb"), CAMERA)
-    with pytest.raises(InputError, match=r"the rig has no \[camera\.depth\]"):
-        blind.frame(0.2, picture[20:140, :160], deep)
 
 
 @pytest.mark.parametrize(
