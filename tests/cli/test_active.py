@@ -1,8 +1,5 @@
 """``fgloc active``: a table, files, JSON, and errors of one line."""
 
-import json
-import math
-
 import polars as pl
 import pytest
 
@@ -36,16 +33,6 @@ def test_policies_are_compared(fgloc, tmp_path):
     assert (out / "plots" / "comparison.png").exists()
 
 
-def test_json_is_all_that_is_printed(fgloc, tmp_path):
-    done = fgloc("active", "office", *SMALL, *FEW, "--policy", "random,patrol", "--json", "-o", tmp_path / "out")
-    assert done.exit_code == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert [(run["policy"], run["seed"]) for run in found["runs"]] == [("random", 0), ("patrol", 0)]
-    assert [one["policy"] for one in found["summaries"]] == ["random", "patrol"]
-    assert found["differences"][0]["pairs"] == 1
-    assert found["failures"] == []
-
-
 def test_a_robot_that_finds_nothing_gives_up(fgloc, tmp_path):
     out = tmp_path / "out"
     bare = (*SMALL[:-1], "world.tags=0")
@@ -55,16 +42,6 @@ def test_a_robot_that_finds_nothing_gives_up(fgloc, tmp_path):
     assert not row["localized"]
     assert 2.0 < row["metres"] <= 3.3  # a step of its way more
     assert "never" in done.stdout
-
-
-def test_the_world_may_come_from_a_file(fgloc, tmp_path):
-    path = tmp_path / "store.toml"
-    path.write_text('preset = "office"\n[world]\nplan = "hall"\nwidth = 8\ndepth = 6\ntags = 12\n')
-    done = fgloc("active", path, *FEW, "--policy", "random", "--set", "start=[4.0, 3.0, 0.5]", "-o", tmp_path / "out")
-    assert done.exit_code == 0, done.stderr
-    (row,) = pl.read_parquet(tmp_path / "out" / "results.parquet").to_dicts()
-    assert (row["world"], row["status"]) == ("store", "ok")
-    assert row["error_heading"] < math.radians(10.0)
 
 
 @pytest.mark.parametrize(

@@ -62,12 +62,6 @@ def test_compare_checks_names_and_seeds_before_it_runs(fgloc, short_log, tmp_pat
     assert not out.exists()
 
 
-def test_a_long_value_of_an_option_is_shortened(fgloc, short_log):
-    result = fgloc("run", short_log, "-e", "ekf", "-o", "x", "--seed", "9" * 3000 + "x\n")
-    assert result.exit_code == 2
-    assert len(result.stderr.splitlines()[-1]) < 400
-
-
 def test_typers_own_usage_errors_have_exit_code_2(fgloc, short_log):
     assert fgloc("run", short_log).exit_code == 2
     assert "Did you mean" in fgloc("inof").stderr

@@ -30,15 +30,6 @@ def test_the_rig_is_complete_and_runs(fgloc, short_log, calibrated, tmp_path):
     assert json.loads(result.stdout)["causal.position_rmse"] < 0.5
 
 
-def test_the_report_needs_no_other_file(calibrated):
-    out, report, result = calibrated
-    assert f"the rig is in {out}, the report in {report}" in result.stdout
-    page = report.read_text()
-    assert page.count("data:image/png;base64,") == 3
-    assert "http" not in page
-    assert "heading_rate_bias" in page
-
-
 def test_what_the_estimator_accepts_and_what_it_refuses_is_listed_with_its_figures(calibrated):
     _, report, result = calibrated
     header, *rows = [
@@ -58,16 +49,6 @@ def test_what_is_there_is_not_replaced_unasked(fgloc, short_log, calibrated):
     assert result.exit_code == 2
     assert "exists already" in result.stderr
     assert out.read_bytes() == before
-
-
-@pytest.mark.parametrize(
-    ("out", "message"),
-    [("mower.toml", "expected a name that ends in .rig.toml"), ("no/a.rig.toml", "there is no folder")],
-)
-def test_a_bad_name_is_told_at_once(fgloc, tmp_path, out, message):
-    result = fgloc("calibrate", "plaza2", "-o", tmp_path / out)
-    assert result.exit_code == 2
-    assert message in result.stderr
 
 
 def test_a_log_without_reference_is_calibrated_by_itself(fgloc, short_log, tmp_path):

@@ -74,24 +74,6 @@ def test_the_rig_is_complete_and_runs(fgloc, calibrated, tmp_path):
     assert found["after"]["circles"]["final.position_rmse"] < 0.3
 
 
-def test_the_report_tells_what_was_chosen(calibrated):
-    _, out, found = calibrated
-    assert sum(model["kept"] for model in found["rfid"]["models"]) == 1
-    assert 0.0 < found["rfid"]["independent_share"] <= 1.0
-    page = out.with_name("cart.report.html").read_text()
-    assert page.count("data:image/png;base64,") == 3
-    assert "model of detection" in page
-
-
-def test_json_is_one_document(calibrated):
-    _, out, found = calibrated
-    assert found["files"] == {"rig": str(out), "report": str(out.with_name("cart.report.html"))}
-    assert {c["name"] for c in found["constants"]} >= {"scale_distance", "scale_rotation", "heading_rate_bias"}
-    assert found["after"]["circles"]["causal.position_rmse"] > 0.0
-    assert {name for one in found["judged"] for name in one["parameters"]} >= {"odometry.noise", "rfid.models"}
-    assert all({"accepted", "new", "old", "gain", "gain_error"} <= set(one) for one in found["judged"])
-
-
 def test_without_places_of_antennas_nothing_is_learnt(fgloc, calibrated, tmp_path):
     log, _, _ = calibrated
     empty = tmp_path / "empty.rig.toml"

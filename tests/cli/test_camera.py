@@ -73,23 +73,3 @@ def test_bad_images_are_told_of_and_the_run_goes_on(fgloc, hall, tmp_path):
         "hall: 1 of 9 images show no features",
     ):
         assert text in result.stderr
-
-
-def test_a_calibration_of_another_resolution(fgloc, hall, tmp_path):
-    (hall / "run.toml").write_text(RUN.replace("width = 160, height = 120", "width = 320, height = 240"))
-    result = fgloc("run", hall, "-e", "ekf", "-o", tmp_path / "out")
-    assert result.exit_code == 2
-    assert "calibrated for images of 320 x 240 px, those of the log have 160 x 120 px" in result.stderr
-    assert result.stderr.count("\n") == 1
-    assert "! the camera is calibrated for images of 320x240 px" in fgloc("info", hall).stdout
-
-
-def test_a_rig_without_camera(fgloc, hall, tmp_path):
-    lines = [line for line in RUN.splitlines() if not line.startswith("camera")]
-    (hall / "run.toml").write_text("\n".join(lines))
-    result = fgloc("run", hall, "-e", "ekf", "-o", tmp_path / "out")
-    assert result.exit_code == 0
-    assert "camera left out, as the rig cart has no [camera]" in result.stderr
-    asked = fgloc("run", hall, "-e", "ekf", "--sensors", "odometry,camera", "-o", tmp_path / "asked")
-    assert asked.exit_code == 2
-    assert "camera needs [camera] in the rig" in asked.stderr

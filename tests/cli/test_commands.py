@@ -1,16 +1,12 @@
 """Commands that run no estimator, and how all of them print."""
 
 import json
-import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from factorgraph_loc import __version__
-from factorgraph_loc.cli import show
-from factorgraph_loc.evaluation.tables import COLUMNS, comparison_cells, comparison_table
 
 
 def test_version_and_help(fgloc):
@@ -69,26 +65,3 @@ def test_convert_overwrites_a_log_alone(fgloc, short_log, tmp_path):
     assert refused.exit_code == 2
     assert "expected a new one, or one with a log in the native format to overwrite" in refused.stderr
     assert (out / "notes.md").read_text() == "mine"
-
-
-def test_a_pipe_gets_plain_text(short_log, tmp_path):
-    """A comparison as it is given to a shell, with processes of its own and all pictures."""
-    command = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
-    arguments = ["compare", str(short_log), "-e", "dead_reckoning", "-o", str(tmp_path / "out")]
-    done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=True)
-    assert "\x1b" not in done.stdout + done.stderr
-    assert done.stderr == ""
-    assert Path(tmp_path / "out/results.csv").is_file()
-
-
-@pytest.mark.parametrize("columns", [40, 80, 200])
-def test_a_narrow_terminal_cuts_nothing_off(columns, capsys, monkeypatch):
-    scores = {key: 31.494 for key, _, _ in COLUMNS.values()}
-    row = {"log": "plaza2", "estimator": "dead_reckoning", "seed": 0, "status": "ok", "time_to_localized": 0.0} | scores
-    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    monkeypatch.setattr("shutil.get_terminal_size", lambda **_: os.terminal_size((columns, 24)))
-    show.rich_table(comparison_table([row]))
-    text = capsys.readouterr().out
-    assert "…" not in text
-    line = next(line for line in text.splitlines() if "plaza2" in line).split()
-    assert line == ["plaza2", "dead_reckoning", *comparison_cells([row])[1][0][2:]]

@@ -21,15 +21,6 @@ def test_compare(fgloc, short_log, tmp_path):
     assert "--overwrite" in again.stderr
 
 
-def test_compare_says_why_there_are_no_errors(fgloc, short_log, tmp_path):
-    bare = tmp_path / "bare"
-    shutil.copytree(short_log, bare)
-    (bare / "reference.tum").unlink()
-    result = fgloc("compare", bare, "-e", "dead_reckoning", "-o", tmp_path / "out", "--prior", "0,0,0", "--jobs", 1)
-    assert result.exit_code == 0, result.output
-    assert "short: there is no reference to score against, so there are no errors" in result.stdout
-
-
 def test_compare_prints_one_table_with_seeds_pooled_and_the_best_in_words(fgloc, short_log, tmp_path):
     out = tmp_path / "out"
     result = fgloc(
@@ -67,14 +58,6 @@ def test_compare_reports_a_failed_run_and_goes_on(fgloc, short_log, tmp_path):
     table = pl.read_csv(tmp_path / "out/results.csv")
     assert table["status"].to_list() == ["ok", "failed"]
     assert table["final.position_rmse"].null_count() == 1
-
-
-def test_a_folder_with_results_is_refused_before_anything_is_read(fgloc, tmp_path):
-    (tmp_path / "metrics.json").write_text("{}")
-    for command in ("run", "compare"):
-        result = fgloc(command, "no-such-log", "-e", "ekf", "-o", tmp_path)
-        assert result.exit_code == 2
-        assert "metrics.json" in result.stderr
 
 
 def test_compare_prints_json_alone(fgloc, short_log, tmp_path):

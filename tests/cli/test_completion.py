@@ -5,16 +5,13 @@ import subprocess
 import sys
 
 import pytest
-import shellingham
 
 from factorgraph_loc.cli import completion
 from factorgraph_loc.files.settings import settings_in
 from factorgraph_loc.files.shipped import manifests
-from factorgraph_loc.fusion.registry import settings_type
 from factorgraph_loc.planning import closed_loop
 from factorgraph_loc.planning.policies import POLICIES
 from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.plugins import ESTIMATORS
 from factorgraph_loc.simulation import PRESETS, SimulationSettings
 
 FGLOC = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
@@ -41,11 +38,6 @@ def test_the_settings_of_simulations_and_active_runs_are_those_of_the_models():
     assert set(completion.simulation_settings()) == keys
     found = completion.active_setting("")
     assert {key.removesuffix("=") for key in found} == keys | {s.key for s in settings_in(ActiveSettings)}
-
-
-@pytest.mark.parametrize("name", ESTIMATORS)
-def test_the_settings_are_those_of_the_models(name):
-    assert completion.settings_of(name) == list(settings_type(name).model_fields)
 
 
 @pytest.mark.parametrize(
@@ -93,24 +85,3 @@ def test_completion_loads_no_numerical_libraries():
         "print(sorted({'numpy', 'gtsam', 'polars', 'scipy'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n[]\n"
-
-
-@pytest.mark.parametrize(
-    ("shell", "line"),
-    [
-        ("bash", "complete -o default -F"),
-        ("zsh", "#compdef"),
-        ("fish", "complete --command"),
-    ],
-)
-def test_the_script_of_the_shell_that_is_named_is_shown(shell, line, fgloc, monkeypatch):
-    """Whatever shell this runs in, if in any."""
-
-    def nowhere():
-        raise shellingham.ShellDetectionFailure
-
-    monkeypatch.setattr(shellingham, "detect_shell", nowhere)
-    done = fgloc("--show-completion", shell)
-    assert done.exit_code == 0
-    assert "_COMPLETE" in done.stdout
-    assert line in done.stdout

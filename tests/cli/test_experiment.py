@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -69,33 +68,6 @@ def test_damage_is_told_and_repaired(fgloc, file, tmp_path):
     assert json.loads(fgloc("experiment", "report", file, "--json").stdout)["damaged"] == []
 
 
-@pytest.mark.parametrize("content", [b"", b"PAR1", b"text", None])
-def test_a_damaged_table_of_results_is_written_anew(fgloc, file, tmp_path, content):
-    index = tmp_path / "out/lags/results.parquet"
-    index.parent.mkdir(parents=True)
-    if content is None:
-        pl.DataFrame({"label": [1], "estimator": ["ekf"], "log": ["short"], "duration": ["x"]}).write_parquet(index)
-    else:
-        index.write_bytes(content)
-    assert "2 runs, 2 to do" in fgloc("experiment", "run", file, "--dry-run").stdout
-    assert fgloc("experiment", "run", file, "--jobs", 1).exit_code == 0
-    assert len(pl.read_parquet(index)) == 2
-
-
-def test_warnings_are_told_once_and_stand_on_the_page(fgloc, file, tmp_path, short_log):
-    shutil.copytree(short_log, tmp_path / "doubtful")
-    lines = (short_log / "reference.tum").read_text().splitlines(keepends=True)
-    (tmp_path / "doubtful/reference.tum").write_text("".join(lines[: len(lines) // 4]))
-    file.write_text(TEXT.format(log=tmp_path / "doubtful"))
-    made = fgloc("experiment", "run", file, "--jobs", 2)
-    assert made.exit_code == 0, made.output
-    assert made.stderr.count("warning: ") == made.stderr.count("warning: short: scored over ") == 1
-    (text,) = set(pl.read_parquet(tmp_path / "out/lags/results.parquet")["warnings"].to_list())
-    assert json.loads(fgloc("experiment", "run", file, "--json").stdout)["warnings"] == [text]
-    fgloc("experiment", "report", file)
-    assert (tmp_path / "out/lags/report.html").read_text().count(text) == 1
-
-
 def test_a_failure_is_named_and_the_exit_code_is_1(fgloc, file, tmp_path):
     result = fgloc("experiment", "run", file, "--jobs", 1, "--set", "prior=log")
     assert result.exit_code == 1, result.output
@@ -127,13 +99,6 @@ def test_what_is_wrong_is_refused_in_one_line(fgloc, file, args, fragments):
     (line,) = result.stderr.splitlines()
     for fragment in ("error: ", *fragments):
         assert fragment in line
-
-
-def test_ten_thousand_runs_can_be_listed(fgloc, file):
-    args = ("--set", 'estimators=["particle_filter"]', "--set", "seeds=0:10000", "--dry-run", "--json")
-    document = json.loads(fgloc("experiment", "run", file, *args).stdout)
-    assert document["todo"] == len({run["key"] for run in document["runs"]}) == 10_000
-    assert document["seconds"] > 0.0
 
 
 def test_an_interrupt_ends_it_cleanly_and_it_goes_on(fgloc, file, tmp_path, processes):

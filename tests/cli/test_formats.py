@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scripts_here import run_script
 
-from factorgraph_loc.io.native.world_file import read_world
 from factorgraph_loc.io.readers import load
 
 ROOT = Path(__file__).parents[2]
@@ -55,12 +54,3 @@ def test_the_tutorial(hall, fgloc, monkeypatch):
             getattr(copy.streams["rfid"], column), getattr(log.streams["rfid"], column), rtol=0, atol=2e-9
         )
     np.testing.assert_array_equal(copy.streams["odometry"].dx, log.streams["odometry"].dx)
-
-
-def test_the_markers_of_the_page_are_a_map(tmp_path):
-    family, markers = (block for block in re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL) if "[markers]" in block)
-    assert 'family = "tag36h11"' in family
-    (tmp_path / "a.world.toml").write_text(markers)
-    points = read_world(tmp_path / "a.world.toml").points
-    assert points.names[:4] == tuple(f"tag36h11-7/{i}" for i in range(4))
-    np.testing.assert_allclose(points.positions[4:, 2], 2.8, atol=1e-6)

@@ -4,7 +4,6 @@ import json
 import shutil
 
 import cv2
-import pytest
 
 
 def test_info(fgloc, short_log):
@@ -33,23 +32,6 @@ def test_info_names_landmarks_that_are_swapped(fgloc, data_root, tmp_path):
         fgloc("info", root / "mrclam6", "--reader", "mrclam", "--reader-option", "robot=3", "--json").stdout
     )
     assert {(s["landmark"], s["swapped_with"]) for s in content["suspects"]} == {("6", "15"), ("15", "6")}
-
-
-@pytest.mark.parametrize("robot", [1, 3, 5])
-def test_info_suspects_no_landmark_of_a_right_map(fgloc, data_root, robot):
-    content = json.loads(fgloc("info", f"mrclam6-robot{robot}", "--data-root", data_root, "--json").stdout)
-    assert content["suspects"] == []
-    assert content["unseen"] == []
-
-
-def test_info_says_when_a_file_is_not_the_one_of_the_manifest(fgloc, data_root, tmp_path):
-    shutil.copytree(data_root / "mrclam6", tmp_path / "mrclam6")
-    with (tmp_path / "mrclam6" / "Barcodes.dat").open("a") as file:
-        file.write("# changed\n")
-    result = fgloc("info", "mrclam6-robot1", "--data-root", str(tmp_path))
-    assert result.exit_code == 0
-    assert "Barcodes.dat: is not the file that the manifest describes" in result.stderr
-    assert "sha256" not in fgloc("info", "mrclam6-robot1", "--data-root", str(data_root)).stderr
 
 
 def test_info_draws_a_log(fgloc, short_log, tmp_path):

@@ -1,14 +1,6 @@
 """What there is to choose from, and its settings."""
 
-import fcntl
 import json
-import os
-import pty
-import struct
-import subprocess
-import sys
-import termios
-from collections import Counter
 
 import pytest
 
@@ -17,7 +9,6 @@ from factorgraph_loc.io.readers import reader
 from factorgraph_loc.planning.policies import POLICIES
 from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
 from factorgraph_loc.sensors.registry import channels
-from factorgraph_loc.simulation import PRESETS, preset
 
 
 def test_the_list_names_all_estimators(fgloc):
@@ -68,45 +59,12 @@ def test_a_sensor_has_columns_with_units_and_the_keys_of_the_rig(fgloc):
     assert "models.*.sigma_phi" in printed
 
 
-def test_a_channel_stands_for_its_sensor(fgloc):
-    assert fgloc("sensors", "sightings").stdout == fgloc("sensors", "camera").stdout
-    assert "did you mean bearing_range?" in fgloc("sensors", "bearing_rang").stderr
-    assert "did you mean landmarks?" in fgloc("sensors", "landmark").stderr
-
-
 @pytest.mark.parametrize("name", READERS)
 def test_every_option_of_a_reader_is_told(fgloc, name):
     found = json.loads(fgloc("readers", name, "--json").stdout)
     assert {one["key"].partition(".")[0] for one in found["options"]} == set(reader(name).options.model_fields)
     assert all(one["meaning"] for one in found["options"])
     assert fgloc("readers", name).exit_code == 0
-
-
-def test_the_list_of_readers(fgloc):
-    found = json.loads(fgloc("readers", "--json").stdout)
-    assert [one["name"] for one in found] == list(READERS)
-    assert all(one["about"] in fgloc("readers").stdout for one in found)
-    assert "did you mean rosbag?" in fgloc("readers", "rosbags").stderr
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_has_its_own_values(fgloc, name):
-    found = json.loads(fgloc("presets", name, "--json").stdout)
-    values = {one["key"]: one["default"] for one in found["settings"]}
-    settings = preset(name)
-    expected = (settings.world.plan, settings.world.tags, settings.faults.fading.share)
-    assert (values["world.plan"], values["world.tags"], values["faults.fading.share"]) == expected
-    assert not [key for key in values if key.startswith("rig.")]
-    printed = fgloc("presets", name)
-    assert f"fgloc rigs show {name}" in printed.stdout
-    assert all(one["meaning"] in printed.stdout for one in found["settings"])
-
-
-def test_the_list_of_presets(fgloc):
-    found = json.loads(fgloc("presets", "--json").stdout)
-    assert [one["name"] for one in found] == list(PRESETS)
-    assert all(one["about"] in fgloc("presets").stdout for one in found)
-    assert "did you mean office?" in fgloc("presets", "offce").stderr
 
 
 def test_policies_and_what_is_set_of_active_runs(fgloc):
@@ -116,25 +74,3 @@ def test_policies_and_what_is_set_of_active_runs(fgloc):
     assert all(about in printed for about in found["policies"].values())
     assert "policy.horizon" in printed
     assert "above 0 to 100 m" in printed
-
-
-@pytest.mark.parametrize("columns", [90, 140])
-def test_a_terminal_wraps_long_texts_and_loses_none(fgloc, columns):
-    ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
-    code = "from factorgraph_loc.cli.main import main; main()"
-    environment = {name: value for name, value in os.environ.items() if name != "COLUMNS"} | {"TERM": "dumb"}
-    with subprocess.Popen([sys.executable, "-c", code, "sensors", "rfid"], stdout=theirs, env=environment):
-        os.close(theirs)
-        told = b""
-        try:
-            while part := os.read(ours, 4096):
-                told += part
-        except OSError:  # the end
-            pass
-    os.close(ours)
-    lines = told.decode().splitlines()
-    assert columns - 20 < max(map(len, lines)) <= columns
-    words = [line.split() for line in lines]
-    expected = fgloc("sensors", "rfid").stdout.split()
-    assert Counter(word for line in words for word in line) == Counter(expected)

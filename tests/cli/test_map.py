@@ -1,7 +1,6 @@
 """`fgloc map`, from the arguments to the files, on a small simulated log."""
 
 import json
-import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -101,15 +100,6 @@ def test_a_map_is_extended(fgloc, on_disk, tmp_path):
     np.testing.assert_allclose(made.positions(), PLACES, atol=0.15)
 
 
-def test_json_says_the_same(fgloc, on_disk, tmp_path):
-    result = fgloc("map", on_disk(), "-e", "smoother", "-o", tmp_path / "a.world.toml", "--json")
-    content = json.loads(result.stdout)
-    assert [entry["verdict"] for entry in content["landmarks"]] == ["agrees"] * 7
-    written = tomllib.loads((tmp_path / "a.world.toml").read_text())["landmarks"]
-    assert content["landmarks"][0]["learnt"] == pytest.approx([written["1"]["x"], written["1"]["y"]])
-    assert content["frame"] == "that of the given map"
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -133,9 +123,3 @@ def test_beacons_cannot_be_mapped(fgloc, short_log, tmp_path):
     assert result.exit_code == 2
     assert "no sighting has a bearing; from a range alone a landmark cannot be located" in result.stderr
     assert not list(tmp_path.glob("a.*"))
-
-
-def test_there_must_be_a_map_to_extend(fgloc, on_disk, tmp_path):
-    result = fgloc("map", on_disk(world=World()), "--extend", "-o", tmp_path / "a.world.toml")
-    assert result.exit_code == 2
-    assert "has no map that could be extended" in result.stderr

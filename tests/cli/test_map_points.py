@@ -38,13 +38,6 @@ def test_points_lie_on_the_wall(fgloc, gallery_on_disk, tmp_path):
     assert report["frame"] == "that of the reference"
 
 
-def test_points_are_mapped_where_nothing_else_is_asked_for(fgloc, gallery_on_disk, tmp_path):
-    result = fgloc("map", gallery_on_disk(), "-o", tmp_path / "a.world.toml")
-    assert result.exit_code == 0, result.output
-    assert "points are in the new map" in result.stdout
-    assert "the frame of the new map is that of the reference" in result.stdout
-
-
 def test_bad_input(fgloc, gallery_on_disk, tmp_path, gallery):
     out = tmp_path / "a.world.toml"
 
@@ -170,22 +163,6 @@ def test_a_map_goes_to_g2o(fgloc, gallery_on_disk, tmp_path):
     assert len(edges) > 300
     assert np.median(np.linalg.norm(apart, axis=1)) < 2.0
     assert rows[-1] == ["FIX", "0"]
-
-
-def test_settings_of_points(fgloc, gallery_on_disk, tmp_path):
-    out, log = tmp_path / "a.world.toml", gallery_on_disk()
-    for arguments, message in (
-        (("--set", "points.moast=3"), "unknown key moast"),
-        (("--set", "points.most=0"), "most"),
-        (("--of", "points", "--extend"), "no map of points that could be extended"),
-        (("--of", "landmarks", "--set", "points.most=3"), "is for maps of points"),
-    ):
-        result = fgloc("map", log, "-o", out, *arguments)
-        assert result.exit_code == 2
-        assert message in result.stderr
-    result = fgloc("export", log, "-o", tmp_path / "a.ply")
-    assert result.exit_code == 2
-    assert "has no points to write" in result.stderr
 
 
 UNKNOWN = ("-e", "smoother", "--set", "smoother.landmarks=unknown")

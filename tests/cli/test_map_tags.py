@@ -112,9 +112,3 @@ def test_bad_options_are_one_line(fgloc, on_disk, tmp_path, options, message):
     assert message in result.stderr
     assert result.stderr.count("\n") == 1
     assert not list(tmp_path.glob("a.*"))
-
-
-def test_there_must_be_tags_to_extend(fgloc, on_disk, tmp_path):
-    result = fgloc("map", on_disk(world=World()), "--extend", "-o", tmp_path / "a.world.toml")
-    assert result.exit_code == 2
-    assert "has no map of tags that could be extended" in result.stderr

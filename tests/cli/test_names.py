@@ -62,13 +62,6 @@ def test_any_name_gives_a_run_with_tables_and_plots(name: str, landmark: str) ->
         assert list((out / "plots").glob("*.png"))
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
-@given(name=ANY)
-def test_tables_documents_and_lines_show_no_character_that_a_terminal_obeys(name: str) -> None:
-    done = CliRunner().invoke(app, ["info", name])  # a name that is no log
-    assert shown(done.output)
-
-
 @pytest.mark.parametrize("name", ["\x1b[31m\x00\u202e\x9b", "a\nb", "caf\udce9", "[/red]:smile:{x}"])
 def test_whatever_is_printed_goes_through_one_function(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     row = {"log": name, "estimator": name, "seed": 0, "status": "ok"}

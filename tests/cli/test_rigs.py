@@ -2,22 +2,13 @@
 
 import json
 import math
-import os
-import pty
-import subprocess
-import sys
 
 import pytest
 
 from factorgraph_loc import read_rig
 from factorgraph_loc.cli import completion
-from factorgraph_loc.files.models import parse_model, parse_toml
-from factorgraph_loc.io.native.rig_file import rig_text
-from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.rfid.settings import rackham
-from factorgraph_loc.simulation import PRESETS, preset
-
-FGLOC = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
+from factorgraph_loc.simulation import PRESETS
 
 
 def test_the_list_has_shipped_rigs_and_those_of_simulations(fgloc):
@@ -35,23 +26,6 @@ def test_a_rig_that_is_printed_can_be_used(fgloc, tmp_path, name):
     printed = json.loads(fgloc("rigs", "show", name, "--json").stdout)
     assert read_rig(file).model_dump(mode="json", exclude_none=True) == printed
     assert fgloc("rigs", "show", file).stdout == file.read_text()
-
-
-def test_keys_have_their_meaning(fgloc):
-    printed = fgloc("rigs", "show", "office").stdout
-    assert "round_gap = 0.05  # gap between reads that ends an inventory round, if the log has no rounds [s]" in printed
-    assert "r_max = 4.5  # beam: distance at which it has fallen to a half [m]" in printed
-
-
-def test_any_name_can_be_written():
-    antennas = {'le"ft [1]': {"yaw": 1e-7}, "é": {"yaw": 1.0}}
-    rig = parse_model(Rig, {"name": 'a "b"\n\\ \x07', "rfid": {"antennas": antennas}}, "a rig")
-    assert parse_model(Rig, parse_toml(rig_text(rig), "text"), "text") == rig
-
-
-def test_a_wrong_name_is_told_with_the_nearest(fgloc):
-    done = fgloc("rigs", "show", "plazza")
-    assert (done.exit_code, done.stderr) == (2, "error: no rig is called 'plazza': did you mean plaza?\n")
 
 
 def test_a_new_rig_has_the_sensors_that_are_named(fgloc, tmp_path):
@@ -105,49 +79,9 @@ def test_wrong_options_are_one_line(fgloc, tmp_path, monkeypatch, options, why):
     assert not list(tmp_path.iterdir())
 
 
-def test_questions_are_asked_at_a_terminal(tmp_path):
-    ours, theirs = pty.openpty()
-    with subprocess.Popen(
-        [*FGLOC, "rigs", "new", "--imu"], stdin=theirs, stdout=theirs, stderr=theirs, cwd=tmp_path
-    ) as process:
-        os.close(theirs)
-        os.write(ours, b"\n0.3\nmany\n4\n\nhall.rig.toml\n")  # a wrong answer is asked for again
-        told = b""
-        try:
-            while part := os.read(ours, 4096):
-                told += part
-        except OSError:  # the end
-            pass
-        os.close(ours)
-    assert process.returncode == 0
-    assert b"odometry: differential, omnidirectional, none [differential]: " in told
-    assert b"gyro" not in told
-    assert b"--antennas is 'many', expected a whole number" in told
-    assert read_rig(tmp_path / "hall.rig.toml").sensors == ("odometry", "imu", "bearing_range", "rfid")
-    assert len(read_rig(tmp_path / "hall.rig.toml").rfid.antennas) == 4
-
-
 def test_a_run_uses_the_new_rig(fgloc, short_log, tmp_path):
     fgloc("rigs", "new", "--landmarks", 0.3, "-o", tmp_path / "mower.rig.toml")
     done = fgloc("run", short_log, "-e", "ekf", "--rig", tmp_path / "mower.rig.toml", "-o", tmp_path / "out", "--json")
     assert done.exit_code == 0
     assert json.loads(done.stdout)["nis.bearing_range.count"] > 10
     assert json.loads(done.stdout)["causal.position_rmse"] < 10.0
-
-
-def test_a_run_with_tags_uses_the_new_rig(fgloc, tmp_path):
-    assert preset("office").rig.rfid is not None
-    fgloc("simulate", "office", "-o", tmp_path / "log", "--duration", 10)
-    fgloc("rigs", "new", "--antennas", 8, "-o", tmp_path / "cart.rig.toml")
-    rig = ("--rig", tmp_path / "cart.rig.toml")
-    done = fgloc("run", tmp_path / "log", "-e", "ekf", *rig, "-o", tmp_path / "out", "--json")
-    assert done.exit_code == 0
-    assert json.loads(done.stdout)["causal.position_rmse"] < 1.0
-
-
-def test_a_run_with_images_uses_the_new_rig(fgloc, gallery_on_disk, tmp_path):
-    fgloc("rigs", "new", "--camera", "320x240", "-o", tmp_path / "cart.rig.toml")
-    rig = ("--rig", tmp_path / "cart.rig.toml")
-    chosen = ("--set", "smoother.landmarks=unknown")
-    done = fgloc("run", gallery_on_disk(), "-e", "smoother", *rig, *chosen, "-o", tmp_path / "out", "--json")
-    assert done.exit_code == 0, done.stderr

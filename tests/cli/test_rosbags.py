@@ -42,20 +42,6 @@ def test_from_a_bag_to_a_comparison(recorded, fgloc, monkeypatch):
     assert Path("drive.rrd").stat().st_size > 10_000
 
 
-def test_topics_as_json(recorded, fgloc):
-    document = json.loads(fgloc("info", recorded, "--json").stdout)
-    uses = {topic["topic"]: (topic["use"], topic["messages"]) for topic in document["topics"]}
-    assert uses == {
-        "/odom": ("odometry", 151),
-        "/joint_states": (None, 151),
-        "/mocap/pose": ("reference", 151),
-        "/rfid/tags": ("rfid", 240),
-        "/scan": (None, 76),
-    }
-    unused = {topic["topic"]: topic["unused"] for topic in document["topics"] if topic["unused"]}
-    assert unused == {"/scan": "laser scan"}
-
-
 def test_the_wheels_and_what_is_not_read(recorded, fgloc, monkeypatch):
     monkeypatch.chdir(recorded.parent)
     manifest = tomllib.loads(fgloc("manifest", "drive.bag").stdout)
@@ -67,20 +53,6 @@ def test_the_wheels_and_what_is_not_read(recorded, fgloc, monkeypatch):
     moved = [log.streams["odometry"] for log in (by_wheels, by_poses)]
     np.testing.assert_allclose(moved[0].dtheta, moved[1].dtheta, atol=1e-6)
     assert "not read" in fgloc("info", "wheels.toml").stdout
-
-
-def test_a_manifest_as_json(recorded, fgloc, monkeypatch):
-    monkeypatch.chdir(recorded.parent)
-    document = json.loads(fgloc("manifest", recorded, "--json").stdout)
-    assert document["manifest"] == tomllib.loads(fgloc("manifest", recorded).stdout)
-    assert document["remarks"][1].startswith("rfid: each message is treated as one inventory round")
-
-
-def test_a_manifest_of_a_bag_elsewhere(recorded, fgloc, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    proposed = fgloc("manifest", recorded)
-    assert f"save it in {recorded.parent}, or give --data-root {recorded.parent}" in proposed.stderr
-    assert 'path = "drive.bag"' in proposed.stdout
 
 
 @pytest.mark.parametrize("suffix", ["bag", "mcap", "db3"])

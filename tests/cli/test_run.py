@@ -1,17 +1,15 @@
 """`fgloc run`, from the arguments to the files."""
 
 import json
-import shutil
 import tomllib
 from dataclasses import replace
 
-import numpy as np
 import polars as pl
 import pytest
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.experiments.run import run
-from factorgraph_loc.model.belief import Learnt, LearntPoint
+from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.trajectory import read_tum
 
 RUN_FILES = {
@@ -93,30 +91,6 @@ def test_run_says_how_consistent_it_was_and_what_it_learnt(fgloc, short_log, tmp
     assert len(pl.read_csv(tmp_path / "out/events.csv")) == 7
 
 
-def test_run_aligns_where_the_map_was_free(fgloc, short_log, tmp_path, monkeypatch):
-    def mapping(log, config, progress):
-        result = run(log, config, progress)
-        landmarks = {n: LearntPoint(log.world.position(n), np.eye(2)) for n in log.world.landmarks}
-        config = {**result.config, "settings": {"landmarks": "unknown"}}
-        return replace(result, config=config, learnt=Learnt(landmarks=landmarks))
-
-    monkeypatch.setattr("factorgraph_loc.experiments.run.run", mapping)
-    result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out")
-    assert "final, aligned because the map was free: position RMSE 0." in result.stdout
-    assert "learnt landmarks: 4, aligned RMSE 0." in result.stdout
-
-
-def test_a_log_without_reference_has_innovations(fgloc, short_log, tmp_path):
-    shutil.copytree(short_log, tmp_path / "log")
-    (tmp_path / "log/reference.tum").unlink()
-    result = fgloc("run", tmp_path / "log", "-e", "ekf", "-o", tmp_path / "out", "--prior", "0,0,0")
-    assert result.exit_code == 0, result.output
-    assert "there is no reference to score against" in result.stdout
-    assert "bearing_range: normalised innovation squared " in result.stdout
-    names = {"short-trajectories.png", "short-consistency-ekf.png"}
-    assert {path.name for path in (tmp_path / "out/plots").iterdir()} == names
-
-
 def test_a_run_that_fails_has_exit_code_1(fgloc, short_log, tmp_path, monkeypatch):
     def fail(*_):
         raise RunFailedError("short: the estimate at 3.000 s is not finite")
@@ -126,10 +100,3 @@ def test_a_run_that_fails_has_exit_code_1(fgloc, short_log, tmp_path, monkeypatc
     assert result.exit_code == 1
     assert result.stderr == "error: short: the estimate at 3.000 s is not finite\n"
     assert not (tmp_path / "out").exists()
-
-
-def test_batch_is_not_timed_by_update(fgloc, short_log, tmp_path):
-    result = fgloc("run", short_log, "-e", "batch", "-o", tmp_path / "out")
-    assert result.exit_code == 0, result.output
-    assert "for the final trajectory" in result.stdout
-    assert "per update" not in result.stdout

@@ -1,7 +1,6 @@
 """``fgloc score``: tables, documents, files, and what is refused."""
 
 import json
-from pathlib import Path
 
 import polars as pl
 import pytest
@@ -70,21 +69,6 @@ def test_a_run_against_its_log(fgloc, short_log, tmp_path):
     assert result["pairs"] == run["final.scored"]
     assert result["ape.position_rmse"] == pytest.approx(run["final.position_rmse"], rel=1e-6)
     assert result["rpe_per_m.position_rmse"] == pytest.approx(run["final.rpe_position_per_m"], rel=1e-6)
-
-
-def test_results_of_several_runs_are_not_one(fgloc, tmp_path, pair):
-    for name in ("a", "b"):
-        folder = tmp_path / f"out/runs/log/{name}/seed0"
-        folder.mkdir(parents=True)
-        (folder / "final.tum").write_text(Path(pair[0]).read_text())
-    assert_refused(fgloc("score", tmp_path / "out", pair[1]), "holds 2 runs, expected the folder of one, such as")
-
-
-def test_rows_without_stamps_must_be_as_many(fgloc, tmp_path, pair):
-    reference, _ = wander(7, 99)
-    shorter = write(tmp_path / "reference.kitti", reference)
-    assert_refused(fgloc("score", pair[0], shorter), "has 100 poses, expected 99 as", "matched by their number")
-    assert_refused(fgloc("score", pair[0], shorter, "--associate", "interpolate"), "has no stamps to interpolate at")
 
 
 def test_what_is_not_there(fgloc, pair):

@@ -54,19 +54,6 @@ def test_relative_errors_and_an_alignment_are_shown_where_they_are_asked_for(fgl
     assert "m per s" in page
 
 
-def test_what_cannot_be_aligned_is_a_warning(fgloc, short_log, tmp_path):
-    still = tmp_path / "still"
-    shutil.copytree(short_log, still)
-    rows = (still / "reference.tum").read_text().splitlines()
-    first = rows[0].split()
-    same = [" ".join((row.split()[0], *first[1:])) for row in rows]
-    (still / "reference.tum").write_text("\n".join(same) + "\n")
-    result = fgloc("run", still, "-e", "ekf", "-o", tmp_path / "run", "--align", "se2")
-    assert result.exit_code == 0, result.output
-    assert "warning: not aligned: the reference: all positions are one, which --align se2 cannot turn" in result.stderr
-    assert json.loads((tmp_path / "run/metrics.json").read_text())["final.aligned_position_rmse"] is None
-
-
 def test_a_sparse_reference_is_scored_and_how_often_stands_beside_it(fgloc, sparse_log, tmp_path):
     log, count = sparse_log
     result = fgloc("run", log, "-e", "ekf", "-o", tmp_path / "run")
@@ -121,15 +108,3 @@ def test_run_says_what_is_doubtful_and_stores_it(fgloc, doubtful_log, tmp_path):
     stored = json.loads((tmp_path / "out/metrics.json").read_text())["warnings"]
     assert f"warning: {stored[0]}" == told
     assert len(stored) == 1
-
-
-def test_compare_says_what_is_doubtful_once_and_stores_it(fgloc, doubtful_log, tmp_path):
-    out = tmp_path / "out"
-    result = fgloc("compare", doubtful_log, "-e", "dead_reckoning,ekf", "-o", out, "--jobs", 2)
-    assert result.exit_code == 0, result.output
-    assert result.stderr.count(DOUBT) == 1
-    text = json.loads((out / "runs/short/ekf/seed0/metrics.json").read_text())["warnings"][0]
-    assert pl.read_csv(out / "results.csv")["warnings"].to_list() == [text, text]
-    assert (out / "report.html").read_text().count(text) == 1
-    again = fgloc("compare", doubtful_log, "-e", "ekf", "-o", tmp_path / "json", "--json")
-    assert json.loads(again.stdout)["warnings"] == [text]

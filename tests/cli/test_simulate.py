@@ -36,15 +36,6 @@ def test_the_same_seed_gives_the_same_bytes(fgloc, tmp_path):
     assert first["rfid.csv"] != content(tmp_path / "c")["rfid.csv"]
 
 
-def test_several_seeds_make_several_folders(fgloc, tmp_path):
-    done = fgloc("simulate", "corridor", "-o", tmp_path / "logs", "--seeds", "3:5", "--duration", 5)
-    assert done.exit_code == 0, done.stderr
-    assert sorted(folder.name for folder in (tmp_path / "logs").iterdir()) == ["corridor-3", "corridor-4"]
-    alone = fgloc("simulate", "corridor", "-o", tmp_path / "alone", "--seed", 4, "--duration", 5)
-    assert alone.exit_code == 0
-    assert content(tmp_path / "alone") == content(tmp_path / "logs" / "corridor-4")
-
-
 def test_a_file_of_settings_takes_the_place_of_a_preset(fgloc, tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('preset = "warehouse"\n[drive]\nduration = 500\nspeed = 1.0\n')
@@ -76,13 +67,6 @@ def test_images_are_written_with_the_log(fgloc, tmp_path):
     images = film(preset("office", changes | {"images": {"rate": 2.0}}), 3)
     read = cv2.imread(str(log.streams["camera"].file[3]))
     assert abs(read.astype(float) - images[3]).mean() < 4.0  # what the file's compression takes
-
-
-def test_nothing_is_rendered_for_a_folder_that_holds_something(fgloc, tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    done = fgloc("simulate", "office", "-o", tmp_path, "--images", "--duration", 300)
-    assert done.exit_code == 2
-    assert "not an empty folder" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """``fgloc view``: which log and which runs are meant."""
 
-import json
-
 import pytest
 
 pytest.importorskip("rerun")
@@ -26,12 +24,6 @@ def test_a_file_for_the_viewer(fgloc, short_log, run_folder, tmp_path, with_run)
     assert result.exit_code == 0, result.stderr
     assert result.stdout == f"wrote {out}: open it with rerun {out}\n"
     assert out.read_bytes()[:4] == b"RRF2"
-
-
-def test_runs_without_particles_are_told(fgloc, short_log, run_folder, tmp_path):
-    result = fgloc("view", run_folder, short_log, "--particles", "--rrd", tmp_path / "view.rrd", "--json")
-    assert result.stderr == "warning: no run has particles; only particle_filter and switching use them\n"
-    assert json.loads(result.stdout)["runs"] == {"ekf": str(run_folder)}
 
 
 def test_what_is_not_clear_is_asked_for(fgloc, short_log, run_folder, tmp_path):

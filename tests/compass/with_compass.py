@@ -8,18 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from compass.settings import CompassSettings
-from compass.stream import HEADINGS, Heading, HeadingStream
+from compass.stream import Heading, HeadingStream
 from in_short import blank_pictures, in_short, runs_here  # noqa: F401 - fixtures
 from typer.testing import CliRunner
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.cli.app import app
-from factorgraph_loc.io.bags.file import open_bag
-from factorgraph_loc.io.bags.manifest import propose
-from factorgraph_loc.io.bags.proposed import manifest_of, manifest_text
-from factorgraph_loc.model.log import cut, join
-from factorgraph_loc.sensors.registry import channels
-from factorgraph_loc.sensors.tables import all_tables
 from factors import se2
 
 T = np.arange(50) / 10.0
@@ -44,11 +38,6 @@ def command(*words: object) -> SimpleNamespace:
     """What a command prints, and its exit code."""
     done = CliRunner().invoke(app, [str(word) for word in words])
     return SimpleNamespace(stdout=done.stdout, stderr=done.stderr, returncode=done.exit_code)
-
-
-def test_its_channel_and_its_table_are_known():
-    assert "compass" in channels()
-    assert HEADINGS in list(all_tables())
 
 
 def test_a_rig_has_its_section(tmp_path):
@@ -78,13 +67,6 @@ def test_a_log_comes_back_from_its_folder(tmp_path, format):
     np.testing.assert_allclose(found.streams["compass"].t, log.streams["compass"].t, atol=1e-9)
 
 
-def test_what_is_wrong_in_its_table_is_told_with_file_and_row(tmp_path):
-    fgloc.write_native(made_log(), tmp_path / "arc")
-    (tmp_path / "arc/compass.csv").write_text(f"t_ns,heading\n{UNIX},0.1\n{UNIX + 10**9},90\n")
-    with pytest.raises(fgloc.InputError, match=r"compass\.csv:3: heading is 90.*radians, not degrees"):
-        fgloc.read_log(tmp_path / "arc")
-
-
 def test_a_table_of_another_program_by_a_mapping(tmp_path):
     (tmp_path / "wheels.csv").write_text("time,v,w\n0.0,1,0\n1.0,1,0\n")
     (tmp_path / "kvh.csv").write_text("time;yaw\n0.0;90\n0.5;-45\n")
@@ -97,39 +79,6 @@ def test_a_table_of_another_program_by_a_mapping(tmp_path):
     stream = fgloc.read_log(tmp_path / "arc.toml").streams["compass"]
     np.testing.assert_allclose(stream.t, (0.25, 0.75))
     np.testing.assert_allclose(stream.heading, (math.pi / 2.0, -math.pi / 4.0))
-
-
-@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
-def test_a_bag_gives_it_back(tmp_path, suffix):
-    log = made_log()
-    path = tmp_path / f"arc{suffix}"
-    fgloc.write_log(log, path)
-    with open_bag(path) as bag:
-        manifest = manifest_of(propose(bag), path.name, {"rig": "arc.rig.toml", "world": "arc.world.toml"})
-    (tmp_path / "arc.toml").write_text(manifest_text(manifest, []))
-    found = fgloc.read_log(tmp_path / "arc.toml").streams["compass"]
-    np.testing.assert_array_equal(found.heading, log.streams["compass"].heading)
-    np.testing.assert_allclose(found.t, log.streams["compass"].t, atol=1e-8)
-
-
-def test_parts_of_logs_hold_it():
-    log = made_log()
-    assert len(cut(log, 1.0, 2.0).streams["compass"].t) == 2
-    assert len(join(log, log).streams["compass"].t) == 20
-    given = [m for m in log.measurements(log.rig.sensors) if isinstance(m, Heading)]
-    assert [m.t for m in given] == log.streams["compass"].t.tolist()
-
-
-def test_what_lies_outside_its_bounds_is_not_run():
-    log = made_log()
-    log.streams["compass"].heading[3] = 1e3
-    with pytest.raises(fgloc.InputError, match=r"arc: compass at 1\.530 s: heading is 1000\.0"):
-        fgloc.run(log, "dead_reckoning")
-
-
-def test_an_estimator_that_does_not_use_it_counts_it():
-    run = fgloc.run(made_log(), "dead_reckoning", sensors=["odometry", "compass"])
-    assert run.result.diagnostics.ignored == {"compass": 10}
 
 
 def drifting_log() -> fgloc.Log:
@@ -182,28 +131,6 @@ def test_info_tells_of_it(tmp_path):
     assert told["rig"]["compass"]["bias"] == 0.1
     assert told["compass"]["bias"] == pytest.approx(0.1, abs=1e-6)
     assert "the compass reports 0.100 rad too much" in command("info", tmp_path / "arc").stdout
-
-
-def test_it_is_named_on_the_command_line(tmp_path):
-    fgloc.write_native(made_log(), tmp_path / "arc")
-    done = command(
-        "run", tmp_path / "arc", "--estimator", "ekf", "--sensors", "odometry,compas", "--out", tmp_path / "out"
-    )
-    assert done.returncode == 2
-    assert "did you mean compass?" in done.stderr
-    done = command(
-        "run", tmp_path / "arc", "--estimator", "ekf", "--sensors", "odometry,compass", "--out", tmp_path / "out"
-    )
-    assert done.returncode == 0, done.stderr
-
-
-def test_it_is_listed_with_its_table_and_its_keys():
-    listed = json.loads(command("sensors", "--json").stdout)
-    assert listed[-1] == {"name": "compass", "about": listed[-1]["about"], "channels": ["compass"], "rig": ["compass"]}
-    found = json.loads(command("sensors", "compass", "--json").stdout)
-    assert {"name": "heading", "unit": "rad"}.items() <= found["tables"][0]["columns"][1].items()
-    assert "bias" in {setting["key"] for setting in found["settings"]["compass"]}
-    assert "compass" in json.loads(command("estimators", "ekf", "--json").stdout)["sensors"]
 
 
 def test_a_simulated_drive_has_it():

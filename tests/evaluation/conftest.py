@@ -1,14 +1,7 @@
 """Runs that never were, and Chromium without a window, driven through a pipe by the DevTools protocol, for tests of pages."""
 
-import base64
 import io
-import json
-import os
-import shutil
-import subprocess
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -17,122 +10,6 @@ from scipy.signal import lfilter
 
 from factorgraph_loc.evaluation.report import RunFiles, Scene
 from factorgraph_loc.model.scoring import MAX_GAP
-
-
-class Chromium:
-    """One tab. ``problems``: what the console told of errors."""
-
-    def __init__(self, command, profile):
-        ours, to_child = os.pipe(), os.pipe()  # what it writes, what it reads
-        flags = ["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--remote-debugging-pipe"]
-        line = f'exec "$0" "$@" 3<&{to_child[0]} 4>&{ours[1]}'
-        self._process = subprocess.Popen(
-            ["bash", "-c", line, command, *flags, f"--user-data-dir={profile}", "about:blank"],
-            pass_fds=(to_child[0], ours[1]),
-            stderr=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-        )
-        os.close(to_child[0])
-        os.close(ours[1])
-        self._from, self._to = os.fdopen(ours[0], "rb"), os.fdopen(to_child[1], "wb")
-        self._count, self._session = 0, None
-        self.problems, self._events = [], []
-        (target,) = [t for t in self.send("Target.getTargets")["targetInfos"] if t["type"] == "page"][:1]
-        found = self.send("Target.attachToTarget", targetId=target["targetId"], flatten=True)
-        self._session = found["sessionId"]
-        for domain in ("Page", "Runtime", "Log", "Network"):
-            self.send(f"{domain}.enable")
-
-    def send(self, method, **params):
-        """The result of a command."""
-        self._count += 1
-        message = {"id": self._count, "method": method, "params": params}
-        if self._session:
-            message["sessionId"] = self._session
-        self._to.write(json.dumps(message).encode() + b"\0")
-        self._to.flush()
-        while True:
-            answer = self._read()
-            if answer.get("id") == self._count:
-                assert "error" not in answer, f"{method}: {answer['error']}"
-                return answer["result"]
-
-    def open(self, path, *, width=1280, height=900, dark=False, phone=False):
-        """Open a page in a window of this size, and wait until its script is done."""
-        self.problems, self._events = [], []
-        self.send(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=2 if phone else 1,
-            mobile=phone,
-        )
-        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self.send("Emulation.setEmulatedMedia", features=[scheme])
-        self.send("Page.navigate", url=path.resolve().as_uri())
-        while not any(event == "Page.loadEventFired" for event, _ in self._events):
-            self._read()
-
-    def requests(self):
-        """The addresses that the page asked for, beside its own."""
-        return [p["request"]["url"] for e, p in self._events if e == "Network.requestWillBeSent"][1:]
-
-    def run(self, expression):
-        """The value of a JavaScript expression."""
-        found = self.send("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
-        assert "exceptionDetails" not in found, found["exceptionDetails"]
-        return found["result"].get("value")
-
-    def mouse(self, kind, x, y, **more):
-        """A mouse event at a place of the window."""
-        self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
-
-    def screenshot(self, path, *, whole=False):
-        """A PNG of the window, or of the whole page."""
-        size = self.send("Page.getLayoutMetrics")["cssContentSize"]
-        clip = {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
-        more = {"clip": clip, "captureBeyondViewport": True} if whole else {}
-        path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png", **more)["data"]))
-
-    def close(self):
-        """End it."""
-        self._process.terminate()
-        self._process.wait(timeout=10)
-        self._from.close()
-        self._to.close()
-
-    def _read(self):
-        text = bytearray()
-        while (one := self._from.read(1)) != b"\0":
-            assert one, "chromium has gone"
-            text += one
-        message = json.loads(text)
-        if "method" in message:
-            self._events.append((message["method"], message["params"]))
-            if message["method"] == "Runtime.exceptionThrown":
-                self.problems.append(message["params"]["exceptionDetails"])
-            if message["method"] == "Log.entryAdded" and message["params"]["entry"]["level"] == "error":
-                self.problems.append(message["params"]["entry"]["text"])
-        return message
-
-
-@pytest.fixture(scope="session")
-def chromium(tmp_path_factory) -> Iterator[Chromium]:
-    """A browser; the test is skipped where there is none."""
-    command = shutil.which("chromium") or shutil.which("chromium-browser")
-    if command is None:
-        pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
-    browser = Chromium(command, tmp_path_factory.mktemp("chromium"))
-    yield browser
-    browser.close()
-
-
-@pytest.fixture(scope="session")
-def pictures() -> Path:
-    """Where pictures of pages are kept, to be looked at."""
-    folder = Path("out", "screenshots")
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 def estimates(rng, *, count=400, sigma=0.1, offset=(0.0, 0.0)):

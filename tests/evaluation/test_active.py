@@ -10,12 +10,9 @@ from factorgraph_loc.evaluation.active import (
     Decision,
     SeekingTrack,
     comparison,
-    difference_cells,
     differences,
-    metres_text,
     run_picture,
     summaries,
-    summary_cells,
 )
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.rfid.map import Tag
@@ -81,31 +78,6 @@ def test_policies_are_compared_on_the_same_seeds(rows):
     assert fewer["difference"] == pytest.approx(11.5 - 23.0)
 
 
-def test_worlds_are_told_apart(rows):
-    other = [row(policy, seed, 5.0, world="store") for policy in ("information", "random") for seed in range(3)]
-    found = differences([*rows, *other])
-    assert [(one["world"], one["pairs"]) for one in found] == [("hall", 10), ("store", 3)]
-    assert found[1]["ratio"] == 1.0
-
-
-def test_tables_say_what_never_came(rows):
-    header, lines = summary_cells(rows)
-    assert all(len(line) == len(header) for line in lines)
-    cells = dict(zip(header, lines[1], strict=True))
-    assert (cells["median [m]"], cells["90 % [m]"], cells["[deg]"]) == ("29.0", "never", "5.0")
-    assert cells["failed (95 %)"].startswith("2 (")
-    header, lines = difference_cells(rows)
-    assert dict(zip(header, lines[0], strict=True))["failed only first / second"] == "0 / 1"
-    assert metres_text(math.nan) == "–"
-
-
-def test_runs_that_all_fail_have_a_table_and_a_picture():
-    rows = [crashed(policy, seed) for policy in ("information", "random") for seed in range(2)]
-    assert summary_cells(rows)[1][0][3:5] == ["2", "never"]
-    assert difference_cells(rows)[1][0][4] == "– (-∞ to ∞)"
-    comparison(rows).draw_without_rendering()
-
-
 def test_the_picture_of_a_comparison_counts_what_came_and_what_did_not(rows):
     figure = comparison(rows)
     boxes, shares = figure.axes
@@ -157,9 +129,3 @@ def test_the_picture_of_a_run_shows_what_was_proposed_chosen_and_believed():
     assert len(spread) == 9
     # of 200 particles: farther off than 20 % in one of 2,000 draws
     np.testing.assert_allclose(spread[1:] / spread[:-1], 0.5, rtol=0.2)
-
-
-@pytest.mark.parametrize("count", [0, 1, 4])
-def test_a_short_run_has_a_picture_too(count):
-    figure = run_picture(track(count))
-    assert sum(axis.get_title().startswith("after") for axis in figure.axes) == count

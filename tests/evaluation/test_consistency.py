@@ -71,14 +71,3 @@ def test_gaps_of_the_reference_and_a_heading_that_means_nothing():
     assert np.isnan(mean[300:]).all()
     assert set(line(figure.axes[0], "ideal")) == {2.0}
     assert figure.axes[0].get_ylabel() == "NEES of x, y"
-
-
-def test_nothing_to_show_and_nothing_to_score():
-    track = track_of(np.random.default_rng(5), events=((1.0, "lost"),))
-    assert consistency(Log("log", Rig(), World(), {}), "ekf", track) is None
-    never = Track(None, Trajectory(T, np.zeros((len(T), 3))), np.ones(1), events=((1.0, "lost"),))
-    figure = consistency(log_of(), "ekf", never)
-    assert [axis.texts[0].get_text() for axis in figure.axes] == [
-        f"no {k} estimate to score" for k in ("causal", "final")
-    ]
-    assert all(any(drawn.get_linestyle() == "--" for drawn in axis.lines) for axis in figure.axes)

@@ -13,7 +13,6 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera import summary as inspect_camera
 from factorgraph_loc.sensors.camera.mounting_check import mounting_problems
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
@@ -55,16 +54,6 @@ def test_counts(log):
     assert found.streams["camera"].rate == pytest.approx(5.0)
 
 
-def test_images_that_cannot_be_read(log):
-    for file in log.streams["camera"].file[20:]:
-        file.write_bytes(b"no image")
-    found = inspect(log)
-    assert found.images.readable == 16
-    (problem,) = found.problems
-    assert problem.startswith("24 of the 40 examined images cannot be read: ")
-    assert "is not an image" in problem
-
-
 def test_sizes(log):
     files = log.streams["camera"].file
     for file in files[:25]:
@@ -76,12 +65,6 @@ def test_sizes(log):
     assert inspect(doubled).problems == (
         "the camera is calibrated for images of 160x120 px, those of the log have 320x240 px",
     )
-
-
-def test_black_images(log):
-    for file in log.streams["camera"].file:
-        cv2.imwrite(str(file), np.zeros((120, 160), dtype=np.uint8))
-    assert inspect(log).problems == ("half of the examined images, or more, show no orb features",)
 
 
 def test_a_rig_without_camera(log):
@@ -100,13 +83,6 @@ def test_points_that_the_map_lacks_and_pixels_outside(log):
         "2 sightings are of 1 points that the map lacks: chair",
         "1 of 4 sightings lie outside of the camera's image",
     )
-
-
-def test_no_images(log):
-    nothing = replace(log, streams=dict(log.streams) | {"camera": ImageStream(np.empty(0), [])})
-    found = inspect(nothing)
-    assert found.images == inspect_camera.ImageSummary(0, 0, 0, 0, {}, "orb", 0.0, None)
-    assert found.problems == ("camera is empty",)
 
 
 def turning(tmp_path, pitch, way):
@@ -147,9 +123,3 @@ def test_a_camera_that_looks_at_the_floor_though_its_rig_says_ahead(tmp_path):
     assert "as of a camera that looks ahead, by the rig's mounting 1.00 times" in problem
     (problem,) = mounting_problems(turning(tmp_path, np.pi / 2, -1.0))
     assert "at the ceiling" in problem
-
-
-def test_without_headings_nothing_is_said_of_the_mounting(tmp_path):
-    log = turning(tmp_path, 0.0, 1.0)
-    assert mounting_problems(replace(log, reference=None)) == []
-    assert mounting_problems(replace(log, reference=replace(log.reference, has_heading=False))) == []

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from factorgraph_loc.cli.app import app
 from factorgraph_loc.evaluation.figures import Track
-from factorgraph_loc.evaluation.plots import error_bands, plot_log, plot_run, remove_plots, trajectories
+from factorgraph_loc.evaluation.plots import error_bands, plot_log, plot_run, trajectories
 from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -50,15 +50,6 @@ def test_files(track, tmp_path):
     assert set((tmp_path / "plots").iterdir()) == set(paths)
 
 
-def test_files_of_one_run(track, tmp_path):
-    paths = plot_run(log_of(track), "ekf", track, tmp_path, "log")
-    assert {path.name for path in paths} == {f"log-{n}.png" for n in ("trajectories", "errors-ekf", "consistency-ekf")}
-    (tmp_path / "mine.png").write_text("mine")
-    remove_plots(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.png"]
-    remove_plots(tmp_path / "nowhere")
-
-
 def test_walls_and_tags_are_drawn_where_the_estimators_take_them_to_be(track):
     """The survey is shifted by 5 m: the tag is drawn there, within the view, and named in the legend."""
     first, second = ((0.0, 0.0), (8.0, 0.0)), ((8.0, 0.0), (8.0, 7.0))
@@ -75,11 +66,6 @@ def test_walls_and_tags_are_drawn_where_the_estimators_take_them_to_be(track):
             assert low < values[0]
             assert values[1] < high
     assert {"tags", "walls", "reference", "ekf"} <= {text.get_text() for text in figure.legends[0].texts}
-
-
-def test_without_tags_and_walls_nothing_tells_of_them(track):
-    labels = {text.get_text() for text in trajectories(log_of(track), {"ekf": track}).legends[0].texts}
-    assert labels == {"landmarks", "reference", "ekf"}
 
 
 def test_without_reference(track, tmp_path):
@@ -115,35 +101,6 @@ def test_a_log_that_never_tells_the_pose_is_run_and_plotted(track, estimator, re
     assert result.exit_code == 0, result.output
     assert "warning: log: never localized: no landmark of the map was seen" in result.stderr
     assert [path.name for path in (tmp_path / "out/plots").iterdir()] == ["log-trajectories.png"]
-
-
-def test_events_are_marked_in_all_panels_and_named_once(track):
-    log = log_of(track)
-    figure = error_bands(log, log.reference, "ekf", replace(track, events=((0.5, "lost"), (1.5, "found"))))
-    for axis in figure.axes:
-        assert [line.get_xdata()[0] for line in axis.lines if line.get_linestyle() == "--"] == [0.5, 1.5]
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels.count("event (see events.csv)") == 1
-
-
-def test_causal_and_final_errors_have_one_scale(track):
-    log = log_of(track)
-    axes = error_bands(log, log.reference, "ekf", track).axes
-    for causal, final in zip(axes[::2], axes[1::2], strict=True):
-        assert causal.get_ylim() == final.get_ylim()
-        assert not any(label.get_visible() for label in final.get_yticklabels())
-
-
-def test_no_panel_for_a_heading_that_is_not_scored(track):
-    log = log_of(track, has_heading=False)
-    assert len(error_bands(log, log.reference, "ekf", track).axes) == 4
-
-
-def test_axes_have_units_and_runs_a_legend(track):
-    figure = trajectories(log_of(track), {"ekf": track, "smoother": track})
-    assert {axis.get_xlabel() for axis in figure.axes} == {"x [m]"}
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["reference", "landmarks", "ekf", "smoother"]
 
 
 def test_no_line_is_drawn_across_a_gap(track):

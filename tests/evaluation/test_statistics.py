@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.evaluation.statistics import differences, pooled_rms
-from factorgraph_loc.evaluation.tables import ALL, comparison_cells, comparison_table, markdown, verdict
+from factorgraph_loc.evaluation.tables import ALL, comparison_cells, verdict
 
 METRIC = "causal.position_rmse"
 
@@ -98,25 +98,6 @@ def test_table_pools_seeds_and_logs():
     assert pooled[runs] == "3/4"
 
 
-def test_times_of_an_offline_estimator_are_not_shown():
-    rows = rows_of({("one", "a", 0): 0.3})
-    header, _ = comparison_cells(rows)
-    rows[0]["time_to_localized"] = None
-    _, (line,) = comparison_cells(rows)
-    assert line[header.index("x real time")] == "-"
-
-
-def test_how_many_poses_were_scored_is_a_column():
-    rows = rows_of({(log, "a", seed): 0.3 for log in ("one", "two") for seed in (0, 1)})
-    for row, scored in zip(rows, (40, 40, 100, 98), strict=True):
-        row["causal.scored"] = scored
-    rows[3] |= {"causal.scored": None, "final.scored": 98}  # of an offline estimator
-    header, lines = comparison_cells(rows)
-    assert [line[header.index("poses scored")] for line in lines] == ["40", "98 to 100", "138 to 140"]
-    header, lines = comparison_cells(rows_of({("one", "a", 0): None}))
-    assert lines[0][header.index("poses scored")] == "-"
-
-
 def test_verdict_names_the_best_that_can_be_compared():
     rows = rows_of({(log, name, 0): value for log in ("one", "two") for name, value in (("a", 0.4), ("b", 0.2))})
     rows += rows_of({("one", "c", 0): 0.1, ("one", "dead_reckoning", 0): 3.0, ("two", "dead_reckoning", 0): 4.0})
@@ -125,13 +106,3 @@ def test_verdict_names_the_best_that_can_be_compared():
     assert verdict(rows_of({("one", "a", 0): None})) == []
     (line,) = verdict(rows_of({("one", "a", 0): 0.201, ("one", "b", 0): 0.2, ("one", "c", 0): 0.203}))
     assert line == "least causal position error: b, 0.200 m, within 1% of it a"
-
-
-def test_table_as_markdown_and_for_the_terminal():
-    rows = rows_of({("one", "a", 0): 0.3, ("two", "a", 0): 0.1})
-    lines = markdown(*comparison_cells(rows)).splitlines()
-    assert len(lines) == 5
-    assert len({len(line) for line in lines}) == 1
-    table = comparison_table(rows)
-    assert table.row_count == 3
-    assert "causal\npos\n[m]" in [str(column.header) for column in table.columns]

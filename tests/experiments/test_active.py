@@ -13,7 +13,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
 from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.simulation.settings import SimulationSettings, preset
+from factorgraph_loc.simulation.settings import preset
 
 OFFICE = preset("office")
 WALLS = ((0.0, 0.0, 5.0, 0.0), (0.0, 0.0, 0.0, 5.0))
@@ -134,43 +134,6 @@ def test_what_was_interrupted_goes_on(calls, tmp_path):
     assert {seed for _, _, seed in calls} == {5, 6, 7, 8, 9}  # two of them failed: nothing was kept
 
 
-def test_other_settings_are_other_runs(tmp_path):
-    def part(simulation=OFFICE, **changes):
-        return jobs_of(simulation, ("random",), ("smoother",), (0,), tmp_path, ActiveSettings(**changes))[0].part
-
-    assert part() == part()
-    assert part() != part(max_metres=50.0)
-    assert part() != part(preset("office", {"world": {"tags": 3}}))
-
-
-@pytest.mark.usefixtures("calls")
-def test_a_process_that_dies_takes_its_runs_alone(monkeypatch, tmp_path):
-    def dying(function, jobs, _):
-        for i, job in enumerate(jobs):
-            yield i, RunFailedError("the process died") if i == 0 else function(job)
-
-    monkeypatch.setattr(active, "run_each", dying)
-    results = seek(OFFICE, ("information", "random"), ("active_mcl",), range(3), tmp_path)
-    assert [row["status"] for row in results.rows] == ["failed"] * 3 + ["ok"] * 3
-    assert len(results.failures) == 3
-
-
-@pytest.mark.usefixtures("calls")
-def test_results_are_not_replaced_unasked(tmp_path):
-    def go(**options):
-        seek(OFFICE, ("information",), ("active_mcl",), (0,), tmp_path, **options)
-
-    go()
-    (tmp_path / "plots" / "mine.txt").write_text("mine")
-    with pytest.raises(InputError, match="holds results already"):
-        go()
-    go(overwrite=True)
-    assert (tmp_path / "plots" / "mine.txt").exists()
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="is a file"):
-        seek(OFFICE, ("information",), ("active_mcl",), (0,), tmp_path / "file")
-
-
 @pytest.mark.parametrize(
     ("policies", "estimators", "message"),
     [
@@ -185,8 +148,3 @@ def test_names_are_checked_before_anything_runs(calls, tmp_path, policies, estim
         seek(OFFICE, policies, estimators, (0,), tmp_path / "out")
     assert not calls
     assert not (tmp_path / "out").exists()
-
-
-def test_no_key_is_of_the_run_and_of_the_world():
-    """``fgloc active --set`` tells them apart by their names."""
-    assert not ActiveSettings.model_fields.keys() & SimulationSettings.model_fields.keys()

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from factorgraph_loc.cli.app import app
-from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments import cluster
 from factorgraph_loc.experiments.experiment_file import Limits, read_experiment
 from factorgraph_loc.experiments.plan import plan
@@ -78,15 +78,6 @@ def test_a_worker_that_is_killed_loses_no_run_and_none_is_stored_twice(workers, 
     assert not list((store.folder / "claims").iterdir())
 
 
-def test_what_is_stored_is_not_run_again(workers, planned, stored):
-    runs, folder = planned(2)
-    first = list(cluster.execute(runs[:2], folder, scheduler=workers.scheduler_address, limits=Limits()))
-    again = list(cluster.execute(runs, folder, scheduler=workers.scheduler_address, limits=Limits()))
-    assert {o.key for o in first} == {r.key for r in runs[:2]}
-    assert {o.key for o in again} == {r.key for r in runs}
-    assert stored == {run.key: 1 for run in runs}
-
-
 def test_a_run_that_another_process_has_is_waited_for(workers, planned, stored):
     runs, folder = planned(1)
     claim = Store(folder).claim(runs[0].key)
@@ -141,18 +132,6 @@ def test_workers_with_other_code_are_refused(workers, planned, stored, monkeypat
         list(cluster.execute(runs, folder, scheduler=workers.scheduler_address, limits=Limits()))
     assert not stored
     assert not list((Store(folder).folder / "claims").iterdir())
-
-
-def test_a_scheduler_that_goes_away_ends_the_experiment_not_the_results(planned, monkeypatch):
-    runs, folder = planned(3)
-    monkeypatch.setattr(cluster, "CONNECT", 2.0)
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as made:
-        outcomes = cluster.execute(runs, folder, scheduler=made.scheduler_address, limits=Limits())
-        first = next(outcomes)
-        made.close()
-        with pytest.raises(RunFailedError, match="the scheduler has disappeared"):
-            list(outcomes)
-    assert Store(folder).state(first.key) == "ok"
 
 
 def test_no_scheduler_and_no_package_are_told_in_a_line(planned, monkeypatch):

@@ -58,17 +58,6 @@ def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
     assert [path.name for path in (out / "plots").glob("*-errors-*")] == ["straight-errors-dead_reckoning.png"]
 
 
-def test_an_unforeseen_error_leaves_its_traceback(log, tmp_path):
-    """In a process of its own, as the run beside it, whose pictures are drawn."""
-    broken = replace(log, streams={"odometry": log.streams["odometry"], "bearing_range": None})
-    config = RunConfig("dead_reckoning", prior="0,0,0")
-    row, other = compare([broken, replace(log, name="whole")], [config], tmp_path, jobs=2).rows
-    assert other["status"] == "ok"
-    assert (tmp_path / "plots/whole-trajectories.png").stat().st_size > 5000  # it is drawn
-    assert row["reason"].startswith("AttributeError: ")
-    assert "Traceback" in (tmp_path / "runs/straight/dead_reckoning/seed0/error.txt").read_text()
-
-
 def test_bad_input_is_found_before_anything_runs(log, tmp_path):
     config = RunConfig("dead_reckoning")
     for logs, configs, message in (

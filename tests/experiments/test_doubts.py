@@ -85,31 +85,6 @@ def test_images_and_wheels_alone_make_a_map_by_themselves(blank, name, sensor):
     assert named.config["settings"]["landmarks"] == "known"
 
 
-@pytest.mark.parametrize("name", ["smoother", "monoslam"])
-def test_points_that_are_estimated_need_no_map(blank, name):
-    assert run(blank, RunConfig(name, {"landmarks": "unknown"}, ("odometry", "camera"))).warnings == ()
-
-
-def test_nothing_is_missed_where_no_camera_is_used(blank):
-    assert run(blank, RunConfig("ekf", sensors=("odometry",))).warnings == ()
-    assert run(blank, RunConfig("dead_reckoning", sensors=("odometry", "camera"))).warnings == ()
-    assert run(blank, RunConfig("smoother", {"visual_odometry": True}, ("odometry", "camera"))).warnings == ()
-
-
-def test_images_need_points_that_look_like_something(blank):
-    assert run(with_points(blank, 2), RunConfig("ekf", sensors=("odometry", "camera"))).warnings == ()
-    named = with_points(blank, 0)
-    assert run(named, RunConfig("ekf", sensors=("odometry", "camera"))).warnings == (NO_POINTS,)
-    assert run(named, RunConfig("ekf", sensors=("odometry", "sightings"))).warnings == ()
-
-
-def test_who_takes_the_points_of_the_map_as_they_are_says_so_where_they_should_be_unknown(blank):
-    named, unknown, used = with_points(blank, 0), {"landmarks": "unknown"}, ("odometry", "sightings")
-    told = "straight: ekf does not estimate points: those of the map are used as they are"
-    assert run(named, RunConfig("ekf", unknown, used)).warnings == (told,)
-    assert run(named, RunConfig("smoother", unknown, used)).warnings == ()
-
-
 def test_why_a_start_stayed_unknown_is_told_by_the_sensors_that_were_used(blank, log):
     def why(log, *sensors):
         result = run(log, RunConfig("smoother", sensors=("odometry", *sensors), prior="unknown"))
@@ -141,16 +116,6 @@ def test_landmarks_that_no_sighting_can_place_are_not_estimated(log, name, lacks
         run(alone, RunConfig(name, {"landmarks": "unknown"}))
     with pytest.raises(InputError, match=f"{name}.landmarks is extended"):
         run(replace(alone, world=World()), RunConfig(name, {"landmarks": "extended"}))
-
-
-def test_landmarks_that_some_sighting_can_place_are_estimated(log):
-    free = {"landmarks": "unknown"}
-    alone = with_sightings(log, bearing=NOTHING)
-    run(alone, RunConfig("ekf", {"landmarks": "extended"}))  # its map has them
-    run(alone, RunConfig("ekf"))
-    run(alone, RunConfig("ekf", free, ("odometry",)))
-    of_a = np.where(np.arange(8) % 2, np.nan, log.streams["bearing_range"].bearing)
-    assert set(run(with_sightings(log, bearing=of_a), RunConfig("ekf", free)).learnt.landmarks) == {"a"}
 
 
 def with_reference(log, t):

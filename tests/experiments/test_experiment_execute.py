@@ -9,7 +9,7 @@ import pytest
 
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments import execute
-from factorgraph_loc.experiments.experiment import PACE, estimate_seconds, prepare, run_experiment
+from factorgraph_loc.experiments.experiment import prepare, run_experiment
 from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.plan import plan
 from factorgraph_loc.experiments.result_table import load_results
@@ -75,14 +75,6 @@ def test_the_same_run_again_is_the_same_to_the_byte_but_for_times(planned, out, 
         assert (a / name).read_bytes() == (b / name).read_bytes(), name
 
 
-def test_what_is_stored_is_not_done_again(planned, out, fake):
-    (one,) = planned()
-    execute.run_planned(one, out)
-    del fake.made
-    assert execute.run_planned(one, out).status == "ok"
-    assert not hasattr(fake, "made")
-
-
 def test_a_claimed_run_is_left_to_its_owner(planned, out):
     (one,) = planned()
     with Store(out).claim(one.key):
@@ -119,16 +111,6 @@ def test_a_failure_is_stored_with_its_reason_and_tried_again_if_told(
     assert not (Store(out).path(one.key) / FAILURE).exists()
 
 
-def test_a_failure_keeps_the_traceback_of_what_nobody_foresaw(planned, out, fake, monkeypatch):
-    def fail(*_):
-        raise KeyError("lost")
-
-    monkeypatch.setattr(fake, "process", fail)
-    (one,) = planned()
-    execute.run_planned(one, out)
-    assert b"in fail" in Store(out).read(one.key, FAILURE)
-
-
 @pytest.mark.parametrize("how", ["removed", "changed"])
 def test_a_log_that_vanishes_or_changes_mid_way_is_a_failure(planned, out, tmp_path, how):
     one, other = planned(estimators=["dead_reckoning", "ekf"])
@@ -143,17 +125,6 @@ def test_a_log_that_vanishes_or_changes_mid_way_is_a_failure(planned, out, tmp_p
     assert "log" in outcome.reason
     assert Store(out).row(other.key)["kind"] == "vanished"
     assert Store(out).state(one.key) == "ok"
-
-
-def test_a_full_disk_is_no_failure_of_the_run(planned, out, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    (one,) = planned()
-    monkeypatch.setattr("factorgraph_loc.experiments.output.write_files", full)
-    with pytest.raises(StoreError, match="No space left on device"):
-        execute.run_planned(one, out)
-    assert Store(out).state(one.key) == "missing"
 
 
 @pytest.fixture
@@ -241,26 +212,3 @@ def test_an_experiment_ends_with_one_line_when_the_disk_is_full_and_goes_on_when
     assert set(counts) == {"ok", "missing"}
     subprocess.run(["mount", "-o", "remount,size=10M", disk], check=True)
     assert len(run_experiment(experiment(text, folder=disk), executor=here(disk)).rows) == 20
-
-
-def test_how_long_runs_take_is_told_from_like_ones(experiment, out):
-    prepared = experiment()
-    fake, ekf = prepared.runs
-    assert estimate_seconds(prepared.runs, out) == pytest.approx(2 * fake.duration / PACE)
-    rows = run_experiment(prepared, executor=here(out)).rows
-    taken = rows["timing.run_seconds"].to_list()
-    assert estimate_seconds([ekf], out) == pytest.approx(taken[1])
-    longer = dataclasses.replace(fake, log="another", duration=3.0 * fake.duration)
-    assert estimate_seconds([longer, ekf], out) == pytest.approx(3.0 * taken[0] + taken[1])
-    assert estimate_seconds([dataclasses.replace(ekf, label="new", estimator="batch")], out) == pytest.approx(
-        ekf.duration / PACE
-    )
-
-
-def test_a_table_that_is_no_table_is_told(experiment, out):
-    run_experiment(experiment(), executor=here(out))
-    (out / "results.parquet").write_bytes(b"PAR1")
-    with pytest.raises(FglocError, match=r"results.parquet: is not a Parquet file that can be read"):
-        load_results(out)
-    run_experiment(experiment(), executor=here(out))
-    assert len(load_results(out)) == 2

@@ -29,29 +29,6 @@ def read(tmp_path):
     return read_text
 
 
-def test_names_alone_are_entries(read):
-    experiment = read(GOOD)
-    assert [entry.log for entry in experiment.logs] == ["plaza2", None]
-    assert experiment.logs[1].seeds == (0, 1, 2)
-    assert [entry.shown for entry in experiment.estimators] == ["ekf", "short"]
-    assert experiment.seeds == (0, 1)
-    assert experiment.sensors == (None,)
-    assert str(experiment.folder()) == "out/lags"
-
-
-def test_one_list_of_sensors_is_one_set_and_a_list_of_lists_several(read):
-    assert read(GOOD + 'sensors = ["odometry", "rfid"]').sensors == (("odometry", "rfid"),)
-    assert read(GOOD + 'sensors = [["odometry"], ["odometry", "rfid"]]').sensors == (
-        ("odometry",),
-        ("odometry", "rfid"),
-    )
-
-
-@pytest.mark.parametrize("text", ['"short.lag" = [1, 2]', "short.lag = [1, 2]"])
-def test_a_sweep_is_the_same_with_quoted_and_with_nested_keys(read, text):
-    assert read(f"{GOOD}[sweep]\n{text}").sweep.points() == [{"short.lag": 1}, {"short.lag": 2}]
-
-
 def test_a_grid_takes_every_value_with_every_other_and_a_list_the_first_with_the_first():
     over = {"a.x": [1, 2], "b.y": ["u", "v"]}
     assert len(Sweep.model_validate(over).points()) == 4
@@ -137,14 +114,6 @@ def test_a_change_of_another_type_is_one_line(read, change, fragments):
         assert fragment in str(caught.value)
 
 
-@pytest.mark.parametrize("wrong", ["estimators = 5", "estimators = [[1]]", "logs = {x = 1}"])
-def test_a_change_of_a_setting_in_a_file_of_other_types_is_one_line(read, wrong):
-    key = wrong.partition(" = ")[0]
-    kept = "\n".join(line for line in GOOD.splitlines() if not line.startswith(f"{key} ="))
-    with pytest.raises(InputError, match=f"a.toml: {key}"):
-        read(f"{kept}\n{wrong}", ("ekf.max_delay", 0.4))
-
-
 def test_the_points_of_a_sweep_are_counted_without_making_them():
     over = {"a.x": [1, 2, 2], "b.y": ["u", "v"], "b.z": [1, 2, 3]}
     for content in (over, over | {"mode": "list", "b.y": ["u", "v", "v"]}):
@@ -153,14 +122,6 @@ def test_the_points_of_a_sweep_are_counted_without_making_them():
             assert sweep.count(*words) == len(sweep.points(*words))
     large = Sweep.model_validate({f"a.k{i}": list(range(10_000)) for i in range(50)})
     assert large.count() == 10_000**50
-
-
-@pytest.mark.parametrize(
-    ("change", "hint"), [(("sedes", 1), "seeds"), (("shrot.lag", 1), "short"), (("simulatoin.name", 1), "simulation")]
-)
-def test_a_misspelt_change_names_the_nearest(read, change, hint):
-    with pytest.raises(InputError, match=f"did you mean {hint}"):
-        read(GOOD, change)
 
 
 def test_the_file_of_the_documentation_is_one(read):

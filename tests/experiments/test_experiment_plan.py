@@ -1,13 +1,10 @@
 """Which runs an experiment has, and what their keys depend on."""
 
 import dataclasses
-import os
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import pytest
-from pydantic import BaseModel
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments import keys, log_source
@@ -73,11 +70,6 @@ def test_a_glob_visits_a_bounded_number_of_files(planned, logs, monkeypatch):
     assert len(planned(logs=["one"])) == 1
 
 
-def test_a_link_to_a_folder_above_ends_no_walk(planned, logs):
-    (logs / "loop").symlink_to(logs)
-    assert [run.log for run in planned(logs=["./**"])] == ["one", "two"]
-
-
 @pytest.mark.parametrize(
     "content",
     [
@@ -111,51 +103,6 @@ def test_what_is_to_simulate_is_counted_before_any_log_is_simulated(planned, mon
     monkeypatch.setattr(plan_module, "MOST_LOOKS", 28_799_999 if looks else 10**12)
     with pytest.raises(InputError, match=rf"^has to simulate drives of .*{expected}.*, expected at most"):
         planned(logs=["one", {"simulate": "office", "settings": settings, "seeds": [3] if looks else range(140)}])
-
-
-def test_what_is_simulated_already_counts_no_more(planned, monkeypatch):
-    logs = [{"simulate": "office", "settings": {"drive": {"duration": 20.0}}, "seeds": [1, 2]}]
-    monkeypatch.setattr(plan_module, "MOST_SECONDS", 40)
-    first = planned(logs=logs)
-    monkeypatch.setattr(plan_module, "MOST_SECONDS", 0)
-    assert planned(logs=logs) == first
-    with pytest.raises(InputError, match="20 s and 12,800 observations"):
-        planned(logs=[*logs, logs[0] | {"seeds": [3]}])
-
-
-def test_an_interrupted_plan_keeps_what_it_has_looked_up(planned, monkeypatch):
-    logs = [{"simulate": "office", "settings": {"drive": {"duration": 20.0}}, "seeds": [1, 2]}]
-    look, made = keys._facts, []
-
-    def once(log):
-        if made:
-            raise KeyboardInterrupt
-        made.append(log.name)
-        return look(log)
-
-    monkeypatch.setattr(keys, "_facts", once)
-    with pytest.raises(KeyboardInterrupt):
-        planned(logs=logs)
-    monkeypatch.setattr(keys, "_facts", lambda log: made.append(log.name) or look(log))
-    assert [run.log for run in planned(logs=logs)] == made == ["office-1", "office-2"]
-
-
-def test_recorded_logs_are_planned_once_for_all_points_of_simulated_ones(planned, monkeypatch):
-    made, runs = [], plan_module._runs
-    monkeypatch.setattr(plan_module, "_runs", lambda e, log, *rest: made.append(log.name) or runs(e, log, *rest))
-    office = {"simulate": "office", "settings": {"drive": {"duration": 5.0}}}
-    found = planned(logs=["one", office], sweep={"simulation.world.tags": [3, 4, 5]})
-    assert [run.log for run in found] == ["one", "office-0", "office-0", "office-0"]
-    assert made.count("one") == 1
-
-
-def test_what_is_not_run_again_does_not_count(planned):
-    sweep = {"short.lag": [1, 2, 3], "ekf.max_delay": [0.4, 0.5]}
-    estimators = ["ekf", {"name": "smoother", "label": "short"}, "dead_reckoning"]
-    content = {"estimators": estimators, "sweep": sweep, "seeds": [1, 2]}
-    assert len(planned(**content, most=12)) == 12
-    with pytest.raises(TooManyRunsError, match="plans 12 runs, more than 11"):
-        planned(**content, most=11)
 
 
 def test_seeds_are_for_estimators_that_are_random(planned):
@@ -252,36 +199,6 @@ def test_what_cannot_be_run_is_told_before_anything_runs(planned, content, fragm
     with pytest.raises(InputError) as caught:
         planned(**content)
     assert fragment in str(caught.value)
-
-
-def test_a_file_is_read_again_only_if_it_has_changed(tmp_path, monkeypatch):
-    file, cache = tmp_path / "a.csv", tmp_path / "digests.json"
-    file.write_text("1")
-    monkeypatch.setattr(keys, "_UNSETTLED", -1.0)
-    digests = keys.FileDigests(cache)
-    first = digests.of_file(file)
-    digests.save()
-    monkeypatch.setattr(keys, "hashlib", SimpleNamespace())
-    assert keys.FileDigests(cache).of_file(file) == first
-    monkeypatch.undo()
-    file.write_text("12")
-    assert keys.FileDigests(cache).of_file(file) != first
-    cache.write_text("{")
-    assert keys.FileDigests(cache).of_file(file) != first
-
-
-def test_a_cache_that_is_too_large_or_no_file_is_made_again(tmp_path):
-    class Kept(BaseModel):
-        one: int
-
-    file = tmp_path / "cache.json"
-    keys.write_cache(file, Kept(one=1))
-    assert keys.read_cache(file, Kept) == Kept(one=1)
-    os.truncate(file, 2**40)
-    assert keys.read_cache(file, Kept) is None
-    file.unlink()
-    os.mkfifo(file)
-    assert keys.read_cache(file, Kept) is None
 
 
 def test_where_only_final_scores_are_shown_the_smoother_makes_no_causal_estimates(planned):

@@ -88,12 +88,6 @@ def test_an_estimator_that_takes_no_pixels_waits_for_no_features(seeing, fake, m
     assert "straight: fake does not use images: all 8 are ignored" in result.warnings
 
 
-def test_images_that_are_not_used_are_left_alone(seeing, sees):
-    result = run(seeing, RunConfig("fake", sensors=("odometry",)))
-    assert result.timings.images == 0
-    assert frames_fed(sees) == []
-
-
 @pytest.mark.usefixtures("sees")
 def test_a_calibration_of_another_resolution_is_an_error(seeing):
     other = CAMERA.model_copy(update={"width": 320, "height": 240})
@@ -140,12 +134,3 @@ def test_a_comparison_finds_features_once(seeing, sees, tmp_path, monkeypatch):
     rows = compare([seeing], [RunConfig("fake", seed=k) for k in range(3)], tmp_path / "out").rows
     assert [row["timing.images"] for row in rows] == [8, 8, 8]
     assert sorted(found) == [f"{k}.png" for k in range(8)]
-
-
-@pytest.mark.usefixtures("sees")
-def test_a_comparison_of_a_log_that_cannot_be_used_is_a_failed_run(seeing, tmp_path, monkeypatch):
-    monkeypatch.setattr(comparing, "run_each", in_this_process)
-    other = CAMERA.model_copy(update={"width": 320, "height": 240})
-    log = replace(seeing, rig=seeing.rig.model_copy(update={"camera": other}))
-    (failure,) = compare([log], [RunConfig("fake")], tmp_path / "out").failures
-    assert "calibrated for images of 320 x 240 px" in failure

@@ -39,15 +39,6 @@ def test_a_manifest_beside_its_log_has_all_files_behind_it(manifest):
     assert all(path.is_file() for path in files.values())
 
 
-def test_a_manifest_may_be_called_run_toml(manifest, tmp_path):
-    """Then what else lies beside it, results perhaps, is none of the log."""
-    expected = set(RecordedSource(str(manifest)).files()) - {manifest.name}
-    manifest.rename(tmp_path / "run.toml")
-    (tmp_path / "results.txt").write_text("of no matter")
-    for log in (tmp_path / "run.toml", tmp_path):
-        assert set(RecordedSource(str(log)).files()) == {*expected, "run.toml"}
-
-
 def test_a_log_below_the_data_root(manifest, tmp_path):
     root = tmp_path / "data"
     (root / "elsewhere").mkdir(parents=True)

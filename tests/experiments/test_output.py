@@ -70,12 +70,6 @@ def test_table_of_estimates(result, log, tmp_path):
     assert not any(table[name].is_nan().any() for name in COLUMNS if name not in types)
 
 
-def test_json_has_no_nan(result, log, tmp_path):
-    text = (write_run(result, log, tmp_path / "out"), (tmp_path / "out" / "metrics.json").read_text())[1]
-    assert "NaN" not in text
-    assert "Infinity" not in text
-
-
 def test_what_was_learnt_and_what_happened(result, log, tmp_path):
     point = LearntPoint(np.array((5.0, 1.0)), np.array(((0.04, 0.01), (0.01, np.nan))))
     result = replace(result, learnt=replace(result.learnt, landmarks={"a": point}))
@@ -103,20 +97,6 @@ def test_results_are_not_overwritten_unless_told(result, log, tmp_path):
     write_run(result, log, out, overwrite=True)
     assert (out / "notes.txt").read_text() == "mine"
     assert {path.name for path in out.iterdir()} == {*FILES, "notes.txt"}
-
-
-def test_a_folder_without_results_may_be_used(result, log, tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    write_run(result, log, tmp_path)
-    assert (tmp_path / "metrics.json").is_file()
-
-
-def test_a_file_in_the_way(result, log, tmp_path):
-    (tmp_path / "out").write_text("")
-    with pytest.raises(InputError, match="is a file"):
-        write_run(result, log, tmp_path / "out", overwrite=True)
-    with pytest.raises(InputError, match="cannot be written"):
-        write_run(result, log, tmp_path / "out" / "below")
 
 
 def test_nothing_is_left_half_written(result, log, tmp_path, monkeypatch):

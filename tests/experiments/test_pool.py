@@ -3,7 +3,6 @@
 import multiprocessing
 import os
 import signal
-import tempfile
 import threading
 import time
 
@@ -14,7 +13,6 @@ from factorgraph_loc.experiments.experiment_file import Experiment, Limits
 from factorgraph_loc.experiments.plan import plan
 from factorgraph_loc.experiments.pool import execute
 from factorgraph_loc.experiments.store import Store
-from factorgraph_loc.files.temporary import MARK
 
 SHORT = {"simulate": "office", "settings": {"drive": {"duration": 4}}}
 LONG = {"simulate": "office", "settings": {"name": "long", "drive": {"duration": 60}}}
@@ -81,12 +79,3 @@ def test_workers_end_when_the_caller_stops_listening(planned, tmp_path):
     outcomes.close()
     assert multiprocessing.active_children() == []
     assert Store(tmp_path / "out").state(runs[1].key) == "missing"
-
-
-def test_temporary_folders_of_killed_processes_are_removed_at_the_end(tmp_path, monkeypatch):
-    Store(tmp_path / "out").create()
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    left = tmp_path / f".run{MARK}{'0' * 8}"
-    left.mkdir()
-    assert list(execute([], tmp_path / "out", jobs=1, limits=Limits())) == []
-    assert not left.exists()

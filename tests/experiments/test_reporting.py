@@ -8,7 +8,6 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.execute import run_planned
 from factorgraph_loc.experiments.experiment import prepare
 from factorgraph_loc.experiments.keys import code_version
-from factorgraph_loc.experiments.log_source import SimulatedSource
 from factorgraph_loc.experiments.reporting import report_experiment
 
 TEXT = """
@@ -43,30 +42,6 @@ def test_page_of_what_is_stored(prepared):
     assert "opencv-python-headless" in page
     assert "max_delay = 0.4" in page
     assert '"walls":[' in page
-
-
-def test_part_of_it_is_a_page_too(prepared, tmp_path):
-    page = report_experiment(prepared(made=1)).page.read_text(encoding="utf-8")
-    assert "1 estimator on 1 log: 1 run." in page
-    assert "Differences from" not in page
-    with pytest.raises(InputError, match="no runs"):
-        report_experiment(prepare(tmp_path / "tiny.toml", out=tmp_path / "other"))
-
-
-def test_logs_are_read_once(prepared, monkeypatch):
-    first = report_experiment(prepared()).page
-    before = first.read_bytes()
-    monkeypatch.setattr(SimulatedSource, "load", lambda _: pytest.fail("was read again"))
-    assert report_experiment(prepared(made=0)).page.read_bytes() == before
-
-
-def test_a_log_that_has_vanished_is_drawn_without_map(prepared, monkeypatch):
-    def vanished(_):
-        raise InputError("is not there")
-
-    some = prepared()
-    monkeypatch.setattr(SimulatedSource, "load", vanished)
-    assert '"scene":null' in report_experiment(some).page.read_text(encoding="utf-8")
 
 
 def damage(run, store):
@@ -107,9 +82,3 @@ def test_what_is_kept_beside_the_results_is_made_again_where_it_is_damaged(prepa
     for file in (scene, *(tmp_path / "out/store").glob("*.json")):
         file.write_bytes(content)
     assert report_experiment(prepared(made=0)).page.read_bytes() == first
-
-
-def test_a_page_that_cannot_be_written_is_told(prepared, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
-        report_experiment(prepared(), tmp_path / "file" / "report.html")

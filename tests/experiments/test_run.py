@@ -1,8 +1,5 @@
 """What an estimator is given in a run, in which order, and what is kept."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -70,22 +67,6 @@ def test_a_first_run_is_rehearsed_and_no_result_depends_on_it(log, name, monkeyp
     assert np.array_equal(first.covariances, second.covariances)
 
 
-def test_a_rehearsal_reaches_the_first_observations_of_a_robot_that_drives_blind_at_first(log, monkeypatch):
-    seen = log.streams["bearing_range"]
-    log = replace(log, streams={**log.streams, "bearing_range": replace(seen, t=np.linspace(1.2, 1.9, len(seen.t)))})
-    estimator = estimator_type("ekf")
-    process = estimator.process
-    taken = {}
-    monkeypatch.setattr(
-        estimator, "process", lambda self, m: (taken.setdefault(id(self), []).append(m.sensor), process(self, m))
-    )
-    monkeypatch.setattr("factorgraph_loc.experiments.run._REHEARSED", set())
-    monkeypatch.setattr("factorgraph_loc.experiments.run._REHEARSAL", 0.3)
-    run(log, RunConfig("ekf"))
-    rehearsal, itself = taken.values()
-    assert 0 < rehearsal.count("bearing_range") < itself.count("bearing_range")
-
-
 @pytest.mark.parametrize("start", [None, 0.72])
 @pytest.mark.parametrize("name", ["dead_reckoning", "ekf", "smoother"])
 def test_rows_of_odometry_may_come_at_once(log, name, start, monkeypatch):
@@ -150,13 +131,6 @@ def test_effective_configuration(log):
         run(log, RunConfig("fake", {"localised_at": 0.5}))
 
 
-def test_progress_ends_at_one(log):
-    shares = []
-    run(log, RunConfig("fake"), shares.append)
-    assert shares == sorted(shares)
-    assert shares[-1] == 1.0
-
-
 def test_a_pose_that_is_not_finite_is_an_error(log):
     with pytest.raises(
         RunFailedError, match=r"^fake on straight: the estimate at 1\.000 s \(after .*\): the pose is not finite$"
@@ -181,16 +155,6 @@ def test_a_clock_that_jumps_costs_no_ticks(log, name, far):
     assert result.config["tick_gap"] == 60.0
 
 
-def test_gaps_without_ticks_are_a_setting(log):
-    silent = {key: replace(s, t=np.where(s.t > 1.0, s.t + 5.0, s.t)) for key, s in log.streams.items()}
-    silent = replace(log, streams=silent)
-    whole, parted = run(silent, RunConfig("fake")), run(silent, RunConfig("fake", tick_gap=2.0))
-    assert len(whole.t) == 71
-    assert parted.t.tolist() == [t for t in whole.t.tolist() if t <= 1.0 or t >= 6.02]
-    with pytest.raises(InputError, match="tick_gap is 0, expected 1 to 86400 s"):
-        run(log, RunConfig("fake", tick_gap=0.0))
-
-
 def test_stamps_that_are_no_times_of_a_log(log):
     for far in (np.nan, np.inf, 1e300):
         stream = replace(log.streams["odometry"], t=np.append(log.streams["odometry"].t[:-1], far))
@@ -207,11 +171,6 @@ def test_what_an_estimator_cannot_compute_is_one_line(log, fake, monkeypatch):
     with pytest.raises(RunFailedError) as told:
         run(log, RunConfig("fake"))
     assert str(told.value) == "fake on straight: bearing_range at 0.520 s: Singular matrix"
-
-
-def test_a_log_without_measurements(log):
-    with pytest.raises(InputError, match="has no measurements of odometry"):
-        run(replace(log, streams={"odometry": VelocityStream(*np.empty((3, 0)))}), RunConfig("fake", prior="0,0,0"))
 
 
 def test_priors(log):
@@ -292,14 +251,3 @@ def test_same_seed_same_result(log):
     one, other = (run(log, RunConfig("particle_filter", seed=3)) for _ in range(2))
     assert np.array_equal(one.poses, other.poses)
     assert np.array_equal(one.final.poses, other.final.poses)
-
-
-def test_one_thread_is_asked_for_before_numpy():
-    code = (
-        "import sys, os; from factorgraph_loc.threads import use_one_thread; use_one_thread();"
-        "assert 'numpy' not in sys.modules; print(os.environ['OPENBLAS_NUM_THREADS'], os.environ['OMP_NUM_THREADS'])"
-    )
-    clean = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
-    for environment, expected in ((clean, "1 1"), (clean | {"OMP_NUM_THREADS": "4"}, "1 4")):
-        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-        assert done.stdout.strip() == expected

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.compare import compare
 from factorgraph_loc.experiments.preparation import use_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import settings_of
@@ -14,9 +13,7 @@ from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.rfid.describe import doubts
 from factorgraph_loc.sensors.rfid.map import Tag
-from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.simulation import preset, simulate
 
 ALL = ("odometry", "rfid", "rssi", "phase")
 
@@ -50,13 +47,6 @@ def test_rssi_and_phase_are_sensors_of_the_reads(reading, fake):
     assert fake.made.setup.sensors == ALL
 
 
-def test_rssi_without_the_reads_is_an_error(reading, log):
-    with pytest.raises(InputError, match="rssi comes with reads of tags, expected rfid among the sensors too"):
-        run(reading, RunConfig("fake", sensors=("odometry", "rssi")))
-    with pytest.raises(InputError, match="has no sensor 'rssi'"):
-        run(log, RunConfig("fake", sensors=("odometry", "rssi", "rfid")))
-
-
 def test_what_the_rig_lists_and_the_reads_lack_is_left_out(reading, fake):
     rig = reading.rig.model_copy(update={"sensors": ALL})
     result = run(replace(reading, rig=rig), RunConfig("fake"))
@@ -86,31 +76,3 @@ def test_no_tag_of_the_map_is_ever_read(reading):
     stream = replace(reading.streams["rfid"], epc=["", "x"])
     result = run(replace(reading, streams=dict(reading.streams) | {"rfid": stream}), RunConfig("fake", sensors=ALL[:2]))
     assert any("none of the 3 tags of the map is read" in warning for warning in result.warnings)
-
-
-@pytest.mark.usefixtures("runs_here", "blank_pictures")
-def test_compare_takes_the_same_sensors(reading, tmp_path):
-    compare([reading], [RunConfig("dead_reckoning", sensors=ALL[:3])], tmp_path / "out", jobs=1)
-    assert not list((tmp_path / "out").rglob("error.txt"))
-    with pytest.raises(InputError, match="no log has a sensor 'phse': did you mean phase"):
-        compare([reading], [RunConfig("dead_reckoning", sensors=("odometry", "phse"))], tmp_path / "none")
-
-
-def test_a_log_of_tags_alone_that_never_tells_the_place_says_so_of_tags(reading):
-    """One read of one tag, and only reads of others: once several places are left, once nothing is told."""
-    world = reading.world.model_copy(update={"landmarks": {}})
-    rig = reading.rig.model_copy(update={"rfid": RfidSettings(preset="rackham")})
-    alone = replace(reading, rig=rig, world=world)
-    config = RunConfig("particle_filter", sensors=ALL[:2], prior="unknown")
-    assert run(alone, config).warnings[-1] == "straight: never localized: its tags leave several places possible"
-    stream = replace(reading.streams["rfid"], epc=["x", "x"])
-    unread = run(replace(alone, streams=dict(reading.streams) | {"rfid": stream}), config)
-    # silences alone leave most of the map, and it is said that no tag was read
-    assert unread.warnings[-1] == "straight: never localized: its tags leave several places possible"
-    assert "straight: none of the 3 tags of the map is read" in unread.warnings
-
-
-def test_an_estimator_without_tags_says_so():
-    log = simulate(preset("office", {"drive": {"duration": 60.0}}), 0)
-    (warning,) = set(run(log, RunConfig("monoslam")).warnings) - set(run(log, RunConfig("dead_reckoning")).warnings)
-    assert warning == f"{log.name}: monoslam does not use RFID: all 960 inventory rounds are ignored"

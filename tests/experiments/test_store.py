@@ -139,27 +139,11 @@ def test_contents_of_other_types_are_damage(store, name, content):
     assert store.state(KEY) == "ok"
 
 
-def test_scores_do_not_stand_for_what_the_run_is(store):
-    with_files(store, {METRICS: b'{"status": 3, "causal.anees": 2}', TIMINGS: b'{"kind": 1, "timing.updates": 4}'})
-    row = store.row(KEY)
-    assert (row["status"], row["kind"], row["causal.anees"], row["timing.updates"]) == ("ok", None, 2, 4)
-
-
 def test_a_manifest_names_files_of_its_folder_alone(store):
     store.put(KEY, FILES)
     manifest = store.path(KEY) / MANIFEST
     manifest.write_text(manifest.read_text().replace("estimates.parquet", "../estimates.parquet"))
     assert store.state(KEY) == "damaged"
-
-
-@pytest.mark.parametrize("place", ["ab", f"ab/{KEY}", f"tmp/{KEY}"])
-def test_a_file_in_the_place_of_a_folder_gives_way(store, place):
-    path = store.folder / place
-    path.parent.mkdir(exist_ok=True)
-    path.write_text("in the way")
-    assert store.state(KEY) in ("damaged", "missing")
-    store.put(KEY, FILES)
-    assert store.state(KEY, thorough=True) == "ok"
 
 
 def test_a_pipe_in_the_place_of_a_file_is_damage_and_nobody_waits_for_it(store):
@@ -169,32 +153,6 @@ def test_a_pipe_in_the_place_of_a_file_is_damage_and_nobody_waits_for_it(store):
     assert store.state(KEY) == "damaged"
     with pytest.raises(DamagedError, match="is a named pipe, expected a regular file"):
         store.read(KEY, METRICS)
-
-
-@pytest.mark.parametrize("name", ["estimates.parquet", METRICS, MANIFEST])
-def test_a_folder_in_the_place_of_a_file_is_damage(store, name):
-    store.put(KEY, FILES)
-    (store.path(KEY) / name).unlink()
-    (store.path(KEY) / name).mkdir()
-    assert store.state(KEY) == "damaged"
-    store.put(KEY, FILES)
-    assert store.state(KEY, thorough=True) == "ok"
-
-
-@pytest.mark.parametrize("place", ["", "claims", "tmp"])
-def test_a_file_in_the_place_of_the_store_is_told(tmp_path, place):
-    path = tmp_path / "out/store" / place
-    path.parent.mkdir(parents=True)
-    path.write_text("in the way")
-    with pytest.raises(StoreError, match="cannot be written: "):
-        Store(tmp_path / "out").create()
-
-
-def test_times_may_be_lost_without_the_run(store):
-    store.put(KEY, FILES)
-    (store.path(KEY) / TIMINGS).write_bytes(b"{")
-    assert store.state(KEY, thorough=True) == "ok"
-    assert store.row(KEY)["causal.position_rmse"] == 0.5
 
 
 def hold(folder, connection):
@@ -257,26 +215,6 @@ def test_a_write_that_fails_leaves_what_was_there(store, monkeypatch):
     monkeypatch.undo()
     assert store.read(KEY, METRICS) == FILES[METRICS]
     assert list((store.folder / "tmp").iterdir()) == []
-
-
-def test_a_full_disk_is_told_and_the_store_stays_whole(small_disk):
-    store = Store(small_disk(64))
-    store.create()
-    store.put(KEY, FILES)
-    with pytest.raises(StoreError, match=r"cannot be written.*No space left"):
-        store.put(OTHER, FILES | {"estimates.parquet": bytes(10**6)})
-    assert store.state(KEY, thorough=True) == "ok"
-    assert store.state(OTHER) == "missing"
-    store.put(OTHER, FILES)
-
-
-def test_a_disk_that_is_full_at_a_claim_is_told_in_one_line(store, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "write", full)
-    with pytest.raises(StoreError, match="cannot be written: No space left on device"), store.claim(KEY):
-        pass
 
 
 @pytest.mark.parametrize("folder", ["a file", "/proc"])  # neither of which root can write into

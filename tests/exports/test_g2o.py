@@ -6,7 +6,6 @@ import gtsam
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports.trajectories import pose_graph, write_g2o
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.trajectory import Trajectory
@@ -76,12 +75,3 @@ def test_a_robot_at_rest_has_finite_information(log, tmp_path):
     )
     write_g2o(pose_graph(replace(log, streams={"odometry": still}), log.reference, SENSORS), tmp_path / "arc.g2o")
     assert np.isfinite(rows(tmp_path / "arc.g2o", "EDGE_SE2")).all()
-
-
-def test_what_makes_no_pose_graph(log, tmp_path):
-    with pytest.raises(InputError, match="has no odometry among rfid"):
-        pose_graph(log, log.reference, ("rfid",))
-    with pytest.raises(InputError, match="has 0 poses, expected two or more"):
-        pose_graph(log, Trajectory(np.empty(0), np.empty((0, 3))), SENSORS)
-    with pytest.raises(InputError, match=r"arc.g2o: cannot be written: No such file"):
-        write_g2o(pose_graph(log, log.reference, SENSORS), tmp_path / "missing" / "arc.g2o")

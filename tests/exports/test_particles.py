@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.particles import SHOWN, _drawn, particles_of
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -39,16 +38,6 @@ def test_another_run_is_told_by_its_difference(log, filtered):
     assert particles_of(replace(filtered, causal=moved), log).difference == pytest.approx(0.25)
     fewer = replace(filtered.causal, t=moved.t[1:], poses=moved.poses[1:], covariances=moved.covariances[1:])
     assert particles_of(replace(filtered, causal=fewer), log).difference == np.inf
-
-
-def test_an_estimator_without_particles(log, results):
-    assert [particles_of(r, log) for r in read_runs(find_runs(results), log)] == [None, None]
-
-
-def test_a_configuration_that_is_not_whole(log, filtered):
-    config = filtered.folder.config.model_copy(update={"prior": None})
-    with pytest.raises(InputError, match=r"config.toml has no sensors or no prior"):
-        particles_of(replace(filtered, folder=replace(filtered.folder, config=config)), log)
 
 
 def test_draws_follow_the_weights():

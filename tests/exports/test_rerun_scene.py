@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import rerun_scene
 from factorgraph_loc.exports.runs import Particles, find_runs, read_runs
 from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
 from factors.camera import model as reprojection
 
@@ -88,16 +86,6 @@ def test_robots_go_their_ways(log, results, recording):
         assert np.allclose(np.array(path)[:, :2], run.final.poses[:, :2], atol=1e-6)
 
 
-def test_no_trail_leads_across_a_gap(monkeypatch):
-    drawn = []
-    monkeypatch.setattr(rerun_scene, "_lines_over_time", lambda _, at, t, lines, __: drawn.append((at, t, lines)))
-    poses = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (5.0, 5.0, 0.0), (6.0, 5.0, 0.0)])
-    rerun_scene._trail(None, "/way", Trajectory(np.array((0.0, 0.1, 100.0, 100.1)), poses), (0, 0, 0))
-    ((at, t, lines),) = drawn
-    assert (at, t.tolist()) == ("/way", [0.1, 100.1])
-    assert lines.tolist() == [[[0.0, 0.0], [1.0, 0.0]], [[5.0, 5.0], [6.0, 5.0]]]
-
-
 def test_tags_are_lit_while_they_are_read(recording):
     rows = recording("/world/tags/lit", "labels")
     assert [(t, v) for t, v in rows if t is not None] == [
@@ -144,17 +132,6 @@ def test_particles_come_and_go(log, results, tmp_path):
     assert [(t, v) for t, v in rows if t is not None] == [(0.0, [[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]]), (0.5, [])]
 
 
-def test_a_log_alone_and_a_reference_without_headings(log, tmp_path):
-    bare = replace(log, reference=replace(log.reference, has_heading=False))
-    rerun_scene.write_rrd(bare, [], tmp_path / "log.rrd")
-    recording = Recording(tmp_path / "log.rrd")
-    assert len(recording("/world/reference/robot", "translation")) == len(log.reference)
-    assert not recording("/world/reference/robot/heading", "vectors")
-    blind = replace(log, reference=None, streams={"odometry": log.streams["odometry"]}, world=type(log.world)())
-    rerun_scene.write_rrd(blind, [], tmp_path / "log.rrd")
-    assert {at for at, _ in Recording(tmp_path / "log.rrd").rows if not at.startswith("/__")} == {"/world"}
-
-
 def test_a_reference_in_space_carries_its_camera(log, tmp_path):
     turns = Rotation.from_rotvec([(0.0, 0.0, 0.0), (0.4, 0.0, 0.0)]).as_matrix()
     space = Trajectory3(np.array((0.0, 1.0)), np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 1.5))), turns)
@@ -165,19 +142,3 @@ def test_a_reference_in_space_carries_its_camera(log, tmp_path):
     assert np.allclose(np.ravel(recording("/world/reference/robot", "translation")[1][1]), (1.0, 0.0, 1.5))
     assert len(recording("/world/reference/robot/camera/image", "blob")) == 3
     assert len(recording("/world/reference/robot/camera", "translation")) == 1
-
-
-def test_without_the_library_it_says_what_to_install(log, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(InputError, match=r"pip install 'factorgraph-loc\[viewer\]'"):
-        rerun_scene.write_rrd(log, [], tmp_path / "log.rrd")
-
-
-def test_where_nothing_can_be_written_or_shown(log, tmp_path, monkeypatch):
-    with pytest.raises(InputError, match=r"log.rrd: cannot be written: No such file"):
-        rerun_scene.write_rrd(log, [], tmp_path / "missing" / "log.rrd")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr(sys, "platform", "linux")
-    with pytest.raises(InputError, match="no display to open the viewer on, expected --rrd FILE"):
-        rerun_scene.show(log, [])

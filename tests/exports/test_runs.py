@@ -36,16 +36,6 @@ def test_one_run_or_all_of_a_comparison(results):
     assert [folder.estimator for folder in find_runs(results)] == ["dead_reckoning", "ekf"]
 
 
-def test_seeds_and_folders_tell_runs_of_one_estimator_apart(log, results, tmp_path):
-    one = results / "runs" / "arc" / "ekf" / "seed0"
-    shutil.copytree(one, tmp_path / "first")
-    shutil.copytree(one, tmp_path / "second")
-    folders = [*find_runs(tmp_path / "first"), *find_runs(tmp_path / "second")]
-    assert [r.name for r in read_runs(folders, log)] == ["ekf-seed0-first", "ekf-seed0-second"]
-    with pytest.raises(InputError, match="is named twice"):
-        read_runs([folders[0], folders[0]], log)
-
-
 def test_bad_folders(log, results, tmp_path):
     assert not is_results(tmp_path)
     with pytest.raises(InputError, match="holds no results, expected a folder that `fgloc run`"):
@@ -98,15 +88,6 @@ def test_a_damaged_file_is_one_line_that_names_it(log, results, tmp_path, name, 
     shutil.copytree(run_folder, tmp_path / "run")
     (tmp_path / "run" / name).write_bytes(content)
     with pytest.raises(InputError, match=name):
-        read_runs(find_runs(tmp_path / "run"), log)
-
-
-@pytest.mark.parametrize("name", ["config.toml", "learnt.json", "events.csv", "estimates.parquet"])
-def test_a_folder_in_the_place_of_a_file_is_told(log, results, tmp_path, name):
-    shutil.copytree(find_runs(results)[0].path, tmp_path / "run")
-    (tmp_path / "run" / name).unlink()
-    (tmp_path / "run" / name).mkdir()
-    with pytest.raises(InputError, match=f"{name}: is a folder"):
         read_runs(find_runs(tmp_path / "run"), log)
 
 

@@ -4,11 +4,9 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera import draw
@@ -23,10 +21,6 @@ def test_tags_are_lit_from_when_the_antenna_had_them(log):
     lights = lights_of(log)["tags"]
     assert np.allclose(lights.t, [1.0, 1.5, 1.8, 2.0, 2.3, 2.5])
     assert lights.names == (("A",), (), ("A",), ("A", "B"), ("B",), ())
-
-
-def test_a_log_without_reads_has_no_lights(log):
-    assert all(lights.names == () for lights in lights_of(replace(log, streams={})).values())
 
 
 @given(st.lists(st.tuples(st.integers(0, 40), st.sampled_from("abc")), max_size=20))
@@ -49,14 +43,6 @@ def test_an_ellipse_holds_95_percent():
     assert np.allclose(outline[0], outline[-1])
 
 
-def test_poses_without_a_covariance_have_no_ellipse():
-    covariances = np.array((np.eye(3), np.full((3, 3), np.nan)))
-    t, outlines = scene.ellipses(Trajectory(np.array((0.0, 1.0)), np.zeros((2, 3)), covariances))
-    assert t.tolist() == [0.0]
-    assert np.isfinite(outlines).all()
-    assert len(scene.ellipses(Trajectory(np.zeros(1), np.zeros((1, 3))))[0]) == 0
-
-
 def test_pictures_become_jpegs(log):
     pictures = list(draw.images(log))
     assert [t for t, _ in pictures] == [0.5, 1.5, 2.5]
@@ -68,17 +54,6 @@ def test_pictures_become_jpegs(log):
     jpeg.write_bytes(pictures[1][1])
     kept = replace(log, streams={"camera": ImageStream(np.zeros(1), [jpeg])})
     assert next(draw.images(kept))[1] == pictures[1][1]
-
-
-@pytest.mark.parametrize(
-    ("content", "message"), [(None, "cannot be read"), (b"no picture", "is not an image"), (b"", "is not an image")]
-)
-def test_a_picture_that_cannot_be_read_is_named(log, tmp_path, content, message):
-    if content is not None:
-        (tmp_path / "p.png").write_bytes(content)
-    bad = replace(log, streams={"camera": ImageStream(np.zeros(1), [tmp_path / "p.png"])})
-    with pytest.raises(InputError, match=f"p.png: {message}"):
-        list(draw.images(bad))
 
 
 def test_a_path_is_cut_at_gaps():

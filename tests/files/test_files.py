@@ -1,8 +1,6 @@
-import gc
 import os
 import socket
 import time
-import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -10,8 +8,7 @@ import pytest
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files import models as files
-from factorgraph_loc.files.models import inside, parse_json, parse_model, read_json, read_text, read_toml
-from factorgraph_loc.model.world import World
+from factorgraph_loc.files.models import inside, parse_json, read_json, read_text, read_toml
 
 
 def refused(call, *words: str) -> str:
@@ -165,30 +162,6 @@ def test_json_has_so_many_values_at_most(monkeypatch):
     refused(lambda: parse_json("[1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1]", "a.json"), "the number of its values is 11")
 
 
-def test_to_tell_one_of_many_faults_looks_for_no_garbage():
-    """Those looks would take ten times as long as all else."""
-    looks = []
-
-    def note(phase, info):
-        looks.append((phase, info))
-
-    gc.callbacks.append(note)
-    try:
-        refused(
-            lambda: parse_model(World, {"name": "a", "walls": ["a"] * 20_000}, "a.toml"), "walls.0 is 'a'", "19999 more"
-        )
-    finally:
-        gc.callbacks.remove(note)
-    assert len(looks) < 10
-    assert gc.isenabled()
-
-
-def test_long_words_and_numbers_with_points_are_no_long_keys(tmp_path):
-    path = tmp_path / "a.toml"
-    path.write_text(f'x = [{", ".join(["0.5"] * 1000)}]\ny = "{"a" * 500_000}"\nz = "{"..." * 1000} 1.2.3.4"\n')
-    assert read_toml(path)["x"] == [0.5] * 1000
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -239,17 +212,3 @@ def test_a_pointer_of_git_lfs_is_named_as_such(tmp_path):
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
     with pytest.raises(InputError, match=r"a\.csv: is a pointer of Git LFS, not the file: `git lfs pull` fetches it"):
         read_text(path)
-
-
-def test_a_file_without_a_size_is_read():
-    assert "processor" in read_text(Path("/proc/cpuinfo"))
-    refused(lambda: read_text(Path("/proc/cpuinfo"), 100), "its size in bytes is", "expected at most 100")
-
-
-def test_no_more_memory_is_asked_for_than_a_file_has(tmp_path):
-    path = tmp_path / "a"
-    path.write_bytes(b"12345")
-    tracemalloc.start()
-    assert read_text(path) == "12345"
-    assert tracemalloc.get_traced_memory()[1] < 2**20
-    tracemalloc.stop()

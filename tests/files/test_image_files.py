@@ -1,16 +1,13 @@
 import os
 import struct
-import threading
 import zlib
 from contextlib import nullcontext, suppress
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.bounded import quiet
 from factorgraph_loc.files.images import size_of_file
 from factorgraph_loc.vision import images
 from factorgraph_loc.vision.images import as_image, read_image
@@ -81,11 +78,6 @@ def test_sixteen_bits_become_eight():
     np.testing.assert_array_equal(as_image(values), np.round(values / 257.0).astype(np.uint8))
 
 
-def test_a_device_is_no_image():
-    with pytest.raises(InputError, match=r"/dev/zero: is a device, expected a regular file"):
-        read_image(Path("/dev/zero"))
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_what_libraries_write_of_damaged_images_stays_unseen(suffix, capfd, monkeypatch):
     pixels = np.random.default_rng(0).integers(0, 255, (40, 60), dtype=np.uint8)
@@ -102,20 +94,3 @@ def test_what_libraries_write_of_damaged_images_stays_unseen(suffix, capfd, monk
     assert capfd.readouterr().err == "seen"
     monkeypatch.setattr(images, "quiet", nullcontext)
     assert written() != ""
-
-
-def test_other_threads_hear_the_libraries():
-    """Standard error is one for all threads: only one of them may take it away and give it back."""
-    before, during = os.fstat(2), []
-
-    def look():
-        with quiet():
-            during.append(os.path.samestat(os.fstat(2), before))
-
-    thread = threading.Thread(target=look)
-    thread.start()
-    thread.join()
-    with quiet():
-        during.append(os.path.samestat(os.fstat(2), before))
-    assert during == [True, False]
-    assert os.path.samestat(os.fstat(2), before)

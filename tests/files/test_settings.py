@@ -7,7 +7,7 @@ import pytest
 from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.files.settings import bound_text, default_text, first_sentence, settings_in, values_text
+from factorgraph_loc.files.settings import default_text, settings_in, values_text
 
 
 class Growth(FileModel):
@@ -85,23 +85,3 @@ def test_settings_in_words(found):
         "line": ("[0.5, 1]", "a list of any number: 0 to 1"),
         "pair": ("[1, 2]", "a list of 2: whole number"),
     }
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(math.inf, ""), (-2.0 * math.pi, "-2 pi"), (1e7, "1e7"), (5e-324, "above 0"), (0.25, "0.25")]
-)
-def test_a_bound_in_words(value, text):
-    assert bound_text(value) == text
-
-
-def test_the_first_sentence():
-    assert first_sentence(Grid) == "Another."
-    assert first_sentence(Everything()) == "All kinds of fields."
-    assert first_sentence(type("Bare", (), {})) == ""
-
-
-def test_settings_typed_at_a_prompt_have_no_meaning():
-    typed: dict = {"FileModel": FileModel, "__name__": "__console__"}
-    exec('class Typed(FileModel):\n    gain: float = 1.0\n    """how much"""', typed)
-    (setting,) = settings_in(typed["Typed"])
-    assert (setting.key, setting.default, setting.meaning) == ("gain", 1.0, "")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from mapped_hall import MANIFEST, ODOMETRY, READS, TRUTH, WHEELS
+from mapped_hall import MANIFEST, ODOMETRY, READS, WHEELS
 
 from factorgraph_loc.files.column_mapping import iso_nanoseconds
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
@@ -160,18 +160,6 @@ def test_poses_of_a_data_set(hall, with_options, one, refused, form):
     refused(with_options(as_odometry.replace(times, "") + other), "format kitti and times, the file of the stamps, are")
 
 
-def test_columns_that_are_not_read_are_told(hall, with_options, one):
-    (told,) = (line for line in one(hall).warnings if "not read" in line)
-    assert told.endswith("reads.csv: columns that are not read: TID, Hostname, DopplerFrequency, CRHandle")
-    mapped = '[options.reference]\nfile = "wheels.csv"\nseparator = ";"\nhas_heading = false\ncolumns = '
-    both = f'{WHEELS}\n{mapped}{{ t = "time_ms", x = "east", y = "north" }}\nunits = {{ t = "ms" }}\n'
-    (hall.parent / "run" / "wheels.csv").write_text(
-        "time_ms;speed;turn;east;north;volts\n1000;1;0;0;0;12\n2000;1;0;1;0;12\n"
-    )
-    told = [line for line in one(with_options(both)).warnings if "not read" in line]
-    assert [line.partition("read: ")[2] for line in told] == ["volts"]  # what one of two tables reads is read
-
-
 def test_stamps_keep_their_nanoseconds():
     assert iso_nanoseconds("2026-04-09T14:24:20.255000001-05:00") == 1775762660255000001
     assert iso_nanoseconds("2026-04-09 19:24:20.255") == 1775762660255000000
@@ -229,18 +217,6 @@ def test_a_wrong_manifest(hall, refused, old, new, fragments):
 def test_a_wrong_file(hall, refused, file, content, fragments):
     (hall.parent / "run" / file).write_text(content)
     refused(hall, *fragments)
-
-
-def test_a_reference_of_another_time_is_told(hall, one):
-    truth = hall.parent / "run" / "truth.csv"
-    truth.write_text(TRUTH.replace("\n1,", "\n100001,").replace("\n2,", "\n100002,"))
-    assert any("do not overlap" in line and "clock_offset" in line for line in one(hall).warnings)
-
-
-def test_a_folder_that_is_not_beside_its_manifest(hall, refused, monkeypatch):
-    monkeypatch.delenv("FGLOC_DATA", raising=False)
-    hall.write_text(MANIFEST.replace('"run"', '"rnu"'))
-    refused(hall, "hall.toml (which has no rnu beside it): needs the data folder")
 
 
 NAMES = """

@@ -113,13 +113,6 @@ def test_strengths_in_columns(hall, with_options, one, refused, head, columns, m
     refused(with_options(WHEELS + WIDE.format(columns=columns.replace("*", "*x"), more=more)), "has no column '")
 
 
-def test_strengths_in_columns_that_are_no_reads(hall, with_options, refused):
-    (hall.parent / "run" / "wide.csv").write_text("t;tag;1;2\n1;A;;\n")
-    refused(with_options(WHEELS + WIDE.format(columns='epc = "tag", rssi = "*"', more="")), "contains no reads")
-    neither = WIDE.format(columns='rssi = "*"', more="")
-    refused(with_options(WHEELS + neither), "with rssi = '*' columns maps t, expected t and one of epc, antenna")
-
-
 def test_rows_of_one_kind(hall, with_options, one):
     rows = "kind,timestamp,antenna,rssi,epc\nread,1.1,1,-60,aa\nkeepalive,1.2,,,\nread,1.3,1,-61,bb\n"
     (hall.parent / "run" / "log.csv").write_text(rows)
@@ -192,11 +185,6 @@ def test_wrong_json_lines(hall, with_options, refused, content, fragments):
     refused(manifest, *fragments)
 
 
-@pytest.mark.parametrize("preset", ["[]", "{}", "5", "true", '"x"', '["sllurp_log"]'])
-def test_a_preset_that_is_none(with_options, refused, preset):
-    refused(with_options(f'{WHEELS}\n[options.rfid]\nfile = "reads.csv"\npreset = {preset}\n'), "preset")
-
-
 def test_reads_in_several_files(hall, one, refused):
     folder = hall.parent / "run"
     expected = one(hall).streams["rfid"]
@@ -252,8 +240,3 @@ def test_three_readers_of_a_recorded_robot(data_root, tmp_path, one):
     assert ours.antenna[part] == theirs.antenna
     for column in ("age", "rssi", "phase", "frequency"):
         np.testing.assert_allclose(getattr(ours, column)[part], getattr(theirs, column), rtol=0, atol=1e-6)
-
-
-def test_readers_and_a_single_one_do_not_go_together(hall, refused):
-    hall.write_text(MANIFEST + READERS)
-    refused(hall, "has rfid and readers")

@@ -38,18 +38,6 @@ def test_what_is_read(native, one):
     np.testing.assert_allclose(log.reference.poses, ((0, 0, 0), (0.25, 0, 0)))
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_columns_that_are_not_read_are_told(native, one, suffix):
-    table = pl.read_csv(native / "odometry.csv").with_columns(slip=0.0, note=pl.lit("ok"))
-    (native / "odometry.csv").unlink()
-    getattr(table, f"write_{suffix}")(native / f"odometry.{suffix}")
-    assert one(native).warnings == (f"{native}/odometry.{suffix}: columns that are not read: slip, note",)
-
-
-def test_the_run_file_names_the_log_too(native, one):
-    assert one(native / "run.toml").name == "hall"
-
-
 def test_increments_imu_start_and_files_beside(native, one):
     (native / "odometry.csv").write_text("dtheta,dy,dx,t_ns\n0,0,0,1000000000\n0.1,0.01,0.2,1500000000\n")
     (native / "imu.csv").write_text("t_ns,w\n900000000,0.25\n")
@@ -73,13 +61,6 @@ def test_streams_and_reference_may_be_missing(native, one):
     log = one(native)
     assert list(log.streams) == ["odometry"]
     assert (log.reference, log.warnings) == (None, ())
-
-
-@pytest.mark.parametrize("end", ["\r\n", "\n\n"])
-def test_line_ends_and_blank_lines(native, one, end):
-    text = (native / "odometry.csv").read_text()
-    (native / "odometry.csv").write_text(text.replace("\n", end), newline="")
-    assert len(one(native).streams["odometry"].t) == 3
 
 
 BAD_ODOMETRY = {
@@ -159,18 +140,6 @@ BAD_FILES = {
 def test_bad_files(native, refused, name, text, fragments):
     (native / name).write_text(text)
     refused(native, *fragments)
-
-
-def test_no_odometry(native, refused):
-    (native / "odometry.csv").unlink()
-    refused(native, "has no odometry, which every estimator needs")
-
-
-def test_an_empty_run_file_alone_is_said_to_be_empty(native, refused):
-    """As `fgloc manifest BAG > run.toml` leaves one when it fails."""
-    (native / "odometry.csv").unlink()
-    (native / "run.toml").write_text("\n")
-    refused(native, "run.toml: is empty, expected a manifest, or odometry.csv beside it")
 
 
 def test_a_table_that_links_outside(native, refused, tmp_path):

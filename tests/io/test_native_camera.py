@@ -1,7 +1,6 @@
 """Images and identified pixels in the native format: what is read, refused, mended, and that what is written comes back."""
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.native.native import write_native
-from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream, SightingStream
+from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
 
 CAMERA = "t_ns,file\n1100000000,a.png\n1300000000,b.png\n1500000000,c.png\n"
 PIXELS = "t_ns,landmark,u,v\n1200000000,door,10.5,20\n1200000000,lamp,-3,400.25\n1400000000,door,11,21\n"
@@ -69,12 +68,6 @@ def test_images_in_a_folder_that_links_outside_are_refused(seen, refused, name):
     refused(seen, "camera.csv: path 'camera' leaves its folder")
 
 
-def test_images_in_a_folder_that_links_inside_are_read(seen, one):
-    (seen / "camera").rename(seen / "other")
-    (seen / "camera").symlink_to("other")
-    assert len(one(seen).streams["camera"].file) == 3
-
-
 def test_an_image_that_links_outside_is_refused(seen, refused):
     (seen / "camera" / "b.png").unlink()
     (seen / "camera" / "b.png").symlink_to("/etc/hostname")
@@ -87,25 +80,12 @@ def test_an_image_that_is_a_named_pipe_is_refused(seen, refused):
     refused(seen, "camera.csv:3: path 'b.png' is a named pipe, expected a regular file")
 
 
-def test_an_image_twice_is_two_images(seen, one, tmp_path):
-    (seen / "camera.csv").write_text("t_ns,file\n1100000000,a.png\n1300000000,a.png\n")
-    write_native(one(seen), tmp_path / "copy")
-    assert len(one(tmp_path / "copy").streams["camera"].file) == 2
-
-
 def test_an_image_that_goes_before_it_is_written_is_an_error_and_leaves_nothing(seen, one, tmp_path):
     log = one(seen)
     (seen / "camera" / "b.png").unlink()
     with pytest.raises(InputError, match=r"b\.png: cannot be read: No such file"):
         write_native(log, tmp_path / "copy")
     assert not (tmp_path / "copy").exists()
-
-
-def test_features_cannot_be_written(seen, one, tmp_path):
-    log = one(seen)
-    features = replace(log, streams=dict(log.streams) | {"camera": FeatureStream(np.empty(0), [])})
-    with pytest.raises(InputError, match="hall: camera holds features, expected the images they were computed from"):
-        write_native(features, tmp_path / "copy")
 
 
 def test_missing_images_are_left_out_with_a_warning(seen, one):
@@ -115,21 +95,6 @@ def test_missing_images_are_left_out_with_a_warning(seen, one):
     assert [file.name for file in log.streams["camera"].file] == ["a.png", "c.png"]
     (warning,) = log.warnings
     assert warning.endswith("camera.csv: 2 of 4 images are missing and skipped, the first is b.png of row 3")
-
-
-def test_of_two_images_at_one_stamp_the_last_is_kept(seen, one):
-    (seen / "camera.csv").write_text(CAMERA.replace("1300000000", "1100000000"))
-    log = one(seen)
-    assert [file.name for file in log.streams["camera"].file] == ["b.png", "c.png"]
-    assert "1 rows have the timestamp of a later row" in log.warnings[0]
-
-
-def test_late_images_are_kept_in_order_of_arrival(seen, one):
-    (seen / "camera.csv").write_text(CAMERA.replace("1500000000", "1000000000"))
-    log = one(seen)
-    assert [file.name for file in log.streams["camera"].file] == ["a.png", "b.png", "c.png"]
-    assert log.streams["camera"].t[2] == 0.0
-    assert "1 rows are late, by at most 0.300 s" in log.warnings[0]
 
 
 BAD = {

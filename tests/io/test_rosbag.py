@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from rosbag_reads import FIELDS, MS, OPTIONS, POSES, T0, fill
+from rosbag_reads import FIELDS, MS, OPTIONS, POSES, T0
 from rosbags.typesys import get_types_from_msg
 
 from factorgraph_loc.io.bags import file as bag_file
@@ -30,10 +30,6 @@ def test_what_is_read(bag, read):
     assert reads.rssi.tolist() == [-60.5, -61.0, -50.0]
     assert np.isnan(reads.frequency).all()
     assert log.metadata["clock"].endswith("(median): /odom 0.005 s, /rfid 0.020 s, /truth 0.007 s")
-
-
-def test_a_file_within_a_folder_is_a_bag_of_its_own(mcap, read):
-    assert len(read(mcap / "drive.mcap").streams["odometry"].t) == len(POSES)
 
 
 def test_messages_as_rounds_tell_of_antennas_that_read_nothing(mcap, read):
@@ -69,22 +65,6 @@ def test_a_manifest_beside_the_bag(tmp_path):
     assert load(str(tmp_path))[0].name == "drive"
 
 
-def test_a_topic_that_is_missing(mcap, refuse):
-    refuse(mcap, "has no topic '/odo': did you mean /odom?", odometry={"topic": "/odo"})
-
-
-def test_a_topic_of_another_type(mcap, refuse):
-    refuse(mcap, "topic /rfid is of type shop_msgs/msg/Reads", "nav_msgs/msg/Odometry", odometry={"topic": "/rfid"})
-    refuse(mcap, "topic /rfid is of type shop_msgs/msg/Reads", "PoseStamped", reference={"topic": "/rfid"})
-
-
-def test_a_topic_without_messages(tmp_path, bag_maker, refuse):
-    with bag_maker(tmp_path / "drive") as made:
-        fill(made)
-        made.topic("/silent", "geometry_msgs/msg/PoseStamped")
-    refuse(tmp_path / "drive", "topic /silent", "has no messages", reference={"topic": "/silent"})
-
-
 def test_a_field_that_the_message_lacks(mcap, refuse):
     fields = FIELDS | {"epc": "reads[].tag"}
     message = refuse(
@@ -108,13 +88,6 @@ def test_degrees_for_radians(mcap, refuse):
         "drive /rfid:1: phase is 90.0, expected a finite number of radians",
         rfid={"topic": "/rfid", "fields": FIELDS},
     )
-
-
-def test_stamps_that_go_back(tmp_path, bag_maker, refuse):
-    with bag_maker(tmp_path / "drive") as made:
-        for i, t in enumerate((0, 100, 50)):
-            made.odometry("/odom", T0 + t * MS, (0.0, 0.0, 0.0), delay=i * 300 * MS)
-    refuse(tmp_path / "drive", "drive /odom:3: time is", "not before that of the row before", rfid=None, reference=None)
 
 
 def test_headers_without_stamps(tmp_path, bag_maker, read, refuse):
@@ -165,12 +138,3 @@ def test_types_are_compiled_once_however_often_a_bag_is_read(mcap, monkeypatch):
 def test_without_the_library(mcap, refuse, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.interfaces", None)
     refuse(mcap, "need the library rosbags: pip install 'factorgraph-loc[ros]'")
-
-
-def test_a_mapping_without_odometry(mcap, refuse):
-    refuse(mcap, "odometry is missing", odometry=None)
-
-
-def test_a_stamp_that_is_no_number(mcap, refuse):
-    fields = FIELDS | {"stamp": "header.frame_id"}
-    refuse(mcap, "drive /rfid:1: stamp is '', expected a time, or a number", rfid={"topic": "/rfid", "fields": fields})

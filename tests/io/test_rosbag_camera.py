@@ -7,8 +7,6 @@ import cv2
 import numpy as np
 from rosbag_drive import MS, T0, add_frames, transform
 
-from factorgraph_loc.io.bags.camera import Images
-from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factors.camera.model import mounting
 
 
@@ -54,23 +52,6 @@ def test_images_without_loss(maker, read_drive, one):
     assert one(maker.path, reader="rosbag", options=options).streams["camera"].file[2].is_file()
 
 
-def test_images_that_another_process_has_written_meanwhile_are_left_as_they_are(maker, read_drive, one, monkeypatch):
-    add_image(maker, T0, np.zeros((4, 4)), "mono8")
-    options = {"odometry": {"topic": "/odom"}, "camera": {"topic": "/camera/image_raw"}}
-    stream, seen = Images.stream, []
-
-    def late(images, *args):
-        monkeypatch.setattr(Images, "stream", stream)
-        (file,) = one(maker.path, reader="rosbag", options=options).streams["camera"].file
-        seen.append((file, file.stat().st_ino))
-        return stream(images, *args)
-
-    monkeypatch.setattr(Images, "stream", late)
-    (file,) = read_drive(maker, camera={"topic": "/camera/image_raw"}).streams["camera"].file
-    assert [(file, file.stat().st_ino)] == seen
-    assert sorted(path.name for path in file.parent.parent.iterdir()) == [".lock", file.parent.name]
-
-
 def test_a_bayer_pattern_becomes_colour(maker, read_drive):
     mosaic = np.zeros((20, 30))
     mosaic[::2, ::2] = 200.0  # red lies at even rows and columns
@@ -78,14 +59,6 @@ def test_a_bayer_pattern_becomes_colour(maker, read_drive):
     (file,) = read_drive(maker, camera={"topic": "/camera/image_raw"}).streams["camera"].file
     blue, green, red = cv2.imread(str(file))[10, 10]
     assert (blue, green, red) == (0, 0, 200)
-
-
-def test_images_of_a_kind_that_is_not_read(maker, refuse_drive, tmp_path):
-    add_image(maker, T0, np.zeros((4, 4)), "yuv422")
-    refuse_drive(
-        maker, "image_raw:1: encoding is 'yuv422', expected one of mono8", camera={"topic": "/camera/image_raw"}
-    )
-    assert [f for f in (tmp_path / "cache").rglob("*") if f.is_file()] == []
 
 
 def test_an_image_with_too_few_bytes(maker, refuse_drive, tmp_path):
@@ -104,13 +77,6 @@ def test_an_image_with_too_few_bytes(maker, refuse_drive, tmp_path):
     )
     refuse_drive(maker, "image_raw:1: has 16 bytes, expected 5 rows of 4", camera={"topic": "/camera/image_raw"})
     assert not list((tmp_path / "cache" / "bags").iterdir())
-
-
-def test_a_compressed_image_that_is_none(maker, refuse_drive):
-    data = np.frombuffer(b"nothing", dtype=np.uint8)
-    kind = "sensor_msgs/msg/CompressedImage"
-    maker.write("/image", T0, kind, header=maker.header(T0), format="compressedDepth", data=data)
-    refuse_drive(maker, "/image:1: format is 'compressedDepth', expected JPEG", camera={"topic": "/image"})
 
 
 def add_info(made, **changes):
@@ -161,24 +127,6 @@ def test_the_camera_of_the_bag(maker, read_drive):
     assert log.rig.sensors == ("odometry", "camera")
 
 
-def test_a_lens_with_more_terms_and_a_camera_without_a_place(maker, read_drive, one):
-    add_info(maker, **{"d": np.array((0.1, 0.0, 0.0, 0.0, 0.7))})
-    add_image(maker, T0, np.zeros((480, 640)), "mono8")
-    options = {"odometry": {"topic": "/odom"}, "camera": CAMERA}
-    told = read_drive(maker, camera=CAMERA).metadata["robot"]
-    assert "tf_static has no mounting of lens on base_link" in told
-    assert "only k1, k2, p1, p2 are used, not [0.7]" in told
-    assert (
-        "robot" not in one(maker.path, reader="rosbag", options=options, rig=DEFAULT_RIG).metadata
-    )  # that is another robot
-
-
-def test_a_lens_that_is_none(maker, refuse_drive):
-    add_info(maker, k=np.zeros(9))
-    add_image(maker, T0, np.zeros((480, 640)), "mono8")
-    refuse_drive(maker, "/camera/camera_info: fx is 0.0", camera=CAMERA)
-
-
 def test_images_pass_through_memory_one_at_a_time(maker, read_drive):
     """A bag of 24 MB is read in a third of that: a message, its chunk, and what the library keeps of the chunks."""
     data = np.zeros(400_000, dtype=np.uint8)
@@ -194,16 +142,3 @@ def test_images_pass_through_memory_one_at_a_time(maker, read_drive):
     tracemalloc.stop()
     assert len(images.file) == 60
     assert peak < 8e6
-
-
-def test_a_camera_that_the_bag_defines_otherwise(tmp_path, bag_maker, refused):
-    with bag_maker(tmp_path / "drive") as made:
-        made.odometry("/odom", T0, (0.0, 0.0, 0.0))
-        add_info(made)
-        add_image(made, T0, np.zeros((480, 640)), "mono8")
-    file = tmp_path / "drive" / "drive.mcap"
-    assert b"float64[9] k" in file.read_bytes()
-    file.write_bytes(file.read_bytes().replace(b"float64[9] k", b"float64[9] q"))
-    options = {"odometry": {"topic": "/odom"}, "camera": CAMERA}
-    says = "/camera/camera_info:1: sensor_msgs/msg/CameraInfo is defined"
-    refused(file, says, "'K'", reader="rosbag", options=options)

@@ -1,29 +1,12 @@
 """Bags that are damaged, cut off, or do not define what they hold, and what is no bag at all."""
 
 import sqlite3
-from pathlib import Path
-from types import SimpleNamespace
 
-import numpy as np
-import pytest
-from rosbag_reads import MS, OPTIONS, POSES, T0, fill
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbag_reads import MS, POSES, T0, fill
+from rosbags.typesys import get_types_from_idl
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.models import parse_model
-from factorgraph_loc.io.bags import file as bag_file
-from factorgraph_loc.io.bags import rosbag
 from factorgraph_loc.io.bags.file import open_bag
 from factorgraph_loc.io.bags.manifest import propose
-
-
-@pytest.mark.parametrize("keep", [0.0, 0.02, 0.3, 0.6, 0.95, 0.999])
-def test_truncated_bags(bag, tmp_path, refuse, keep):
-    file = bag if bag.is_file() else next(f for f in bag.iterdir() if f.suffix in {".mcap", ".db3"})
-    content = file.read_bytes()
-    short = tmp_path / f"short{file.suffix}"
-    short.write_bytes(content[: int(keep * len(content))])
-    refuse(short, f"{short}: cannot be read as a bag")
 
 
 def test_a_bag_of_ros_1_whose_recording_was_cut_off(tmp_path, bag_maker, refuse):
@@ -44,25 +27,6 @@ def test_an_unknown_compression(tmp_path, bag_maker, refuse):
     refuse(path, "Compression 'zpaq' is not supported")
 
 
-def test_a_bag_without_its_metadata(mcap, refused, refuse):
-    (mcap / "metadata.yaml").unlink()
-    refused(mcap, "is a ROS 2 bag without metadata.yaml: `ros2 bag reindex", "drive.mcap, can be read without")
-    refuse(mcap, "is a ROS 2 bag without metadata.yaml")
-
-
-def test_a_pointer_in_place_of_a_bag(mcap, refuse):
-    (mcap / "drive.mcap").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
-    refuse(mcap, "drive.mcap: is a pointer of Git LFS")
-    refuse(mcap / "drive.mcap", "drive.mcap: is a pointer of Git LFS")
-
-
-def test_no_bag_at_all(tmp_path, refuse):
-    (tmp_path / "drive.txt").write_text("x")
-    refuse(
-        tmp_path / "drive.txt", "is not a ROS bag, expected a file .bag, .mcap, .db3, or a folder with metadata.yaml"
-    )
-
-
 def test_old_bags_hold_no_definitions(tmp_path, bag_maker, read, refuse):
     """Messages of ROS are known all the same, others cannot be read."""
     with bag_maker(tmp_path / "drive", "sqlite3") as made:
@@ -72,37 +36,6 @@ def test_old_bags_hold_no_definitions(tmp_path, bag_maker, read, refuse):
     database.close()
     assert len(read(tmp_path / "drive", rfid=None).streams["odometry"].t) == len(POSES)
     refuse(tmp_path / "drive", "topic /rfid is of type shop_msgs/msg/Reads, which the bag does not define")
-
-
-def test_a_definition_without_end(mcap, refuse, monkeypatch):
-    monkeypatch.setattr(bag_file, "DEFINITION", 100)
-    refuse(mcap, "the length of the definition of nav_msgs/msg/Odometry is", "expected at most 100")
-
-
-def test_a_folder_whose_metadata_is_damaged(mcap, refuse):
-    (mcap / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 99}")
-    refuse(mcap, "drive: cannot be read as a bag: Rosbag2 version 99 not supported")
-
-
-def test_damaged_bytes_never_surprise(bag, tmp_path):
-    """A bag with some bytes changed is read, or refused in one line; so is the manifest that is proposed for it."""
-    file = bag if bag.is_file() else next(f for f in bag.iterdir() if f.suffix in {".mcap", ".db3"})
-    content, damaged = file.read_bytes(), tmp_path / f"damaged{file.suffix}"
-    options = parse_model(rosbag.Options, OPTIONS, "options")
-    rng = np.random.default_rng(7)
-    messages = []
-    for _ in range(25):
-        changed = bytearray(content)
-        for place in rng.integers(len(content), size=4).tolist():
-            changed[place] = int(rng.integers(256))
-        damaged.write_bytes(bytes(changed))
-        for read_damaged in (lambda: rosbag.read(damaged, options), lambda: proposed(damaged)):
-            try:
-                read_damaged()
-            except InputError as error:
-                messages.append(str(error))
-    assert messages
-    assert [message for message in messages if len(message.splitlines()) != 1] == []
 
 
 def proposed(path):
@@ -129,29 +62,6 @@ def test_a_type_of_ros_that_the_bag_defines_otherwise(tmp_path, bag_maker, refus
     refuse(file, "/odom:1: nav_msgs/msg/Odometry is defined in the bag unlike in ROS", rfid=None)
 
 
-@pytest.mark.parametrize(
-    ("definition", "fragment"),
-    [
-        ("geometry_msgs/Pose pose\nfloat64[36] variance", "has no attribute 'covariance'"),
-        ("geometry_msgs/Pose pose\nfloat64[9] covariance", "out of bounds"),
-        ("geometry_msgs/Pose pose\nstring covariance", "could not convert string"),
-    ],
-)
-def test_a_start_that_the_bag_defines_otherwise(definition, fragment, tmp_path, bag_maker, refuse):
-    kind = "geometry_msgs/msg/PoseWithCovariance"
-    with bag_maker(tmp_path / "drive") as made:
-        fill(made)
-        made.store = get_typestore(Stores.ROS2_HUMBLE)
-        del made.store.fielddefs[kind]
-        made.store.register(get_types_from_msg(definition, kind))
-        name = definition.split()[-1]
-        value = "much" if "string" in definition else np.ones(36 if "36" in definition else 9)
-        told = made.make(kind, pose=made.pose(1.0, 2.0, 0.0), **{name: value})
-        made.write("/initialpose", T0, f"{kind}Stamped", header=made.header(T0), pose=told)
-    start = {"topic": "/initialpose"}
-    refuse(made.path, f"/initialpose:1: {kind}Stamped is defined", fragment, start=start, rfid=None)
-
-
 IDL = """\
 ================================================================================
 IDL: shop_msgs/msg/Ping
@@ -171,9 +81,3 @@ def test_definitions_in_idl(tmp_path, bag_maker, read):
     rfid = {"topic": "/ping", "fields": {"epc": "epc", "rssi": "power"}, "antenna": "front"}
     reads = read(tmp_path / "drive", rfid=rfid).streams["rfid"]
     assert (reads.epc, reads.rssi.tolist(), reads.t.tolist()) == (["E2CC"], [-55.0], [0.1])
-
-
-def test_a_topic_whose_name_is_no_text():
-    connection = SimpleNamespace(topic=b"/odom", msgtype="nav_msgs/msg/Odometry", msgcount=1)
-    with pytest.raises(InputError, match=r"^log\.db3: the name or the type of a topic is not text$"):
-        bag_file.Bag(Path("log.db3"), SimpleNamespace(connections=[connection]))

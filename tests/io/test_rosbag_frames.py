@@ -64,15 +64,6 @@ def test_odometry_from_transforms(maker, read_drive, refused):
         refused(maker.path, message, reader="rosbag", options={"odometry": options | changed})
 
 
-def test_transforms_without_a_common_time(maker, refuse_drive):
-    for i, (parent, child) in enumerate((("map", "odom"), ("odom", "base_link"))):
-        for k in range(2):
-            t = T0 + (10 * i + k) * 100 * MS
-            add_frames(maker, "/tf", t, transform(maker, t, parent, child, (0.1 * k, 0.0, 0.0)))
-    reference = {"topic": "/tf", "parent": "map", "child": "base_link"}
-    refuse_drive(maker, "the transforms from base_link to map have no time in common", reference=reference)
-
-
 def proposed(path):
     with open_bag(path) as opened:
         return propose(opened)
@@ -103,12 +94,4 @@ def test_what_is_measured_comes_before_frames(maker, read_drive):
     assert found.notes == [
         "odometry could also be /tf",
         "/tf has the frames axle in odom, odom in vicon: parent and child of [options.reference] would use two",
-    ]
-
-
-def test_frames_with_names_of_their_own_are_told(maker, read_drive):
-    add_frames(maker, "/tf", T0, transform(maker, T0, "start", "cart", (0.0, 0.0, 0.0)))
-    read_drive(maker)
-    assert proposed(maker.path).notes == [
-        "/tf has the frames cart in start: parent and child of [options.reference] would use two"
     ]

@@ -9,7 +9,7 @@ from rosbags.typesys import get_types_from_msg
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.io.bags.file import open_bag
-from factorgraph_loc.io.bags.manifest import propose, range_fields, read_fields
+from factorgraph_loc.io.bags.manifest import propose, read_fields
 from factorgraph_loc.io.bags.proposed import manifest_of, manifest_text, remarks
 
 T0 = 1_700_000_000_000_000_000
@@ -76,42 +76,9 @@ def test_an_estimate_is_not_taken_for_the_truth_without_a_word(proposal):
     assert "# /robot_pose is used as the reference: remove it if it is an estimate, not the truth" in text
 
 
-def test_what_nothing_uses_is_called_by_its_name(proposal, tmp_path):
-    def fill(made):
-        made.odometry("/odom", T0, (0.0, 0.0, 0.0))
-        made.write("/depth", T0, "sensor_msgs/msg/Range", **range_of(made))
-        made.write("/note", T0, "std_msgs/msg/String", data="x")
-
-    found, _, text = proposal(fill)
-    assert found.options == {"odometry": {"topic": "/odom"}}
-    assert (
-        "# not used: /depth (sensor_msgs/msg/Range, 1 messages), sonar or infrared range: nothing here uses it\n"
-        in text
-    )
-    assert "# not used: /note (std_msgs/msg/String, 1 messages)\n" in text
-    topics = {one.topic: (one.use, one.unused) for one in fgloc.manifest(tmp_path / "drive.bag").topics}
-    assert topics == {
-        "/odom": ("odometry", None),
-        "/depth": (None, "sonar or infrared range"),
-        "/note": (None, None),
-    }
-
-
 def range_of(made):
     numbers = dict.fromkeys(("field_of_view", "min_range", "max_range", "range"), 1.0)
     return {"header": made.header(T0), "radiation_type": 0, **numbers}
-
-
-def test_commands_are_taken_last(proposal):
-    def fill(made):
-        twist = made.twist(1.0, 0.0)
-        made.write("/cmd_vel", T0, "geometry_msgs/msg/Twist", linear=twist.linear, angular=twist.angular)
-
-    found, manifest, text = proposal(fill)
-    assert manifest["options"] == {"clock": "receive", "odometry": {"topic": "/cmd_vel"}}
-    assert "/cmd_vel contains commanded velocities" in text
-    assert "no rig is given" in text
-    assert found.uses == {"/cmd_vel": "odometry"}
 
 
 def test_reads_by_the_names_of_fields(proposal):
@@ -167,18 +134,6 @@ def test_ranges_of_radios_by_the_names_of_fields(proposal, tmp_path):
     ranges = fgloc.read_log(tmp_path / "drive.toml").streams["bearing_range"]
     assert list(ranges.landmark) == ["7"] * 3
     np.testing.assert_array_equal(ranges.range, (2.0, 3.0, 4.0))
-
-
-@pytest.mark.parametrize(
-    ("paths", "expected"),
-    [
-        (["header.stamp", "id", "anchor_id", "distance"], {"landmark": "anchor_id", "range": "distance"}),
-        (["id", "nodes[].id", "nodes[].dis"], {"landmark": "nodes[].id", "range": "nodes[].dis"}),
-        (["id", "angle", "samples[].distance"], {}),
-    ],
-)
-def test_usual_names_of_ranges(paths, expected):
-    assert range_fields(paths) == expected
 
 
 def test_images_and_what_tells_of_their_camera(proposal):

@@ -92,21 +92,6 @@ def test_a_gyro_that_is_mounted_otherwise(maker, read_drive, options, axis):
     )
 
 
-@pytest.mark.parametrize(
-    ("options", "fragments"),
-    [
-        ({"axes": "x y"}, ("imu.axes is 'x y'", "the three axes that point forward, left and up")),
-        ({"axes": "y x z"}, ("right-handed",)),
-        ({"frame": "imu_link"}, ("tf_static has no pose of imu_link on base_link",)),
-        ({"frame": "imu_link", "axes": "body"}, ("expected no axes or mounting",)),
-        ({"mounting": {"roll": 90.0}}, ("imu.mounting.roll is 90.0",)),
-    ],
-)
-def test_a_wrong_mounting(maker, refuse_drive, options, fragments):
-    add_imu(maker, [(0.0, 0.0, 0.1)] * COUNT)
-    refuse_drive(maker, *fragments, imu={"topic": "/imu", **options})
-
-
 def add_poses(maker, poses):
     """Poses in space, of positions and quaternions (N, 7)."""
     for i, (x, y, z, *q) in enumerate(poses):
@@ -167,11 +152,6 @@ def test_antennas_by_their_frames(maker, read_drive):
     assert (round(second.pitch, 9), second.z) == (0.5, 0.5)
 
 
-def test_a_rotation_that_is_none(maker, refuse_drive):
-    add_frames(maker, "/tf_static", T0, transform(maker, T0, "a", "b", (0.0, 0.0, 0.0), quaternion=(0.0,) * 4))
-    refuse_drive(maker, "/tf_static:1: length of the quaternion is 0.0, expected 1")
-
-
 def add_markers(made, place):
     made.store.register(get_types_from_msg(MARKERS, "aruco_opencv_msgs/msg/ArucoDetection"))
     pose = made.pose(place[0], place[1], 0.0, z=place[2])
@@ -195,33 +175,6 @@ def test_markers_in_the_robots_frame(maker, read_drive):
     np.testing.assert_allclose((seen.range[0], seen.bearing[0]), (2.5, 0.0), atol=1e-12)
 
 
-def test_a_frame_of_markers_that_is_not_told(maker, refuse_drive):
-    add_markers(maker, (0.0, 0.0, 2.0))
-    options = {"topic": "/markers", "frame": "lens"}
-    refuse_drive(maker, "tf_static has no pose of lens on base_link; frames: none", bearing_range=options)
-
-
-def test_landmarks_of_a_type_that_is_not_known(maker, refuse_drive, refused):
-    maker.reads("/rfid", T0, [("E2AA", 1, -60.0, 0.0, T0)])
-    refuse_drive(
-        maker,
-        "/rfid is of type shop_msgs/msg/Reads: give its fields; known without: apriltag_ros",
-        bearing_range={"topic": "/rfid"},
-    )
-    options = {
-        "odometry": {"topic": "/odom"},
-        "bearing_range": {"topic": "/rfid", "fields": {"landmark": "reads[].epc"}},
-    }
-    refused(maker.path, "fields are landmark, expected landmark with x, y and z", reader="rosbag", options=options)
-
-
-@pytest.mark.parametrize("fields", [None, {}])
-def test_pixels_of_a_type_that_is_not_known(maker, refuse_drive, fields):
-    maker.reads("/rfid", T0, [("E2AA", 1, -60.0, 0.0, T0)])
-    why = "/rfid is of type shop_msgs/msg/Reads: give its fields; known without: apriltag_msgs"
-    refuse_drive(maker, why, sightings={"topic": "/rfid"} | ({} if fields is None else {"fields": fields}))
-
-
 def test_corners_of_tags(maker, read_drive):
     maker.store.register(get_types_from_msg(TAGS, "apriltag_msgs/msg/AprilTagDetectionArray"))
     corners = [maker.make("apriltag_msgs/msg/Point", x=10.0 + i, y=20.0 + i) for i in range(4)]
@@ -232,12 +185,3 @@ def test_corners_of_tags(maker, read_drive):
     assert seen.point == [f"tag36h11-5/{i}" for i in (3, 2, 1, 0)]  # from the lower left
     assert seen.u.tolist() == [10.0, 11.0, 12.0, 13.0]
     assert seen.v.tolist() == [20.0, 21.0, 22.0, 23.0]
-
-
-def test_detections_of_tags_without_corners(maker, refuse_drive):
-    lacking = TAGS.replace("Point[4] corners\n", "")
-    maker.store.register(get_types_from_msg(lacking, "apriltag_msgs/msg/AprilTagDetectionArray"))
-    tag = maker.make("apriltag_msgs/msg/AprilTagDetection", family="tag36h11", id=5)
-    kind = "apriltag_msgs/msg/AprilTagDetectionArray"
-    maker.write("/tags", T0, kind, header=maker.header(T0), detections=[tag])
-    refuse_drive(maker, "lacks detections[].corners[].x, detections[].corners[].y", sightings={"topic": "/tags"})

@@ -42,14 +42,6 @@ def test_wheels_as_a_differential_drive(maker, read_drive, one):
     np.testing.assert_allclose(speeds.w, 0.5 * turned, atol=1e-12)
 
 
-def test_wheels_that_are_not_there(maker, refuse_drive, refused):
-    add_wheels(maker, [0.0, 1.0], [0.0, 1.0])
-    wheels = WHEELS | {"right": "rr"}
-    refuse_drive(maker, "no message with both wheels, 'rr'", odometry={"topic": "/joints", "wheels": wheels})
-    options = {"odometry": {"topic": "/joints"}}
-    refused(maker.path, "odometry.wheels is missing", reader="rosbag", options=options)
-
-
 def test_wheels_that_tell_their_speed_alone(maker, refuse_drive):
     maker.write(
         "/joints",
@@ -84,27 +76,6 @@ def test_a_topic_for_each_wheel(maker, read_drive, unit, size):
     moved = read_drive(maker, odometry=options, clock="receive").streams["odometry"]
     np.testing.assert_allclose(moved.v, 3.0 * size * turned, atol=1e-12)
     np.testing.assert_allclose(moved.w, 5.0 * size * turned, atol=1e-12)
-
-
-def test_angles_of_wheels_with_a_topic_each(maker, read_drive):
-    turned = np.arange(COUNT)
-    add_topics(maker, 2.0 * turned, 4.0 * turned)
-    options = {"topic": "/left_wheel/speed", "wheels": PAIR | {"radius": 0.1}}
-    moved = read_drive(maker, odometry=options).streams["odometry"]
-    np.testing.assert_allclose(moved.dtheta[1:], 0.5, atol=1e-12)
-    np.testing.assert_allclose(moved.dx[1:], 0.6 * math.sin(0.5), atol=1e-12)
-
-
-def test_messages_of_one_wheel_alone_are_told(maker, read_drive):
-    for i in range(6):
-        t = T0 + 100 * MS * i
-        maker.write("/left_wheel/speed", t, "std_msgs/msg/Float64", data=1.0)
-        if i != 3:
-            maker.write("/right_wheel/speed", t, "std_msgs/msg/Float64", data=1.0)
-    options = {"topic": "/left_wheel/speed", "use": "twist", "wheels": PAIR | {"unit": "m"}}
-    log = read_drive(maker, odometry=options)
-    np.testing.assert_allclose(log.streams["odometry"].t, (0.0, 0.1, 0.2, 0.4, 0.5), atol=1e-9)
-    assert any("1 messages have none of the right wheel near in time" in line for line in log.warnings)
 
 
 def test_what_is_wrong_with_wheels(maker, refuse_drive, refused):

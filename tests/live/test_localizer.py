@@ -226,28 +226,6 @@ def test_its_life(log):
     assert localizer.diagnostics().ignored["before the start"] == 1
 
 
-def test_a_pull_changes_nothing_that_was_given_out(log):
-    localizer = started(log, "ekf")
-    localizer.push(IncrementOdometry(0.5, 0.1, 0.0, 0.0))
-    given = localizer.estimate()
-    given.pose[:] = 99.0
-    localizer.diagnostics().ignored["mine"] = 1
-    assert np.all(localizer.estimate().pose < 90.0)
-    assert "mine" not in localizer.diagnostics().ignored
-
-
-def test_a_measurement_is_copied(log):
-    sensors, buffer = ("odometry", "bearing_range"), np.array((2.0, 3.0))
-    localizer = started(log, sensors=sensors)
-    names = tuple(log.world.landmarks)[:2]
-    for t in (1.0, 1.5):
-        localizer.push(IncrementOdometry(t, 0.1, 0.0, 0.0))
-        localizer.push(BearingRange(t, names, buffer, np.array((0.1, 0.2))))
-    before = localizer.trajectory().poses
-    buffer[:] = np.nan
-    assert np.array_equal(localizer.trajectory().poses, before)
-
-
 def test_foreign_tags_antennas_and_sensors_are_counted(log):
     localizer = started(log, sensors=("odometry", "rfid"))
     antenna = next(iter(log.rig.rfid.all_antennas()))
@@ -282,18 +260,6 @@ def test_increments_of_one_stamp_follow_one_another(log, name, pulled):
         if pulled:
             localizer.estimate()
     assert localizer.estimate().pose == pytest.approx((3.0, 0.0, 0.0))
-
-
-def test_images_need_a_camera():
-    localizer = fgloc.Localizer(Rig(name="blind"))
-    with pytest.raises(InputError, match=r"image at 1.000 s: the rig blind has no \[camera\]"):
-        localizer.push_image(1.0, np.zeros((48, 64), dtype=np.uint8))
-
-
-def test_images_are_ignored_by_who_takes_none(log):
-    localizer = started(log, "dead_reckoning", sensors=("odometry", "camera"))
-    localizer.push_image(1.0, np.zeros((48, 64), dtype=np.uint8))
-    assert localizer.diagnostics().ignored == {"images": 1}
 
 
 def test_an_estimator_that_fails_stays_lost_until_it_begins_anew(log, monkeypatch):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.maps.free_space import free_space
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.information import (
@@ -24,7 +23,6 @@ from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.worlds import make_world
-from factors import se2
 from factors.odometry.model import Growth, OdometryModel
 from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.model import Antenna, BeamModel, RfidModel
@@ -104,13 +102,6 @@ def test_particles_in_one_cell_have_its_size():
     turned = poses.copy()
     turned[::2, 2] += 2.0 * math.pi
     assert particle_entropy(turned, np.ones(50), ALL) == pytest.approx(np.log(CELL).sum())
-
-
-@pytest.mark.parametrize("dims", [(), ("z",), ("x", "heading"), ("y",)])
-def test_wrong_dimensions_are_named(dims):
-    poses, weights = drawn(10)
-    with pytest.raises(InputError, match="dims"):
-        particle_entropy(poses, weights, dims)
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.3, 1.0, 4.0])
@@ -261,14 +252,3 @@ def test_a_turn_in_place_tells_something_but_not_without_rounds():
     (none,) = expected_gain(fast, poses, weights, turn, np.random.default_rng(0))
     assert more > gain > 0.1
     assert none == pytest.approx(0.0, abs=1e-5)
-
-
-def test_no_paths():
-    poses, weights = drawn(10)
-    assert expected_gain(beam(), poses, weights, [], np.random.default_rng(0)).shape == (0,)
-
-
-def test_few_particles_are_all_taken():
-    poses = se2.compose(np.zeros(3), np.array(((0.0, 0.0, 0.0), (0.5, 0.0, 0.1), (0.0, 0.5, -0.1))))
-    (gain,) = expected_gain(beam((3.0, 0.0)), poses, np.full(3, 1.0 / 3.0), [straight(2.0)], np.random.default_rng(0))
-    assert math.isfinite(gain)

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.maps.free_space import CELL, crosses, distance_to_walls, free_space
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.paths import STEP, Path, free_steps, primitives, waypoint_paths, waypoints
@@ -45,28 +44,10 @@ def test_primitives_have_their_length_and_start_at_the_robot(length):
         assert (steps[:, 0] > -1e-9).all()
 
 
-def test_primitives_differ():
-    ends = np.array([p.poses[-1] for p in primitives(4.0)])
-    apart = np.hypot(*(ends[:, None, :2] - ends[None, :, :2]).transpose(2, 0, 1))
-    assert apart[~np.eye(len(ends), dtype=bool)].min() > 0.1
-
-
-@pytest.mark.parametrize("length", [0.0, -1.0, math.nan, math.inf])
-def test_a_horizon_of_nothing_is_an_error(length):
-    with pytest.raises(InputError, match=r"horizon is .* m, expected a length above 0"):
-        primitives(length)
-
-
 def test_a_turn_takes_time_and_no_way():
     straight_back = Path(np.array(((0.0, 0.0, 0.0), (0.0, 0.0, math.pi), (-1.0, 0.0, math.pi))), "arc")
     assert straight_back.length == pytest.approx(1.0)
     assert straight_back.duration(0.5, 1.0) == pytest.approx(1.0 / 0.5 + math.pi / 1.0)
-
-
-def test_a_path_is_cut_at_a_pose():
-    path = straight(4.0)
-    assert path.until(1.1).length == pytest.approx(1.0)
-    assert path.until(9.0).length == pytest.approx(4.0)
 
 
 def test_ways_to_places_go_through_no_wall(office):

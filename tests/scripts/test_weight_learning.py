@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from weight_learning import SHARE, learn, learn_weights, save
+from weight_learning import SHARE, learn, learn_weights
 
 from factorgraph_loc.evaluation.features.sequences import find_sequences
 from factorgraph_loc.vision.colour_features import shipped_weights
@@ -37,27 +37,12 @@ def test_differences_of_the_same_point_become_alike_in_all_directions(
     assert np.allclose(after, np.sort(expected), rtol=0.02)
 
 
-def test_the_own_scale_does_not_count(seen_twice: tuple[np.ndarray, np.ndarray]) -> None:
-    for weights in (learn(*seen_twice), shipped_weights()):
-        values = np.random.default_rng(7).normal(size=(5, VALUES)).astype(np.float32)
-        zoomed = values + 1.5 * (np.arange(VALUES) == OWN_SCALE).astype(np.float32)
-        assert np.array_equal(weights(values), weights(zoomed))
-
-
 def test_descriptors_have_length_one_and_nothing_is_nan() -> None:
     weights = shipped_weights()
     values = np.vstack([np.random.default_rng(8).normal(size=(5, VALUES)).astype(np.float32), weights.mean])
     descriptors = weights(values)
     assert descriptors.dtype == np.float32
     assert np.allclose(np.linalg.norm(descriptors, axis=1), [1, 1, 1, 1, 1, 0], atol=1e-5)
-
-
-def test_weights_are_read_as_they_were_written(tmp_path: Path, seen_twice: tuple[np.ndarray, np.ndarray]) -> None:
-    weights = learn(*seen_twice)
-    save(weights, tmp_path / "weights.npz")
-    with np.load(tmp_path / "weights.npz", allow_pickle=False) as stored:
-        assert np.array_equal(stored["mean"], weights.mean)
-        assert np.array_equal(stored["map"], weights.map)
 
 
 def test_the_shipped_weights_are_those_of_bark_and_graf(data_root: Path) -> None:

@@ -7,12 +7,11 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.preparation import resolve_prior
-from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.settings import Landmark, SightingSettings
 from factorgraph_loc.sensors.landmarks.simulation import sighting_stream
-from factorgraph_loc.simulation import PRESETS, SimulationSettings, named_settings, read_settings, simulate
+from factorgraph_loc.simulation import PRESETS, read_settings, simulate
 from factors import se2
 from factors.landmarks import model as bearing_range
 
@@ -38,14 +37,6 @@ def test_a_fault_changes_nothing_else(make):
     assert plain.reference.poses.tobytes() == faulty.reference.poses.tobytes()
     assert plain.streams["odometry"].dx.tobytes() == faulty.streams["odometry"].dx.tobytes()
     assert plain.world.tags == faulty.world.tags
-
-
-def test_a_log_says_that_it_is_simulated(office):
-    assert "simulated" in office.metadata["origin"]
-    assert (office.metadata["preset"], office.metadata["seed"]) == ("office", "0")
-    assert office.rig.sensors == ("odometry", "rfid")
-    assert office.span() == (0.0, 600.0)
-    assert len(office.world.tags) == 40
 
 
 def test_the_stated_start_is_off_by_what_it_states(make):
@@ -121,20 +112,6 @@ def test_no_landmark_is_seen_through_a_wall_too_far_or_out_of_view():
     assert seen.landmark == ["beside", "before"]
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"world": {"density": 100.0}}, "density makes 24,000 tags, expected at most 10,000"),
-        ({"world": {"tags": 10_000}}, "tags are observed 96,000,000 times in all, expected at most 50,000,000"),
-        ({"world": {"landmarks": 10_000}, "sightings": {"rate": 100.0}}, "landmarks are observed 600,000,000 times"),
-        ({"world": {"points": 10_000}, "pixels": {"rate": 100.0}}, "points are observed 600,000,000 times"),
-    ],
-)
-def test_what_would_take_all_memory_is_refused(changes, words):
-    with pytest.raises(InputError, match=words):
-        named_settings("office", changes)
-
-
 def test_a_file_changes_a_preset(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(
@@ -178,8 +155,3 @@ def test_a_wrong_file_is_an_error_of_one_line(tmp_path, text, message):
     with pytest.raises(InputError, match=message) as found:
         read_settings(path)
     assert str(path) in str(found.value)
-
-
-def test_a_rig_without_antennas_is_an_error():
-    with pytest.raises(InputError, match="the rig has no rfid"):
-        parse_model(SimulationSettings, {"world": {"tags": 1}, "rig": {"name": "bare"}}, "x")

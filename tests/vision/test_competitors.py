@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.features.competitors import BOX_SIGMA, BOX_XY, DETECTORS, OCTAVES, box_hessian, hessian
 from factorgraph_loc.evaluation.features.repeatability import repeatability
 from factorgraph_loc.evaluation.features.sequences import find_sequences
@@ -98,26 +97,6 @@ def test_turning_the_image_turns_the_points(name, turns):
         x, y = 127.0 - y, x
     distance = np.linalg.norm(straight.points[:, None] - np.column_stack((x, y)), axis=2)
     assert np.mean(distance.min(axis=1) < 0.1) > 0.9
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("image", [np.zeros((15, 300)), np.full((64, 64), 0.4), np.zeros((64, 64, 4))], ids=str)
-def test_images_without_features(name, image):
-    assert len(DETECTORS[name](10).detect(image)) == 0
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_small_images_do_not_break_large_filters(name):
-    image = np.random.default_rng(5).random((17, 40))
-    assert len(DETECTORS[name](1000).detect(image)) < 200
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_images_that_are_none(name):
-    with pytest.raises(InputError, match="not finite"):
-        DETECTORS[name](10).detect(np.full((64, 64), np.nan))
-    with pytest.raises(InputError, match="expected that of the image"):
-        DETECTORS[name](10).detect(np.random.default_rng(6).random((64, 64)), np.ones((64, 60), dtype=np.uint8))
 
 
 @pytest.mark.parametrize(

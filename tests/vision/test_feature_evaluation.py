@@ -4,8 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.features.competitors import DETECTORS
 from factorgraph_loc.evaluation.features.feature_evaluation import (
     Feature,
     RankedMatches,
@@ -129,17 +127,6 @@ def test_matches_out_of_the_common_part_are_wrong():
     assert ranked.possible == 1
 
 
-def test_a_feature_that_finds_nothing_scores_zero():
-    points = keypoints([(100.0, 100.0)])
-    vectors = np.ones((1, 4), dtype=np.float32)
-    ((scores, _),) = evaluate(pair(), made(points, vectors, Keypoints.empty(), vectors[:0]))
-    row = scores.row()
-    assert row["homography_error"] == np.inf
-    assert not any(
-        row[name] for name in ("features", "repeatability", "matching_score", "precision", "accuracy", "matches")
-    )
-
-
 def test_detectors_have_no_matching_scores():
     image = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 255, SHAPE).astype(np.uint8), (0, 0), 2.0)
     sequence = Sequence("same", image, (image,), (np.eye(3),), SCALE, (1.0,))
@@ -162,22 +149,6 @@ def test_homography_error_despite_outliers(noise):
     assert homography_error(points[:3], seen[:3], HALF, SHAPE) == np.inf
 
 
-def test_features_by_name():
-    assert feature("orb", 10).name == "orb"
-    with pytest.raises(InputError, match="'harris_laplac' is not known: did you mean harris_laplace"):
-        feature("harris_laplac", 10)
-    for name in ("sift", "hessian_laplace"):
-        with pytest.raises(InputError, match="count is 0, expected at least 1"):
-            feature(name, 0)
-
-
-def test_opencv_threads_are_as_before():
-    threads = cv2.getNumThreads()
-    points = keypoints([(100.0, 100.0)])
-    list(evaluate(pair(), made(points, None, points, None)))
-    assert cv2.getNumThreads() == threads
-
-
 @pytest.mark.parametrize(("name", "score", "precision"), [("sift", 0.58, 0.92), ("orb", 0.41, 0.90)])
 def test_opencv_features_match_as_well_as_they_are_known_to(data_root, name, score, precision):
     (graf,) = find_sequences([data_root / "oxford_affine" / "graf"])
@@ -186,7 +157,3 @@ def test_opencv_features_match_as_well_as_they_are_known_to(data_root, name, sco
     assert np.mean([s.matching_score for s in found]) == pytest.approx(score, abs=0.1)
     assert np.mean([s.precision for s in found]) == pytest.approx(precision, abs=0.05)
     assert all(s.homography_error < 7.0 for s in found)
-
-
-def test_no_name_is_both_a_feature_and_a_detector():
-    assert not {"sift", "orb"} & set(DETECTORS)

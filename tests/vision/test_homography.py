@@ -7,10 +7,8 @@ from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.features.sequences import (
-    checked,
     corner_error,
     inside,
-    invert,
     jacobians,
     project,
     read_homography,
@@ -29,10 +27,6 @@ XML = """<?xml version="1.0"?>
 def similarity(zoom, angle, shift=(0.0, 0.0)):
     c, s = zoom * np.cos(angle), zoom * np.sin(angle)
     return np.array(((c, -s, shift[0]), (s, c, shift[1]), (0.0, 0.0, 1.0)))
-
-
-def test_there_and_back():
-    assert project(invert(TILTED), project(TILTED, POINTS)) == pytest.approx(POINTS, abs=1e-9)
 
 
 def test_jacobians_are_the_derivatives():
@@ -95,12 +89,3 @@ def test_bad_files_are_one_line(tmp_path, text, message):
         read_homography(file, SHAPE)
     assert str(error.value).startswith(f"{file}: ")
     assert "\n" not in str(error.value)
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match="H1to2p: cannot be read: No such file"):
-        read_homography(tmp_path / "H1to2p", SHAPE)
-
-
-def test_the_sign_of_the_matrix_does_not_matter():
-    assert checked(-3.0 * TILTED, SHAPE, "h") == pytest.approx(checked(TILTED, SHAPE, "h"))

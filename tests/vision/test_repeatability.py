@@ -10,7 +10,6 @@ from factorgraph_loc.evaluation.features.repeatability import (
     RADIUS,
     SCALE_RATIO,
     distinct_count,
-    one_to_one,
     overlaps,
     pair_errors,
     repeatability,
@@ -146,20 +145,6 @@ def test_several_orientations_are_one_region():
     assert (double.regions, double.repeatability, double.strict, double.near) == (30, 1.0, 1.0, 1.0)
     # but they are redundant
     assert double.non_redundant == pytest.approx(0.5 * single.non_redundant)
-
-
-@pytest.mark.parametrize("which", [0, 1])
-def test_without_points_there_is_nothing(which):
-    both = [scattered(5, np.random.default_rng(7))] * 2
-    both[which] = Keypoints.empty()
-    found = repeatability(*both, np.eye(3), SHAPES)
-    assert found == type(found)(0, 0.0, 0.0, 0.0, 0.0)
-
-
-def test_one_to_one_takes_the_best_first():
-    first, second = np.array((0, 0, 1, 2, 2)), np.array((0, 1, 0, 2, 2))
-    error = np.array((0.2, 0.1, 0.3, 0.4, 0.3))
-    assert one_to_one(first, second, error).tolist() == [1, 2, 4]
 
 
 def test_distinct_count_of_known_sets():
