@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
@@ -37,7 +37,7 @@ from factorgraph_loc.vision.tracks import follow
 
 TAGS = 20
 RATE, MAP_RATE = 5.0, 2.0  # images/s
-COUNT = 500  # features per image
+FEATURE, COUNT = "colour", 500  # per image
 MAP_DURATION = 600.0  # s
 MAP_SEED = 100_000  # added to the seed of a drive for that of its mapping drive
 SIGMAS = np.array(
@@ -47,15 +47,13 @@ SIGMAS = np.array(
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive with ``seed`` through the office ``world``, ``duration`` [s] long, and the features to detect: ``everywhere`` where
-    there is no map."""
+    """A drive with ``seed`` through the office ``world``, ``duration`` [s] long. ``everywhere``: features are detected in all parts of an image, as
+    where there is no map."""
 
     world: int
     seed: int
     duration: float
     rate: float = RATE
-    feature: str = "colour"
-    count: int = COUNT
     everywhere: bool = False
 
     def settings(self) -> SimulationSettings:
@@ -64,12 +62,9 @@ class Drive:
             "world_seed": self.world,
             "drive": {"duration": self.duration},
             "images": {"rate": self.rate},
-            "rig": {"camera": {"frontend": self.frontend()}},
+            "rig": {"camera": {"frontend": {"feature": FEATURE, "count": COUNT, "everywhere": self.everywhere}}},
         }
         return preset("office", changes)
-
-    def frontend(self) -> dict[str, Any]:
-        return {"feature": self.feature, "count": self.count, "everywhere": self.everywhere}
 
     def mapping(self) -> Drive:
         """The other drive through the same office, from which the map is learnt."""
@@ -87,20 +82,15 @@ class Seconds:
 
 def log_of(drive: Drive, folder: Path) -> tuple[Log, Seconds]:
     """The log of a drive with features and without a map of points; stored in ``folder``."""
-    keep_features([drive], folder)
+    path = folder / f"{_key(drive)}.npz"
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_features(drive, path)
     log = simulate(drive.settings(), drive.seed)
-    stream, seconds = _read_features(drive, _path(drive, folder))
+    stream, seconds = _read_features(path)
     streams = {**log.streams, "camera": stream}
     rig = log.rig.model_copy(update={"sensors": (*log.rig.sensors, "camera")})
     return replace(log, streams=streams, rig=rig), seconds
-
-
-def keep_features(drives: Sequence[Drive], folder: Path) -> None:
-    """Detect and store the features that are not yet in ``folder``; ``drives`` differ only in the features."""
-    missing = [drive for drive in drives if not _path(drive, folder).exists()]
-    if missing:
-        folder.mkdir(parents=True, exist_ok=True)
-        _write_features(missing, folder)
 
 
 def written(drive: Drive, folder: Path) -> Log:
@@ -154,56 +144,46 @@ def compressed(image: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, JPEG)[1], cv2.IMREAD_COLOR))
 
 
-def _write_features(drives: Sequence[Drive], folder: Path) -> None:
-    settings = drives[0].settings()
+def _write_features(drive: Drive, path: Path) -> None:
+    settings = drive.settings()
     assert settings.rig.camera is not None
-    finders = [extractor(drive.feature, drive.count, everywhere=drive.everywhere) for drive in drives]
-    contents: list[list[bytes]] = [[] for _ in drives]
-    render, find = 0.0, np.zeros(len(drives))
+    finder = extractor(FEATURE, COUNT, everywhere=drive.everywhere)
+    contents: list[bytes] = []
+    render = find = 0.0
     before = perf_counter()
-    for image in images(settings, drives[0].seed):
-        render += perf_counter() - before
-        for i, finder in enumerate(finders):
-            before = perf_counter()
-            contents[i].append(encode(*finder.detectAndCompute(image)))
-            find[i] += perf_counter() - before
+    for image in images(settings, drive.seed):
+        rendered = perf_counter()
+        contents.append(encode(*finder.detectAndCompute(image)))
+        render, find = render + rendered - before, find + perf_counter() - rendered
         before = perf_counter()
-    for i, drive in enumerate(drives):
-        found = [decode(content) for content in contents[i]]
-        before = perf_counter()
-        tracks = follow(
-            [f.pixels for f in found],
-            [f.descriptors for f in found],
-            settings.rig.camera.model(),
-            binary=finders[i].binary,
+    found = [decode(content) for content in contents]
+    before = perf_counter()
+    tracks = follow(
+        [f.pixels for f in found], [f.descriptors for f in found], settings.rig.camera.model(), binary=finder.binary
+    )
+    seconds = np.array((render, find, perf_counter() - before))
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez(
+            file,
+            stamps=film(settings, drive.seed).stamps,
+            content=np.frombuffer(b"".join(contents), dtype=np.uint8),
+            lengths=np.array([len(content) for content in contents]),
+            tracks=np.concatenate(tracks),
+            seconds=seconds,
         )
-        seconds = np.array((render, find[i], perf_counter() - before))
-        with replacing(_path(drive, folder)) as temporary, temporary.open("wb") as file:
-            np.savez(
-                file,
-                stamps=film(settings, drive.seed).stamps,
-                content=np.frombuffer(b"".join(contents[i]), dtype=np.uint8),
-                lengths=np.array([len(content) for content in contents[i]]),
-                tracks=np.concatenate(tracks),
-                seconds=seconds,
-            )
 
 
-def _read_features(drive: Drive, path: Path) -> tuple[FeatureStream, Seconds]:
+def _read_features(path: Path) -> tuple[FeatureStream, Seconds]:
     with np.load(path) as stored:
         content, ends = stored["content"].tobytes(), np.cumsum(stored["lengths"]).tolist()
         found = [decode(content[a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
         numbers = np.split(stored["tracks"], np.cumsum([len(f.pixels) for f in found])[:-1])
         t = stored["stamps"]
         frames = [
-            CameraFrame(stamp, drive.feature, f.pixels, f.sizes, f.descriptors, tracks)
+            CameraFrame(stamp, FEATURE, f.pixels, f.sizes, f.descriptors, tracks)
             for stamp, f, tracks in zip(t.tolist(), found, numbers, strict=True)
         ]
         return FeatureStream(t, frames), Seconds(*stored["seconds"].tolist())
-
-
-def _path(drive: Drive, folder: Path) -> Path:
-    return folder / f"{_key(drive)}.npz"
 
 
 def _key(drive: Drive) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from benchmarking.report import Report
 
-from camera_benchmark.drives import COUNT, RATE, Drive, log_of, map_of, with_map
+from camera_benchmark.drives import COUNT, FEATURE, RATE, Drive, log_of, map_of, with_map
 from camera_benchmark.options import CameraOptions
 from camera_benchmark.report import NOTHING
 from factorgraph_loc.experiments.preparation import prepare, use_of
@@ -159,7 +159,7 @@ def chained(job: Chain) -> Links:
             run(prepared.log, config)
             smooth = perf_counter() - started
     find, associate = prepared.seconds - sum(follow), sum(guided) + sum(relocalized)
-    return Links(prepared.images, drive.feature, len(points), find, sum(follow), associate, smooth - associate)
+    return Links(prepared.images, FEATURE, len(points), find, sum(follow), associate, smooth - associate)
 
 
 def rendered(_: Chain) -> float:

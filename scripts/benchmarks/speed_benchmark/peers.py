@@ -48,7 +48,6 @@ class Peer:
 PEERS = (
     Peer("EKF", "filterpy, motion composed to each stamp", "filterpy_ekf", "composed", "filterpy"),
     Peer("EKF", "filterpy, each row of odometry", "filterpy_ekf", "rows", "filterpy"),
-    Peer("EKF", "navlie", "navlie_ekf", "composed", "navlie"),
     Peer("EKF", "Stone Soup", "stonesoup_filters", "ekf", "stonesoup"),
     Peer("EKF, 5 constants", "filterpy without constants", "filterpy_ekf", "composed", "filterpy"),
     Peer("smoother, lag 10 s, 5 constants", "fixed-lag smoother in a plain loop", "gtsam_loops", "lag"),
