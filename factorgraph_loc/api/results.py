@@ -10,6 +10,7 @@ from factorgraph_loc.experiments.colmap import model_of
 from factorgraph_loc.experiments.particles import particles_of
 from factorgraph_loc.exports import foxglove, rerun_scene
 from factorgraph_loc.exports.points import write_bundle, write_ply
+from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 from factorgraph_loc.exports.runs import Particles, StoredRun, find_runs, is_results, read_runs
 from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write_g2o
 from factorgraph_loc.files.shipped import manifests
@@ -31,15 +32,17 @@ def view(
     world: WorldLike | None = None,
     rrd: str | Path | None = None,
     particles: bool = False,
+    bind: str = LOOPBACK,
 ) -> None:
     """Show a log and its runs over time, in Rerun.
 
     ``results``: folders of runs or comparisons, and their log if :func:`~factorgraph_loc.api.logs.datasets` does not list it; or
     a log alone. ``rrd``: file to write for the viewer instead of opening it. ``particles``: repeat runs of particle filters to
-    show their particles. InputError if ``rerun-sdk`` is not installed.
+    show their particles. ``bind``: IP address on which the viewer listens, without credentials; by default that of this machine
+    alone. InputError if ``rerun-sdk`` is not installed, the viewer does not start, or the file cannot be written.
     """
     log, runs = stored(_listed(results), lambda name: one(name, rig, world))
-    show(log, runs, None if rrd is None else Path(rrd), clouds_of(log, runs) if particles else {})
+    show(log, runs, None if rrd is None else Path(rrd), clouds_of(log, runs) if particles else {}, bind)
 
 
 def export(
@@ -98,10 +101,10 @@ def clouds_of(
     return {name: cloud for name, cloud in clouds.items() if cloud is not None}
 
 
-def show(log: Log, runs: list[StoredRun], rrd: Path | None, clouds: dict[str, Particles]) -> None:
+def show(log: Log, runs: list[StoredRun], rrd: Path | None, clouds: dict[str, Particles], bind: str) -> None:
     """Open the viewer, or write a file for it."""
     if rrd is None:
-        rerun_scene.show(log, runs, clouds)
+        rerun_scene.show(log, runs, clouds, bind)
     else:
         rerun_scene.write_rrd(log, runs, rrd, clouds)
 

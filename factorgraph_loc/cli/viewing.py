@@ -36,6 +36,13 @@ def view(
     particles: Annotated[
         bool, typer.Option("--particles", help="Repeat runs of particle filters to show their particles.")
     ] = False,
+    bind: Annotated[
+        str,
+        typer.Option(
+            metavar="ADDRESS",
+            help="IP address on which the viewer listens, without credentials; by default only this machine reaches it.",
+        ),
+    ] = "127.0.0.1",
     *,
     source: LogOptions,
     json: Json = False,
@@ -44,7 +51,7 @@ def view(
     from factorgraph_loc.api import results
 
     log, runs = results.stored(what, source.load_one)
-    results.show(log, runs, rrd, _particles(log, runs) if particles else {})
+    results.show(log, runs, rrd, _particles(log, runs) if particles else {}, bind)
     if json:
         show.document(shown(log, runs) | {"file": None if rrd is None else str(rrd)})
     elif rrd is not None:

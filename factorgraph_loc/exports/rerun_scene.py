@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.rerun_camera import TIMELINE, WORLD, camera_path, record_camera, times
+from factorgraph_loc.exports.rerun_viewer import LOOPBACK, open_viewer
 from factorgraph_loc.exports.runs import Particles, StoredRun
 from factorgraph_loc.exports.scene import DARK, LIT, REFERENCE, Colour, colours
 from factorgraph_loc.files.models import replacing
@@ -45,32 +47,58 @@ def write_rrd(
 ) -> None:
     """Write a file that ``rerun FILE`` opens. ``particles``: by name of the run.
 
-    Raises InputError if ``rerun-sdk`` is not installed or an image cannot be read.
+    Raises InputError if ``rerun-sdk`` is not installed, an image cannot be read, or the file cannot be written.
     """
     recording = _recording()
+    stream = recording.binary_stream()  # in memory: Rerun's own writer hangs when the disk is full
+    recording.send_blueprint(_blueprint(log, runs), make_active=False)
+    _record(recording, log, runs, particles)
+    content = stream.read()
+    recording.disconnect()
     with writing(path), replacing(path) as temporary:
-        recording.save(temporary, _blueprint(log, runs))
-        _record(recording, log, runs, particles)
-        recording.flush()
-        recording.disconnect()
+        temporary.write_bytes(content or b"")
 
 
-def show(log: Log, runs: Sequence[StoredRun], particles: Mapping[str, Particles] = MappingProxyType({})) -> None:
-    """Open the viewer, or use one that is open. Raises InputError as :func:`write_rrd` does, and without a display."""
+def show(
+    log: Log,
+    runs: Sequence[StoredRun],
+    particles: Mapping[str, Particles] = MappingProxyType({}),
+    bind: str = LOOPBACK,
+) -> None:
+    """Open the viewer, or use one that is open. ``bind``: IP address on which a new viewer listens, by default that of this machine
+    alone.
+
+    Raises InputError as :func:`write_rrd` does, without a display, and if the viewer does not start.
+    """
     if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
         raise InputError("there is no display to open the viewer on, expected --rrd FILE, for a viewer elsewhere")
     recording = _recording()
-    recording.spawn(default_blueprint=_blueprint(log, runs))
-    _record(recording, log, runs, particles)
-    recording.flush()
+    with open_viewer(bind) as url:
+        recording.connect_grpc(url, default_blueprint=_blueprint(log, runs))
+        _record(recording, log, runs, particles)
+        recording.flush()
 
 
 def _recording() -> rr.RecordingStream:
     try:
-        import rerun as rr  # noqa: PLC0415 - an optional library
+        with _quiet():
+            import rerun as rr  # noqa: PLC0415 - an optional library
     except ImportError as error:
         raise InputError("the viewer needs rerun-sdk: pip install 'factorgraph-loc[viewer]'") from error
     return rr.RecordingStream("fgloc")
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Import Rerun such that it does not print the errors that it raises, unless the environment variable ``RUST_LOG`` is set."""
+    if "RUST_LOG" in os.environ:
+        yield
+        return
+    os.environ["RUST_LOG"] = "off"
+    try:
+        yield
+    finally:
+        del os.environ["RUST_LOG"]
 
 
 def _record(

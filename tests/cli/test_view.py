@@ -1,6 +1,10 @@
 """``fgloc view``: which log and which runs are meant."""
 
+import sys
+
 import pytest
+
+from factorgraph_loc.exports import rerun_viewer
 
 pytest.importorskip("rerun")
 
@@ -24,6 +28,15 @@ def test_a_file_for_the_viewer(fgloc, short_log, run_folder, tmp_path, with_run)
     assert result.exit_code == 0, result.stderr
     assert result.stdout == f"wrote {out}: open it with rerun {out}\n"
     assert out.read_bytes()[:4] == b"RRF2"
+
+
+def test_a_viewer_that_does_not_start(fgloc, short_log, monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(rerun_viewer, "_listens", lambda _: False)
+    monkeypatch.setattr(rerun_viewer, "COMMAND", (sys.executable, "-c", "raise SystemExit(1)"))
+    result = fgloc("view", short_log)
+    assert result.exit_code == 2
+    assert result.stderr == "error: the viewer did not start; expected --rrd FILE, for a viewer elsewhere\n"
 
 
 def test_what_is_not_clear_is_asked_for(fgloc, short_log, run_folder, tmp_path):

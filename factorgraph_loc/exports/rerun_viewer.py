@@ -1,0 +1,81 @@
+"""The process of the Rerun viewer.
+
+The viewer has no credentials, and ``rerun.spawn`` makes it listen on all network interfaces. It is therefore started here, with an
+address to listen on.
+"""
+
+import ipaddress
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import BinaryIO
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.text import quoted
+
+PORT = 9876
+COMMAND = (sys.executable, "-P", "-m", "rerun_cli")  # -P: no modules of the working folder
+LOOPBACK = "127.0.0.1"
+PATIENCE = 30.0  # s for the viewer to start
+
+
+@contextmanager
+def open_viewer(bind: str) -> Iterator[str]:
+    """The URL of a viewer for :meth:`rerun.RecordingStream.connect_grpc`: of one that is open, or of a new one that listens on the
+    address ``bind`` and stays open after this process has ended.
+
+    InputError if ``bind`` is no IP address, or the viewer does not start or is closed before the end of the block.
+    """
+    host = _reachable(bind)
+    url = f"rerun+http://{f'[{host}]' if ':' in host else host}:{PORT}/proxy"
+    with tempfile.TemporaryFile() as printed:
+        process = None if _listens(host) else _start(bind, printed)
+        latest = time.monotonic() + PATIENCE
+        while process is not None and not _listens(host):
+            if process.poll() is not None or time.monotonic() > latest:
+                raise InputError(
+                    f"the viewer did not start{_reason(printed)}; expected --rrd FILE, for a viewer elsewhere"
+                )
+            time.sleep(0.1)
+        try:
+            yield url
+        except RuntimeError as error:  # of rerun
+            raise InputError(f"{host}:{PORT}: no viewer answers there: {error}{_reason(printed)}") from error
+        if process is not None and process.poll() is not None:
+            raise InputError(f"the viewer was closed{_reason(printed)}")
+
+
+def _reachable(bind: str) -> str:
+    """The address at which this machine reaches a server that listens on ``bind``."""
+    try:
+        address = ipaddress.ip_address(bind)
+    except ValueError as error:
+        raise InputError(f"bind is {quoted(bind)}, expected an IP address such as {LOOPBACK}") from error
+    if address.is_unspecified:
+        return LOOPBACK if address.version == 4 else "::1"
+    return str(address)
+
+
+def _listens(host: str) -> bool:
+    try:
+        socket.create_connection((host, PORT), timeout=1.0).close()
+    except OSError:
+        return False
+    return True
+
+
+def _start(bind: str, printed: BinaryIO) -> "subprocess.Popen[bytes]":
+    """Start the viewer in a session of its own, so that it is not closed with the terminal."""
+    command = [*COMMAND, "--bind", bind, "--port", str(PORT), "--expect-data-soon"]
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=printed, stderr=printed, start_new_session=True)
+
+
+def _reason(printed: BinaryIO) -> str:
+    """The error that the viewer printed."""
+    printed.seek(0)
+    lines = printed.read().decode(errors="replace").splitlines()
+    return next((f": {line.removeprefix('Error: ')}" for line in lines if line.startswith(("Error", "thread "))), "")
