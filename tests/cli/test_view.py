@@ -26,7 +26,7 @@ def test_a_file_for_the_viewer(fgloc, short_log, run_folder, tmp_path, with_run)
     out = tmp_path / "view.rrd"
     result = fgloc("view", *([run_folder] if with_run else []), short_log, "--rrd", out)
     assert result.exit_code == 0, result.stderr
-    assert result.stdout == f"wrote {out}: open it with rerun {out}\n"
+    assert result.stdout == f"wrote {out}: open it with rerun --bind 127.0.0.1 {out}\n"
     assert out.read_bytes()[:4] == b"RRF2"
 
 
