@@ -10,7 +10,7 @@ RUN apt-get update \
 
 COPY . /src
 RUN python3 -m venv /opt/fgloc \
-    && /opt/fgloc/bin/pip install --no-cache-dir --disable-pip-version-check -c /src/constraints.txt '/src[foxglove,ros]' \
+    && /opt/fgloc/bin/pip install --no-cache-dir --disable-pip-version-check -c /src/constraints.txt '/src[ros]' \
     && rm -rf /src \
     && ln -s /opt/fgloc/bin/fgloc /usr/local/bin/fgloc \
     && fgloc --version

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from factorgraph_loc.io.native.rig_file import read_rig, write_rig
     from factorgraph_loc.io.native.world_file import read_world, write_world
     from factorgraph_loc.io.readers.load import load, read_log
-    from factorgraph_loc.io.write import write_log
     from factorgraph_loc.live.localizer import Localizer
     from factorgraph_loc.maps.points import PointMap
     from factorgraph_loc.model.belief import PoseEstimate
@@ -138,7 +137,6 @@ __all__ = [
     "status",
     "view",
     "write_grid",
-    "write_log",
     "write_native",
     "write_rig",
     "write_tum",
@@ -169,7 +167,6 @@ _MODULES = {
     "io.native.rig_file": ("read_rig", "write_rig"),
     "io.native.world_file": ("read_world", "write_world"),
     "io.readers.load": ("load", "read_log"),
-    "io.write": ("write_log",),
     "live.localizer": ("Localizer",),
     "sensors.rfid.pushed": ("RfidRead",),
     "maps.points": ("PointMap",),

@@ -72,7 +72,7 @@ def made_log():
 
 def test_a_script_makes_writes_reads_and_runs_a_log(tmp_path):
     log = made_log()
-    fgloc.write_log(log, str(tmp_path / "hall"))
+    fgloc.write_native(log, str(tmp_path / "hall"))
     read = fgloc.read_log(str(tmp_path / "hall"))
     assert read.name == "hall"
     assert read.streams["odometry"].v == pytest.approx(log.streams["odometry"].v)

@@ -13,7 +13,6 @@ from factorgraph_loc.files.temporary import temporary_folder, writing
 from factorgraph_loc.io.bags.proposed import BagManifest, manifest_of_bag
 from factorgraph_loc.io.native.native import require_new, write_native
 from factorgraph_loc.io.readers import Dataset, describe
-from factorgraph_loc.io.write import write_log
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.recorded import RecordedLooks
 from factorgraph_loc.simulation import SimulationSettings, named_settings, recorded_looks, with_images
@@ -39,11 +38,11 @@ def convert(
     world: WorldLike | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a log as a new folder in the native format, or as a ROS bag if ``out`` ends with .bag, .mcap or .db3.
+    """Write a log as a new folder in the native format.
 
     ``overwrite`` replaces a log that ``out`` is.
     """
-    write_log(one(log, rig, world), out, format=format, overwrite=overwrite)
+    write_native(one(log, rig, world), out, format, overwrite=overwrite)
 
 
 def manifest(bag: str | Path, out: str | Path | None = None, *, overwrite: bool = False) -> BagManifest:

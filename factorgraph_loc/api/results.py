@@ -8,9 +8,10 @@ from factorgraph_loc.api.given import LogLike, RigLike, WorldLike, one
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.colmap import model_of
 from factorgraph_loc.experiments.particles import particles_of
-from factorgraph_loc.exports import foxglove, rerun_scene
+from factorgraph_loc.exports import rerun_scene
 from factorgraph_loc.exports.points import write_bundle, write_ply
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK
+from factorgraph_loc.exports.ros import write_mcap
 from factorgraph_loc.exports.runs import Particles, StoredRun, find_runs, is_results, read_runs
 from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write_g2o
 from factorgraph_loc.files.shipped import manifests
@@ -52,7 +53,7 @@ def export(
     rig: RigLike | None = None,
     world: WorldLike | None = None,
 ) -> list[Path]:
-    """Write runs for Foxglove, or the final trajectory of a run, the reference of a log or the points of its map for other
+    """Write runs for Foxglove and RViz, or the final trajectory of a run, the reference of a log or the points of its map for other
     programs; return the files.
 
     ``results``: as for :func:`view`. ``out``: its suffix selects the format: .mcap, .tum, .kitti, .g2o, .ply or .colmap (a folder).
@@ -118,7 +119,7 @@ def require_format(out: Path) -> None:
 def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
     """Write a log and its runs, or a trajectory, in the format of the suffix; return the files."""
     if out.suffix == ".mcap":
-        foxglove.write_mcap(log, runs, out)
+        write_mcap(log, runs, out)
     elif out.suffix == ".ply":
         if log.world.points is None:
             raise InputError(f"{log.name}: its map has no points to write, expected one with points (--world)")

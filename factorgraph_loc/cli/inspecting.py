@@ -89,25 +89,23 @@ def info(
 @takes_log_options
 def convert(
     log: LogName,
-    out: Annotated[
-        Path, typer.Argument(metavar="OUT", help="Folder to write, or a ROS bag: a name with .bag, .mcap or .db3.")
-    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write.")],
     format: Annotated[Format, typer.Option(help="Format of the tables.")] = Format.csv,
     *,
     source: LogOptions,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the log that OUT is.")] = False,
     json: Json = False,
 ) -> None:
-    """Write a log as a folder in the native format, or as a ROS bag."""
-    from factorgraph_loc.io.write import write_log
+    """Write a log as a folder in the native format."""
+    from factorgraph_loc.io.native.native import write_native
 
     loaded = source.load_one(log)
     for warning in loaded.warnings:
         show.note(f"warning: {warning}")
-    files = write_log(loaded, out, format=format.value, overwrite=overwrite)
+    write_native(loaded, out, format.value, overwrite=overwrite)
     if json:
-        names = sorted(path.name for path in files)
-        show.document({"log": loaded.name, "folder": str(files[0].parent), "files": names})
+        names = sorted(path.name for path in out.iterdir())
+        show.document({"log": loaded.name, "folder": str(out), "files": names})
     else:
         show.line(f"wrote {out}")
 

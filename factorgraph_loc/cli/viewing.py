@@ -49,13 +49,14 @@ def view(
 ) -> None:
     """Show a log and its runs over time, in Rerun."""
     from factorgraph_loc.api import results
+    from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 
     log, runs = results.stored(what, source.load_one)
     results.show(log, runs, rrd, _particles(log, runs) if particles else {}, bind)
     if json:
         show.document(shown(log, runs) | {"file": None if rrd is None else str(rrd)})
     elif rrd is not None:
-        show.line(f"wrote {rrd}: open it with rerun {rrd}")
+        show.line(f"wrote {rrd}: open it with rerun --bind {LOOPBACK} {rrd}")
 
 
 def _particles(log: Log, runs: list[StoredRun]) -> dict[str, Particles]:
@@ -90,15 +91,15 @@ def export(
             "--out",
             "-o",
             metavar="FILE",
-            help="The file to write; its suffix selects the format: .mcap (Foxglove), .tum, .kitti, .g2o, .ply or .colmap (maps; a "
-            "folder).",
+            help="The file to write; its suffix selects the format: .mcap (Foxglove, RViz), .tum, .kitti, .g2o, .ply or .colmap "
+            "(maps; a folder).",
         ),
     ],
     *,
     source: LogOptions,
     json: Json = False,
 ) -> None:
-    """Write runs for Foxglove, or the final trajectory of a run or the reference of a log for other programs."""
+    """Write runs for Foxglove and RViz, or the final trajectory of a run or the reference of a log for other programs."""
     from factorgraph_loc.api import results
 
     results.require_format(out)

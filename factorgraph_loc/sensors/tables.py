@@ -149,14 +149,6 @@ def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str,
     raise InputError(f"{writing.log}: {channel.name} has no table in this format")
 
 
-def rows_of(table: Table, stream: Stream) -> Iterator[dict[str, Any]]:
-    """The rows of a stream's table: values by column, without timestamps."""
-    names = [column.name for column in table.columns[1:]]
-    columns = [getattr(stream, column.field or column.name) for column in table.columns[1:]]
-    plain = [values.tolist() if isinstance(values, np.ndarray) else values for values in columns]
-    return (dict(zip(names, row, strict=True)) for row in zip(*plain, strict=True))
-
-
 def columns_of(channel: Channel, stream: Stream) -> Iterator[Column]:
     """The columns that describe a stream's numbers, named by its fields."""
     for table in (*tables_of(channel), *(load(place) for place in channel.described)):

@@ -54,8 +54,7 @@ def test_a_pose_graph(fgloc, short_log, ekf, tmp_path):
     assert factors.size() == values.size() - 1 == len(read_tum(ekf / "final.tum").t) - 1
 
 
-def test_all_runs_for_foxglove(fgloc, short_log, comparison, tmp_path):
-    pytest.importorskip("mcap")
+def test_all_runs_for_foxglove_and_rviz(fgloc, short_log, comparison, tmp_path):
     assert fgloc("export", comparison, short_log, "-o", tmp_path / "short.mcap").exit_code == 0
     assert (tmp_path / "short.mcap").read_bytes()[:5] == b"\x89MCAP"
 

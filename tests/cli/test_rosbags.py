@@ -1,4 +1,4 @@
-"""From a bag of a robot that nobody knows to a comparison, as docs/rosbags.md tells, and logs as bags."""
+"""From a bag of a robot that nobody knows to a comparison, as docs/rosbags.md tells."""
 
 import json
 import tomllib
@@ -53,21 +53,6 @@ def test_the_wheels_and_what_is_not_read(recorded, fgloc, monkeypatch):
     moved = [log.streams["odometry"] for log in (by_wheels, by_poses)]
     np.testing.assert_allclose(moved[0].dtheta, moved[1].dtheta, atol=1e-6)
     assert "not read" in fgloc("info", "wheels.toml").stdout
-
-
-@pytest.mark.parametrize("suffix", ["bag", "mcap", "db3"])
-def test_a_log_as_a_bag(short_log, fgloc, monkeypatch, tmp_path, suffix):
-    monkeypatch.chdir(tmp_path)
-    converted = fgloc("convert", short_log, f"short.{suffix}", "--json")
-    assert json.loads(converted.stdout)["files"] == [f"short.{suffix}", "short.rig.toml", "short.world.toml"]
-    Path("short.toml").write_text(fgloc("manifest", f"short.{suffix}").stdout)
-    (log,), (expected,) = load("short.toml"), load(str(short_log))
-    assert (log.rig, log.world) == (expected.rig, expected.world)
-    np.testing.assert_array_equal(log.streams["bearing_range"].range, expected.streams["bearing_range"].range)
-    again = fgloc("convert", short_log, f"short.{suffix}")
-    assert again.exit_code == 2
-    assert f"short.{suffix}: exists" in again.stderr
-    assert fgloc("convert", short_log, f"short.{suffix}", "--overwrite").exit_code == 0
 
 
 def test_what_is_no_bag(fgloc, tmp_path):

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bag_maker import BagMaker
 from compass.settings import CompassSettings
 from compass.stream import Heading, HeadingStream
 from in_short import blank_pictures, in_short, runs_here  # noqa: F401 - fixtures
@@ -79,6 +80,23 @@ def test_a_table_of_another_program_by_a_mapping(tmp_path):
     stream = fgloc.read_log(tmp_path / "arc.toml").streams["compass"]
     np.testing.assert_allclose(stream.t, (0.25, 0.75))
     np.testing.assert_allclose(stream.heading, (math.pi / 2.0, -math.pi / 4.0))
+
+
+def test_a_topic_of_a_bag_by_a_mapping(tmp_path):
+    with BagMaker(tmp_path / "arc.bag") as made:
+        for i, heading in enumerate((0.1, 0.2)):
+            t = UNIX + i * 10**9
+            made.odometry("/odom", t, (0.1 * i, 0.0, 0.0))
+            vector = made.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=heading)
+            made.write("/kvh", t, "geometry_msgs/msg/Vector3Stamped", header=made.header(t), vector=vector)
+    (tmp_path / "arc.toml").write_text(
+        'title = "arc"\nreader = "rosbag"\nlicence = "none"\norigin = "made"\npath = "arc.bag"\n'
+        '[options.odometry]\ntopic = "/odom"\n'
+        '[options.compass]\ntopic = "/kvh"\nfields = { heading = "vector.z" }\nunits = { heading = 0.5 }\n'
+    )
+    found = fgloc.read_log(tmp_path / "arc.toml").streams["compass"]
+    np.testing.assert_allclose(found.heading, (0.05, 0.1))
+    np.testing.assert_allclose(found.t, (0.0, 1.0))
 
 
 def drifting_log() -> fgloc.Log:

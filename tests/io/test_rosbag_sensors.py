@@ -8,6 +8,9 @@ from rosbag_drive import COUNT, MS, T0, add_frames, transform
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
+from factorgraph_loc.io.bags.file import open_bag
+from factorgraph_loc.io.bags.manifest import propose
+
 MARKERS = """\
 std_msgs/Header header
 MarkerPose[] markers
@@ -185,3 +188,17 @@ def test_corners_of_tags(maker, read_drive):
     assert seen.point == [f"tag36h11-5/{i}" for i in (3, 2, 1, 0)]  # from the lower left
     assert seen.u.tolist() == [10.0, 11.0, 12.0, 13.0]
     assert seen.v.tolist() == [20.0, 21.0, 22.0, 23.0]
+
+
+def test_a_start(maker, read_drive):
+    spread = np.zeros((6, 6))
+    spread[[0, 1, 5], [0, 1, 5]] = 0.01, 0.04, 0.09
+    pose = maker.make("geometry_msgs/msg/PoseWithCovariance", pose=maker.pose(1.0, 2.0, 3.0), covariance=spread.ravel())
+    kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
+    maker.write("/initialpose", T0 + 250 * MS, kind, header=maker.header(T0 + 250 * MS, "map"), pose=pose)
+    start = read_drive(maker, start={"topic": "/initialpose"}).start
+    assert start.t == pytest.approx(0.25)
+    np.testing.assert_allclose(start.pose, (1.0, 2.0, 3.0), atol=1e-12)
+    np.testing.assert_allclose(start.sigmas, (0.1, 0.2, 0.3), atol=1e-12)
+    with open_bag(maker.path) as bag:
+        assert propose(bag).options["start"] == {"topic": "/initialpose"}

@@ -10,7 +10,8 @@ import tomllib
 import pytest
 from package_tables import MODULES, ROOT
 
-from factorgraph_loc import InputError, write_log
+from factorgraph_loc import InputError
+from factorgraph_loc.exports.ros import write_mcap
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ADDRESS = PROJECT["urls"]["Repository"]
@@ -86,13 +87,12 @@ def test_messages_and_pages_name_extras_that_exist():
         }
         for path in (*MODULES.values(), *pages)
     }
-    assert {extra for path in MODULES.values() for extra in named[path]} == {"cluster", "foxglove", "ros", "viewer"}
+    assert {extra for path in MODULES.values() for extra in named[path]} == {"cluster", "ros", "viewer"}
     assert set().union(*named.values()) <= set(PROJECT["optional-dependencies"])
 
 
-@pytest.mark.parametrize("name", ["log.bag", "log.mcap", "log.db3"])
-def test_a_bag_cannot_be_written_without_the_extra(log, tmp_path, monkeypatch, name):
+def test_messages_of_ros_cannot_be_written_without_the_extra(log, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.interfaces", None)
     with pytest.raises(InputError, match=r"pip install 'factorgraph-loc\[ros\]'"):
-        write_log(log, tmp_path / name)
+        write_mcap(log, [], tmp_path / "log.mcap")
     assert list(tmp_path.iterdir()) == []

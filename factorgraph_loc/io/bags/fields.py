@@ -1,6 +1,5 @@
 """Access to fields of ROS messages by path: ``tag.epc``, or ``reads[].tag.epc`` for a list; their timestamps, those in headers
-(time of measurement) or those of the recording; and the message types of exported logs: those of ROS where available, else our
-own, with a field for each column of a table.
+(time of measurement) or those of the recording.
 
 Paths are checked against the message type before messages are read; errors list the available fields.
 """
@@ -16,9 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.columns import Table
 from factorgraph_loc.io.bags.file import Bag, Stamped, Topic
-from factorgraph_loc.sensors.tables import native_tables
 from factorgraph_loc.text import listed, quoted
 
 if TYPE_CHECKING:
@@ -34,14 +31,6 @@ Row = tuple[Any, ...]
 Clock = Literal["header", "receive"]
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # the latter in old bags
 APART = 0.5  # s; larger differences between topics are clock offsets, not delays
-OURS = "factorgraph_loc_msgs/msg/"
-NAMED = {"bearing_range": f"{OURS}LandmarkSighting", "sightings": f"{OURS}PixelSighting"}
-ROS_HAS = ("odometry", "imu", "camera", "rfid", "inventories")  # tables that are exported differently
-READ, ROUND = f"{OURS}RfidRead", f"{OURS}RfidRound"
-INITIAL_POSE = ("/initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped")
-
-LINE = "=" * 80
-KINDS = {"number": "float64", "whole": "int64", "name": "string", "file": "string"}
 
 
 class Fields:
@@ -210,26 +199,3 @@ def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[str]]:
             "choose clock in the manifest, or set time_offset in the rig"
         )
     return line, warnings
-
-
-def tables_of_messages() -> Mapping[str, Table]:
-    """The tables whose rows are messages of our own, by message type."""
-    return {
-        NAMED.get(name) or OURS + "".join(part.capitalize() for part in name.split("_")): tables[0]
-        for name, (_, tables) in native_tables().items()
-        if name not in ROS_HAS
-    }
-
-
-def definitions() -> dict[str, str]:
-    """Definitions of our own message types; ``{time}`` is replaced by the type of a timestamp."""
-    rows = {
-        kind: "std_msgs/Header header\n" + "".join(f"{KINDS[c.kind]} {c.name}\n" for c in table.columns[1:])
-        for kind, table in tables_of_messages().items()
-    }
-    return rows | {
-        # timestamped at the end of the round; without reads if none was read
-        ROUND: "std_msgs/Header header\nstring antenna\nRfidRead[] reads\n"
-        f"{LINE}\nMSG: factorgraph_loc_msgs/RfidRead\n"
-        "{time} stamp\nstring epc\nfloat64 rssi\nfloat64 phase\nfloat64 frequency\n",
-    }

@@ -7,7 +7,7 @@ from typing import Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.bags.camera import COMPRESSED, INFO, RAW
-from factorgraph_loc.io.bags.fields import INITIAL_POSE, LIST, ROUND, TF, has_header, leaves, tables_of_messages
+from factorgraph_loc.io.bags.fields import LIST, TF, has_header, leaves
 from factorgraph_loc.io.bags.file import Bag, Topic
 from factorgraph_loc.io.bags.frames import ODOMETRY as ORIGINS
 from factorgraph_loc.io.bags.frames import ROBOT, STATIC, WORLD, Tree, tree_of
@@ -27,6 +27,8 @@ WHEELS = {"radius": 0.1, "track": 0.5}  # m
 NUMBERS = {"twist": "speeds of wheels [rad/s]", "pose": "angles of wheels [rad]"}
 MEASURE = "measure radius and track [m]: here, or as [odometry.wheels] in the rig, which comes first"
 NOT_MEASURED = re.compile(r"goal|cmd|command|target|plan|initialpose", re.IGNORECASE)
+
+INITIAL_POSE = ("/initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
 # common names of the last part of a field's path, without underscores
 NAMES: dict[str, tuple[str, ...]] = {
@@ -218,12 +220,8 @@ def _camera(out: Proposal, topics: Sequence[Topic]) -> None:
 
 
 def _tables(out: Proposal, topics: Sequence[Topic]) -> None:
-    ours = tables_of_messages()
     for topic in topics:
-        if topic.type in ours:
-            table = ours[topic.type]
-            out.take(table.name, topic, fields={column.name: column.name for column in table.columns[1:]})
-        elif topic.type in DETECTIONS and "bearing_range" not in out.options:
+        if topic.type in DETECTIONS and "bearing_range" not in out.options:
             out.take("bearing_range", topic)
         elif topic.type == CORNERS and "sightings" not in out.options:
             out.take("sightings", topic)
@@ -260,12 +258,11 @@ def _rfid(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
         settings["units"] = units
     if LIST in fields["epc"] and LIST not in fields.get("antenna", LIST):
         settings["rounds"] = "message"
-        if topic.type != ROUND:
-            out.notes.append(
-                "rfid: each message is treated as one inventory round of its antenna, an empty one as a round without reads"
-            )
+        out.notes.append(
+            "rfid: each message is treated as one inventory round of its antenna, an empty one as a round without reads"
+        )
     out.take("rfid", topic, **settings)
-    doubtful = [name for name in UNITS if name in fields and name not in units and topic.type != ROUND]
+    doubtful = [name for name in UNITS if name in fields and name not in units]
     if doubtful:
         out.notes.append(f"rfid: {', '.join(doubtful)}: assumed to be in rad, Hz and us, set units otherwise")
     _others(out, "rfid", [other for other, _ in found if other is not topic])

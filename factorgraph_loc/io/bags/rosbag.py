@@ -16,7 +16,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, add_fields, parse_model
 from factorgraph_loc.io.bags import fields as bag_clock
 from factorgraph_loc.io.bags.camera import CameraTopic, Images, Info
-from factorgraph_loc.io.bags.fields import TF, Clock, Stamper, tables_of_messages
+from factorgraph_loc.io.bags.fields import TF, Clock, Stamper
 from factorgraph_loc.io.bags.file import Bag, Stamped, open_bag
 from factorgraph_loc.io.bags.frames import STATIC, FrameReference, StaticFrames
 from factorgraph_loc.io.bags.landmarks import Landmarks, LandmarkTopic, PixelsOfPoints, PixelTopic
@@ -34,6 +34,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.tables import native_tables
 from factorgraph_loc.text import listed, plain, told
 from factors.camera.model import angles_of_camera
 from factors.se2 import Array
@@ -96,7 +97,9 @@ class Options(FileModel):
     """frame of the robot, for mountings in tf_static"""
 
 
-OTHERS = [table for table in tables_of_messages().values() if table.name not in Options.model_fields]
+OTHERS = [
+    tables[0] for name, (_, tables) in native_tables().items() if name not in {*Options.model_fields, "inventories"}
+]
 add_fields(Options, {table.name: (TableTopic | None, None) for table in OTHERS}, after="sightings")
 
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import write_toml
+from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.io.readers.pose_file import read_kitti
-from factorgraph_loc.io.write import write_log
 from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.trajectory import Trajectory
@@ -58,7 +58,7 @@ def prepare(recording: Recording, folder: Path, out: Path) -> Log:
         log = cut(log, 0.0, recording.seconds)
     target = out / recording.name
     if not target.exists():
-        write_log(log, target)
+        write_native(log, target)
     # use what was written
     return load(target)[0]
 

@@ -22,7 +22,7 @@ def drive(tmp_path):
         gyro = fgloc.YawRateStream(T + 0.033, np.full(101, RATE))
         start = fgloc.StartPose(0.0, np.zeros(3), np.full(3, 0.01))
         log = fgloc.Log("circle", rig or fgloc.Rig(), fgloc.World(), {"odometry": odometry, "imu": gyro}, start=start)
-        fgloc.write_log(log, tmp_path / "circle")
+        fgloc.write_native(log, tmp_path / "circle")
         if rig is None:
             text = (tmp_path / "circle/run.toml").read_text()
             (tmp_path / "circle/run.toml").write_text(text.replace('rig = "circle.rig.toml"\n', ""))

@@ -1,0 +1,225 @@
+"""Export of a log and its runs as an MCAP file (https://mcap.dev) with standard messages of ROS 2, which Foxglove, RViz and
+``ros2 bag play`` read.
+
+Poses are in the frame ``map``, stamped with the absolute time of the log. The library ``rosbags`` is optional and imported only
+where it is used.
+"""
+
+import heapq
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.exports import scene
+from factorgraph_loc.exports.runs import StoredRun
+from factorgraph_loc.exports.scene import DARK, Colour, colours
+from factorgraph_loc.files.checks import absolute
+from factorgraph_loc.files.temporary import temporary_folder, writing
+from factorgraph_loc.io.bags.file import require_rosbags
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.camera import draw
+from factors.se2 import Array
+
+MAP, BASE, CAMERA, REFERENCE = "map", "base_link", "camera", "reference"
+PLANAR = (0, 1, 5)  # x, y and the rotation about z in the covariances of ROS
+NO_ESTIMATE = np.array([-1.0, *[0.0] * 35])  # covariance of a value that is not estimated, as in sensor_msgs
+LATEST = 2**31 * 10**9  # ns: stamps of ROS have 32 bits of seconds
+DOT, POINT, LINE, LETTERS = 0.12, 0.03, 0.02, 0.15  # m: diameters, width of a line, height of letters
+LINES, SPHERES, TEXT = 5, 7, 9  # types of a marker: LINE_LIST, SPHERE_LIST, TEXT_VIEW_FACING
+
+Message = tuple[int, str, str, Any]  # time [ns], topic, type, content
+
+
+def write_mcap(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
+    """Write an MCAP file.
+
+    Topics: for each run NAME ``/NAME/odometry`` (causal estimates with covariances), ``/NAME/path`` (the final trajectory) and
+    ``/NAME/markers`` (learnt landmarks); ``/reference/odometry`` and ``/reference/path``; ``/tf``, the same poses as frames;
+    ``/markers`` (walls, tags, landmarks and points of the map); ``/camera/image/compressed``. The robot's frame is ``base_link``,
+    or ``NAME/base_link`` if there are several runs, and ``reference/base_link``.
+
+    Raises InputError if ``rosbags`` is not installed, a stamp is not between 1970 and 2038, or an image cannot be read.
+    """
+    require_rosbags()
+    from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415 - an optional library
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    connections: dict[str, Any] = {}
+    with writing(path), temporary_folder(path) as folder:
+        with Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            for t_ns, topic, kind, content in heapq.merge(
+                *_sources(log, runs, _Maker(store.types)), key=lambda m: m[0]
+            ):
+                if not 0 <= t_ns < LATEST:
+                    raise InputError(f"{log.name}: {topic} has a stamp of {t_ns} ns, expected one from 1970 to 2038")
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, kind, typestore=store)
+                writer.write(connections[topic], t_ns, store.serialize_cdr(content, kind))
+        (folder / "bag/bag.mcap").replace(path)
+
+
+def _sources(log: Log, runs: Sequence[StoredRun], make: "_Maker") -> Iterator[Iterator[Message]]:
+    """All messages, as streams ordered by time."""
+    moving = [(run.name, BASE if len(runs) == 1 else f"{run.name}/{BASE}", run.played(), run.final) for run in runs]
+    if log.reference is not None:
+        moving.append((REFERENCE, f"{REFERENCE}/{BASE}", log.reference, log.reference))
+    firsts = [float(t.t[0]) for _, _, played, final in moving for t in (played, final) if len(t)]
+    start_ns = int(absolute(np.array([min([log.span()[0], *firsts])]), log.t0_ns)[0])
+    yield iter([(start_ns, "/markers", *make.markers(start_ns, _map(log, make)))])
+    for name, frame, played, final in moving:
+        yield _poses(f"/{name}/odometry", frame, played, log.t0_ns, make)
+        yield iter([(start_ns, f"/{name}/path", *make.path(start_ns, final, log.t0_ns))])
+    for run, colour in zip(runs, colours(), strict=False):
+        learnt = {name: np.array((*point.position, 0.0)) for name, point in run.landmarks.items()}
+        known = {name: position for name, position in learnt.items() if np.isfinite(position).all()}
+        if known:
+            yield iter(
+                [(start_ns, f"/{run.name}/markers", *make.markers(start_ns, make.dots("learnt", known, colour)))]
+            )
+    yield _images(log, make)
+
+
+def _map(log: Log, make: "_Maker") -> list[dict[str, Any]]:
+    """The walls and what the sensors have in the map."""
+    ends = [(x, y, 0.0) for x, y in np.array(log.world.walls).reshape(-1, 2).tolist()]
+    found = [make.shape("walls", LINES, LINE, DARK, ends)] if ends else []
+    for marks, positions, _ in scene.layers(log):
+        if marks.dense and len(marks.positions):
+            found.append(make.shape(marks.layer, SPHERES, POINT, DARK, marks.positions.tolist()))
+        elif positions:
+            found += make.dots(marks.layer, positions, DARK)
+    return found
+
+
+def _poses(topic: str, frame: str, trajectory: Trajectory, t0_ns: int, make: "_Maker") -> Iterator[Message]:
+    """Each pose as odometry and as a transform, with its covariance, or zeros where that is unknown."""
+    covariances = np.zeros((len(trajectory), 6, 6))
+    if trajectory.covariances is not None:
+        known = np.isfinite(trajectory.covariances).all(axis=(1, 2))
+        covariances[np.ix_(known, PLANAR, PLANAR)] = trajectory.covariances[known]
+    still = make("geometry_msgs/Twist", linear=make.vector(0.0, 0.0, 0.0), angular=make.vector(0.0, 0.0, 0.0))
+    no_twist = make("geometry_msgs/TwistWithCovariance", twist=still, covariance=NO_ESTIMATE)
+    stamps = absolute(trajectory.t, t0_ns).tolist()
+    for t_ns, (x, y, heading), covariance in zip(stamps, _planar(trajectory), covariances, strict=True):
+        header = make.header(t_ns, MAP)
+        place = make.pose(x, y, 0.0, heading)
+        move = make("geometry_msgs/Transform", translation=make.vector(x, y, 0.0), rotation=place.orientation)
+        transform = make("geometry_msgs/TransformStamped", header=header, child_frame_id=frame, transform=move)
+        yield t_ns, "/tf", *make.typed("tf2_msgs/TFMessage", transforms=[transform])
+        pose = make("geometry_msgs/PoseWithCovariance", pose=place, covariance=covariance.ravel())
+        yield (
+            t_ns,
+            topic,
+            *make.typed("nav_msgs/Odometry", header=header, child_frame_id=frame, pose=pose, twist=no_twist),
+        )
+
+
+def _planar(trajectory: Trajectory) -> list[list[float]]:
+    """x, y and heading, which is 0 where it is undefined."""
+    return np.where((True, True, trajectory.has_heading), trajectory.poses, 0.0).tolist()  # type: ignore[no-any-return]
+
+
+def _images(log: Log, make: "_Maker") -> Iterator[Message]:
+    for t, jpeg in draw.images(log):
+        t_ns = log.t0_ns + round(t * 1e9)
+        content = {"format": "jpeg", "data": np.frombuffer(jpeg, dtype=np.uint8)}
+        yield (
+            t_ns,
+            "/camera/image/compressed",
+            *make.typed("sensor_msgs/CompressedImage", header=make.header(t_ns, CAMERA), **content),
+        )
+
+
+class _Maker:
+    """Makes messages from their types and fields."""
+
+    def __init__(self, types: Mapping[str, Any]) -> None:
+        self._types = types
+
+    def __call__(self, kind: str, **fields: Any) -> Any:
+        return self.typed(kind, **fields)[1]
+
+    def typed(self, kind: str, **fields: Any) -> tuple[str, Any]:
+        """The full name of the type, and the message."""
+        name = kind.replace("/", "/msg/")
+        return name, self._types[name](**fields)
+
+    def header(self, t_ns: int, frame: str) -> Any:
+        stamp = self("builtin_interfaces/Time", sec=t_ns // 10**9, nanosec=t_ns % 10**9)
+        return self("std_msgs/Header", stamp=stamp, frame_id=frame)
+
+    def vector(self, x: float, y: float, z: float) -> Any:
+        return self("geometry_msgs/Vector3", x=x, y=y, z=z)
+
+    def point(self, x: float, y: float, z: float) -> Any:
+        return self("geometry_msgs/Point", x=x, y=y, z=z)
+
+    def pose(self, x: float, y: float, z: float, heading: float) -> Any:
+        half = heading / 2.0
+        turn = self("geometry_msgs/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
+        return self("geometry_msgs/Pose", position=self.point(x, y, z), orientation=turn)
+
+    def path(self, start_ns: int, trajectory: Trajectory, t0_ns: int) -> tuple[str, Any]:
+        poses = [
+            self("geometry_msgs/PoseStamped", header=self.header(t_ns, MAP), pose=self.pose(x, y, 0.0, heading))
+            for t_ns, (x, y, heading) in zip(absolute(trajectory.t, t0_ns).tolist(), _planar(trajectory), strict=True)
+        ]
+        return self.typed("nav_msgs/Path", header=self.header(start_ns, MAP), poses=poses)
+
+    def markers(self, t_ns: int, shapes: Sequence[Mapping[str, Any]]) -> tuple[str, Any]:
+        """An array of the shapes that :meth:`shape` and :meth:`dots` give, numbered."""
+        empty = {
+            "header": self.header(t_ns, MAP),
+            "action": 0,  # ADD
+            "lifetime": self("builtin_interfaces/Duration", sec=0, nanosec=0),  # for ever
+            "frame_locked": False,
+            "colors": [],
+            "texture_resource": "",
+            "texture": self(
+                "sensor_msgs/CompressedImage", header=self.header(0, ""), format="", data=np.empty(0, dtype=np.uint8)
+            ),
+            "uv_coordinates": [],
+            "mesh_resource": "",
+            "mesh_file": self("visualization_msgs/MeshFile", filename="", data=np.empty(0, dtype=np.uint8)),
+            "mesh_use_embedded_materials": False,
+        }
+        made = [self("visualization_msgs/Marker", id=i, **empty, **shape) for i, shape in enumerate(shapes)]
+        return self.typed("visualization_msgs/MarkerArray", markers=made)
+
+    def dots(self, name: str, positions: Mapping[str, Array], colour: Colour) -> list[dict[str, Any]]:
+        """Spheres at positions (3,), with their names above."""
+        places = {label: position.tolist() for label, position in positions.items()}
+        labels = [
+            self.shape(f"{name}: names", TEXT, LETTERS, colour, [], text=label, at=(x, y, z + DOT))
+            for label, (x, y, z) in places.items()
+        ]
+        return [self.shape(name, SPHERES, DOT, colour, list(places.values())), *labels]
+
+    def shape(
+        self,
+        name: str,
+        kind: int,
+        size: float,
+        colour: Colour,
+        points: Sequence[Sequence[float]],
+        *,
+        text: str = "",
+        at: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> dict[str, Any]:
+        """The fields of a marker that are particular to it."""
+        red, green, blue = (value / 255.0 for value in colour)
+        return {
+            "ns": name,
+            "type": kind,
+            "pose": self.pose(*at, 0.0),
+            "scale": self.vector(size, size, size),
+            "color": self("std_msgs/ColorRGBA", r=red, g=green, b=blue, a=1.0),
+            "points": [self.point(*point) for point in points],
+            "text": text,
+        }
