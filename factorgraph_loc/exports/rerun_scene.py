@@ -50,7 +50,9 @@ def write_rrd(
     Raises InputError if ``rerun-sdk`` is not installed, an image cannot be read, or the file cannot be written.
     """
     recording = _recording()
-    stream = recording.binary_stream()  # in memory: Rerun's own writer hangs when the disk is full
+    import rerun as rr  # noqa: PLC0415 - once it is known to be installed
+
+    stream = rr.binary_stream(recording)  # in memory, because Rerun's own writer hangs when the disk is full
     recording.send_blueprint(_blueprint(log, runs), make_active=False)
     _record(recording, log, runs, particles)
     content = stream.read()

@@ -26,7 +26,7 @@ from factorgraph_loc.sensors.camera import draw
 from factors.se2 import Array
 
 MAP, BASE, CAMERA, REFERENCE = "map", "base_link", "camera", "reference"
-PLANAR = (0, 1, 5)  # x, y and the rotation about z in the covariances of ROS
+PLANAR = np.array((0, 1, 5))  # x, y and the rotation about z in the covariances of ROS
 NO_ESTIMATE = np.array([-1.0, *[0.0] * 35])  # covariance of a value that is not estimated, as in sensor_msgs
 LATEST = 2**31 * 10**9  # ns: stamps of ROS have 32 bits of seconds
 DOT, POINT, LINE, LETTERS = 0.12, 0.03, 0.02, 0.15  # m: diameters, width of a line, height of letters
