@@ -39,8 +39,8 @@ def view(
 
     ``results``: folders of runs or comparisons, and their log if :func:`~factorgraph_loc.api.logs.datasets` does not list it; or
     a log alone. ``rrd``: file to write for the viewer instead of opening it. ``particles``: repeat runs of particle filters to
-    show their particles. ``bind``: IP address on which the viewer listens, without credentials; by default that of this machine
-    alone. InputError if ``rerun-sdk`` is not installed, the viewer does not start, or the file cannot be written.
+    show their particles. ``bind``: IP address that the viewer listens on, without credentials; only this machine reaches the
+    default one. InputError if ``rerun-sdk`` is not installed, the viewer does not start, or the file cannot be written.
     """
     log, runs = stored(_listed(results), lambda name: one(name, rig, world))
     show(log, runs, None if rrd is None else Path(rrd), clouds_of(log, runs) if particles else {}, bind)

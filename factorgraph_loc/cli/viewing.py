@@ -40,7 +40,7 @@ def view(
         str,
         typer.Option(
             metavar="ADDRESS",
-            help="IP address on which the viewer listens, without credentials; by default only this machine reaches it.",
+            help="IP address that the viewer listens on, without credentials; only this machine reaches the default one.",
         ),
     ] = "127.0.0.1",
     *,

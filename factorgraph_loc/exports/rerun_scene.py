@@ -67,8 +67,8 @@ def show(
     particles: Mapping[str, Particles] = MappingProxyType({}),
     bind: str = LOOPBACK,
 ) -> None:
-    """Open the viewer, or use one that is open. ``bind``: IP address on which a new viewer listens, by default that of this machine
-    alone.
+    """Open the viewer, or use one that is open. ``bind``: IP address that a new viewer listens on; only this machine reaches the
+    default one.
 
     Raises InputError as :func:`write_rrd` does, without a display, and if the viewer does not start.
     """

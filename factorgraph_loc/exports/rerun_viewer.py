@@ -38,7 +38,7 @@ def open_viewer(bind: str) -> Iterator[str]:
         while process is not None and not _listens(host):
             if process.poll() is not None or time.monotonic() > latest:
                 raise InputError(
-                    f"the viewer did not start{_reason(printed)}; expected --rrd FILE, for a viewer elsewhere"
+                    f"the viewer did not start{_reason(printed)}; --rrd FILE writes a file that `rerun FILE` opens"
                 )
             time.sleep(0.1)
         try:

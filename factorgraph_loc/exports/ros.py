@@ -88,13 +88,13 @@ def _sources(log: Log, runs: Sequence[StoredRun], make: "_Maker") -> Iterator[It
 def _map(log: Log, make: "_Maker") -> list[dict[str, Any]]:
     """The walls and what the sensors have in the map."""
     ends = [(x, y, 0.0) for x, y in np.array(log.world.walls).reshape(-1, 2).tolist()]
-    found = [make.shape("walls", LINES, LINE, DARK, ends)] if ends else []
+    shapes = [make.shape("walls", LINES, LINE, DARK, ends)] if ends else []
     for marks, positions, _ in scene.layers(log):
         if marks.dense and len(marks.positions):
-            found.append(make.shape(marks.layer, SPHERES, POINT, DARK, marks.positions.tolist()))
+            shapes.append(make.shape(marks.layer, SPHERES, POINT, DARK, marks.positions.tolist()))
         elif positions:
-            found += make.dots(marks.layer, positions, DARK)
-    return found
+            shapes += make.dots(marks.layer, positions, DARK)
+    return shapes
 
 
 def _poses(topic: str, frame: str, trajectory: Trajectory, t0_ns: int, make: "_Maker") -> Iterator[Message]:

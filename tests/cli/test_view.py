@@ -36,7 +36,7 @@ def test_a_viewer_that_does_not_start(fgloc, short_log, monkeypatch):
     monkeypatch.setattr(rerun_viewer, "COMMAND", (sys.executable, "-c", "raise SystemExit(1)"))
     result = fgloc("view", short_log)
     assert result.exit_code == 2
-    assert result.stderr == "error: the viewer did not start; expected --rrd FILE, for a viewer elsewhere\n"
+    assert result.stderr == "error: the viewer did not start; --rrd FILE writes a file that `rerun FILE` opens\n"
 
 
 def test_what_is_not_clear_is_asked_for(fgloc, short_log, run_folder, tmp_path):
