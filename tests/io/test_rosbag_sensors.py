@@ -202,3 +202,16 @@ def test_a_start(maker, read_drive):
     np.testing.assert_allclose(start.sigmas, (0.1, 0.2, 0.3), atol=1e-12)
     with open_bag(maker.path) as bag:
         assert propose(bag).options["start"] == {"topic": "/initialpose"}
+
+
+def test_landmarks_and_pixels_by_a_mapping(maker, read_drive):
+    maker.reads("/seen", T0, [("AB", 1, 2.5, 0.5, T0), ("CD", 1, 3.5, -0.5, T0)])
+    numbers = ("reads[].rssi", "reads[].phase_degrees")
+    polar, pixels = (
+        {"topic": "/seen", "fields": {"landmark": "reads[].epc", **dict(zip(names, numbers, strict=True))}}
+        for names in (("range", "bearing"), ("u", "v"))
+    )
+    log = read_drive(maker, bearing_range=polar, sightings=pixels)
+    seen, shown = log.streams["bearing_range"], log.streams["sightings"]
+    assert (seen.landmark, seen.range.tolist(), seen.bearing.tolist()) == (["AB", "CD"], [2.5, 3.5], [0.5, -0.5])
+    assert (shown.point, shown.u.tolist(), shown.v.tolist()) == (["AB", "CD"], [2.5, 3.5], [0.5, -0.5])
