@@ -31,7 +31,7 @@ FAULTY = tuple(f"field-office-1-{fault}" for fault in FAULTS)
 
 def recorded(names: tuple[str, ...], logs: Path, _: Path) -> None:
     log = fgloc.read_log(names[0].removesuffix("-carried"))
-    fgloc.write_log(carried(log) if names[0].endswith("-carried") else log, logs / names[0])
+    fgloc.write_native(carried(log) if names[0].endswith("-carried") else log, logs / names[0])
 
 
 def carried(log: fgloc.Log) -> fgloc.Log:
@@ -59,9 +59,11 @@ def office(names: tuple[str, ...], logs: Path, _: Path) -> None:
     log = replace(log, rig=fgloc.Rig.model_validate(rig), streams={**log.streams, **own})
     for name, column in zip(names[1:3], ("bearing", "range"), strict=True):
         some = replace(seen, **{column: np.full(len(seen.t), np.nan)})
-        fgloc.write_log(replace(log, streams={"odometry": wheels, "bearing_range": some}), logs / name, overwrite=True)
-    fgloc.write_log(carried(log), logs / names[3], overwrite=True)
-    fgloc.write_log(log, logs / names[0], overwrite=True)
+        fgloc.write_native(
+            replace(log, streams={"odometry": wheels, "bearing_range": some}), logs / name, overwrite=True
+        )
+    fgloc.write_native(carried(log), logs / names[3], overwrite=True)
+    fgloc.write_native(log, logs / names[0], overwrite=True)
 
 
 def loops(reference: fgloc.Trajectory, rng: np.random.Generator) -> fgloc.LoopStream:
@@ -87,12 +89,12 @@ def camera(names: tuple[str, ...], logs: Path, _: Path) -> None:
         for drive, folder in enumerate((first, second)):
             fgloc.simulate("office", 10 * seed + drive, changes=changes, images=True, out=folder)
         fgloc.build_map(first, world)
-        fgloc.write_log(fgloc.read_log(second, world=world), logs / names[0])
+        fgloc.write_native(fgloc.read_log(second, world=world), logs / names[0])
 
 
 def lifted(names: tuple[str, ...], logs: Path, _: Path) -> None:
     log = fgloc.simulate("office", int(names[0].rpartition("-")[2]), changes={"drive": {"duration": 140.0}})
-    fgloc.write_log(carried(log), logs / names[0])
+    fgloc.write_native(carried(log), logs / names[0])
 
 
 def halls(names: tuple[str, ...], logs: Path, programs: Path) -> None:
@@ -101,7 +103,7 @@ def halls(names: tuple[str, ...], logs: Path, programs: Path) -> None:
         for name in names:
             site, day = name.split("-")[2:]
             log = fgloc.read_log(Path(temporary) / f"site{site}/day{day}.toml")
-            fgloc.write_log(log, logs / name, overwrite=True)
+            fgloc.write_native(log, logs / name, overwrite=True)
 
 
 def faulty(names: tuple[str, ...], logs: Path, programs: Path) -> None:
