@@ -47,8 +47,8 @@ SIGMAS = np.array(
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive with ``seed`` through the office ``world``, ``duration`` [s] long. ``everywhere``: features are detected in all parts of an image, as
-    where there is no map."""
+    """A drive with ``seed`` through the office ``world``, ``duration`` [s] long. ``everywhere``: features are detected in all parts
+    of an image, as where there is no map."""
 
     world: int
     seed: int
