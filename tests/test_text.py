@@ -41,14 +41,6 @@ def test_escapes_are_those_of_python() -> None:
     assert quoted("a\nb") == "'a\\nb'"
 
 
-@pytest.mark.parametrize(
-    "text", ["", "hall 3", "Gärtnerstraße", "廊下", "🤖", "C:\\logs\\a", "$x_1^2$", "it's", 'a "b"']
-)
-def test_ordinary_text_is_shown_as_it_is(text: str) -> None:
-    assert plain(text) == text
-    assert quoted(text) == repr(text)
-
-
 def test_of_long_text_begin_and_end_are_shown() -> None:
     name = "/data/" + "x" * 5000 + "/run.toml"
     assert len(plain(name)) == NAME
@@ -77,15 +69,6 @@ def test_of_long_and_deep_values_little_is_looked_at() -> None:
         deep = [deep]
     assert quoted(deep) == "[[[[...]]]]"
     assert quoted(list(range(10**6))) == "[0, 1, 2, 3, 4, ...]"
-
-
-class Unwritable:
-    def __repr__(self) -> str:
-        raise ZeroDivisionError
-
-
-def test_a_value_that_cannot_be_written_is_named_by_its_type() -> None:
-    assert quoted(Unwritable()) == "<Unwritable>"
 
 
 def test_of_many_names_the_first_are_listed() -> None:

@@ -1,4 +1,4 @@
-"""Runs that never were, and Chromium without a window, driven through a pipe by the DevTools protocol, for tests of pages."""
+"""Runs that never were, for tests of reports."""
 
 import io
 from dataclasses import dataclass
