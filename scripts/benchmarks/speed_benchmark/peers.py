@@ -48,12 +48,10 @@ class Peer:
 PEERS = (
     Peer("EKF", "filterpy, motion composed to each stamp", "filterpy_ekf", "composed", "filterpy"),
     Peer("EKF", "filterpy, each row of odometry", "filterpy_ekf", "rows", "filterpy"),
-    Peer("EKF", "Stone Soup", "stonesoup_filters", "ekf", "stonesoup"),
     Peer("EKF, 5 constants", "filterpy without constants", "filterpy_ekf", "composed", "filterpy"),
     Peer("smoother, lag 10 s, 5 constants", "fixed-lag smoother in a plain loop", "gtsam_loops", "lag"),
     Peer("smoother, 5 constants", "iSAM2 in a plain loop", "gtsam_loops", "full"),
     Peer("smoother, full history, 5 constants", "iSAM2 in a plain loop", "gtsam_loops", "full"),
-    Peer("particle filter, 5,000", "Stone Soup", "stonesoup_filters", "particles", "stonesoup"),
     Peer("batch", "GTSAM's factors, from dead reckoning", "gtsam_loops", "batch"),
 )
 
