@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from in_short import blank_pictures, in_short, runs_here  # noqa: F401 - fixtures
+from scripts_here import run_script
 
 import factorgraph_loc as fgloc
 
@@ -178,13 +179,13 @@ def test_stored_results_are_written_for_other_programs(office, tmp_path):
     assert (tmp_path / "ekf.rrd").stat().st_size > 10_000
 
 
-def test_a_bag_gets_a_manifest(office, tmp_path):
+def test_a_bag_gets_a_manifest(tmp_path):
     pytest.importorskip("rosbags", reason="needs the extra ros")
-    fgloc.convert(office, tmp_path / "drive.bag")
+    run_script("example_bag", tmp_path / "drive.bag", "--seconds", 5)
     found = fgloc.manifest(tmp_path / "drive.bag", tmp_path / "drive.toml")
     assert {topic.use for topic in found.topics} >= {"odometry", "rfid", "reference"}
     assert tomllib.loads(found.text) == found.content
-    assert fgloc.read_log(tmp_path / "drive.toml").rig == office.rig
+    assert fgloc.read_log(tmp_path / "drive.toml").rig == fgloc.read_rig(tmp_path / "drive.rig.toml")
     with pytest.raises(fgloc.InputError, match=r"drive.toml: exists already, expected a new file"):
         fgloc.manifest(tmp_path / "drive.bag", tmp_path / "drive.toml")
     (tmp_path / "other").mkdir()

@@ -4,7 +4,7 @@ import os
 import signal
 import socket
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import pytest
@@ -35,7 +35,8 @@ def started(monkeypatch, port):
     monkeypatch.setattr(rerun_viewer, "_start", lambda *args: processes.append(start(*args)) or processes[-1])
     yield processes
     for process in processes:
-        os.killpg(process.pid, signal.SIGKILL)
+        with suppress(ProcessLookupError):  # a test has killed it
+            os.killpg(process.pid, signal.SIGKILL)
         process.wait()
 
 
