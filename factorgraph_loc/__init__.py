@@ -14,7 +14,7 @@ from factorgraph_loc.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from factorgraph_loc.api.experimenting import active, experiment, report, status
-    from factorgraph_loc.api.learning import build_map, calibrate, features, images
+    from factorgraph_loc.api.learning import build_map, calibrate, features
     from factorgraph_loc.api.logs import convert, datasets, info, manifest, simulate
     from factorgraph_loc.api.lookups import (
         known_estimators,
@@ -113,7 +113,6 @@ __all__ = [
     "experiment",
     "export",
     "features",
-    "images",
     "info",
     "known_estimators",
     "known_policies",
@@ -146,7 +145,7 @@ __all__ = [
 # module of each public name
 _MODULES = {
     "api.experimenting": ("active", "experiment", "report", "status"),
-    "api.learning": ("features", "images", "build_map", "calibrate"),
+    "api.learning": ("features", "build_map", "calibrate"),
     "api.logs": ("convert", "datasets", "info", "manifest", "simulate"),
     "api.lookups": (
         "known_estimators",

@@ -1,6 +1,6 @@
-"""``fgloc calibrate``, ``map``, ``images`` and ``features evaluate`` as functions."""
+"""``fgloc calibrate``, ``map`` and ``features evaluate`` as functions."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from factorgraph_loc.calibration import report as rig_report
 from factorgraph_loc.evaluation.features import scores as feature_scores
 from factorgraph_loc.evaluation.features.feature_evaluation import feature
 from factorgraph_loc.evaluation.features.sequences import find_sequences
-from factorgraph_loc.experiments import image_localization, maps, output
+from factorgraph_loc.experiments import maps, output
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.temporary import of_system, temporary_folder, writing
 from factorgraph_loc.io.native.rig_file import write_rig
@@ -63,7 +63,6 @@ def build_map(
     prior: str | None = None,
     drop_dead: bool = False,
     points: Settings | None = None,
-    colmap: str | Path | None = None,
     rig: RigLike | None = None,
     world: WorldLike | None = None,
     overwrite: bool = False,
@@ -73,10 +72,7 @@ def build_map(
     For the arguments see :class:`~factorgraph_loc.experiments.maps.MapOptions`.
     """
     maps.picture_beside(Path(out), overwrite=overwrite)
-    model = None if colmap is None else Path(colmap)
-    options = maps.MapOptions(
-        of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead, points or {}, model
-    )
+    options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead, points or {})
     made = maps.make_map(one(log, rig, world), options)
     made.write(Path(out), overwrite=overwrite)
     return made
@@ -90,27 +86,6 @@ def smoothed(log: Log) -> RunResult:
 def _score(log: Log) -> dict[str, Any]:
     """Scores of the EKF, or of the smoother if the log has RFID, with the log's rig and its sensors."""
     return run(log, calibration.estimator_for(log.rig)).scores
-
-
-def images(
-    log: LogLike,
-    out: str | Path,
-    *,
-    mapped: Sequence[int],
-    queries: Mapping[str, Sequence[int]],
-    features: Sequence[str] = FEATURES,
-    count: int = 1500,
-    rig: RigLike | None = None,
-    world: WorldLike | None = None,
-    overwrite: bool = False,
-    progress: Callable[[float], None] = lambda _: None,
-) -> image_localization.ImageResults:
-    """Map some images of a log with their reference poses, localize the images of each query, and write the errors to ``out``."""
-    image_localization.check_free(Path(out), overwrite=overwrite)
-    loaded = one(log, rig, world)
-    results = image_localization.evaluate_images(loaded, features, count, mapped, queries, progress)
-    image_localization.write_results(loaded.name, results, Path(out))
-    return results
 
 
 def features(

@@ -6,7 +6,6 @@ from typing import TypeVar
 
 from factorgraph_loc.api.given import LogLike, RigLike, WorldLike, one
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.colmap import model_of
 from factorgraph_loc.experiments.particles import particles_of
 from factorgraph_loc.exports import rerun_scene
 from factorgraph_loc.exports.points import write_bundle, write_ply
@@ -15,14 +14,12 @@ from factorgraph_loc.exports.ros import write_mcap
 from factorgraph_loc.exports.runs import Particles, StoredRun, find_runs, is_results, read_runs
 from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write_g2o
 from factorgraph_loc.files.shipped import manifests
-from factorgraph_loc.io.colmap import write_colmap
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
-from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.text import listed, quoted
 
-FORMATS = (".mcap", ".tum", ".kitti", ".g2o", ".ply", ".colmap")
+FORMATS = (".mcap", ".tum", ".kitti", ".g2o", ".ply")
 L = TypeVar("L", bound=LogLike)
 
 
@@ -56,7 +53,7 @@ def export(
     """Write runs for Foxglove and RViz, or the final trajectory of a run, the reference of a log or the points of its map for other
     programs; return the files.
 
-    ``results``: as for :func:`view`. ``out``: its suffix selects the format: .mcap, .tum, .kitti, .g2o, .ply or .colmap (a folder).
+    ``results``: as for :func:`view`. ``out``: its suffix selects the format: .mcap, .tum, .kitti, .g2o or .ply.
     """
     require_format(Path(out))
     log, runs = stored(_listed(results), lambda name: one(name, rig, world))
@@ -124,10 +121,8 @@ def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
         if log.world.points is None:
             raise InputError(f"{log.name}: its map has no points to write, expected one with points (--world)")
         write_ply(log.world.points, out)
-    elif out.suffix == ".colmap":
-        write_colmap(model_of(log), log.rig.of(CameraSettings).model(), out)
     elif out.suffix == ".g2o" and not runs and log.world.points is not None:
-        write_bundle(model_of(log), log.rig.of(CameraSettings).model(), out)
+        write_bundle(log, out)
     elif out.suffix == ".g2o":
         run = _only(runs, out)
         sensors = run.folder.config.sensors or log.rig.sensors

@@ -10,7 +10,7 @@ from typer.core import TyperGroup
 
 from factorgraph_loc.cli import (
     experimenting,
-    images,
+    features,
     inspecting,
     learning,
     lookups,
@@ -97,12 +97,11 @@ app.command()(viewing.view)
 app.command()(viewing.export)
 app.command()(learning.calibrate)
 app.command("map")(learning.map_)
-app.command()(images.images)
 app.command()(simulating.simulate)
 app.command()(experimenting.active)
 app.add_typer(rigs.app, name="rigs")
 app.add_typer(experimenting.app, name="experiment")
-app.add_typer(images.features, name="features")
+app.add_typer(features.app, name="features")
 
 
 def _print_version(wanted: bool) -> None:

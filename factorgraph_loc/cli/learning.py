@@ -110,10 +110,6 @@ def map_(
         bool,
         typer.Option("--drop-dead", help="Only write the log's map without the tags that are believed dead."),
     ] = False,
-    colmap: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Take the points of this model of COLMAP (text) of the log's images."),
-    ] = None,
     prior: Prior = None,
     set_: Settings = None,
     *,
@@ -128,7 +124,7 @@ def map_(
     loaded = source.load_one(log)
     settings = parse_settings(set_ or (), [estimator], [maps.POINTS])
     options = maps.MapOptions(
-        of, estimator, settings[estimator], extend, poses, tag_height, prior, drop_dead, settings[maps.POINTS], colmap
+        of, estimator, settings[estimator], extend, poses, tag_height, prior, drop_dead, settings[maps.POINTS]
     )
     made = maps.make_map(loaded, options, partial(show.progress, counted=False))
     made.write(out, overwrite=overwrite)

@@ -91,8 +91,7 @@ def export(
             "--out",
             "-o",
             metavar="FILE",
-            help="The file to write; its suffix selects the format: .mcap (Foxglove, RViz), .tum, .kitti, .g2o, .ply or .colmap "
-            "(maps; a folder).",
+            help="The file to write; its suffix selects the format: .mcap (Foxglove, RViz), .tum, .kitti, .g2o or .ply (maps).",
         ),
     ],
     *,

@@ -3,11 +3,9 @@
 __all__ = [
     "active",
     "cluster",
-    "colmap",
     "compare",
     "experiment",
     "experiment_file",
-    "image_localization",
     "learning",
     "maps",
     "output",

@@ -13,13 +13,11 @@ import numpy as np
 
 from factorgraph_loc.drawing.figures import save
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.colmap import points_of
 from factorgraph_loc.experiments.output import beside
 from factorgraph_loc.experiments.preparation import START_SIGMA, first_odometry, resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import parse_model, replacing
 from factorgraph_loc.files.temporary import writing
-from factorgraph_loc.io.colmap import read_colmap
 from factorgraph_loc.io.native.world_file import write_world
 from factorgraph_loc.mapping import map_figure, mapping, tag_mapping
 from factorgraph_loc.mapping.camera_poses import posed_frames
@@ -70,8 +68,7 @@ class MapOptions:
     ``poses``: of the robot, for tags: reference, or odometry, with estimation of the poses; None: the reference if there is one.
     ``tag_height`` [m]: of tags that the log's map lacks; None: that of the antennas. ``drop_dead``: write the log's map without the
     tags that are believed dead, and map nothing. ``prior``: see
-    :func:`~factorgraph_loc.experiments.preparation.resolve_prior`. ``colmap``: folder of a model of COLMAP (text) of the log's
-    images, whose points are taken instead of mapping.
+    :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
     """
 
     of: str | None = None
@@ -83,7 +80,6 @@ class MapOptions:
     prior: str | None = None
     drop_dead: bool = False
     points: Mapping[str, Any] = field(default_factory=dict)
-    colmap: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -146,9 +142,7 @@ def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points
             "--estimator, --set of an estimator and --tag-height are for other maps, but points are mapped here"
         )
     extends = not options.extend or log.world.points is not None
-    if options.colmap is not None and of_others:
-        raise InputError("--colmap is for maps of points, but others are mapped here")
-    if of == POINTS or options.colmap is not None or (of is None and not of_others and extends and POINTS in there):
+    if of == POINTS or (of is None and not of_others and extends and POINTS in there):
         return "points"
     if options.points:
         raise InputError("--set points... is for maps of points, but others are mapped here")
@@ -244,17 +238,13 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     if options.poses not in (None, "reference"):
         raise InputError(f"--poses is {quoted(options.poses)}, expected reference for points: {BY_RUN}")
     settings = parse_model(PointSettings, options.points, "--set points")
-    model = None if options.colmap is None else read_colmap(options.colmap)
-    if model is None and log.reference is None and log.reference3 is None:
+    if log.reference is None and log.reference3 is None:
         raise InputError(f"{log.name}: has no reference that says where its images were taken: {BY_RUN}")
     with stages("features") as report:
         seen, doubts = with_features(log, camera.frontend, lambda share: report(share, 1.0))
     with stages("points") as report:
-        if model is not None and options.colmap is not None:
-            made = points_of(model, log, seen, settings, options.colmap)
-        else:
-            posed = posed_frames(seen, TURN_SIGMA, SHIFT_SIGMA)
-            made = map_points(camera.model(), posed, settings, progress=lambda share: report(share, 1.0))
+        posed = posed_frames(seen, TURN_SIGMA, SHIFT_SIGMA)
+        made = map_points(camera.model(), posed, settings, progress=lambda share: report(share, 1.0))
     points, fused = made.points, 0
     if options.extend and log.world.points is not None:
         points, fused = merged(log.world.points, points)
@@ -263,8 +253,7 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     world = log.world.model_copy(update={"name": f"{log.name}-map", "points": points})
     draw = partial(map_figure.point_figure, log.name, points, made.cameras.positions, world.walls)
     details = replace(made.report, points=len(points), fused=fused)
-    frame = OF_REFERENCE if model is None else "that of the model"
-    return MadeMap(world, frame, details, (*log.warnings, *doubts), draw)
+    return MadeMap(world, OF_REFERENCE, details, (*log.warnings, *doubts), draw)
 
 
 def _along_reference(options: MapOptions, *, there: bool) -> bool:

@@ -1,13 +1,10 @@
 """Maps made from logs: landmarks, tags, and 3-D points from images."""
 
 __all__ = [
-    "bends",
     "camera_poses",
-    "image_localization",
     "map_figure",
     "mapping",
     "point_mapping",
     "point_maps",
     "tag_mapping",
-    "triangulation",
 ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -31,7 +31,7 @@ FOCAL_SIGMA, ASPECT_SIGMA = 0.1, 0.005  # standard deviations of an unknown foca
 CENTRE_SIGMA = 0.01  # standard deviation of an unknown principal point, relative to the focal length
 LENS_SIGMA = (0.1, 0.1, 0.003, 0.003)  # standard deviations of an unknown distortion
 FIXED = 1e-5  # standard deviation of the known calibration constants
-SOMEWHERE = 1000.0  # m, standard deviation of a point without a prior
+SOMEWHERE = 1000.0  # m, standard deviation of a point before it was seen
 CHUNK = 500  # points whose covariances are computed at once
 
 
@@ -55,27 +55,6 @@ class Bundle:
     point_covariances: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Known:
-    """Those of the ``points`` (M,) with prior ``positions`` (M, 3) [m] and ``covariances`` (M, 3, 3) from a map."""
-
-    points: Integers
-    positions: Array
-    covariances: Array
-
-    def kept(self, left: Integers) -> Known:
-        """The priors of the points ``left`` (T',), ascending, by their new indices."""
-        rows = np.isin(self.points, left)
-        return Known(np.searchsorted(left, self.points[rows]), self.positions[rows], self.covariances[rows])
-
-
-class MotionPrior(Protocol):
-    """A motion model between consecutive cameras."""
-
-    def add_to(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        """Add factors on the poses ``X(0)``, ``X(1)``, ..."""
-
-
 def adjust(
     model: CameraModel,
     cameras: Cameras,
@@ -83,62 +62,47 @@ def adjust(
     tracks: Tracks,
     points: Array,
     *,
-    known: Known | None = None,
-    motion: MotionPrior | None = None,
     focal: bool = False,
     lens: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Bundle:
     """Adjust ``points`` (T, 3) and ``cameras``, whose prior poses have ``covariances`` (F, 6, 6), see :class:`Bundle`.
 
-    ``known``: priors of some of the points; ``motion``: a motion model, which the covariances of the result do not include.
     ``focal``: whether to estimate the focal lengths; ``lens``: and the principal point and the distortion. Raises RuntimeError
     if the graph cannot be solved.
     """
-    known = known or Known(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
     old = np.arange(len(points))
     fixed = gtsam.NonlinearFactorGraph()
     for i, covariance in enumerate(covariances):
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         fixed.add(gtsam.PriorFactorPose3(X(i), pose3(cameras.positions[i], cameras.rotations[i]), noise))
-    if motion is not None:
-        motion.add_to(fixed)
     if focal or lens:
         noise = gtsam.noiseModel.Gaussian.Covariance(_unknown_constants(model, lens=lens))
         fixed.add(gtsam.PriorFactorCal3DS2(K(0), model.calibration(), noise))
     for i in range(ROUNDS):
-        model, cameras, points = _optimized(model, fixed, known, cameras, tracks, points, constants=focal or lens)
-        least = np.full(len(points), 2)
-        least[known.points] = 1
-        right = agreeing(model, cameras, tracks, points, LOOSE if i == 0 else OUTLIER, least)
+        model, cameras, points = _optimized(model, fixed, cameras, tracks, points, constants=focal or lens)
+        right = agreeing(model, cameras, tracks, points, LOOSE if i == 0 else OUTLIER)
         progress((i + 1) / ROUNDS)
         if right.all() and i > 0:
             break
         tracks, left = tracks.kept(right)
-        points, old, known = points[left], old[left], known.kept(left)
+        points, old = points[left], old[left]
     errors = reproject(model, cameras, points, tracks)[0]
     information = np.asarray(np.linalg.inv(covariances), dtype=float)
-    of_cameras, of_points = marginals(model, cameras, information, tracks, points, known)
+    of_cameras, of_points = marginals(model, cameras, information, tracks, points)
     return Bundle(model, cameras, tracks, points, old, errors, of_cameras, of_points)
 
 
-def agreeing(
-    model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array, limit: float, least: Integers
-) -> Truths:
-    """Observations (N,) with residuals of at most ``limit`` standard deviations, of points that retain ``least`` (T,) of them."""
+def agreeing(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array, limit: float) -> Truths:
+    """Observations (N,) with residuals of at most ``limit`` standard deviations, of points that retain two of them or more."""
     errors, _, _, depths = reproject(model, cameras, points, tracks)
     right = (np.sum(errors**2, axis=1) < (limit * model.sigma) ** 2) & (depths > NEAREST)
     seen = np.bincount(tracks.track[right], minlength=tracks.count)
-    return np.asarray(right & (seen >= least)[tracks.track])
+    return np.asarray(right & (seen >= 2)[tracks.track])
 
 
 def marginals(
-    model: CameraModel,
-    cameras: Cameras,
-    information: Array,
-    tracks: Tracks,
-    points: Array,
-    known: Known | None = None,
+    model: CameraModel, cameras: Cameras, information: Array, tracks: Tracks, points: Array
 ) -> tuple[Array, Array]:
     """Marginal covariances of the cameras (F, 6, 6) and points (T, 3, 3), linearised at the input; ``information`` (F, 6, 6):
     of the cameras' priors.
@@ -148,8 +112,6 @@ def marginals(
     by_camera, by_point = by_camera / model.sigma, by_point / model.sigma
     of_points = np.repeat(SOMEWHERE**-2 * np.eye(3)[None], total, axis=0)
     np.add.at(of_points, tracks.track, np.einsum("nij,nik->njk", by_point, by_point))
-    if known is not None:
-        of_points[known.points] += np.linalg.inv(known.covariances)
     of_cameras = np.array(information)
     np.add.at(of_cameras, tracks.frame, np.einsum("nij,nik->njk", by_camera, by_camera))
     inverse = np.linalg.inv(of_points)
@@ -193,7 +155,6 @@ def _unknown_constants(model: CameraModel, *, lens: bool) -> Array:
 def _optimized(
     model: CameraModel,
     fixed: gtsam.NonlinearFactorGraph,
-    known: Known,
     cameras: Cameras,
     tracks: Tracks,
     points: Array,
@@ -207,8 +168,6 @@ def _optimized(
         values.insert(X(i), pose3(cameras.positions[i], cameras.rotations[i]))
     for k, point in enumerate(points):
         values.insert(L(k), point)
-    for k, position, covariance in zip(known.points.tolist(), known.positions, known.covariances, strict=True):
-        graph.add(gtsam.PriorFactorPoint3(L(k), position, gtsam.noiseModel.Gaussian.Covariance(covariance)))
     noise = robust_noise(model)
     rows = zip(tracks.frame.tolist(), tracks.track.tolist(), tracks.pixels, strict=True)
     if constants:

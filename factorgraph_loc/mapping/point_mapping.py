@@ -129,18 +129,6 @@ def map_points(
     return _made(posed, adjusted, settings, len(pairs), total, int(np.count_nonzero(good)))
 
 
-def points_of_others(
-    model: CameraModel, posed: PosedFrames, tracks: Tracks, points: Array, settings: PointSettings
-) -> MadePoints:
-    """A map of ``points`` (T, 3), as another program has them, seen in ``posed`` frames as ``tracks`` say."""
-    information = np.asarray(np.linalg.inv(posed.covariances), dtype=float)
-    of_cameras, of_points = bundle.marginals(model, posed.cameras, information, tracks, points)
-    errors = reproject(model, posed.cameras, points, tracks)[0]
-    count = len(points)
-    found = Bundle(model, posed.cameras, tracks, points, np.arange(count), errors, of_cameras, of_points)
-    return _made(posed, found, settings, 0, count, count)
-
-
 def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
     """Indices of the keyframes, with a spacing that bounds their number."""
     filled = np.flatnonzero([len(frame.pixels) > 0 for frame in posed.frames])

@@ -1,19 +1,16 @@
-"""`fgloc map` of points, from images to files and back to a run's map; `fgloc images`."""
+"""`fgloc map` of points, from images to files and back to a run's map."""
 
 import dataclasses
 import json
 
 import numpy as np
-import polars as pl
-import pytest
 from PIL import Image
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.io.colmap import read_colmap
 from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.world import World
 
 WALL = 3.0  # m, where the picture hangs
 
@@ -57,47 +54,6 @@ def test_bad_input(fgloc, gallery_on_disk, tmp_path, gallery):
     assert "has no [camera]" in refused("--of", "points", rig=Rig(sensors=("odometry",)))
 
 
-def test_images_are_located_in_a_map_of_others(fgloc, gallery_on_disk, tmp_path):
-    out = tmp_path / "found"
-    arguments = ("images", gallery_on_disk(), "--map", "0:10:2", "--query", "A=1:10:2", "-o", out)
-    result = fgloc(*arguments, "--feature", "sift,orb", "--count", 300)
-    assert result.exit_code == 0, result.output
-    rows = pl.read_csv(out / "images.csv")
-    assert rows["image"].to_list() == [1, 3, 5, 7, 9] * 4
-    graph = rows.filter((pl.col("feature") == "sift") & (pl.col("method") == "graph"))
-    assert graph["position_error"].median() < 0.03
-    assert graph["angle_error"].median() < 0.02
-    assert (out / "table.md").read_text().count("image by image") == 2
-    with Image.open(out / "images.png") as picture:
-        assert picture.width == 1600
-    again = fgloc(*arguments)
-    assert again.exit_code == 2
-    assert "holds results already" in again.stderr
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--map", "0-10", "--query", "A=1:3"), "--map is '0-10'"),
-        (("--map", "5:2", "--query", "A=1:3"), "--map is '5:2'"),
-        (("--map", "0:4", "--query", "1:3"), "--query is '1:3'"),
-        (("--map", "0:4", "--query", "A=1:30"), "A asks for images 1 to 29, expected some of 0 to 9"),
-        (("--map", "0:4", "--query", "A=1:3", "--feature", "surf"), "feature 'surf' is not known"),
-    ],
-)
-def test_ranges_that_are_none(fgloc, gallery_on_disk, tmp_path, options, message):
-    result = fgloc("images", gallery_on_disk(), "--count", 300, "--feature", "sift", *options, "-o", tmp_path / "out")
-    assert result.exit_code == 2
-    assert message in result.stderr
-
-
-def test_images_without_poses(fgloc, gallery_on_disk, tmp_path):
-    log = gallery_on_disk(reference=Trajectory(np.array((0.0, 2.0)), np.zeros((2, 3))))
-    result = fgloc("images", log, "--map", "0:4", "--query", "A=1:3", "--feature", "sift", "-o", tmp_path / "out")
-    assert result.exit_code == 2
-    assert "of 10 images have no pose" in result.stderr
-
-
 def test_a_map_is_thinned_extended_and_exported(fgloc, gallery_on_disk, tmp_path):
     log, few, both = gallery_on_disk(), tmp_path / "few.world.toml", tmp_path / "both.world.toml"
     assert fgloc("map", log, "-o", few, "--set", "points.most=40").exit_code == 0
@@ -114,35 +70,6 @@ def test_a_map_is_thinned_extended_and_exported(fgloc, gallery_on_disk, tmp_path
     rows = np.array([line.split() for line in body.splitlines()], dtype=float)
     np.testing.assert_allclose(rows[:, :3], read_world(both).points.positions, atol=1e-6)
     assert (rows[:, 4] >= 1).all()
-
-
-def test_a_map_goes_to_colmap_and_comes_back(fgloc, gallery_on_disk, tmp_path):
-    log, out, back, model = (
-        gallery_on_disk(),
-        tmp_path / "a.world.toml",
-        tmp_path / "b.world.toml",
-        tmp_path / "a.colmap",
-    )
-    assert fgloc("map", log, "-o", out).exit_code == 0
-    result = fgloc("export", log, "--world", out, "-o", model)
-    assert result.exit_code == 0, result.output
-    result = fgloc("map", log, "--colmap", model, "-o", back, "--json")
-    assert result.exit_code == 0, result.output
-    given, found = read_world(out).points, read_world(back).points
-    assert json.loads(result.stdout)["points"] == len(found) > 0.7 * len(given)
-    apart, nearest = cKDTree(given.positions).query(found.positions)
-    assert apart.max() < 1e-6
-    # cameras are exact here, and those of the first map were not
-    assert (
-        np.trace(found.covariances, axis1=1, axis2=2).mean()
-        < np.trace(given.covariances[nearest], axis1=1, axis2=2).mean()
-    )
-    again = tmp_path / "b.colmap"
-    assert fgloc("export", log, "--world", back, "-o", again).exit_code == 0
-    assert len(read_colmap(again).points) == len(found)
-    result = fgloc("export", log, "-o", again)
-    assert result.exit_code == 2
-    assert "no points with descriptors" in result.stderr
 
 
 def test_a_map_goes_to_g2o(fgloc, gallery_on_disk, tmp_path):
@@ -163,6 +90,15 @@ def test_a_map_goes_to_g2o(fgloc, gallery_on_disk, tmp_path):
     assert len(edges) > 300
     assert np.median(np.linalg.norm(apart, axis=1)) < 2.0
     assert rows[-1] == ["FIX", "0"]
+
+
+def test_points_without_descriptors_do_not_go_to_g2o(fgloc, gallery_on_disk, tmp_path):
+    World(points=PointMap.of(["door"], np.ones((1, 3)))).write(tmp_path / "a.world.toml")
+    out = tmp_path / "a.g2o"
+    result = fgloc("export", gallery_on_disk(), "--world", tmp_path / "a.world.toml", "-o", out)
+    assert result.exit_code == 2
+    assert "its map has no points with descriptors to write" in result.stderr
+    assert not out.exists()
 
 
 UNKNOWN = ("-e", "smoother", "--set", "smoother.landmarks=unknown")

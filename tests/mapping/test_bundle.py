@@ -8,7 +8,7 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 from scipy.stats import chi2
 
-from factorgraph_loc.mapping.bundle import Known, adjust, marginals, pose3
+from factorgraph_loc.mapping.bundle import adjust, marginals, pose3
 from factorgraph_loc.mapping.triangulation import Tracks, triangulate
 from factors.camera.model import project, recalibrated
 
@@ -64,13 +64,11 @@ def test_covariances_are_those_of_gtsam(look):
         graph.add(gtsam.PriorFactorPose3(X(i), pose, gtsam.noiseModel.Gaussian.Covariance(covariances[i])))
     for k, point in enumerate(points):
         values.insert(L(k), point)
-    graph.add(gtsam.PriorFactorPoint3(L(0), points[0], gtsam.noiseModel.Isotropic.Sigma(3, 0.01)))
     calibration = sight.model.calibration()
     for k, i, pixel in zip(tracks.track.tolist(), tracks.frame.tolist(), tracks.pixels, strict=True):
         graph.add(gtsam.GenericProjectionFactorCal3DS2(pixel, noise, X(i), L(k), calibration))
     expected = gtsam.Marginals(graph, values)
-    known = Known(np.zeros(1, dtype=int), points[:1], 1e-4 * np.eye(3)[None])
-    of_cameras, of_points = marginals(sight.model, sight.cameras, np.linalg.inv(covariances), tracks, points, known)
+    of_cameras, of_points = marginals(sight.model, sight.cameras, np.linalg.inv(covariances), tracks, points)
     for i in range(5):
         np.testing.assert_allclose(of_cameras[i], expected.marginalCovariance(X(i)), rtol=1e-5, atol=1e-10)
     for k in range(len(points)):
@@ -118,20 +116,3 @@ def test_the_lens_can_be_found(look):
     apart = np.abs(project(made.model, seen) - project(sight.model, seen))
     assert apart.max() < 0.25 * np.abs(project(nominal, seen) - project(sight.model, seen)).max()
     assert np.median(np.abs(offsets(sight, made.cameras))) < 0.4 * np.median(np.abs(offsets(sight, bent.cameras)))
-
-
-def test_known_points_place_cameras_that_nothing_else_does(look):
-    rng = np.random.default_rng(4)
-    sight = look(rng, noise=0.5)
-    tracks, old = sight.tracks()
-    wrong = sight.moved(rng, 0.05, 0.1)
-    known = np.arange(0, len(old), 5)
-    start = sight.points[old] + 0.1 * rng.standard_normal((len(old), 3))
-    facts = Known(known, sight.points[old[known]], np.repeat(1e-6 * np.eye(3)[None], len(known), axis=0))
-    made = adjust(sight.model, wrong, prior(len(wrong), 1.0, 3.0), tracks, start, known=facts)
-    errors = offsets(sight, made.cameras)
-    assert np.abs(errors).max() < 0.01
-    # their covariances know of these points; pixels are twice as good as stated, so mean squares are about 0.25
-    assert np.mean(errors**2 / np.diagonal(made.camera_covariances, axis1=1, axis2=2)) < 2.0
-    # a few known points, of which some are seen once only, are kept
-    assert np.isin(known, made.old).mean() > 0.95

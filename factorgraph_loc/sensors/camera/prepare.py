@@ -43,14 +43,6 @@ def frames_of(log: Log) -> tuple[Array, Sequence[CameraFrame]]:
     return stream.t + log.rig.time_offset("camera"), stream.frame
 
 
-def image_names(log: Log) -> tuple[str, ...]:
-    """The names (N,) of a log's image files; InputError if it has none."""
-    stream = log.streams.get("camera")
-    if not isinstance(stream, ImageStream):
-        raise InputError(f"{log.name}: has no images (camera), expected some")
-    return tuple(file.name for file in stream.file)
-
-
 def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
     """Replace images by features if the run uses them, else by empty frames."""
     log, stream = use.log, use.log.streams.get("camera")

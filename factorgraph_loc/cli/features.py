@@ -1,0 +1,51 @@
+"""``fgloc features``: repeatability and matching of point features."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from factorgraph_loc.cli import show
+from factorgraph_loc.cli.options import Json, Out, Overwrite, parse_list
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.text import quoted
+
+app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Point features of images and their quality.")
+ALL = "colour,sift,orb,fast_hessian,harris_laplace,hessian_laplace"
+
+
+@app.command()
+def evaluate(
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="IMAGES...",
+            help="Folders with img1, img2, ... and H1to2p, ... (or folders of these), or photographs, which are warped.",
+        ),
+    ],
+    out: Out,
+    features: Annotated[str, typer.Option(metavar="A,B", help="Features and detectors to compare.")] = ALL,
+    count: Annotated[int, typer.Option(min=1, help="Points per image, the strongest of each feature.")] = 1000,
+    overwrite: Overwrite = False,
+    json: Json = False,
+) -> None:
+    """Compare features on images of planar scenes: repeatability, matching, estimated homography, time."""
+    from factorgraph_loc.evaluation.features import scores as evaluation
+    from factorgraph_loc.evaluation.features.feature_evaluation import feature
+    from factorgraph_loc.evaluation.features.sequences import find_sequences
+
+    names = list(dict.fromkeys(parse_list(features)))
+    if not names:
+        raise InputError(f"--features is {quoted(features)}, expected names such as {ALL}")
+    chosen = [feature(name, count) for name in names]
+    evaluation.check_free(out, overwrite=overwrite)  # before the computation
+    sequences = find_sequences(images)
+    with show.progress("evaluating", counted=True) as progress:
+        scores = evaluation.evaluate_all(sequences, chosen, progress)
+    evaluation.write_scores(scores, out)
+    if json:
+        show.document(scores.rows)
+        return
+    show.table(*evaluation.summary(scores))
+    show.line()
+    show.line(f"results are in {out}: {', '.join(evaluation.FILES)}")
