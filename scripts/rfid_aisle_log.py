@@ -58,9 +58,8 @@ def read_rfid_aisle(folder: Path, run: int, odometry_seed: int = 0) -> Log:
 def read_reference(path: Path) -> tuple[Trajectory, int]:
     """All poses, in seconds after the first one, and the time of that."""
     x, y, heading, t = np.loadtxt(path).T
-    rows = np.arange(1, len(t) + 1)
-    t_ns = checks.stamps(path, rows, t, per_second=1e6)  # the resolution of a double at such times
-    keep = checks.in_order(path, rows, t_ns, [])
+    t_ns = np.rint(t * 1e6).astype(np.int64) * 1000  # doubles at such times resolve microseconds
+    keep = checks.in_order(path, np.arange(1, len(t) + 1), t_ns, [])
     poses = np.column_stack((x, y, se2.wrap(heading)))
     return Trajectory(checks.seconds(t_ns[keep], int(t_ns[0])), poses[keep]), int(t_ns[0])
 

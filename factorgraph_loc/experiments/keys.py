@@ -20,6 +20,7 @@ from factorgraph_loc.experiments.experiment_file import canonical
 from factorgraph_loc.experiments.log_source import LogSource
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files.models import write_text
+from factorgraph_loc.files.shipped import readers
 from factorgraph_loc.text import plain
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "numba")
@@ -76,13 +77,15 @@ def code_version() -> str:
 
 def digest_of_code(root: Path) -> str:
     """The digest of the source files that runs use, of the packages in the folder ``root``: all of ``factors``, and the parts
-    :data:`COUNTED` of ``factorgraph_loc``."""
+    :data:`COUNTED` of ``factorgraph_loc``. The shipped descriptions of readers count, too."""
     total = hashlib.sha256()
     for package in (root / PACKAGE, root / "factors"):
         for file in sorted(package.rglob("*")):
             name = file.relative_to(package).as_posix()
             if file.suffix in (".py", ".npz") and (package.name != PACKAGE or is_counted(name)):
                 total.update(f"{package.name}/{name}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
+    for name, file in readers().items():
+        total.update(f"{name}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
     return total.hexdigest()
 
 

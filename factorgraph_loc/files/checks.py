@@ -92,10 +92,10 @@ def sightings_in_order(
     return np.array(sorted(last.values()), dtype=np.int64)
 
 
-def stamps(source: object, rows: Integers, t: Array, *, per_second: float = 1e9) -> Integers:
-    """Timestamps (N,) [s] in nanoseconds, rounded to steps of 1 / ``per_second``; InputError beyond 64 bits."""
+def stamps(source: object, rows: Integers, t: Array) -> Integers:
+    """Timestamps (N,) [s] in nanoseconds; InputError beyond 64 bits."""
     SECONDS.require(source, rows, t, "time")
-    return np.asarray(np.rint(t * per_second).astype(np.int64) * round(1e9 / per_second))
+    return np.asarray(np.rint(t * 1e9).astype(np.int64))
 
 
 def absolute(t: Array, t0_ns: int) -> Integers:

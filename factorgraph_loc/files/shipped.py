@@ -1,4 +1,4 @@
-"""Locations of the shipped manifests and rigs. Importable without numerical libraries, for shell completion."""
+"""The shipped manifests, rigs and descriptions of readers. Importable without numerical libraries, for shell completion."""
 
 from importlib import resources
 from pathlib import Path
@@ -14,6 +14,11 @@ def manifests() -> dict[str, Path]:
 def rigs() -> dict[str, Path]:
     """The shipped rigs: name -> file, sorted by name."""
     return {file.name.removesuffix(".rig.toml"): file for file in sorted(folder().glob("*.rig.toml"))}
+
+
+def readers() -> dict[str, Path]:
+    """The shipped descriptions of readers, manifests of the reader ``mapped`` without data: name -> file, sorted by name."""
+    return {file.name.removesuffix(".reader.toml"): file for file in sorted(folder().glob("*.reader.toml"))}
 
 
 def folder() -> Path:

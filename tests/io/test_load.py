@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import shipped
 from factorgraph_loc.files.models import parse_model
-from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.files.shipped import manifests, readers, rigs
 from factorgraph_loc.io.native.rig_file import read_rig
 from factorgraph_loc.io.readers import READERS, describe, load, read_manifest, verify
 from factorgraph_loc.io.readers.registry import reader
@@ -169,3 +170,12 @@ def test_verify(manifest, mrclam, tmp_path):
     assert "Robot9_Odometry.dat: is missing" in missing
     with pytest.raises(InputError, match="does not exist"):
         verify(found, tmp_path / "nowhere")
+
+
+def test_the_data_sets_of_an_installed_package_lie_in_it(tmp_path, monkeypatch):
+    (tmp_path / "datasets").mkdir()
+    for name in ("hall.toml", "hall.rig.toml", "hall.reader.toml"):
+        (tmp_path / "datasets" / name).touch()
+    monkeypatch.setattr(shipped.resources, "files", lambda package: tmp_path)
+    for files, name in ((manifests(), "hall.toml"), (rigs(), "hall.rig.toml"), (readers(), "hall.reader.toml")):
+        assert files == {"hall": tmp_path / "datasets" / name}

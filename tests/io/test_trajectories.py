@@ -48,7 +48,7 @@ TUM = "1 0 0 0 0 0 0 1\n"
         ),
         ("a.txt", TUM + "2 0 0\n", ":2: row is '2 0 0', expected 8 values"),
         ("a.kitti", "1 0 0 0 0 1 0 0 0 0 2 0\n", ":1: rotation is "),
-        ("a.kitti", "1 0 0 0 0 1 0 0 0 0 1 inf\n", ":1: 34 is inf, expected a finite number"),
+        ("a.kitti", "1 0 0 0 0 1 0 0 0 0 1 inf\n", ":1: 12 is 'inf', expected a finite number"),
         ("a.csv", "#t\n1,0,0,0,1,0\n", ":2: row is '1,0,0,0,1,0', expected 8 values (TUM"),
         ("a.csv", "#t\n1,0,0,0,1,0,0,0\n0,0,0,0,1,0,0,0\n", ":3: time is '0 ns', expected a timestamp not before"),
         ("a.csv", "#t\n1,0,0,0,0,0,0,0\n", ":2: length of the quaternion is 0.0"),

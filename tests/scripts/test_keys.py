@@ -6,6 +6,7 @@ import pytest
 from package_tables import MODULES, ROOT, imported
 
 from factorgraph_loc.experiments import keys
+from factorgraph_loc.files.shipped import readers
 
 RUN = {
     "factorgraph_loc.builtin",  # the registries
@@ -77,3 +78,11 @@ def test_the_parts_that_count_are_those_that_a_run_imports(used):
     assert used - counted == set()
     for part in keys.COUNTED:
         assert any(file.as_posix().startswith(f"factorgraph_loc/{part}") for file in used), part
+
+
+def test_a_key_depends_on_the_tables_that_readers_are_described_by(copied, tmp_path, monkeypatch):
+    before = keys.digest_of_code(copied)
+    changed = tmp_path / "mrclam.reader.toml"
+    changed.write_text(readers()["mrclam"].read_text() + "# changed\n")
+    monkeypatch.setattr(keys, "readers", lambda: {"mrclam": changed})
+    assert keys.digest_of_code(copied) != before

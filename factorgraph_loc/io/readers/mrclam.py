@@ -24,7 +24,7 @@ class Options(FileModel):
 
 def read(path: Path | None, options: Options) -> Log:
     """The run of one robot. InputError names file and row."""
-    file = shipped.folder() / "mrclam.reader.toml"
+    file = shipped.readers()["mrclam"]
     text = read_text(file, bounded.SETTINGS).replace("{robot}", str(options.robot))
     manifest = parse_model(Manifest, parse_toml(text, file), file)
     return mapped.read(path, parse_model(mapped.Options, manifest.options, file))

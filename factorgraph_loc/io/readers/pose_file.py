@@ -12,8 +12,8 @@ import numpy as np
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
-from factorgraph_loc.files.columns import POSES
-from factorgraph_loc.files.models import read_text
+from factorgraph_loc.files.columns import POSES, PURE, within
+from factorgraph_loc.files.models import FARTHEST, read_text
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.trajectory import read_tum_rows
 from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3
@@ -22,6 +22,7 @@ from factors.se2 import Array, Integers
 
 ORTHONORMAL = 2e-3  # tolerance of rotation matrices: KITTI's have seven digits
 MATRIX = tuple(f"{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
+ENTRY = within("entry", PURE, FARTHEST, "of the matrix of a pose")
 # the columns of these formats; velocities and biases of EuRoC's are not used
 EUROC = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 TUM = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -29,48 +30,6 @@ Format = Literal["tum", "kitti", "euroc"]
 EXPECTED = (
     "8 values (TUM: t x y z qx qy qz qw), 12 (KITTI), or 8 or more with commas (EuRoC: t, x, y, z, qw, qx, qy, qz)"
 )
-
-
-def read_columns(path: Path, fields: Sequence[str]) -> tuple[Array, Integers]:
-    """The finite numbers (N, K) of a file with K ``fields``, and line numbers (N,).
-
-    Blank lines and lines that begin with ``#`` are skipped. InputError names file, row and field of an invalid value; an empty file
-    is invalid.
-    """
-    text = read_text(path)
-    if not text.strip():
-        raise InputError(f"{path}: is empty, expected rows of {', '.join(fields)}")
-    numbered = [
-        (row, line)
-        for row, line in enumerate(text.split("\n"), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    rows = np.array([row for row, _ in numbered], dtype=np.int64)
-    if not numbered:
-        return np.empty((0, len(fields))), rows
-    try:
-        table = np.loadtxt([line for _, line in numbered], dtype=float, comments=None, ndmin=2)
-    except ValueError:
-        table = None
-    if table is None or table.shape[1] != len(fields):
-        raise first_fault(path, fields, numbered)
-    for i, field in enumerate(fields):
-        checks.require_finite(path, rows, field, table[:, i])
-    return table, rows
-
-
-def first_fault(path: Path, fields: Sequence[str], numbered: Sequence[tuple[int, str]]) -> InputError:
-    """The error for the first line that does not consist of one number per field."""
-    for row, line in numbered:
-        parts = line.split()
-        if len(parts) != len(fields):
-            return bad_field(path, "row", line.strip(), f"{len(fields)} values: {', '.join(fields)}", row=row)
-        for field, part in zip(fields, parts, strict=True):
-            try:
-                float(part)
-            except ValueError:
-                return bad_field(path, field, part, "a number", row=row)
-    return InputError(f"{path}: cannot be read as rows of {', '.join(fields)}")
 
 
 def read_kitti(path: Path, times: Path) -> tuple[Integers, Integers, Trajectory3]:
@@ -97,10 +56,11 @@ def stamps_of(path: Path, count: int, times: Path) -> Integers:
 def read_matrices(path: Path) -> tuple[Integers, Array]:
     """Rows (N,) and poses (N, 3, 4), rotation and position, of a file in KITTI's format, as they are written. InputError names
     file and row."""
-    table, rows = read_columns(path, MATRIX)
-    if not len(table):
-        raise InputError(f"{path}: contains no poses")
-    matrices = table.reshape(-1, 3, 4)
+    columns = {field: str(i) for i, field in enumerate(MATRIX, start=1)}
+    told = ColumnMapping(file=path.name, columns=columns, separator=" ", header=False)
+    mapped = read_mapped(path, told, (MATRIX,))
+    rows = mapped.rows
+    matrices = np.column_stack([mapped.numbers(field, ENTRY) for field in MATRIX]).reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
     off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((off > ORTHONORMAL) | (np.linalg.det(rotations) < 0.0))
