@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from recorded_logs import recorded_log
 
 import factorgraph_loc as fgloc
 
@@ -30,7 +31,7 @@ FAULTY = tuple(f"field-office-1-{fault}" for fault in FAULTS)
 
 
 def recorded(names: tuple[str, ...], logs: Path, _: Path) -> None:
-    log = fgloc.read_log(names[0].removesuffix("-carried"))
+    log = recorded_log(names[0].removesuffix("-carried"))
     fgloc.write_native(carried(log) if names[0].endswith("-carried") else log, logs / names[0])
 
 

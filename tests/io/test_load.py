@@ -176,6 +176,6 @@ def test_the_data_sets_of_an_installed_package_lie_in_it(tmp_path, monkeypatch):
     (tmp_path / "datasets").mkdir()
     for name in ("hall.toml", "hall.rig.toml", "hall.reader.toml"):
         (tmp_path / "datasets" / name).touch()
-    monkeypatch.setattr(shipped.resources, "files", lambda package: tmp_path)
+    monkeypatch.setattr(shipped.resources, "files", lambda _: tmp_path)
     for files, name in ((manifests(), "hall.toml"), (rigs(), "hall.rig.toml"), (readers(), "hall.reader.toml")):
         assert files == {"hall": tmp_path / "datasets" / name}
