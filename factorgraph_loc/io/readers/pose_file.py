@@ -57,8 +57,8 @@ def read_matrices(path: Path) -> tuple[Integers, Array]:
     """Rows (N,) and poses (N, 3, 4), rotation and position, of a file in KITTI's format, as they are written. InputError names
     file and row."""
     columns = {field: str(i) for i, field in enumerate(MATRIX, start=1)}
-    told = ColumnMapping(file=path.name, columns=columns, separator=" ", header=False)
-    mapped = read_mapped(path, told, (MATRIX,))
+    mapping = ColumnMapping(file=path.name, columns=columns, separator=" ", header=False)
+    mapped = read_mapped(path, mapping, (MATRIX,))
     rows = mapped.rows
     matrices = np.column_stack([mapped.numbers(field, ENTRY) for field in MATRIX]).reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
