@@ -127,29 +127,7 @@ def test_what_a_page_shows_of_an_output_is_compared_with_it(shown, told):
     assert not_as_shown(shown, PRINTED) == told
 
 
-def test_an_output_that_has_changed_is_told_and_renewed(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("```console\n$ touch quiet\n```\n```console\n$ echo new  # a remark\nold\n$ echo more\n...\n```\n")
-    command = [sys.executable, str(ROOT / "scripts/run_tutorial"), str(page), "--shown"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (1, "new\npage.md: echo new prints above, but not as shown: old\n")
-    subprocess.run([*command, "--renew"], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert "$ echo new  # a remark\nnew\n$ echo more\n...\n" in page.read_text()
-    assert not (tmp_path / "quiet").exists()
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_blocks_of_toml_are_toml(page):
     for block in tables(page.read_text()):
         tomllib.loads(block)
-
-
-def test_a_tutorial_ends_with_the_command_that_fails(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("```console\n$ echo first > made\n$ ls nowhere\n$ touch never\n```\n")
-    command = [sys.executable, str(ROOT / "scripts/run_tutorial"), str(page)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert "page.md: exit code 2 of ls nowhere" in done.stderr
-    assert (tmp_path / "made").read_text() == "first\n"
-    assert not (tmp_path / "never").exists()

@@ -1,7 +1,6 @@
 """Rigs, maps and trajectories as files, and trajectories as what other programs take."""
 
-import sys
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -107,12 +106,6 @@ def test_evo_takes_and_gives_a_trajectory(trajectory):
         type(trajectory).from_evo([1, 2])
 
 
-def test_missing_evo_is_told(monkeypatch):
-    monkeypatch.setitem(sys.modules, "evo.core.trajectory", None)
-    with pytest.raises(fgloc.InputError, match="trajectories of evo need evo: pip install evo"):
-        FLAT.to_evo()
-
-
 @BOTH
 def test_ros_takes_and_gives_a_trajectory(trajectory):
     typesys = pytest.importorskip("rosbags.typesys")
@@ -122,17 +115,6 @@ def test_ros_takes_and_gives_a_trajectory(trajectory):
     assert {pose.header.frame_id for pose in (again, *again.poses)} == {"hall"}
     require_alike(type(trajectory).from_ros(again, T0), trajectory)
     require_alike(type(trajectory).from_ros(again.poses, T0), trajectory)
-
-
-def test_messages_of_an_environment_of_ros_are_taken_where_there_are_any(monkeypatch):
-    for package in ("nav_msgs", "geometry_msgs", "std_msgs", "builtin_interfaces"):
-        messages = ModuleType(f"{package}.msg")
-        messages.__getattr__ = lambda _: SimpleNamespace
-        monkeypatch.setitem(sys.modules, f"{package}.msg", messages)
-        monkeypatch.setitem(sys.modules, package, SimpleNamespace(msg=messages))
-    made = FLAT.to_ros(t0_ns=T0)
-    assert isinstance(made, SimpleNamespace)
-    require_alike(fgloc.Trajectory.from_ros(made, T0), FLAT)
 
 
 def stamped(i, **content):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.calibration.calibrate import calibrate, check
-from factorgraph_loc.calibration.report import constants_table, document, page
 from factorgraph_loc.calibration.turns import learn_by_turns
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import score
@@ -78,14 +77,6 @@ def test_priors_come_from_the_scatter_between_logs(found):
     prior = found.rig.rfid.models["default"].prior
     assert 0.005 < prior.range_scale < 0.03
     assert 0.02 < prior.read_rate < 0.2
-
-
-def test_the_report_says_how_it_was_learnt(found):
-    text = page(found)
-    assert "took turns" in text
-    assert "Accuracy of the" not in text
-    assert document(found)["turns"] == list(found.turns)
-    assert any(row[0] == "rfid.models.default.r_max" for row in constants_table(found.knowledge.constants)[1])
 
 
 def test_a_grid_learns_its_range_and_rate(blind, tmp_path):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from scipy.signal import lfilter
 from scipy.stats import wilcoxon
 
@@ -44,13 +43,6 @@ def test_signed_rank_with_ties_and_zeros_counts_all_signs():
 def test_all_on_one_side_is_the_least_p():
     assert signed_rank(np.arange(1.0, 7.0)) == pytest.approx(least_p(6)) == pytest.approx(2 / 64)
     assert signed_rank(np.zeros(8)) == 1.0
-
-
-@given(arrays(float, st.integers(1, 30), elements=st.floats(-5.0, 5.0)))
-def test_sides_are_alike(differences):
-    assert signed_rank(differences) == signed_rank(-differences)
-    assert rank_biserial(differences) == pytest.approx(-rank_biserial(-differences))
-    assert -1.0 <= rank_biserial(differences) <= 1.0
 
 
 def test_effect_of_a_worked_example():
@@ -142,12 +134,6 @@ def test_independent_count_of_an_autoregression(memory):
     counts = [independent_count(lfilter([1.0], [1.0, -memory], rng.standard_normal(n))) for _ in range(20)]
     expected = n * (1.0 - memory) / (1.0 + memory)
     assert np.mean(counts) == pytest.approx(expected, rel=0.2 if memory < 0.95 else 0.33)
-
-
-def test_independent_count_has_bounds():
-    assert independent_count(np.full(50, 3.0)) == 1.0
-    assert independent_count(np.array([1.0])) == 1.0
-    assert independent_count(np.tile([1.0, -1.0], 50)) == 100.0
 
 
 def test_band_holds_the_mean_of_consistent_logs():

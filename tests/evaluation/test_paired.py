@@ -59,13 +59,6 @@ def test_what_never_came_is_beyond_every_number():
     assert quantile(a, 0.9) == math.inf
 
 
-def test_nothing_to_compare_tells_nothing():
-    found = median_difference([], [])
-    assert math.isnan(found.value)
-    assert (found.low, found.high) == (-math.inf, math.inf)
-    assert math.isnan(quantile([], 0.5))
-
-
 def test_intervals_hold_what_is_true():
     """Both medians are e, so the difference is 0: the 95 % interval of 60 cases holds it in about 95 % of 200 trials, a bit more,
     as medians of few cases jump. Fewer than 178 happen in one of 5,000 if that is the true share."""

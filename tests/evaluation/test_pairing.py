@@ -109,9 +109,3 @@ def test_a_pause_is_longer_than_what_is_usual():
     assert pauses(np.array([0.0, 0.1, 0.2, 1.1, 2.2, 2.3])).tolist() == [4]
     assert pauses(2.0 * np.arange(9)).tolist() == []
     assert pauses(np.array([0.0, 2.0, 4.0, 11.0, 13.0])).tolist() == [3]
-
-
-def test_no_estimate_and_no_reference_are_no_error():
-    nothing = Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
-    assert accuracy(nothing, circle(GRID))["scored"] == 0
-    assert accuracy(circle(GRID), nothing)["scored"] == 0

@@ -189,11 +189,6 @@ def test_what_cannot_be_scored_is_refused(estimate, options, message):
         score(estimate, along_x(), **options)
 
 
-def test_few_partners_give_a_warning():
-    late = Trajectory(along_x().t * 1.01, along_x().poses)
-    assert "of 101 poses have a stamp within 0.01 s in reference" in score(late, along_x()).warnings[0]
-
-
 def test_pieces_of_all_pairs_are_those_of_a_search():
     rng = np.random.default_rng(0)
     for _ in range(50):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from absurd_logs import with_rig
 from regression import commands, logs
-from regression.commands import RESULTS, compare, is_present, write
+from regression.commands import RESULTS, is_present
 from regression.differences import differences, size_of
 from regression.records import Record, read_records, record_run, write_records
 from regression.scenarios import SCENARIOS
@@ -15,7 +15,6 @@ from regression.tolerances import TOLERANCE, beyond_processors
 from scripts_here import run_script
 
 from factorgraph_loc.experiments.run import RunConfig
-from factorgraph_loc.sensors.odometry.settings import GrowthSettings
 
 CASES = [(name, label) for name, scenario in SCENARIOS.items() for label in scenario.cases()]
 MOST_BYTES = 1_000_000
@@ -102,29 +101,6 @@ def test_where_a_case_branches_only_what_depends_on_it_is_held_less_closely(quan
     old, new = (Record({}, {**numbers, quantity: np.full((2, 3), x)}) for x in (0.0, off * (0.2 if off > 0.1 else 1.0)))
     assert (beyond_processors("points/particle_filter", old, new) == []) == held
     assert beyond_processors("points/smoother", old, new) or off < TOLERANCE
-
-
-def test_two_commits_are_held_against_each_other(tmp_path, monkeypatch):
-    name = "landmarks-bearings"
-    write(tmp_path, [name], extra={})
-    assert compare(tmp_path, [name], extra={}) == []
-    scenario = SCENARIOS[name]
-    log = with_rig(scenario.log(), "odometry", noise=wider(scenario.log().rig.odometry.noise))
-    changed = replace(scenario, log=lambda: log, labels=("ekf", "dead_reckoning"))
-    monkeypatch.setattr(commands, "SCENARIOS", {name: changed})
-    lines = compare(tmp_path, [], extra={})
-    assert [line.partition(":")[0] for line in lines] == [
-        f"{name}/{label}" for label in ("ekf", "dead_reckoning", "particle_filter", "smoother", "batch")
-    ]
-    assert "causal.covariances differs by" in lines[0]
-    assert "final.position_rmse 0." in lines[0]
-    assert lines[1].endswith(f"is not in {tmp_path}")
-    assert lines[2].endswith(f"only in {tmp_path}")
-
-
-def wider(noise):
-    """The noise of odometry, with a heading that is a thousandth less certain."""
-    return noise.model_copy(update={"heading": GrowthSettings(per_distance=0.08008, per_rotation=0.05005)})
 
 
 def test_results_are_renewed_where_they_changed(tmp_path, monkeypatch):

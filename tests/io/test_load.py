@@ -47,13 +47,6 @@ def test_shipped_manifests_are_right(name):
     assert all(file.startswith(manifest.path) for file in manifest.checksums)
 
 
-def test_describe_without_data(monkeypatch):
-    monkeypatch.delenv("FGLOC_DATA", raising=False)
-    present = {d.name: d.present for d in describe()}
-    assert set(present) == set(manifests())
-    assert {name for name, there in present.items() if there} == {"plaza1", "plaza2"}
-
-
 def test_describe_and_verify_with_data(data_root):
     assert all(d.present for d in describe(data_root))
     for file in manifests().values():
@@ -145,20 +138,6 @@ def test_a_link_that_leaves_the_data_root(manifest, mrclam, tmp_path, refused):
     root.mkdir()
     (root / "set").symlink_to(mrclam)
     refused(manifest(), "leaves its folder", data_root=root)
-
-
-def test_names_that_lead_nowhere(tmp_path, refused):
-    refused("plaza22", "neither a file, nor a folder, nor a known data set", "did you mean plaza2?")
-    refused(tmp_path, "has no run.toml")
-    refused(tmp_path, "no reader 'natve'", "did you mean native?", reader="natve")
-    refused(tmp_path / "nothing", "does not exist", reader="mrclam")
-    refused(tmp_path, "expected a folder in the native format", reader="native")
-    (tmp_path / "x.dat").write_text("")
-    refused(tmp_path / "x.dat", "is not a manifest (.toml)")
-
-
-def test_the_native_format_has_no_options(native, refused):
-    refused(native, "options of reader native: unknown key robot", options={"robot": "1"})
 
 
 def test_verify(manifest, mrclam, tmp_path):

@@ -48,15 +48,6 @@ def test_a_pause_before_the_new_beginning_is_no_motion_of_a_second_or_more():
     np.testing.assert_allclose(moves[59], se2.exp(10.0 * se2.log(STEP)), atol=1e-9)
 
 
-def test_a_robot_that_drives_home_is_left_alone():
-    out = np.linspace(0.0, 30.0, 301)
-    poses = np.column_stack((np.concatenate((out, out[::-1])), np.zeros(602), np.zeros(602)))
-    warnings = []
-    moves = between_poses("odom.csv", stamps(602), poses, warnings)
-    np.testing.assert_allclose(moves, se2.between(poses[:-1], poses[1:]))
-    assert warnings == []
-
-
 @pytest.mark.parametrize(("size", "least"), [(2**16, 0), (2**16, -(2**15)), (2**8, 0), (2**32, 0)])
 @pytest.mark.parametrize("way", [1, -1])
 def test_an_encoder_counts_on_from_its_other_end(size, least, way):

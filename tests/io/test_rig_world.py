@@ -3,7 +3,6 @@
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
@@ -53,14 +52,6 @@ def test_the_example_of_the_documentation(tmp_path):
     (tmp_path / "a.rig.toml").write_text(example)
     model = read_rig(tmp_path / "a.rig.toml").rfid.model()
     assert [antenna.model for antenna in model.antennas] == [0, 1]
-
-
-def test_positions():
-    world = World(landmarks={"A": Landmark(x=1, y=2), "B": Landmark(x=3, y=4)})
-    np.testing.assert_array_equal(world.positions(), ((1, 2), (3, 4)))
-    np.testing.assert_array_equal(world.position("B"), (3, 4))
-    assert world.position("C") is None
-    assert World().positions().shape == (0, 2)
 
 
 BAD_RIGS = {
@@ -119,11 +110,6 @@ def test_bad_worlds(tmp_path, text, fragment):
     assert fragment in str(caught.value)
 
 
-def test_missing_files(tmp_path):
-    with pytest.raises(InputError, match=r"none.rig.toml: cannot be read: No such file"):
-        read_rig(tmp_path / "none.rig.toml")
-
-
 def test_tags_and_walls_come_back(tmp_path):
     tags = {"E1": Tag(x=1.0, y=1 / 3, z=0.5, facing=-1.5), 'a "comma", ü': Tag(x=0.1, y=0.2, sigma=0.05)}
     world = World(name="hall", tags=tags, walls=((0.0, 1.0, 2.0, 3.0), (2.0, 3.0, -4.0, 5.5)))
@@ -168,10 +154,3 @@ def test_bad_tables_of_tags(tmp_path, rows, fragment):
         read_world(tmp_path / "a.world.toml")
     assert fragment in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_table_of_points_that_is_missing(tmp_path):
-    (tmp_path / "hall.world.toml").write_text('points = "hall.points.parquet"\n')
-    message = f"{tmp_path / 'hall.world.toml'}: points names 'hall.points.parquet', which is missing"
-    with pytest.raises(InputError, match=re.escape(message)):
-        read_world(tmp_path / "hall.world.toml")

@@ -41,10 +41,6 @@ def test_tags_of_a_spreadsheet(world):
     assert tags["E2002"] == Tag(x=0.0, y=0.03)
 
 
-def test_a_tag_may_have_the_name_file(world):
-    assert list(world("[tags]\nfile = { x = 1.0, y = 2.0 }\n").tags) == ["file"]
-
-
 @pytest.mark.parametrize(
     ("sheet", "text", "fragments"),
     [
@@ -72,13 +68,6 @@ def test_corners_as_they_are_seen_from_the_front():
     np.testing.assert_allclose(corners, ((4, 1.1, 1.6), (4, 0.9, 1.6), (4, 0.9, 1.4), (4, 1.1, 1.4)), atol=1e-12)
     turned = Marker(x=4.0, y=1.0, z=1.5, size=0.2, facing=np.pi, roll=np.pi / 2).corners()
     np.testing.assert_allclose(turned, np.roll(corners, 1, axis=0), atol=1e-12)
-
-
-def test_a_marker_on_the_ceiling_looks_down():
-    corners = Marker(x=0.0, y=0.0, z=3.0, size=2.0, facing=0.0, pitch=-np.pi / 2).corners()
-    np.testing.assert_allclose(corners[:, 2], 3.0)
-    normal = np.cross(corners[3] - corners[0], corners[1] - corners[0])
-    np.testing.assert_allclose(normal / np.linalg.norm(normal), (0, 0, -1), atol=1e-12)
 
 
 def test_markers_are_points_beside_others(world, tmp_path):

@@ -86,8 +86,3 @@ def test_no_track_has_two_features_of_an_image(look):
     tracks = chained(sight.frames, [*right, wrong])
     assert tracks.count == 10
     assert tracks.lengths().tolist() == [3] * 10
-
-
-def test_no_matches_are_no_tracks(look):
-    tracks = chained(look(np.random.default_rng(4)).frames, [])
-    assert (tracks.count, len(tracks)) == (0, 0)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.mapping.mapping import TOLERANCE, align_robustly, make_map
@@ -14,7 +13,6 @@ from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.mapping import check
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, Landmark
 from factors import se2
@@ -186,31 +184,6 @@ def test_many_landmarks_are_aligned_by_a_sample_of_pairs():
     wrong[:60] = np.random.default_rng(5).permutation(wrong[:60])
     alignment = align_robustly([*learnt(points).values()], wrong, np.zeros((150, 2, 2)))
     np.testing.assert_allclose(alignment.pose, FRAME, atol=0.05)
-
-
-@pytest.mark.parametrize(
-    ("stream", "message"),
-    [
-        (None, "has no sightings of landmarks"),
-        (BearingRangeStream(np.zeros(0), [], np.zeros(0), np.zeros(0)), "has no sightings of landmarks"),
-        (BearingRangeStream(np.zeros(1), ["a"], np.ones(1), np.array([np.nan])), "from a range alone"),
-        (BearingRangeStream(np.zeros(1), ["a"], np.array([np.nan]), np.ones(1)), "from a bearing alone"),
-    ],
-)
-def test_what_cannot_be_mapped_is_said(stream, message):
-    one = replace(log(World()), streams={} if stream is None else {"bearing_range": stream})
-    with pytest.raises(InputError, match=message):
-        check(one)
-
-
-def test_a_rig_without_the_sensor_is_named():
-    with pytest.raises(InputError, match=r"no \[bearing_range\]"):
-        check(replace(log(World()), rig=Rig()))
-
-
-def test_nothing_learnt_is_an_error():
-    with pytest.raises(RunFailedError, match="no landmark was sighted twice"):
-        make_map(log(World()), {})
 
 
 def test_swapped_landmarks_of_a_recorded_log_are_found(data_root):

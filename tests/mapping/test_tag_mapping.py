@@ -9,7 +9,6 @@ import pytest
 from scipy.stats import chi2
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.mapping.tag_looks import tag_looks
 from factorgraph_loc.mapping.tag_mapping import map_tags
 from factorgraph_loc.mapping.tag_search import merged, search
 from factorgraph_loc.mapping.tag_slam import INTERVAL, _keyframes
@@ -203,16 +202,6 @@ def test_tags_that_were_never_read_are_listed_and_kept(room):
     made = map_tags(replace(room, world=far), "reference", None)
     assert made.open["far"] == "never read"
     assert made.world.tags["far"] == far.tags["far"]
-
-
-def test_what_cannot_be_mapped_is_said(room):
-    silent = {name: s for name, s in room.streams.items() if name != "rfid"}
-    with pytest.raises(InputError, match="has no reads of tags"):
-        tag_looks(replace(room, streams=silent))
-    with pytest.raises(InputError, match=r"its rig has no \[rfid\]"):
-        tag_looks(replace(room, rig=room.rig.model_copy(update={"rfid": None})))
-    with pytest.raises(InputError, match="has no reference"):
-        map_tags(replace(room, reference=None), "reference", None)
 
 
 def test_from_an_unknown_start_the_map_is_brought_onto_the_given_one_with_its_facings(room):

@@ -53,16 +53,6 @@ def test_rows_of_one_stamp_belong_together():
     assert (second.t, second.landmarks) == (2.25, ("A",))
 
 
-def test_streams_without_rows():
-    empty = column()
-    streams = (
-        BearingRangeStream(empty, (), empty, empty),
-        VelocityStream(empty, empty, empty),
-        YawRateStream(empty, empty),
-    )
-    assert [list(stream.measurements(0.0)) for stream in streams] == [[], [], []]
-
-
 def test_increments_and_yaw_rates():
     (increment,) = IncrementStream(column(1), column(0.5), column(0.1), column(0.2)).measurements(0.5)
     assert increment == IncrementOdometry(1.5, 0.5, 0.1, 0.2)
@@ -110,11 +100,6 @@ def test_rows_of_odometry_that_follow_one_another_are_one_step():
         assert [m.count for m in found] == steps
         singly = [one for m in found for one in (each_of(m) if isinstance(m, Rows) else [m])]
         assert list(map(str, singly)) == list(map(str, log.measurements(tuple(streams))))
-
-
-def test_span():
-    assert make_log(bearing_range=sightings((-1, "A", 2, 0)), odometry=ODOMETRY).span() == (-1.0, 2.0)
-    assert make_log().span() == (0.0, 0.0)
 
 
 def drive(kind):
@@ -217,11 +202,6 @@ def test_reads_are_cut_and_joined_by_scans():
     assert [scan.t for scan in again] == [2.0, 3.0, 4.5]
     assert [scan.tags for scan in again] == [("E1",), (), ("E1", "E2", "E1")]
     assert again[2].antennas == ("left", "right", "left")
-
-
-def test_sensors_without_a_stream_are_passed_over():
-    log = make_log(odometry=ODOMETRY, rfid=READS)
-    assert len(list(log.measurements(("odometry", "rfid", "rssi", "phase")))) == 6
 
 
 def test_parts_that_are_none_and_logs_that_do_not_fit():

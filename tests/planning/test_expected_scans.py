@@ -78,12 +78,6 @@ def test_who_is_stopped_scans_no_more():
     np.testing.assert_array_equal(one[:, 1], two[:, 1])
 
 
-def test_a_map_without_tags_weighs_nothing():
-    model = RfidModel(ANTENNAS, (BeamModel(),))
-    found = RfidLikelihood(model, TagArray(np.empty((0, 3)), np.empty(0)))
-    assert not weighed(found, np.zeros((2, 5, 3)), (4, 4), (2,) * 5, 3, (1,)).any()
-
-
 def test_draws_are_uniform_and_rounds_binomial():
     """Kolmogorov's bound at a false-alarm rate of 10^-6."""
     u = np.sort([expected_scans._uniform(np.uint64(7), n) for n in range(20_000)])

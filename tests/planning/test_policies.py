@@ -11,7 +11,7 @@ from factorgraph_loc.model.belief import Mode
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.paths import primitives, waypoint_paths
-from factorgraph_loc.planning.policies import POLICIES, Situation, make_policy, usable
+from factorgraph_loc.planning.policies import Situation, make_policy, usable
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
 from factorgraph_loc.sensors.odometry.motion import odometry_model
@@ -69,11 +69,6 @@ def test_what_a_way_costs_counts():
     lengths = np.array([p.length for p in situation().candidates])
     assert np.allclose(choice(0.1).values, choice(0.0).values - 0.1 * lengths)
     assert choice(50.0).path.kind == "patrol"
-
-
-@pytest.mark.parametrize("name", POLICIES)
-def test_without_tags_the_robot_still_drives(name):
-    assert make_policy(name).choose(situation(tags=np.empty((0, 3)))).path.length > 1.0
 
 
 def test_patrol_goes_straight_on_and_then_where_it_is_freest():

@@ -118,26 +118,6 @@ def test_each_form_is_seen(code: str) -> None:
     assert len(choices(code)) == 1
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
-        "isinstance(x, Mapping)",
-        "m.is_motion",
-        "print('rfid')",
-        "type(m).__name__",
-        "modalities = frozenset({'rfid'})",
-        "settings['lag']",
-        "type(entry) is float",
-        "hasattr(value, 'tolist')",
-        "Literal['reference', 'odometry']",
-        "def f(m: RfidScan): pass",
-        "rig.rfid is None",
-    ],
-)
-def test_what_is_no_choice_is_not_seen(code: str) -> None:
-    assert choices(code) == []
-
-
 def test_nothing_else_chooses_by_type_or_name() -> None:
     most = {file: number for file, (number, _) in KEPT.items()}
     grown = {file: number for file, number in counted().items() if number > most.get(file, 0)}

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.model.world import World
@@ -132,26 +131,3 @@ def test_a_file_may_name_a_rig(tmp_path, make):
     path.write_text('rig = "other.rig.toml"\n')
     settings = read_settings(path, {"rig": {"rfid": {"tempering": 0.3}}})
     assert (settings.rig.name, settings.rig.rfid.tempering) == ("other", 0.3)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('preset = "ofice"', "preset is 'ofice': did you mean office"),
-        ("[wrld]\ntags = 3", "unknown key wrld: did you mean world"),
-        ("[faults]\ndaed = 0.1", "unknown key faults.daed: did you mean dead"),
-        ("[faults]\ndead = 2", "faults.dead is 2"),
-        ("[world]\ntags = 1\ndensity = 1.0", "expected either tags or density"),
-        ('[faults.antenna_stop]\nantenna = "9"\ntime = 1', "antenna '9' stops, expected one of 1, 2"),
-        ("[drive]\nduration = 0.1", "drive.duration is 0.1"),
-        ('rig = "../other.rig.toml"', "leaves its folder"),
-        ("preset = 3", "preset is 3"),
-        ("world = [", "is not TOML"),
-    ],
-)
-def test_a_wrong_file_is_an_error_of_one_line(tmp_path, text, message):
-    path = tmp_path / "mine.toml"
-    path.write_text(text + "\n")
-    with pytest.raises(InputError, match=message) as found:
-        read_settings(path)
-    assert str(path) in str(found.value)

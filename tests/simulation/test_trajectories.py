@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.maps.free_space import crosses, distance_to_walls
-from factorgraph_loc.model.world import World
 from factorgraph_loc.simulation import PRESETS, preset
 from factorgraph_loc.simulation.settings import DriveSettings
 from factorgraph_loc.simulation.simulate import drive
@@ -53,11 +51,3 @@ def test_a_robot_gets_around():
         x, y = truth.poses[:, :2].T
         rooms = {(int(a / 5.0), b > 6.0) for a, b in zip(x, y, strict=True) if abs(b - 6.0) > 1.5}
         assert len(rooms) >= 4
-
-
-def test_a_world_without_room_is_an_error():
-    box = World(walls=((0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 1.0, 0.4), (1.0, 0.4, 0.0, 0.4), (0.0, 0.4, 0.0, 0.0)))
-    with pytest.raises(InputError, match="no place that is 0\\.3 m from all walls"):
-        drive(box, DriveSettings(), np.random.default_rng(0))
-    with pytest.raises(InputError, match="has no walls"):
-        drive(World(), DriveSettings(), np.random.default_rng(0))

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.maps.free_space import crosses, distance_to_walls
 from factorgraph_loc.simulation import PRESETS, preset
 from factorgraph_loc.simulation.settings import WorldSettings
@@ -96,17 +95,3 @@ def test_landmarks_are_in_the_map():
     made = world(landmarks=7)
     assert len(made.landmarks) == 7
     assert all(math.isfinite(m.x) for m in made.landmarks.values())
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"plan": "office", "depth": 4.0}, "office of 20 x 4 m has no rooms"),
-        ({"plan": "hall", "surfaces": ("shelf",)}, "has no shelves"),
-        ({"plan": "corridors", "tags": 4}, "tags is 4, expected at most 3"),
-        ({"plan": "corridors", "width": 10.0}, "too small for corridors"),
-    ],
-)
-def test_a_world_that_cannot_be_is_an_error(settings, message):
-    with pytest.raises(InputError, match=message):
-        world(**settings)
