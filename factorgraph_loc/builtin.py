@@ -25,7 +25,6 @@ READERS.own |= {
     "mrclam": "factorgraph_loc.io.readers.mrclam",
     "plaza": "factorgraph_loc.io.readers.plaza",
     "rosbag": "factorgraph_loc.io.bags.rosbag",
-    "sevenscenes": "factorgraph_loc.io.readers.sevenscenes",
     "trajectory": "factorgraph_loc.io.readers.trajectory",
 }
 FILES |= {

@@ -11,7 +11,7 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _NAMED = re.compile(r"# ([\w.-]+\.toml)\b")
 # data of the reader's own or of others, installations, windows
 _ELSEWHERE = re.compile(
-    r"\b(LOG|DATA|FOLDER)\b|(?<![\w/])(monday|tuesday|friday|another|hall)/(?!\S)|\bsevenscenes\b"
+    r"\b(LOG|DATA|FOLDER)\b|(?<![\w/])(monday|tuesday|friday|another|hall)/(?!\S)"
     r"|^(pip|rerun) |^fgloc view"
 )
 

@@ -16,7 +16,6 @@ from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.text import listed, quoted
 
 FORMATS = (".mcap", ".tum", ".kitti", ".g2o", ".ply")
@@ -139,11 +138,10 @@ def _only(runs: list[StoredRun], out: Path) -> StoredRun:
     return runs[0]
 
 
-def _trajectory(log: Log, runs: list[StoredRun], out: Path) -> Trajectory | Trajectory3:
+def _trajectory(log: Log, runs: list[StoredRun], out: Path) -> Trajectory:
     """The final trajectory of the run, or the reference of a log without runs."""
     if runs:
         return _only(runs, out).final
-    reference = log.reference3 if log.reference is None else log.reference
-    if reference is None:
+    if log.reference is None:
         raise InputError(f"{log.name}: has no reference to write, expected the folder of a run too")
-    return reference
+    return log.reference

@@ -136,9 +136,7 @@ def _print(log: Log, found: Inspection) -> None:
         "world": ", ".join([log.world.name, *(f"{count} {layer}" for layer, count in found.in_map.items())]),
         "start": "given by the log" if log.start is not None else "not given",
     }
-    if log.reference is None and log.reference3 is not None:
-        about["reference"] = f"three-dimensional, {len(log.reference3)} poses"
-    elif log.reference is None:
+    if log.reference is None:
         about["reference"] = "none: runs cannot be scored"
     elif not log.reference.has_heading:
         about["reference"] = "positions only, headings are not scored"

@@ -57,8 +57,7 @@ class Inspection:
 def inspect(log: Log) -> Inspection:
     """Inspect a log: summaries of its streams, and problems as lines of text."""
     streams = {name: _summary(stream.t) for name, stream in log.streams.items()}
-    known = log.reference3 if log.reference is None else log.reference
-    reference = None if known is None else _summary(known.t)
+    reference = None if log.reference is None else _summary(log.reference.t)
     problems = list(log.warnings)
     problems += [f"the log has no {sensor}, which the rig lists" for sensor in log.rig.sensors if sensor not in streams]
     problems += [f"{name} is empty" for name, summary in streams.items() if summary.rows == 0]

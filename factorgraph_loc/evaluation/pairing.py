@@ -70,7 +70,7 @@ def pairs(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GA
 def pairs_in_space(
     found: Trajectory3, reference: Trajectory3, max_gap: float = MAX_GAP
 ) -> tuple[Trajectory3, Trajectory3]:
-    """The same in space: estimates with covariances, and true poses; only where both exist."""
+    """The same in space: estimates and true poses, only where both exist."""
     rows = thinned(reference.t)
     at = _within(reference.t[rows], found.t)
     valid = found.spans(at, max_gap=max_gap)

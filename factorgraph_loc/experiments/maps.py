@@ -238,7 +238,7 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     if options.poses not in (None, "reference"):
         raise InputError(f"--poses is {quoted(options.poses)}, expected reference for points: {BY_RUN}")
     settings = parse_model(PointSettings, options.points, "--set points")
-    if log.reference is None and log.reference3 is None:
+    if log.reference is None:
         raise InputError(f"{log.name}: has no reference that says where its images were taken: {BY_RUN}")
     with stages("features") as report:
         seen, doubts = with_features(log, camera.frontend, lambda share: report(share, 1.0))

@@ -104,7 +104,7 @@ def _carrier(log: Log, runs: Sequence[StoredRun]) -> Trajectory | None:
 def camera_path(log: Log, runs: Sequence[StoredRun]) -> str:
     """The entity path of the camera: below the first robot drawn, if there is one."""
     robots = [run.name for run in runs if len(run.played())]
-    if log.reference is not None or log.reference3 is not None:
+    if log.reference is not None:
         robots.append("reference")
     return f"{WORLD}/{robots[0]}/robot/camera" if robots else CAMERA
 

@@ -16,7 +16,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
@@ -28,7 +27,6 @@ from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.camera.draw import has_pictures
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factors.se2 import Array
@@ -113,8 +111,6 @@ def _record(
     if log.reference is not None:
         _path(recording, f"{WORLD}/reference/path", log.reference, REFERENCE)
         _robot(recording, f"{WORLD}/reference/robot", log.reference, REFERENCE)
-    elif log.reference3 is not None:
-        _in_space(recording, f"{WORLD}/reference", log.reference3)
     for run, colour in zip(runs, colours(), strict=False):
         _run(recording, run, colour)
         if run.name in particles:
@@ -238,18 +234,6 @@ def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
         recording.log(f"{at}/heading", arrow, static=True)
 
 
-def _in_space(recording: rr.RecordingStream, at: str, trajectory: Trajectory3) -> None:
-    """Path and position over time of a robot in space."""
-    import rerun as rr  # noqa: PLC0415
-
-    recording.log(
-        f"{at}/path", rr.LineStrips3D([trajectory.positions], radii=LINE / 2.0, colors=REFERENCE), static=True
-    )
-    turns = Rotation.from_matrix(trajectory.rotations).as_quat()
-    poses = rr.Transform3D.columns(translation=trajectory.positions, quaternion=turns)
-    recording.send_columns(f"{at}/robot", times(trajectory.t), poses)
-
-
 def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
     """Layout of the viewer: the plan from above; beside it camera, errors and events, where there are any."""
     import rerun as rr  # noqa: PLC0415
@@ -291,8 +275,6 @@ def _extent(log: Log, runs: Sequence[StoredRun]) -> tuple[Array, float]:
     parts += [marks.positions[:, :2] for marks, _, _ in scene.layers(log) if not marks.dense]
     if log.reference is not None:
         parts.append(log.reference.poses[:, :2])
-    if log.reference3 is not None:
-        parts.append(log.reference3.positions[:, :2])
     points = np.concatenate(parts)
     if not len(points):
         return np.zeros(2), 10.0

@@ -4,13 +4,12 @@ import io
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import BinaryIO
 
 from PIL import Image, UnidentifiedImageError
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.bounded import IMAGE, PIXELS, foreign, opened
+from factorgraph_loc.files.bounded import PIXELS, foreign
 
 # without the formats for which Pillow starts other programs
 FORMATS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP", "GIF", "TGA", "SUN", "JPEG2000")
@@ -46,10 +45,4 @@ def image_size(content: bytes, source: object) -> tuple[int, int]:
         if at > len(content):
             raise InputError(f"{source}: {NO_IMAGE}: it is cut off, or a part of it is damaged")
     with pillow_image(io.BytesIO(content), source) as image:
-        return image.size
-
-
-def size_of_file(path: Path) -> tuple[int, int]:
-    """As :func:`image_size`, reading only the header of the file."""
-    with opened(path, IMAGE) as file, pillow_image(file, path) as image:
         return image.size

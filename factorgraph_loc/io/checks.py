@@ -30,23 +30,18 @@ def require_bounds(log: Log) -> None:
         known = ("x", "y", "heading") if log.reference.has_heading else ("x", "y")
         for name, values in zip(known, log.reference.poses.T, strict=False):
             _require(f"{log.name}: reference", POSES[name], log.reference.t, values)
-    if log.reference3 is not None:
-        for name, values in zip("xyz", log.reference3.positions.T, strict=True):
-            _require(f"{log.name}: reference", POSES[name], log.reference3.t, values)
     if log.start is not None:
         for name, value in zip(("x", "y", "heading"), log.start.pose, strict=True):
             _require(f"{log.name}: start", POSES[name], np.array((log.start.t,)), np.array((value,)))
 
 
 def _require(where: str, column: Column, t: Array, values: Array) -> None:
-    """InputError at the first row of ``values`` (N,) or (N, 3) that is out of bounds by more than rounding; ``t`` (N,): its
-    time."""
+    """InputError at the first of ``values`` (N,) that is out of bounds by more than rounding; ``t`` (N,): its time."""
     low, high = column.low - TOLERANCE * abs(column.low), column.high + TOLERANCE * abs(column.high)
     bad = replace(column, low=low, high=high).outside(values)
     if bad.any():
-        i = int(np.argmax(bad.reshape(len(t), -1).any(axis=1)))
-        value = float(np.ravel(values[i])[np.argmax(np.ravel(bad[i]))])
-        raise InputError(f"{where} at {t[i]:.3f} s: {column.name} is {value!r}, expected {column.expected}")
+        i = int(np.argmax(bad))
+        raise InputError(f"{where} at {t[i]:.3f} s: {column.name} is {float(values[i])!r}, expected {column.expected}")
 
 
 def require_one_span(log: Log) -> None:
@@ -76,7 +71,7 @@ def require_one_span(log: Log) -> None:
 def look_over(log: Log) -> list[str]:
     """Warnings about a whole log; InputError if it has no odometry, which only a bare trajectory lacks."""
     odometry = log.streams.get("odometry")
-    if odometry is None and (log.reference3 is not None or (log.reference is not None and not log.streams)):
+    if odometry is None and log.reference is not None and not log.streams:
         return []
     if odometry is None or len(odometry.t) == 0:
         raise InputError(f"{log.name}: has no odometry, which every estimator needs")

@@ -60,10 +60,9 @@ def _in_bag(text: str) -> tuple[Path, str] | None:
 
 def _reference(log: str) -> PosePath:
     found = read_log(log)
-    reference = found.reference if found.reference3 is None else found.reference3
-    if reference is None:
+    if found.reference is None:
         raise InputError(f"{log}: is a log without a reference, expected one with a reference, or a trajectory")
-    return path_of(reference, log, found.t0_ns)
+    return path_of(found.reference, log, found.t0_ns)
 
 
 def to_evo(path: PosePath) -> Any:

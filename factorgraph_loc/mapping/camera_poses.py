@@ -33,7 +33,7 @@ class PosedFrames:
 
 
 def posed_frames(log: Log, turn_sigma: float, shift_sigma: float) -> PosedFrames:
-    """The frames of a log with features, at the poses of its reference (in the plane or in space).
+    """The frames of a log with features, at the poses of its reference.
 
     ``turn_sigma`` [rad], ``shift_sigma`` [m]: standard deviations about and along each axis for a reference without
     covariances. Frames outside of the reference or in its gaps are omitted. Raises InputError if a camera, features or a
@@ -44,17 +44,11 @@ def posed_frames(log: Log, turn_sigma: float, shift_sigma: float) -> PosedFrames
         raise InputError(f"{log.name}: its rig has no [camera], expected focal length and mounting")
     model = log.rig.of(CameraSettings).model()
     usual = np.diag(np.repeat(np.square((turn_sigma, shift_sigma)), 3))
-    if log.reference3 is not None:
-        inside = (t >= log.reference3.t[0]) & (t <= log.reference3.t[-1])
-        at = log.reference3.at(t[inside])
-        cameras = Cameras(at.positions + at.rotations @ model.position, at.rotations @ model.rotation)
-        covariances = np.repeat(usual[None], len(at), axis=0)
-    elif log.reference is not None and log.reference.has_heading:
-        poses = log.reference.at(t, max_gap=MAX_GAP)
-        inside = np.isfinite(poses).all(axis=1)
-        cameras, covariances = _on_robot(model, log.reference, t[inside], poses[inside], usual)
-    else:
+    if log.reference is None or not log.reference.has_heading:
         raise InputError(f"{log.name}: has no reference with headings that says where its images were taken")
+    poses = log.reference.at(t, max_gap=MAX_GAP)
+    inside = np.asarray(np.isfinite(poses).all(axis=1))
+    cameras, covariances = _on_robot(model, log.reference, t[inside], poses[inside], usual)
     frames = [frame for frame, keep in zip(found, inside.tolist(), strict=True) if keep]
     if not any(len(frame.pixels) for frame in frames):
         raise InputError(f"{log.name}: none of its {len(t)} images has features and a pose of the reference")

@@ -11,7 +11,6 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.measurement import Measurement, Rows, Stream, joined, selected
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.model.world import World
 from factorgraph_loc.text import well_formed
 from factors.se2 import Array, Integers
@@ -35,9 +34,8 @@ class StartPose:
 class Log:
     """A log. ``streams`` by channel; ``t0_ns``: absolute time of t = 0 in nanoseconds.
 
-    ``reference3``: the reference trajectory in three dimensions, if the robot does not move on a floor. ``warnings``: one line
-    for each problem that the reader corrected or skipped. ``metadata``: licence, origin and so on,
-    and what :data:`NOT_READ` and :data:`RIG_NOTES` say.
+    ``warnings``: one line for each problem that the reader corrected or skipped. ``metadata``: licence, origin and so on, and
+    what :data:`NOT_READ` and :data:`RIG_NOTES` say.
     """
 
     name: str
@@ -49,7 +47,6 @@ class Log:
     t0_ns: int = 0
     warnings: tuple[str, ...] = ()
     metadata: Mapping[str, str] = field(default_factory=dict)
-    reference3: Trajectory3 | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", well_formed(self.name))  # it may come from a file name
@@ -62,8 +59,8 @@ class Log:
     def span(self) -> tuple[float, float]:
         """First and last timestamp of all streams [s], or of the reference of a log without any."""
         stamps = [(s.t.min(), s.t.max()) for s in self.streams.values() if len(s.t)]
-        if not self.streams:
-            stamps = [(r.t[0], r.t[-1]) for r in (self.reference, self.reference3) if r is not None and len(r)]
+        if not self.streams and self.reference:
+            stamps = [(self.reference.t[0], self.reference.t[-1])]
         if not stamps:
             return 0.0, 0.0
         return float(min(a for a, _ in stamps)), float(max(b for _, b in stamps))
@@ -145,17 +142,7 @@ def cut(log: Log, start: float, end: float) -> Log:
         keep = inside(reference.t)
         covariances = None if reference.covariances is None else reference.covariances[keep]
         reference = replace(reference, t=reference.t[keep], poses=reference.poses[keep], covariances=covariances)
-    in_space = log.reference3
-    if in_space is not None:
-        keep = inside(in_space.t)
-        in_space = Trajectory3(in_space.t[keep], in_space.positions[keep], in_space.rotations[keep])
-    return replace(
-        log,
-        streams=streams,
-        reference=reference if reference and len(reference) else None,
-        reference3=in_space if in_space and len(in_space) else None,
-        start=None,
-    )
+    return replace(log, streams=streams, reference=reference if reference and len(reference) else None, start=None)
 
 
 def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:

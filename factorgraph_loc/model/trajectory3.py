@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.model.planar import rotations_of
-from factorgraph_loc.model.trajectory import Exchange, Trajectory, averaged, decimal_seconds, neighbours
+from factorgraph_loc.model.trajectory import Exchange, Trajectory, decimal_seconds, neighbours
 from factors.se2 import Array, Integers
 
 _FLAT = 1e-9  # m and sines within which poses are planar
@@ -21,13 +21,11 @@ _FLAT = 1e-9  # m and sines within which poses are planar
 
 @dataclass(frozen=True)
 class Trajectory3(Exchange):
-    """``t`` (N,) seconds, strictly increasing; ``positions`` (N, 3) [m] and ``rotations`` (N, 3, 3) in the world frame;
-    ``covariances`` (N, 6, 6) of a perturbation in the robot frame, rotation before translation."""
+    """``t`` (N,) seconds, strictly increasing; ``positions`` (N, 3) [m] and ``rotations`` (N, 3, 3) in the world frame."""
 
     t: Array
     positions: Array
     rotations: Array
-    covariances: Array | None = None
 
     def __post_init__(self) -> None:
         if self.positions.shape != (len(self.t), 3) or self.rotations.shape != (len(self.t), 3, 3):
@@ -41,19 +39,16 @@ class Trajectory3(Exchange):
         return len(self.t)
 
     def at(self, t: Array) -> Trajectory3:
-        """The poses at times ``t`` (M,), which must lie between the first and the last timestamp. Positions and covariances are
-        interpolated linearly, rotations by slerp."""
+        """The poses at times ``t`` (M,), which must lie between the first and the last timestamp. Positions are interpolated
+        linearly, rotations by slerp."""
         t = np.asarray(t, dtype=float)
-        before, after, fraction, _ = neighbours(self.t, t, np.inf)
-        covariances = None if self.covariances is None else averaged(self.covariances, before, after, fraction)
         if len(self) == 1:
-            alike = self.rows(np.zeros(len(t), dtype=np.int64))
-            return Trajectory3(t, alike.positions, alike.rotations, covariances)
+            return replace(self.rows(np.zeros(len(t), dtype=np.int64)), t=t)
         positions = np.column_stack([np.interp(t, self.t, self.positions[:, i]) for i in range(3)])
         rotations = scipy.spatial.transform.Slerp(self.t, scipy.spatial.transform.Rotation.from_matrix(self.rotations))(
             t
         ).as_matrix()
-        return Trajectory3(t, positions, rotations.reshape(-1, 3, 3), covariances)
+        return Trajectory3(t, positions, rotations.reshape(-1, 3, 3))
 
     def spans(self, t: Array, *, max_gap: float) -> NDArray[np.bool_]:
         """Which of the times ``t`` (M,) lie between the first and the last timestamp and not in a gap longer than ``max_gap``."""
@@ -61,8 +56,7 @@ class Trajectory3(Exchange):
 
     def rows(self, which: Integers) -> Trajectory3:
         """The poses with indices ``which``."""
-        covariances = None if self.covariances is None else self.covariances[which]
-        return Trajectory3(self.t[which], self.positions[which], self.rotations[which], covariances)
+        return Trajectory3(self.t[which], self.positions[which], self.rotations[which])
 
     def planar(self) -> Trajectory:
         """The planar trajectory: (x, y) and the direction of the robot's x axis."""

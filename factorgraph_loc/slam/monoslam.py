@@ -93,7 +93,7 @@ class MonoslamSettings(FilterSettings):
 
 
 class Monoslam(Filter):
-    """The EKF of the paper: one camera on a robot with wheels, with points that it maps on the way. See the module."""
+    """The EKF of the paper: one camera on a robot with wheels, which maps points during the run. See the module."""
 
     modalities = frozenset({"camera"})
     estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
@@ -144,18 +144,13 @@ class Monoslam(Filter):
     def trajectory(self) -> Trajectory:
         """The poses at the ticks, seen from above: smoothed (Rauch, Tung, Striebel, 1965) in a known map, else, or without
         ``smooth``, the causal ones."""
-        found = self._past()
+        is_known = self._settings.landmarks == "known"
+        found = smoothed(self._records) if self._smooth and is_known else self._records
         ticks = np.unique(np.array(self._ticks))
         chosen = [found[i] for i in np.searchsorted([r.t for r in found], ticks, side="right") - 1]
         seen = [seen_from_above(r.robot, self._spread(r.robot, r.covariance)) for r in chosen]
         poses, covariances = np.array([p for p, _ in seen]), np.array([c for _, c in seen])
         return Trajectory(ticks, poses.reshape(-1, 3), covariances.reshape(-1, 3, 3))
-
-    def _past(self) -> list[UpdateRecord]:
-        """The records, smoothed in a known map."""
-        if self._smooth and self._settings.landmarks == "known":
-            return smoothed(self._records)
-        return self._records
 
     def _start(self, prior: PosePrior) -> SlamState:
         s = self._settings
@@ -200,7 +195,6 @@ class Monoslam(Filter):
             return
         self._check.add(m)
         state, match = self._found(m, self._state, eye)
-        self._matched(m, match, eye)
         state, self._anew = self._relocated(m, state, eye, match)
         if len(match.pixels) and not self._anew and not self._vague(state):
             state = self._corrected(m, state, eye, match)
@@ -209,14 +203,11 @@ class Monoslam(Filter):
         self._state = replace(state, seen=self._odometry)
 
     def _found(self, m: Pixels, state: SlamState, eye: Eye) -> tuple[SlamState, Match]:
-        """What is found in an image, and the state before it. Without a map, images tell whether wheels slipped between them."""
+        """The state before an image, and its matches. Without a map, the state is widened if wheels slipped by the image."""
         if self._settings.landmarks == "known" or state.seen is None:
             return state, self._looker.match(m, state, eye)
         slip = self._motion.slip(self._motion.relative(state.seen, self._odometry))
         return self._looker.unless_slipped(m, state, eye, *slip)
-
-    def _matched(self, m: Pixels, match: Match, eye: Eye) -> None:
-        """Called after each image with its matches."""
 
     def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
         """The iterated Kalman update; beyond the gate the noise of a pixel is widened, and Huber weights are applied."""

@@ -29,7 +29,7 @@ class UpdateRecord:
 
 
 def smoothed(records: Sequence[UpdateRecord]) -> list[UpdateRecord]:
-    """The records given all that came later. Velocity and turn rate have no influence later and stay as they are."""
+    """The records, smoothed with all later ones. Velocity and turn rate have no later influence and are not smoothed."""
     found = list(records[-1:])
     for after, here in zip(records[:0:-1], records[-2::-1], strict=True):
         found.append(here if after.anew else _smoothed(here, after, found[-1]))

@@ -7,12 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.exports import rerun_scene
 from factorgraph_loc.exports.runs import Particles, find_runs, read_runs
 from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.model.trajectory3 import Trajectory3
 from factors.camera import model as reprojection
 
 rr = pytest.importorskip("rerun")
@@ -130,15 +128,3 @@ def test_particles_come_and_go(log, results, tmp_path):
     rerun_scene.write_rrd(log, read_runs(find_runs(results), log), tmp_path / "arc.rrd", clouds)
     rows = Recording(tmp_path / "arc.rrd")("/world/ekf/particles", "positions")
     assert [(t, v) for t, v in rows if t is not None] == [(0.0, [[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]]), (0.5, [])]
-
-
-def test_a_reference_in_space_carries_its_camera(log, tmp_path):
-    turns = Rotation.from_rotvec([(0.0, 0.0, 0.0), (0.4, 0.0, 0.0)]).as_matrix()
-    space = Trajectory3(np.array((0.0, 1.0)), np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 1.5))), turns)
-    rerun_scene.write_rrd(replace(log, reference=None, reference3=space), [], tmp_path / "log.rrd")
-    recording = Recording(tmp_path / "log.rrd")
-    rows = recording("/world/reference/robot", "quaternion")
-    assert np.allclose(np.ravel(rows[1][1]), (np.sin(0.2), 0.0, 0.0, np.cos(0.2)))
-    assert np.allclose(np.ravel(recording("/world/reference/robot", "translation")[1][1]), (1.0, 0.0, 1.5))
-    assert len(recording("/world/reference/robot/camera/image", "blob")) == 3
-    assert len(recording("/world/reference/robot/camera", "translation")) == 1

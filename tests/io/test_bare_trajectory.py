@@ -26,14 +26,15 @@ def test_a_file_of_poses_is_a_reference(tmp_path, one, suffix):
         run(log, "ekf")
 
 
-def test_poses_that_rise_or_tilt_are_a_reference_in_space(tmp_path, one):
-    poses = wander(2)[0]
-    path = write(tmp_path / "truth.tum", poses)
-    log = one(path)
-    assert log.reference is None
-    np.testing.assert_allclose(log.reference3.positions, poses[1], atol=1e-8)
-    assert inspect(log).reference.rows == 100
-    assert one(path, options={"axes": "body"}, reader="trajectory").reference is not None
+def test_poses_that_rise_or_tilt_are_seen_from_above(tmp_path, one, refused):
+    t, positions, quaternions = wander(2)[0]
+    low = positions * (1.0, 1.0, 0.5 / np.ptp(positions[:, 2]))
+    log = one(write(tmp_path / "truth.tum", (t, low, quaternions)))
+    np.testing.assert_allclose(log.reference.poses[:, :2], positions[:, :2], atol=1e-8)
+    assert "poses vary in height by 0.50 m and tilt by up to" in log.warnings[0]
+    high = write(tmp_path / "high.tum", (t, 20.0 * low, quaternions))
+    refused(high, "high.tum: the height of poses varies by 10.0 m, expected a robot on a floor")
+    assert one(high, options={"axes": "body"}, reader="trajectory").reference is not None
 
 
 def test_poses_of_kitti_are_those_of_a_camera(tmp_path, one):
@@ -42,8 +43,7 @@ def test_poses_of_kitti_are_those_of_a_camera(tmp_path, one):
     log = one(path)
     assert "has no stamps, and is taken for 10 poses a second" in log.warnings[0]
     assert log.span() == pytest.approx((0.0, 9.9))
-    assert log.reference is None  # the camera looks down
-    np.testing.assert_allclose(log.reference3.positions[:, 0], positions[:, 2], atol=1e-8)
+    np.testing.assert_allclose(log.reference.poses[:, 0], positions[:, 2], atol=1e-8)  # the camera looks down
     (tmp_path / "slow.txt").write_text("".join(f"{2.0 * i}\n" for i in range(100)))
     options = {"axes": "body", "times": "slow.txt"}
     slow = one(path, reader="trajectory", options=options)

@@ -14,7 +14,6 @@ from factorgraph_loc.mapping.point_mapping import PointSettings, map_points
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import FeatureStream
@@ -105,15 +104,3 @@ def test_poses_of_a_robot_on_the_floor(look):
     np.testing.assert_allclose(found.covariances[4], np.cov(np.array(errors).T), atol=0.08 * found.covariances[4].max())
     plain = posed_frames(replace(log, reference=Trajectory(t, poses)), 0.01, 0.02)
     np.testing.assert_allclose(np.diag(plain.covariances[0]), np.square([0.01] * 3 + [0.02] * 3))
-
-
-def test_poses_in_space_go_through_the_mounting(look):
-    sight = look(np.random.default_rng(6))
-    t = np.array([frame.t for frame in sight.frames])
-    log = camera_log(sight, reference3=Trajectory3(t[:-2], sight.cameras.positions[:-2], sight.cameras.rotations[:-2]))
-    found = posed_frames(log, 0.01, 0.02)
-    model = log.rig.camera.model()
-    assert len(found.frames) == len(t) - 2  # the last two are outside
-    np.testing.assert_allclose(found.cameras.rotations[3], sight.cameras.rotations[3] @ model.rotation, atol=1e-9)
-    expected = sight.cameras.positions[3] + sight.cameras.rotations[3] @ model.position
-    np.testing.assert_allclose(found.cameras.positions[3], expected, atol=1e-9)

@@ -276,20 +276,15 @@ def _listen(listeners: Listeners, options: Options) -> Gathered:
 
 
 def _listen_to_camera(listeners: Listeners, options: CameraTopic, out: Gathered) -> None:
-    out.camera = _listen_to_images(listeners, options.topic, options.clock)
+    stamper = listeners.stamper(options.topic, options.clock)
+    out.camera = Images(listeners.bag, options.topic, stamper)
+    if out.camera.known:
+        listeners.stampers.append(stamper)
+    else:
+        listeners.add(options.topic, out.camera, stamper)
     if options.info:
         out.info = Info(listeners.bag, options.info)
         listeners.add(options.info, out.info, listeners.stamper(options.info, None), timed=False)
-
-
-def _listen_to_images(listeners: Listeners, topic: str, clock: Clock | None) -> Images:
-    stamper = listeners.stamper(topic, clock)
-    images = Images(listeners.bag, topic, stamper)
-    if images.known:
-        listeners.stampers.append(stamper)
-    else:
-        listeners.add(topic, images, stamper)
-    return images
 
 
 def _reference(

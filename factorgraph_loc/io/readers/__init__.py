@@ -19,7 +19,6 @@ __all__ = [
     "read_log",
     "read_manifest",
     "reader",
-    "sevenscenes",
     "trajectory",
     "verify",
 ]

@@ -1,6 +1,6 @@
 """What a reader of a fixed format leaves out of its files, for the metadata of the log."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 from factorgraph_loc.files.models import read_text
@@ -12,11 +12,6 @@ def not_read(names: Iterable[str]) -> dict[str, str]:
     """The entry of the metadata; none without ``names``."""
     told = listed(names)
     return {NOT_READ: told} if told else {}
-
-
-def beside(folder: Path, used: Collection[str]) -> list[str]:
-    """What else is in a folder than the entries ``used``."""
-    return sorted(entry.name for entry in folder.iterdir() if entry.name not in used)
 
 
 def columns_after(path: Path, count: int) -> list[str]:

@@ -3,7 +3,6 @@
 TUM, KITTI and EuRoC files are told apart by their first row, see :mod:`factorgraph_loc.io.readers.pose_file`.
 """
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -19,10 +18,10 @@ from factorgraph_loc.io.readers.left_out import columns_after, not_read
 from factorgraph_loc.io.readers.mapped_poses import after_rest
 from factorgraph_loc.io.readers.pose_file import EUROC, read_pose_file, stamps_of
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.planar import RISE, TILT, Turned, on_floor
+from factorgraph_loc.model.planar import Turned, on_floor
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3
+from factorgraph_loc.model.trajectory3 import PosePath
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factors.se2 import Integers
@@ -42,31 +41,23 @@ class Options(Turned):
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The log of a file of poses; t = 0 at the first one.
-
-    As odometry they are seen from above. As a reference too, unless they rise or tilt, and neither ``axes`` nor ``mounting``
-    are given: then they are ``reference3``. InputError names file and row.
-    """
+    """The log of a file of poses, seen from above; t = 0 at the first one. InputError names file and row."""
     if path is None or not path.is_file():
         raise InputError(f"{path}: is not a file, expected one with poses in TUM, KITTI or EuRoC format")
     found = read_pose_file(path)
     warnings = list(found.warnings)
     t_ns = _stamps(path, found, options.times, warnings)
     t0_ns = int(t_ns[0])
-    is_told = options.is_given()
     if found.t_ns is None and options.axes is None and not _beside(path).is_file():
         options = options.model_copy(update={"axes": "optical"})
-    turn = options.standing()
-    space = Trajectory3(checks.seconds(t_ns, t0_ns), found.positions @ turn.T, turn @ found.rotations @ turn.T)
+    t = checks.seconds(t_ns, t0_ns)
     told = not_read(columns_after(path, len(EUROC)))
     bare = Log(path.stem, Rig(name=path.stem, sensors=()), World(name=path.stem), {}, t0_ns=t0_ns, metadata=told)
-    if options.use == "reference" and not is_told and not _is_flat(space):
-        return replace(bare, reference3=space, warnings=tuple(warnings))
     poses = on_floor(path, found.positions, found.rotations, warnings, options)
     if options.use == "reference":
-        return replace(bare, reference=Trajectory(space.t, poses), warnings=tuple(warnings))
+        return replace(bare, reference=Trajectory(t, poses), warnings=tuple(warnings))
     moves = after_rest(motions.between_poses(path, t_ns, poses, warnings))
-    odometry = IncrementStream(space.t, *moves.T)
+    odometry = IncrementStream(t, *moves.T)
     return replace(bare, rig=DEFAULT_RIG, streams={"odometry": odometry}, warnings=tuple(warnings))
 
 
@@ -87,8 +78,3 @@ def _stamps(path: Path, found: PosePath, times: str | None, warnings: list[str])
 def _beside(path: Path) -> Path:
     """The file of stamps that `fgloc export` writes beside poses in KITTI's format."""
     return path.with_name(path.stem + TIMES)
-
-
-def _is_flat(space: Trajectory3) -> bool:
-    upright = bool(np.all(space.rotations[:, 2, 2] >= math.cos(TILT)))
-    return upright and float(np.ptp(space.positions[:, 2])) <= RISE
