@@ -38,7 +38,9 @@ LogNames = Annotated[
 ]
 DataRoot = Annotated[
     Path | None,
-    typer.Option(help="Folder that paths in manifests are relative to; by default the environment's FGLOC_DATA."),
+    typer.Option(
+        help="Folder of data that manifests and experiments may name; by default the environment's FGLOC_DATA."
+    ),
 ]
 Reader = Annotated[
     str | None,

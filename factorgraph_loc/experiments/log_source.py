@@ -5,6 +5,7 @@ Nothing numerical is imported until a log is loaded, so that an experiment with 
 from __future__ import annotations
 
 import fnmatch
+import itertools
 import json
 import os
 import re
@@ -16,7 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import kind
-from factorgraph_loc.files.models import DEEPEST, inside, read_toml
+from factorgraph_loc.files.data_root import find_data_root, named_path
+from factorgraph_loc.files.models import DEEPEST, read_toml
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.files.yaml import read_yaml
 from factorgraph_loc.text import quoted
@@ -50,6 +52,12 @@ def matching(pattern: str, folder: Path, source: object) -> list[Path]:
     for part in parts:
         found = {one for base in found for one in walk.step(base, part)}
     return sorted(one for one in found if os.path.lexists(one))
+
+
+def _fixed_part(pattern: str) -> str:
+    """The path before the first part of a pattern that may match several names."""
+    parts = itertools.takewhile(lambda part: not is_pattern(part), Path(pattern).parts)
+    return str(Path(*parts))
 
 
 class _Walk:
@@ -145,17 +153,18 @@ class RecordedSource:
             return
         yield from _of_toml(str(path))
         content = read_toml(path)
+        for what, given in (("rig", self.rig), ("world", self.world)):
+            if given is None and isinstance(content.get(what), str):
+                file = named_path(path.parent, content[what], path, self.data_root)
+                if not _is_below(file, path.parent):
+                    yield from ((f"{what}/{name}", one) for name, one in _of_toml(str(file)))
         if content.get("path") is None:  # the data come with a library, whose version is part of the key
             return
-        from factorgraph_loc.io.readers.manifests import find_data_root  # noqa: PLC0415
-
-        beside = inside(path.parent, str(content["path"]), path).exists()  # a user's manifest next to its log
-        given = None if self.data_root is None else Path(self.data_root)
-        root = path.parent if beside else find_data_root(given, path)
         summed = content.get("checksums")
-        names = list(summed) if isinstance(summed, dict) and summed else [str(content["path"])]
-        for name in names:
-            data = inside(root, name, path)
+        for name in list(summed) if isinstance(summed, dict) and summed else [str(content["path"])]:
+            data = named_path(path.parent, name, path, self.data_root)
+            if not kind(data):
+                find_data_root(self.data_root, path)
             yield from _of_folder(data) if data.is_dir() else [(name, data)]
 
 
@@ -200,17 +209,20 @@ LogSource = RecordedSource | SimulatedSource
 def recorded_sources(name: str, folder: Path, **others: Any) -> list[RecordedSource]:
     """The sources that ``name`` stands for: a known name, a path relative to ``folder``, or a glob over either.
 
-    ``others``: fields of the sources. Raises InputError if there is none.
+    ``others``: fields of the sources. Raises InputError if there is none, or if a path leaves ``folder`` and the data folder.
     """
     known = manifests()
     if name in known:
         return [RecordedSource(name, **others)]
+    data_root = others.get("data_root")
     if not is_pattern(name):
         # for anything else the reader raises the error, with the nearest name
-        is_path = kind(folder / name) or kind(Path(name))
-        return [RecordedSource(str(folder / name) if is_path else name, **others)]
+        path = named_path(folder, name, "logs", data_root)
+        return [RecordedSource(str(path) if kind(path) or kind(Path(name)) else name, **others)]
     found = [one for one in known if fnmatchcase(one, name)]
-    found += [str(path) for path in matching(name, folder, "logs") if others.get("reader") or _is_log(path)]
+    named_path(folder, _fixed_part(name), "logs", data_root)
+    paths = [named_path(folder, str(path.absolute()), "logs", data_root) for path in matching(name, folder, "logs")]
+    found += [str(path) for path in paths if others.get("reader") or _is_log(path)]
     if not found:
         raise InputError(
             f"no log matches {quoted(name)}: neither a name that `fgloc datasets` lists, nor a path from {folder}"
@@ -236,18 +248,24 @@ def _of_toml(path: str | None) -> Iterator[tuple[str, Path]]:
     """A file of settings, and recursively the files beside it that it names."""
     if path is None:
         return
+    folder = Path(path).parent
     waiting, met = [Path(path)], set()
     while waiting:
         file = waiting.pop()
         if file in met:
             continue
         met.add(file)
-        yield file.relative_to(Path(path).parent).as_posix(), file
+        yield file.relative_to(folder).as_posix(), file
         if file.suffix in NAMING and file.is_file():
             named = (
                 file.parent / text for text in _texts(NAMING[file.suffix](file)) if text and len(text.encode()) < 200
             )
-            waiting += [one for one in named if one.is_relative_to(Path(path).parent) and one.is_file()]
+            waiting += [one for one in named if one.is_relative_to(folder) and one.is_file() and _is_below(one, folder)]
+
+
+def _is_below(path: Path, folder: Path) -> bool:
+    """Whether an existing path lies below ``folder``, with links resolved."""
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
 def _texts(content: Any) -> Iterator[str]:

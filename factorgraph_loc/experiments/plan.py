@@ -22,6 +22,7 @@ from factorgraph_loc.experiments.experiment_file import (
 )
 from factorgraph_loc.experiments.keys import Facts, FileDigests, run_key
 from factorgraph_loc.experiments.log_source import LogSource, RecordedSource, SimulatedSource, recorded_sources
+from factorgraph_loc.files.data_root import named_path
 from factorgraph_loc.files.models import nearest
 from factorgraph_loc.text import quoted
 
@@ -98,6 +99,7 @@ def plan(
     longer than :data:`MOST_SECONDS` together, or have more observations than :data:`MOST_LOOKS`.
     """
     digests, facts = FileDigests(cache / "digests.json"), Facts(cache / "facts.json")
+    experiment = _placed(experiment, folder, data_root)
     sweep = experiment.sweep
     if experiment.prior is not None:
         facts.check_prior(experiment.prior)
@@ -110,9 +112,9 @@ def plan(
     for entry in experiment.estimators:
         for swept in sweep.points(entry.shown, entry.name):
             facts.estimator(entry.name, _settings(entry, swept))  # report a wrong setting before logs are read
-    _check_simulated(experiment, folder, digests, facts)
+    _check_simulated(experiment, digests, facts)
     try:
-        runs = _all_runs(experiment, folder, recorded, digests, facts, most)
+        runs = _all_runs(experiment, recorded, digests, facts, most)
     finally:  # keep what was looked up, even if interrupted
         digests.save()
         facts.save()
@@ -121,7 +123,6 @@ def plan(
 
 def _all_runs(
     experiment: Experiment,
-    folder: Path,
     recorded: Mapping[int, Sequence[LogSource]],
     digests: FileDigests,
     facts: Facts,
@@ -137,9 +138,7 @@ def _all_runs(
         logs = [
             log
             for place, entry in enumerate(experiment.logs)
-            for log in (
-                of_recorded[place] if place in of_recorded else _logs(_simulated(entry, point, folder), digests, facts)
-            )
+            for log in (of_recorded[place] if place in of_recorded else _logs(_simulated(entry, point), digests, facts))
         ]
         _check(logs, experiment.sensors)
         for log in (
@@ -172,13 +171,13 @@ def _check_count(count: int, most: int) -> None:
         raise TooManyRunsError(f"plans {shown} runs, more than {most:,}")
 
 
-def _check_simulated(experiment: Experiment, folder: Path, digests: FileDigests, facts: Facts) -> None:
+def _check_simulated(experiment: Experiment, digests: FileDigests, facts: Facts) -> None:
     """Raise InputError if the simulations exceed the limits."""
     seconds, looks = 0.0, 0.0
     for point in experiment.sweep.points(SIMULATION):
         for entry in experiment.logs:
             if entry.simulate is not None:
-                sources = _simulated(entry, point, folder)
+                sources = _simulated(entry, point)
                 new = sum(not facts.knows(digests.of_source(source)) for source in sources)
                 size = sources[0].size() if new else (0.0, 0.0)
                 seconds, looks = seconds + new * size[0], looks + new * size[1]
@@ -241,27 +240,38 @@ def _only_final(experiment: Experiment, settings: Mapping[str, Any], effective: 
     return shown and effective["smooth"] and effective["lag"] in (None, "all")
 
 
+def _placed(experiment: Experiment, folder: Path, data_root: str | None) -> Experiment:
+    """The experiment with the paths of its rigs, maps and simulations in place of their names."""
+
+    def placed(entry: LogEntry) -> LogEntry:
+        named = {"rig": entry.rig, "world": entry.world}
+        if entry.simulate is not None and entry.simulate.endswith(".toml"):
+            named["simulate"] = entry.simulate
+        paths = {k: str(named_path(folder, v, "logs", data_root)) for k, v in named.items() if v is not None}
+        return entry.model_copy(update=paths)
+
+    return experiment.model_copy(update={"logs": tuple(placed(entry) for entry in experiment.logs)})
+
+
 def _recorded(entry: LogEntry, folder: Path, data_root: str | None) -> list[RecordedSource]:
     assert entry.log is not None
-    rig, world = (None if name is None else str(folder / name) for name in (entry.rig, entry.world))
     return recorded_sources(
         entry.log,
         folder,
         reader=entry.reader,
         options=canonical(entry.options),
-        rig=rig,
-        world=world,
+        rig=entry.rig,
+        world=entry.world,
         data_root=data_root,
     )
 
 
-def _simulated(entry: LogEntry, point: Mapping[str, Any], folder: Path) -> list[SimulatedSource]:
+def _simulated(entry: LogEntry, point: Mapping[str, Any]) -> list[SimulatedSource]:
     assert entry.simulate is not None
     settings = json.loads(canonical(entry.settings))
     for key, value in point.items():
         _merge(settings, nested(key.partition(".")[2], value))
-    preset = str(folder / entry.simulate) if entry.simulate.endswith(".toml") else entry.simulate
-    return [SimulatedSource(preset, canonical(settings), seed) for seed in entry.seeds]
+    return [SimulatedSource(entry.simulate, canonical(settings), seed) for seed in entry.seeds]
 
 
 def _logs(sources: Sequence[LogSource], digests: FileDigests, facts: Facts) -> Iterator[_PlannedLog]:

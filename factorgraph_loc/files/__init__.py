@@ -5,6 +5,7 @@ __all__ = [
     "checks",
     "column_mapping",
     "columns",
+    "data_root",
     "images",
     "models",
     "settings",

@@ -226,22 +226,25 @@ def nearest(word: str, known: list[str]) -> str:
     return f"; known: {listed(sorted(known), 2 * LISTED)}" if known else ""
 
 
-def inside(root: Path, name: str, source: object, expected: str = "") -> Path:
-    """The path ``name`` below ``root``, with links resolved; it need not exist. All paths in files are resolved by this function.
+def inside(root: Path, name: str, source: object, *others: Path, expected: str = "one below it") -> Path:
+    """The path ``name`` below ``root``, or below one of the folders ``others``, with links resolved; it need not exist.
 
-    InputError if it leaves ``root`` (by dots, as an absolute path or by a link), which says what is ``expected``, or is neither a
-    regular file nor a folder; NoFileNameError if no file can have that name.
+    All paths in files are resolved by this function.
+
+    A relative path is that of the first folder in which it exists. InputError if it leaves all of them (by dots, as an absolute
+    path or by a link), which says what is ``expected``, or if it is neither a regular file nor a folder; NoFileNameError if no file
+    can have that name.
     """
     try:
-        path = Path(os.path.realpath(root / name))
-        leaves = not path.is_relative_to(os.path.realpath(root))
+        folders = [os.path.realpath(folder) for folder in (root, *others)]
+        paths = [Path(os.path.realpath(folder / name)) for folder in (root, *others)]
     except (OSError, ValueError) as error:  # NUL, or a lone UTF-16 surrogate
         raise bounded.NoFileNameError(f"{source}: path {quoted(name)} cannot be the name of a file") from error
-    if leaves:
-        told = f", expected {expected}" if expected else ""
+    path = next((path for path in paths if len(paths) == 1 or bounded.kind(path, source)), paths[0])
+    if not any(path.is_relative_to(folder) for folder in folders):
         plain_path = Path(os.path.normpath(root.absolute() / name))
         link = f" by a link, to {quoted(str(path))}" if plain_path.is_relative_to(root.absolute()) else ""
-        raise InputError(f"{source}: path {quoted(name)} leaves its folder {root}{link}{told}")
+        raise InputError(f"{source}: path {quoted(name)} leaves its folder {root}{link}, expected {expected}")
     kind = bounded.kind(path, source)
     if kind not in ("", "a file", "a folder"):
         raise InputError(f"{source}: path {quoted(name)} is {kind}, expected a regular file")

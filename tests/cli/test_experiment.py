@@ -20,6 +20,7 @@ estimators = ["dead_reckoning", "ekf"]
 def file(tmp_path, short_log, monkeypatch):
     """An experiment of two runs, its results in the working folder."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FGLOC_DATA", str(short_log.parent))
     made = tmp_path / "lags.toml"
     made.write_text(TEXT.format(log=short_log))
     return made

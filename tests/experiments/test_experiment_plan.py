@@ -48,11 +48,57 @@ def test_a_glob_stands_for_all_logs_of_a_folder_and_for_known_names(planned):
         ("../logs/t?o", ["two"]),
         ("**/one", ["one"]),
         ("./**/run.toml", ["one", "two"]),
-        ("../l*/one", ["one"]),
     ],
 )
 def test_globs_go_through_folders(planned, glob, found):
     assert [run.log for run in planned(logs=[glob])] == found
+
+
+@pytest.fixture
+def outside(tmp_path, logs):
+    """A folder beside that of the experiment, with a log, a rig and a simulation."""
+    folder = tmp_path / "outside"
+    folder.mkdir()
+    (logs / "two").rename(folder / "two")
+    (folder / "a.rig.toml").write_text("")
+    (folder / "a.toml").write_text("")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        "../outside/two",
+        "{outside}/two",
+        "../outside/*",
+        "../out*/two",
+        "{outside}/*",
+        "linked",
+        "link*",
+        {"log": "one", "rig": "../outside/a.rig.toml"},
+        {"log": "one", "world": "{outside}/a.rig.toml"},
+        {"simulate": "../outside/a.toml"},
+    ],
+)
+def test_an_experiment_leads_to_its_own_folder_or_below_the_data_folder(planned, logs, outside, entry, monkeypatch):
+    monkeypatch.delenv("FGLOC_DATA", raising=False)
+    (logs / "linked").symlink_to(outside / "two")
+    if isinstance(entry, str):
+        entry = entry.format(outside=outside)
+    else:
+        entry = {key: value.format(outside=outside) for key, value in entry.items()}
+    with pytest.raises(InputError, match=r"logs: path .* leaves its folder .*\(--data-root, FGLOC_DATA\)"):
+        planned(logs=[entry])
+
+
+@pytest.mark.parametrize("entry", ["../outside/two", "{outside}/two", "two", "../outside/*", "linked"])
+def test_an_experiment_may_name_logs_below_the_data_folder(planned, logs, outside, entry, monkeypatch):
+    monkeypatch.setenv("FGLOC_DATA", str(outside))
+    (logs / "linked").symlink_to(outside / "two")
+    if "*" in entry:
+        with pytest.raises(InputError, match="leaves its folder"):  # the glob begins above the data folder
+            planned(logs=[entry.replace("outside/", "")])
+    assert [run.log for run in planned(logs=[entry.format(outside=outside)])] == ["two"]
 
 
 @pytest.mark.parametrize("glob", ["**foo", "a**", "/".join(["*"] * 100), "[", "?" * 200, "*/" + "n" * 250])
@@ -158,7 +204,8 @@ def test_a_key_changes_with_everything_that_a_result_depends_on(planned, logs, m
     assert len(set(found)) == len(found)
 
 
-def test_a_key_does_not_change_with_what_a_result_does_not_depend_on(planned, logs):
+def test_a_key_does_not_change_with_what_a_result_does_not_depend_on(planned, logs, monkeypatch):
+    monkeypatch.setenv("FGLOC_DATA", str(logs.parent))
     (before,) = planned(logs=["one"])
     for file in (logs / "one").iterdir():
         file.touch()

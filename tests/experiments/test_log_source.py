@@ -47,3 +47,24 @@ def test_a_log_below_the_data_root(manifest, tmp_path):
     files = RecordedSource(str(manifest), data_root=str(root)).files()
     assert "elsewhere/wheels.csv" in files
     assert "run/wheels.csv" not in files
+
+
+def test_a_rig_below_the_data_root_counts(manifest, tmp_path_factory):
+    root = tmp_path_factory.mktemp("data")
+    (root / "cart.rig.toml").write_text("")
+    manifest.write_text(f'rig = "{root}/cart.rig.toml"\n{MANIFEST}')
+    files = RecordedSource(str(manifest), data_root=str(root)).files()
+    assert files["rig/cart.rig.toml"].is_file()
+    given = RecordedSource(str(manifest), rig=str(root / "cart.rig.toml"))  # in place of that of the manifest
+    assert set(given.files()) == set(files)
+
+
+def test_a_file_that_is_named_outside_of_the_folder_is_not_read(manifest):
+    other = manifest.parent / "below"
+    other.mkdir()
+    moved = manifest.rename(other / "hall.toml")
+    moved.write_text(MANIFEST.replace('path = "run"', 'path = "run"\nrig = "own.rig.toml"'))
+    (other / "run").mkdir()
+    (other / "own.rig.toml").write_text('name = "../tags.csv"\n')
+    (other / "hall.world.toml").write_text("")
+    assert set(RecordedSource(str(moved)).files()) == {"hall.toml", "own.rig.toml", "hall.world.toml"}

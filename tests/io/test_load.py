@@ -1,6 +1,7 @@
 """What a user may name, and the data sets that ship."""
 
 import hashlib
+import shutil
 from pathlib import Path
 
 import pytest
@@ -91,12 +92,17 @@ def test_rig_and_world_replace_those_of_the_log(native, tmp_path):
 
 BAD_MANIFESTS = {
     "path outside": (MANIFEST.replace('"set"', '"../../etc"'), "", "path '../../etc' leaves its folder"),
-    "absolute path": (MANIFEST.replace('"set"', '"/etc/nothing"'), "", "its data /etc/nothing does not exist"),
+    "absolute path": (
+        MANIFEST.replace('"set"', '"/etc/nothing"'),
+        "",
+        "path '/etc/nothing' leaves its folder",
+        "--data-root",
+    ),
     "rig outside": (
         MANIFEST,
-        'rig = "../x.rig.toml"\n',
+        'rig = "../../x.rig.toml"\n',
         "leaves its folder",
-        "expected one below it, an absolute one, or",
+        "or below the data folder (--data-root, FGLOC_DATA); or `--rig FILE` in its place",
     ),
     "no data": (MANIFEST.replace('"set"', '"sat"'), "", "small.toml: its data", "does not exist"),
     "no title": (MANIFEST.replace("title", "titel"), "", "unknown key titel", "did you mean title?"),
@@ -116,18 +122,46 @@ def test_bad_manifests(manifest, tmp_path, refused, text, more, fragments):
     refused(manifest(more, text), *fragments, data_root=tmp_path)
 
 
-def test_absolute_paths_of_a_manifest(manifest, mrclam, tmp_path, one, refused):
-    away = tmp_path / "away"
-    away.mkdir()
-    (away / "cart.rig.toml").write_text('name = "away"\n')
-    (away / "hall.world.toml").write_text('name = "away"\n')
-    more = f'rig = "{away}/cart.rig.toml"\nworld = "{away}/hall.world.toml"\n[options]\nrobot = 1\n'
-    file = manifest(more, MANIFEST.replace('"set"', f'"{mrclam}"'))
-    log = one(file)
+@pytest.fixture
+def away(tmp_path):
+    """A folder with a rig and a map, which is no folder of a manifest."""
+    folder = tmp_path / "away"
+    folder.mkdir()
+    (folder / "cart.rig.toml").write_text('name = "away"\n')
+    (folder / "hall.world.toml").write_text('name = "away"\n')
+    return folder
+
+
+@pytest.mark.parametrize("start", ["{away}", "../away"])
+def test_a_manifest_leads_to_its_own_folder_or_below_the_data_folder(
+    manifest, mrclam, away, one, refused, start, tmp_path
+):
+    start = start.format(away=away)
+    rest = f'rig = "{start}/cart.rig.toml"\nworld = "{start}/hall.world.toml"\n[options]\nrobot = 1\n'
+    file = manifest(rest, MANIFEST.replace('"set"', f'"{mrclam}"'))
+    log = one(file, data_root=tmp_path)
     assert (log.rig.name, log.world.name) == ("away", "away")
-    file = file.rename(away / "run.toml")  # one that comes with the folder of a log
-    for named in (file, away):
-        refused(named, "absolute ones only if it is not named run.toml")
+    refused(file, f"path '{mrclam}' leaves its folder", data_root=away)
+    shutil.copytree(mrclam, file.parent / "set")
+    file = manifest(rest)
+    refused(file, "small.toml: path '", "; or `--rig FILE` in its place")
+    given = {"rig": away / "cart.rig.toml"}
+    refused(file, "small.toml: path '", "; or `--world FILE` in its place", **given)
+    assert one(file, **given, world=away / "hall.world.toml").rig.name == "away"
+    refused(file.rename(file.with_name("run.toml")), "run.toml: path '", "; or `--rig FILE` in its place")
+
+
+def test_links_of_a_manifest_count_by_where_they_lead(manifest, away, one, refused, tmp_path):
+    file = manifest('rig = "linked.rig.toml"\n[options]\nrobot = 1\n')
+    link = file.parent / "linked.rig.toml"
+    (file.parent / "own.rig.toml").write_text('name = "own"\n')
+    link.symlink_to("own.rig.toml")
+    assert one(file, data_root=tmp_path).rig.name == "own"
+    link.unlink()
+    link.symlink_to(away / "cart.rig.toml")
+    assert one(file, data_root=tmp_path).rig.name == "away"
+    shutil.copytree(tmp_path / "set", file.parent / "set")
+    refused(file, "path 'linked.rig.toml' leaves its folder", "`--rig FILE`")
 
 
 def test_a_link_that_leaves_the_data_root(manifest, mrclam, tmp_path, refused):

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,8 @@ from typing import Any
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import kind
 from factorgraph_loc.files.column_mapping import JSON_SUFFIXES
-from factorgraph_loc.files.models import inside, nearest, parse_model, read_toml
+from factorgraph_loc.files.data_root import EXPECTED, find_data_root, named_path
+from factorgraph_loc.files.models import nearest, parse_model, read_toml
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.io.bags.file import is_bag, require_metadata
 from factorgraph_loc.io.checks import look_over, require_bounds
@@ -18,7 +19,7 @@ from factorgraph_loc.io.motions import with_wheels_in, with_wheels_of
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig
 from factorgraph_loc.io.native.world_file import read_world
 from factorgraph_loc.io.readers import registry as readers
-from factorgraph_loc.io.readers.manifests import Manifest, StartSettings, find_data_root, read_manifest
+from factorgraph_loc.io.readers.manifests import Manifest, StartSettings, read_manifest
 from factorgraph_loc.io.readers.pose_file import is_pose_file
 from factorgraph_loc.maps.markers import MarkerSettings
 from factorgraph_loc.model.log import RIG_NOTES, Log
@@ -60,11 +61,12 @@ def load(
     ``log``: a manifest, a folder in the native format or its ``run.toml``, a name in ``manifests()``, a file of poses in TUM, KITTI
     or EuRoC format, or any path with ``reader``.
     ``options``: of the reader, overriding those of a manifest; a list, or text with commas, gives one log per value. ``rig`` and
-    ``world``, values or files, replace those of the log. ``data_root``: folder of data files outside of the manifest's folder, by
+    ``world``, values or files, replace those of the log. ``data_root``: a folder that a manifest may lead to besides its own, by
     default the environment's FGLOC_DATA. InputError describes what is invalid in one line.
     """
     given = dict(options or {})
-    source = _find(str(log), data_root, reader)
+    given_files = [what for what, file in (("rig", rig), ("world", world)) if file is not None]
+    source = _find(str(log), data_root, reader, given_files)
     choices = {key: _choices(value) for key, value in source.options.items()}
     # lists are given as text with commas on the command line
     choices |= {
@@ -112,7 +114,7 @@ def _choices(value: Any) -> list[Any]:
     return list(value) if isinstance(value, (list, tuple)) else [value]
 
 
-def _find(log: str, data_root: str | Path | None, reader: str | None) -> _Source:
+def _find(log: str, data_root: str | Path | None, reader: str | None, given: Collection[str]) -> _Source:
     path = Path(log)
     if reader is not None:
         readers.reader(reader)  # report a wrong reader before a wrong path
@@ -127,21 +129,21 @@ def _find(log: str, data_root: str | Path | None, reader: str | None) -> _Source
     if path.exists() and is_bag(path):
         raise InputError(f"{log}: is a ROS bag: `fgloc manifest {log} > run.toml` proposes how to read it")
     if path.is_file():
-        return _from_file(log, path, data_root)
+        return _from_file(log, path, data_root, given)
     known = manifests()
     if log in known:
-        return _from_manifest(known[log], data_root)
+        return _from_manifest(known[log], data_root, given)
     if path.is_dir():
         require_metadata(path)
         raise InputError(f"{log}: has no {RUN_FILE}, so it is not in the native format; name the reader of its format")
     raise InputError(f"{log}: is neither a file, nor a folder, nor a known data set{nearest(log, list(known))}")
 
 
-def _from_file(log: str, path: Path, data_root: str | Path | None) -> _Source:
+def _from_file(log: str, path: Path, data_root: str | Path | None, given: Collection[str]) -> _Source:
     if path.name == RUN_FILE and "reader" not in read_toml(path):  # a manifest may have this name too
         return _Source("native", path.parent)
     if path.suffix == ".toml":
-        return _from_manifest(path, data_root)
+        return _from_manifest(path, data_root, given)
     if is_pose_file(path):
         return _Source("trajectory", path)
     if path.suffix.lower() in TABLES:
@@ -153,40 +155,33 @@ def _name(path: Path) -> str:
     return path.resolve().stem if path.is_file() else path.resolve().name
 
 
-def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
+def _from_manifest(file: Path, data_root: str | Path | None, given: Collection[str]) -> _Source:
+    """What a manifest describes, without its ``rig`` and ``world`` if these are among those ``given`` in their place."""
     manifest: Manifest = read_manifest(file)
     path = None
     if manifest.path is not None:
-        path = _of_manifest(file, manifest.path)
-        if not path.exists() and not Path(manifest.path).is_absolute():
-            missing = file if file in manifests().values() else f"{file} (which has no {manifest.path} beside it)"
-            path = inside(find_data_root(data_root, missing), manifest.path, file)
+        path = named_path(file.parent, manifest.path, file, data_root)
         if not path.exists():
-            raise InputError(f"{file}: its data {path} does not exist")
+            missing = file if file in manifests().values() else f"{file} (which has no {manifest.path} beside it)"
+            root = find_data_root(data_root, missing)
+            raise InputError(f"{file}: its data {manifest.path} does not exist, neither beside it nor below {root}")
+    named = {what: name for what, name in (("rig", manifest.rig), ("world", manifest.world)) if what not in given}
+    files = {
+        what: named_path(file.parent, name, file, data_root, f"{EXPECTED}; or `--{what} FILE` in its place")
+        for what, name in named.items()
+        if name is not None
+    }
     return _Source(
         reader=manifest.reader,
         path=path,
         name=None if file.name == RUN_FILE else file.stem,
         options=manifest.options,
-        rig=None if manifest.rig is None else read_rig(_of_manifest(file, manifest.rig)),
-        world=None if manifest.world is None else read_world(_of_manifest(file, manifest.world)),
+        rig=read_rig(files["rig"]) if "rig" in files else None,
+        world=read_world(files["world"]) if "world" in files else None,
         start=manifest.start,
         markers=manifest.markers,
         metadata={"title": manifest.title, "licence": manifest.licence, "origin": manifest.origin},
     )
-
-
-def _of_manifest(file: Path, name: str) -> Path:
-    """The path ``name`` below the folder of the manifest ``file``, or an absolute one.
-
-    A manifest is the user's own, but one with the name of ``run.toml`` comes with its folder, out of which no log may lead.
-    """
-    if file.name == RUN_FILE:
-        expected = f"one below it, or below the data folder for path; absolute ones only if it is not named {RUN_FILE}"
-        return inside(file.parent, name, file, expected)
-    if Path(name).is_absolute():
-        return inside(Path(Path(name).anchor), name, file)
-    return inside(file.parent, name, file, "one below it, an absolute one, or for path one below the data folder")
 
 
 def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log:

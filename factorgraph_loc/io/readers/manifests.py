@@ -10,14 +10,12 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.columns import LATEST
+from factorgraph_loc.files.data_root import DATA_ROOT, find_data_root
 from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, inside, parse_model, read_toml
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.maps.markers import MarkerSettings
 from factorgraph_loc.model.log import StartPose
-
-DATA_ROOT = "FGLOC_DATA"
 
 
 class StartSettings(FileModel):
@@ -38,9 +36,8 @@ class StartSettings(FileModel):
 
 
 class Manifest(FileModel):
-    """A manifest. ``path``, ``rig`` and ``world`` are absolute or relative to its folder, ``path`` and the files of ``checksums``
-    (sha256) also to the data root. ``options``: of the reader; a list of values gives several logs. ``markers``: detected in the
-    log's images."""
+    """A manifest. ``path``, ``rig``, ``world`` and the files of ``checksums`` (sha256) lie below its folder or the data folder.
+    ``options``: of the reader; a list of values gives several logs. ``markers``: detected in the log's images."""
 
     title: str
     reader: str
@@ -106,16 +103,3 @@ def verify(manifest: Manifest, data_root: str | Path | None = None) -> list[str]
             if hashlib.file_digest(content, "sha256").hexdigest() != expected:
                 faults.append(f"{file}: is not the file that the manifest describes (its sha256 differs)")
     return faults
-
-
-def find_data_root(data_root: str | Path | None, source: object) -> Path:
-    """The data folder: the argument, else that of the environment; InputError if there is none."""
-    if data_root is None:
-        named = os.environ.get(DATA_ROOT)
-        if not named:
-            raise InputError(f"{source}: needs the data folder: give --data-root or set {DATA_ROOT}")
-        data_root = named
-    folder = Path(data_root)
-    if not folder.is_dir():
-        raise InputError(f"{source}: the data folder {folder} does not exist")
-    return folder
