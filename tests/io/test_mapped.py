@@ -277,3 +277,12 @@ def test_names_of_the_map_and_the_map_are_tables_of_the_folder(hall, one):
 def test_wrong_tables_of_names_and_landmarks(hall, yard, refused, file, text, fragments):
     (yard / file).write_text(text)
     refused(hall, *fragments)
+
+
+def test_bearings_that_are_counted_to_360_degrees(hall, with_options, one):
+    (hall.parent / "run" / "seen.csv").write_text("t,post,bearing\n1,A,350\n2,A,10\n")
+    columns = (
+        '[options.bearing_range]\nfile = "seen.csv"\ncolumns = { t = "t", landmark = "post", bearing = "bearing" }\n'
+    )
+    log = one(with_options(WHEELS + columns + 'units = { t = "s", bearing = "deg" }\n'))
+    np.testing.assert_allclose(log.streams["bearing_range"].bearing, np.radians((-10.0, 10.0)))

@@ -185,10 +185,10 @@ def _table(
     return rows
 
 
-def _in_map(table: TableRows, folder: Path, told: NamesFile, warnings: list[str]) -> TableRows:
+def _in_map(table: TableRows, folder: Path, naming: NamesFile, warnings: list[str]) -> TableRows:
     """The rows of a table with the names of the map, without the rows whose names the table of names lacks."""
-    path = inside(folder, told.file, folder)
-    known = _names(path, told)
+    path = inside(folder, naming.file, folder)
+    known = _names(path, naming)
     ((column, names),) = table.names.items()
     kept = np.flatnonzero([name in known for name in names])
     if not len(kept):
@@ -199,13 +199,13 @@ def _in_map(table: TableRows, folder: Path, told: NamesFile, warnings: list[str]
     return replace(found, names={column: [known[name] for name in found.names[column]]})
 
 
-def _names(path: Path, told: NamesFile) -> dict[str, str]:
+def _names(path: Path, naming: NamesFile) -> dict[str, str]:
     """The names in the map by those in the table of a sensor; InputError if one occurs twice."""
-    mapped = read_mapped(path, told, (("file_name", "name"),))
+    mapped = read_mapped(path, naming, (("file_name", "name"),))
     known: dict[str, str] = {}
     for row, name, meaning in zip(mapped.rows, mapped.names(FILE_NAME), mapped.names(MAP_NAME), strict=True):
         if name in known:
-            raise bad_field(path, told.columns["file_name"], name, "each name once", row=int(row))
+            raise bad_field(path, naming.columns["file_name"], name, "each name once", row=int(row))
         known[name] = meaning
     return known
 
