@@ -59,7 +59,8 @@ class _Shared(FunctionCache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
-            super().save_overload(sig, data)
+            with suppress(OSError):  # the disk is full
+                super().save_overload(sig, data)
         finally:
             self._unlock()
 

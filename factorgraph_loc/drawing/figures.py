@@ -110,8 +110,9 @@ def save(figure: Figure, path: Path) -> None:
     """
     from PIL.Image import Dither, Quantize  # noqa: PLC0415
 
-    full = _drawn(figure, _DPI)
-    full.quantize(256, method=Quantize.FASTOCTREE, dither=Dither.NONE).save(path, format="PNG")
+    out = io.BytesIO()
+    _drawn(figure, _DPI).quantize(256, method=Quantize.FASTOCTREE, dither=Dither.NONE).save(out, format="PNG")
+    path.write_bytes(out.getvalue())
 
 
 def _drawn(figure: Figure, dpi: float) -> Image:

@@ -3,13 +3,11 @@
 Times aside, all files of a run are reproducible to the byte.
 """
 
-import io
 import json
 import math
 import shutil
 import tempfile
 from collections.abc import Mapping
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -23,6 +21,7 @@ from factorgraph_loc.evaluation.aligned import score
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
 from factorgraph_loc.files.models import write_text, write_toml
+from factorgraph_loc.files.tables import write_parquet
 from factorgraph_loc.files.temporary import of_system, require_free, sweep, temporary_folder, writing
 from factorgraph_loc.io.native.world_file import write_world
 from factorgraph_loc.io.results import FILES
@@ -58,20 +57,20 @@ def write_run(
     """
     check_free(out, overwrite=overwrite)
     scores = score(result, log, align)
-    with ExitStack() as stack:
-        with writing(out):
-            out.parent.mkdir(parents=True, exist_ok=True)
-            content = stack.enter_context(temporary_folder(out)) / "run"  # with the permissions of any new folder
+    with writing(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with temporary_folder(out) as temporary:
+            content = temporary / "run"  # with the permissions of any new folder
             content.mkdir()
-        write_files(result, log, scores, content)
-        if (found := map_of(result, log)) is not None:
-            write_world(found, content / MAP)
-        if out.exists():
-            remove_run(out)
-            for path in sorted(content.iterdir(), key=lambda path: path.name == FILES[-1]):
-                path.replace(out / path.name)
-        else:
-            content.replace(out)
+            write_files(result, log, scores, content)
+            if (found := map_of(result, log)) is not None:
+                write_world(found, content / MAP)
+            if out.exists():
+                remove_run(out)
+                for path in sorted(content.iterdir(), key=lambda path: path.name == FILES[-1]):
+                    path.replace(out / path.name)
+            else:
+                content.replace(out)
     return scores
 
 
@@ -81,8 +80,7 @@ def save_run(
     """Write a run as :func:`write_run` does. If that fails, the files go to a new folder in the system's temporary folder, and the
     InputError names it."""
     try:
-        with writing(out):
-            return write_run(result, log, out, align=align, overwrite=overwrite)
+        return write_run(result, log, out, align=align, overwrite=overwrite)
     except InputError as error:
         folder = _keep(result, log, align)
         if folder is None:
@@ -108,9 +106,7 @@ def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: 
     causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
     result.final.write(folder / "final.tum", log.t0_ns)
     causal.write(folder / "causal.tum", log.t0_ns)
-    table = io.BytesIO()  # polars reports a full disk as a file out of specification
-    estimates(result, log).write_parquet(table)
-    (folder / "estimates.parquet").write_bytes(table.getvalue())
+    write_parquet(estimates(result, log), folder / "estimates.parquet")
     write_toml(folder / "config.toml", result.config)
     write_text(folder / "learnt.json", _json(learnt_tables(result.learnt)))
     write_text(folder / "events.csv", events(result, log).write_csv())

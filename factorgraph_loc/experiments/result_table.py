@@ -1,6 +1,5 @@
 """The table of all results of an experiment, with a row per run."""
 
-import io
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,8 @@ from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.store import Store, StoreError
 from factorgraph_loc.files.bounded import kind
-from factorgraph_loc.files.models import replacing
-from factorgraph_loc.files.tables import read_parquet
+from factorgraph_loc.files.tables import read_parquet, write_parquet
+from factorgraph_loc.text import told
 
 INDEX = "results.parquet"
 SWEEP = "sweep."
@@ -33,13 +32,10 @@ def collect(runs: Iterable[PlannedRun], store: Store) -> pl.DataFrame:
 
 def write_index(table: pl.DataFrame, folder: Path) -> None:
     """Write the table into ``folder``, atomically. Raises StoreError if it cannot be written."""
-    content = io.BytesIO()  # polars reports a full disk as a file out of specification
-    table.write_parquet(content)
     try:
-        with replacing(folder / INDEX) as temporary:
-            temporary.write_bytes(content.getvalue())
+        write_parquet(table, folder / INDEX)
     except OSError as error:
-        raise StoreError(f"{folder / INDEX}: cannot be written: {error.strerror or error}") from error
+        raise StoreError(f"{folder / INDEX}: cannot be written: {told(error)}") from error
 
 
 def load_results(path: str | Path) -> pl.DataFrame:

@@ -263,19 +263,31 @@ def file_name(name: str) -> str:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path next to ``path``, which is moved to ``path`` when the block ends without an error."""
-    with temporary_file(path) as temporary:
-        yield temporary
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        temporary.replace(path)
+    """A temporary path next to ``path``, which is moved to ``path`` when the block ends without an error.
+
+    An OSError in the block names ``path``; those for a full disk name no file otherwise.
+    """
+    try:
+        with temporary_file(path) as temporary:
+            yield temporary
+            umask = os.umask(0)
+            os.umask(umask)
+            temporary.chmod(0o666 & ~umask)
+            temporary.replace(path)
+    except OSError as error:
+        raise OSError(error.errno or 0, told(error), str(path)) from error
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file atomically. Libraries should write to memory and this function to the disk: they report a full disk as
+    errors of their own kinds."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # file names need not be UTF-8
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))  # file names need not be UTF-8
 
 
 def write_toml(path: Path, content: Mapping[str, Any]) -> None:

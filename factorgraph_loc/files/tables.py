@@ -14,7 +14,7 @@ import polars as pl
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.bounded import CELLS, DATA, foreign, limited_memory, quiet, read_bytes, require_size
 from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table
-from factorgraph_loc.files.models import Model, nearest, parse_model, read_text, replacing
+from factorgraph_loc.files.models import Model, nearest, parse_model, read_text, write_bytes, write_text
 from factorgraph_loc.text import told
 from factors.se2 import Array, Integers
 
@@ -191,8 +191,9 @@ def read_table(path: Path, tables: Sequence[Table]) -> TableRows:
 
 def write_parquet(frame: pl.DataFrame, path: Path) -> None:
     """Write a table as a Parquet file, atomically."""
-    with replacing(path) as temporary:
-        frame.write_parquet(temporary)
+    content = io.BytesIO()
+    frame.write_parquet(content)
+    write_bytes(path, content.getvalue())
 
 
 def write_table(path: Path, tables: Sequence[Table], columns: Mapping[str, Array | Integers | Sequence[str]]) -> None:
@@ -202,9 +203,9 @@ def write_table(path: Path, tables: Sequence[Table], columns: Mapping[str, Array
     series = [pl.Series(name, column, dtype=kinds[name]) for name, column in columns.items()]
     frame = pl.DataFrame([s.fill_nan(None) if s.dtype.is_float() else s for s in series])
     if path.suffix == ".parquet":
-        frame.write_parquet(path)
+        write_parquet(frame, path)
     else:
-        frame.write_csv(path)
+        write_text(path, frame.write_csv())
 
 
 def _read_csv(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> TableRows:

@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from factorgraph_loc.errors import InputError, unencodable
+from factorgraph_loc.text import told
 
 MARK = ".fgloc-"
 _NAME = re.compile(rf"\..*{re.escape(MARK)}[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
@@ -164,7 +165,7 @@ def writing(path: object) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+        raise InputError(f"{path}: cannot be written: {told(error)}") from error
     except UnicodeEncodeError as error:
         raise InputError(f"{path}: cannot be written: {unencodable(error)}") from error
 

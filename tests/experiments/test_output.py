@@ -104,7 +104,7 @@ def test_nothing_is_left_half_written(result, log, tmp_path, monkeypatch):
         raise OSError("no space left")
 
     monkeypatch.setattr("factorgraph_loc.experiments.output.write_toml", fail)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(InputError, match="out: cannot be written: no space left"):
         write_run(result, log, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, parse_model
-from factorgraph_loc.files.temporary import locked, sweep, temporary_folder
+from factorgraph_loc.files.temporary import locked, sweep, temporary_folder, writing
 from factorgraph_loc.io.bags.fields import Clock, Stamper, as_nanoseconds
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.sensors.camera.settings import CameraSettings
@@ -87,9 +87,10 @@ class Images:
 
     def add(self, item: Stamped, t_ns: int) -> None:
         if self._written is None:
-            self._folder.parent.mkdir(parents=True, exist_ok=True)
-            self._written = self._held.enter_context(temporary_folder(self._folder)) / "images"
-            self._written.mkdir()
+            with writing(self._folder):
+                self._folder.parent.mkdir(parents=True, exist_ok=True)
+                self._written = self._held.enter_context(temporary_folder(self._folder)) / "images"
+                self._written.mkdir()
         where = f"{self._source}:{item.row}"
         if self._compressed:
             content = item.message.data.tobytes()
@@ -99,20 +100,24 @@ class Images:
         else:
             content, suffix = netpbm(item.message, where)
         file = f"{item.row:06d}{suffix}"
-        (self._written / file).write_bytes(content)
+        with writing(self._folder):
+            (self._written / file).write_bytes(content)
         self._rows.append((item.row, as_nanoseconds(item.message.header.stamp, 1), item.received, file))
         self._t_ns.append(t_ns)
 
     def stream(self, t0_ns: int, warnings: list[str]) -> ImageStream:
         """The images; newly extracted ones are moved to the cache folder."""
         if self._written is not None:
-            with (self._written / INDEX).open("w", newline="", encoding="utf-8") as file:
-                csv.writer(file).writerows([COLUMNS, *self._rows])
-            with locked(self._folder.parent / LOCK):
-                if not _read_whole(self._folder):  # otherwise another process was faster, and may be using its files
-                    if self._folder.exists():
-                        self._folder.rename(self._written.with_name("damaged"))
-                    self._written.rename(self._folder)
+            with writing(self._folder):
+                with (self._written / INDEX).open("w", newline="", encoding="utf-8") as file:
+                    csv.writer(file).writerows([COLUMNS, *self._rows])
+                with locked(self._folder.parent / LOCK):
+                    if not _read_whole(
+                        self._folder
+                    ):  # otherwise another process was faster, and may be using its files
+                        if self._folder.exists():
+                            self._folder.rename(self._written.with_name("damaged"))
+                        self._written.rename(self._folder)
             self.discard()
         rows, t_ns = np.array([row[0] for row in self._rows], dtype=np.int64), np.array(self._t_ns, dtype=np.int64)
         keep = checks.images_in_order(self._source, rows, t_ns, warnings)

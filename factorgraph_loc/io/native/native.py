@@ -12,7 +12,7 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.columns import require_span
 from factorgraph_loc.files.models import FileModel, file_name, inside, parse_model, read_toml, write_toml
 from factorgraph_loc.files.tables import TableRows, read_table, write_table
-from factorgraph_loc.files.temporary import sweep, temporary_folder
+from factorgraph_loc.files.temporary import sweep, temporary_folder, writing
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig, write_rig
 from factorgraph_loc.io.native.world_file import parse_world, read_world, write_world
 from factorgraph_loc.io.readers.manifests import StartSettings
@@ -151,14 +151,15 @@ def write_native(
     if not log.streams:
         raise InputError(f"{log.name}: has no measurements, which a log needs: `fgloc export` writes trajectories")
     require_new(folder, overwrite=overwrite)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with temporary_folder(folder) as temporary:
-        content = temporary / "log"  # with the permissions of a new folder; the temporary one is private
-        content.mkdir()
-        write_files(log, content, format)
-        if overwrite and folder.exists():
-            folder.replace(temporary / "before")
-        content.replace(folder)
+    with writing(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with temporary_folder(folder) as temporary:
+            content = temporary / "log"  # with the permissions of a new folder; the temporary one is private
+            content.mkdir()
+            write_files(log, content, format)
+            if overwrite and folder.exists():
+                folder.replace(temporary / "before")
+            content.replace(folder)
 
 
 def require_new(folder: Path, *, overwrite: bool = False) -> None:
@@ -180,9 +181,9 @@ def write_files(log: Log, folder: Path, format: str) -> None:
     run: dict[str, Any] = {"name": log.name, "rig": f"{base}.rig.toml", "world": f"{base}.world.toml"}
     write_rig(log.rig, folder / run["rig"])
     write_world(log.world, folder / run["world"])
-    writing = Writing(log.name, log.t0_ns, folder)
+    context = Writing(log.name, log.t0_ns, folder)
     for name, stream in log.streams.items():
-        for table, columns in disassemble(channel(name), stream, writing).items():
+        for table, columns in disassemble(channel(name), stream, context).items():
             write_table(folder / f"{table}.{format}", native_tables()[table][1], columns)
     if log.reference is not None:
         run["has_heading"] = log.reference.has_heading
