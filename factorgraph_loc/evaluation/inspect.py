@@ -9,6 +9,7 @@ import numpy as np
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.interfaces import Summary
 from factorgraph_loc.sensors.registry import functions
+from factorgraph_loc.text import one_line
 from factors.se2 import Array
 
 LONG_GAP = 5.0  # s
@@ -66,7 +67,7 @@ def inspect(log: Log) -> Inspection:
         problems.append(_gaps("reference", reference.gaps))
     sensors = {name: summarize(log) for name, summarize in functions("summarize")}
     problems += [line for summary in sensors.values() for line in summary.problems]
-    return Inspection(streams, reference, tuple(problems), sensors)
+    return Inspection(streams, reference, tuple(map(one_line, problems)), sensors)
 
 
 def _summary(t: Array) -> StreamSummary:

@@ -4,6 +4,7 @@ CSV with any separator, with or without header, or JSON lines. The cells are rea
 
 import csv
 import re
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -209,7 +210,8 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
     body: Iterator[tuple[int, list[str]]] = chain([(first_row, first)], parsed)
     if not mapping.header:
         kept = list(body)
-        of_numbers = {int(column) - 1: values for column, values in mapping.chosen().items() if column.isdecimal()}
+        numbers = {str(i + 1): i for i in range(max(len(parts) for _, parts in kept))}
+        of_numbers = {numbers[column]: values for column, values in mapping.chosen().items() if column in numbers}
         # rows of other kinds may have other numbers of columns
         first_row, first = next((one for one in kept if _is_chosen(one[1], of_numbers)), kept[0])
         header = [str(i) for i in range(1, len(first) + 1)]
@@ -231,8 +233,12 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
             raise bad_field(path, "row", ",".join(parts), f"{len(header)} values: {','.join(header)}", row=row)
         rows.append(row)
         table.append(parts)
-    wanted = [column for column in mapping.columns.values() if column in header]
-    columns = {column: [parts[header.index(column)] for parts in table] for column in wanted}
+    counts = Counter(header)
+    wanted = [column for column in mapping.columns.values() if column in counts]
+    if twice := [column for column in wanted if counts[column] > 1]:
+        raise InputError(f"{path}:{first_row}: has the column {quoted(twice[0])} more than once")
+    places = {column: header.index(column) for column in wanted}
+    columns = {column: [parts[place] for parts in table] for column, place in places.items()}
     return Cells(path, rows, columns), header, unwanted
 
 

@@ -111,6 +111,10 @@ def test_strengths_in_columns(hall, with_options, one, refused, head, columns, m
     (hall.parent / "run" / "wide.csv").write_text(text.replace("-70", "weak"))
     refused(with_options(WHEELS + WIDE.format(columns=columns, more=more)), "wide.csv:3", "'weak', expected a number")
     refused(with_options(WHEELS + WIDE.format(columns=columns.replace("*", "*x"), more=more)), "has no column '")
+    first, last = head.split(";")[-2:]
+    (hall.parent / "run" / "wide.csv").write_text(text.replace(last, first))
+    twice = with_options(WHEELS + WIDE.format(columns=columns, more=more))
+    refused(twice, f"wide.csv:1: has the column '{first}' more than once")
 
 
 def test_rows_of_one_kind(hall, with_options, one):

@@ -10,6 +10,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.interfaces import Paragraph, Summary
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.text import listed
 
 STOPPED = 10.0  # s; an antenna without rounds for longer before the end has stopped
 CLOCK_STEP = 1.0  # s
@@ -112,11 +113,11 @@ def rfid_problems(log: Log, found: RfidSummary) -> list[str]:
     out = []
     if found.unread:
         out.append(
-            f"{len(found.unread)} of {len(log.world.tags)} tags of the map are never read: {_some(found.unread)}"
+            f"{len(found.unread)} of {len(log.world.tags)} tags of the map are never read: {listed(found.unread, SHOWN)}"
         )
     if found.unknown:
         reads = sum(found.unknown.values())
-        out.append(f"{reads} reads are of {len(found.unknown)} tags that the map lacks: {_some(tuple(found.unknown))}")
+        out.append(f"{reads} reads are of {len(found.unknown)} tags that the map lacks: {listed(found.unknown, SHOWN)}")
     carried = log.rig.of(RfidSettings).all_antennas() if log.rig.find(RfidSettings) else {}
     out += [
         f"antenna {name} is not on the rig: {antenna.reads} reads, {antenna.rounds} rounds"
@@ -151,8 +152,3 @@ def _clock_trouble(log: Log, found: RfidSummary) -> list[str]:
         if excess > CLOCK_STEP:
             out.append(f"the reads reach {excess:.1f} s {side} the odometry: do their clocks agree?")
     return out
-
-
-def _some(names: tuple[str, ...]) -> str:
-    more = len(names) - SHOWN
-    return ", ".join(names[:SHOWN]) + (f" and {more} more" if more > 0 else "")
