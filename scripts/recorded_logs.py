@@ -6,8 +6,8 @@ from pathlib import Path
 from rfid_aisle_log import read_rfid_aisle
 from woods_log import read_woods
 
+from factorgraph_loc.files.data_root import find_data_root
 from factorgraph_loc.io.readers import describe, read_log
-from factorgraph_loc.io.readers.manifests import find_data_root
 from factorgraph_loc.model.log import Log
 
 WOODS, AISLE = "utias/dataset2.mat", "rfid_aisle"  # in the data folder
