@@ -13,13 +13,13 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import bounded, checks
 from factorgraph_loc.files.models import FileModel, parse_model
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
-from factorgraph_loc.io.readers.left_out import not_read
-from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.log import NOT_READ, Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.landmarks.settings import Landmark
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
+from factorgraph_loc.text import listed
 from factors import se2
 from factors.se2 import Array, Integers
 
@@ -62,7 +62,7 @@ def read(path: Path | None, options: Options) -> Log:
         reference=Trajectory(checks.seconds(truth_ns, t0_ns), poses, has_heading=HAS_HEADING[options.run]),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
-        metadata=not_read([*others, "TD: column 2"]),
+        metadata={NOT_READ: listed([*others, "TD: column 2"])},
     )
 
 

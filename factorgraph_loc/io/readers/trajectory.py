@@ -11,19 +11,19 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.models import inside
+from factorgraph_loc.files.models import inside, read_text
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
-from factorgraph_loc.io.readers.left_out import columns_after, not_read
 from factorgraph_loc.io.readers.mapped_poses import after_rest
 from factorgraph_loc.io.readers.pose_file import EUROC, read_pose_file, stamps_of
-from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.log import NOT_READ, Log
 from factorgraph_loc.model.planar import Turned, on_floor
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import PosePath
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
+from factorgraph_loc.text import listed
 from factors.se2 import Integers
 
 RATE = 10.0  # Hz, of KITTI's camera
@@ -51,14 +51,28 @@ def read(path: Path | None, options: Options) -> Log:
     if found.t_ns is None and options.axes is None and not _beside(path).is_file():
         options = options.model_copy(update={"axes": "optical"})
     t = checks.seconds(t_ns, t0_ns)
-    told = not_read(columns_after(path, len(EUROC)))
-    bare = Log(path.stem, Rig(name=path.stem, sensors=()), World(name=path.stem), {}, t0_ns=t0_ns, metadata=told)
+    names = _columns_after(path, len(EUROC))
+    left_out = {NOT_READ: listed(names)} if names else {}
+    bare = Log(path.stem, Rig(name=path.stem, sensors=()), World(name=path.stem), {}, t0_ns=t0_ns, metadata=left_out)
     poses = on_floor(path, found.positions, found.rotations, warnings, options)
     if options.use == "reference":
         return replace(bare, reference=Trajectory(t, poses), warnings=tuple(warnings))
     moves = after_rest(motions.between_poses(path, t_ns, poses, warnings))
     odometry = IncrementStream(t, *moves.T)
     return replace(bare, rig=DEFAULT_RIG, streams={"odometry": odometry}, warnings=tuple(warnings))
+
+
+def _columns_after(path: Path, count: int) -> list[str]:
+    """The columns of a table with commas after the first ``count``: their names in the comment above the rows, or numbers."""
+    names: list[str] = []
+    for line in read_text(path).splitlines():
+        if line.lstrip().startswith("#"):
+            names = [name.strip(" #") for name in line.split(",")]
+        elif line.strip():
+            width = line.count(",") + 1
+            known = names if len(names) == width else [f"column {i}" for i in range(1, width + 1)]
+            return [f"{path.name}: {name}" for name in known[count:]]
+    return []
 
 
 def _stamps(path: Path, found: PosePath, times: str | None, warnings: list[str]) -> Integers:
