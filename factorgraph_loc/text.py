@@ -52,6 +52,11 @@ def one_line(message: str) -> str:
     return plain(message.strip(), MESSAGE)
 
 
+def plain_lines(text: str) -> str:
+    """A text of several lines in which non-printable characters other than line ends are escaped, for files that people print."""
+    return "\n".join(plain(line, None) for line in text.split("\n"))
+
+
 def shortened(text: str, limit: int) -> str:
     """``text``, with the middle cut out if it has more than ``limit`` characters."""
     if len(text) <= limit:

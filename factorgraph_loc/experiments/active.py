@@ -37,7 +37,7 @@ from factorgraph_loc.planning.policies import POLICIES
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.processes import run_each
 from factorgraph_loc.simulation.settings import SimulationSettings
-from factorgraph_loc.text import quoted, told
+from factorgraph_loc.text import plain_lines, quoted, told
 from factorgraph_loc.version import __version__
 
 CHUNK = 10  # runs per process, as starting a process takes longer than a run
@@ -235,9 +235,11 @@ def track_of(run: ActiveRun) -> SeekingTrack:
 def write_tables(rows: Sequence[Row], out: Path) -> None:
     """Write ``results.parquet``, ``results.csv``, ``differences.csv`` and ``table.md`` into a folder."""
     table = pl.DataFrame(rows, schema=ROW)
-    write_text(out / "results.csv", table.write_csv())
-    write_text(out / "differences.csv", pl.DataFrame(differences(rows), schema=DIFFERENCES).write_csv())
-    write_text(out / "table.md", markdown(*summary_cells(rows)) + "\n" + markdown(*difference_cells(rows)))
+    write_text(out / "results.csv", plain_lines(table.write_csv()))
+    compared = pl.DataFrame(differences(rows), schema=DIFFERENCES)
+    write_text(out / "differences.csv", plain_lines(compared.write_csv()))
+    text = markdown(*summary_cells(rows)) + "\n" + markdown(*difference_cells(rows))
+    write_text(out / "table.md", plain_lines(text))
     write_parquet(table, out / "results.parquet")
 
 

@@ -30,7 +30,7 @@ from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import Alignment, check_max_gap, check_tick_gap
 from factorgraph_loc.processes import run_each
-from factorgraph_loc.text import quoted
+from factorgraph_loc.text import plain_lines, quoted
 
 _ERROR = "error.txt"
 _BEGUN = "unfinished.txt"  # exists until a comparison is finished, with a digest of its arguments
@@ -235,12 +235,13 @@ def _row(job: _Job, outcome: _Outcome | Exception) -> dict[str, Any]:
 def _write_tables(rows: Sequence[Mapping[str, Any]], out: Path, *, rpe: bool) -> None:
     table = pl.DataFrame(rows, infer_schema_length=None)
     write_parquet(table, out / "results.parquet")
-    write_text(out / "results.csv", table.write_csv())
-    write_text(out / "differences.csv", pl.DataFrame(differences(rows), schema=DIFFERENCES).write_csv())
+    write_text(out / "results.csv", plain_lines(table.write_csv()))
+    compared = pl.DataFrame(differences(rows), schema=DIFFERENCES)
+    write_text(out / "differences.csv", plain_lines(compared.write_csv()))
     text = markdown(*comparison_cells(rows))
     for title, columns in further_tables(rows, rpe=rpe).items():
         text += f"\n{title}\n\n{markdown(*comparison_cells(rows, columns))}"
-    write_text(out / "table.md", text)
+    write_text(out / "table.md", plain_lines(text))
 
 
 def _write_page(rows: Sequence[Mapping[str, Any]], work: Sequence[_Job], out: Path, *, rpe: bool) -> None:

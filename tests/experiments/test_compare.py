@@ -102,3 +102,13 @@ def test_what_a_killed_run_has_left_beside_its_place_is_removed(log, tmp_path):
     (place / ".seed0.fgloc-0123abcd" / "final.tum").write_text("half")
     compare([log], [RunConfig("dead_reckoning", prior="reference")], tmp_path / "out")
     assert list(place.iterdir()) == []
+
+
+@pytest.mark.usefixtures("runs_here", "blank_pictures")
+def test_no_terminal_obeys_the_tables_of_a_log_with_any_name(log, tmp_path):
+    configs = [RunConfig("dead_reckoning"), RunConfig("ekf")]
+    compare([replace(log, name="a\x1b[31m\u202eb")], configs, tmp_path / "out")
+    for name in ("table.md", "results.csv", "differences.csv"):
+        text = (tmp_path / "out" / name).read_text()
+        assert all(line.isprintable() for line in text.split("\n")), name
+        assert "\\x1b[31m\\u202e" in text, name
