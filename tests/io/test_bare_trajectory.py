@@ -75,3 +75,12 @@ def test_bad_options_and_files_are_refused(tmp_path, refused):
     refused(tmp_path / "a.csv", "is a table: describe its columns in a manifest")
     (tmp_path / "a.txt").write_text("hello\n")
     refused(tmp_path / "a.txt", "is not a manifest (.toml); name the reader of this format")
+
+
+def test_further_columns_are_named(tmp_path, one):
+    path = tmp_path / "truth.csv"
+    rows = "".join(f"{10**9 * i},{i},0,0,1,0,0,0,0.1\n" for i in (1, 2))
+    path.write_text(rows)
+    assert one(path).metadata["not read"] == "truth.csv: column 9"
+    path.write_text(f"#timestamp, x, y, z, qw, qx, qy, qz, v_x [m s^-1]\n{rows}")
+    assert one(path).metadata["not read"] == "truth.csv: v_x [m s^-1]"
