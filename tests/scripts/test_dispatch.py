@@ -30,7 +30,7 @@ KEPT = {
     "simulation/filming.py": (1, "who renders images makes the stream of them"),
     "simulation/settings.py": (2, "presets are rigs, as files would say them"),
     "slam/monoslam_sighting.py": (
-        4,
+        3,
         "monoSLAM is made of one sensor, and asks which of the camera's channels are used",
     ),
 }
