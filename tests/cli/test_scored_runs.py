@@ -3,21 +3,7 @@
 import json
 import shutil
 
-import numpy as np
-import polars as pl
 import pytest
-
-from factorgraph_loc.model.trajectory import Trajectory, read_tum, write_tum
-
-
-@pytest.fixture
-def sparse_log(short_log, tmp_path):
-    """The log with a pose of the reference every 0.13 s, between the ticks."""
-    shutil.copytree(short_log, tmp_path / "sparse")
-    whole = read_tum(short_log / "reference.tum")
-    t = np.arange(whole.t[0] + 0.03, whole.t[-1], 0.13)
-    write_tum(Trajectory(t, whole.at(t)), tmp_path / "sparse/reference.tum")
-    return tmp_path / "sparse", len(t)
 
 
 def test_relative_errors_and_an_alignment_are_shown_where_they_are_asked_for(fgloc, short_log, tmp_path):
@@ -52,41 +38,6 @@ def test_relative_errors_and_an_alignment_are_shown_where_they_are_asked_for(fgl
     page = (tmp_path / "out/report.html").read_text()
     assert "final aligned position RMSE" in page
     assert "m per s" in page
-
-
-def test_a_sparse_reference_is_scored_and_how_often_stands_beside_it(fgloc, sparse_log, tmp_path):
-    log, count = sparse_log
-    result = fgloc("run", log, "-e", "ekf", "-o", tmp_path / "run")
-    assert result.exit_code == 0, result.output
-    (header,) = [line for line in result.stdout.splitlines() if "position RMSE" in line]
-    assert header.split()[-2:] == ["poses", "scored"]
-    scored = [line.split()[-1] for line in result.stdout.splitlines() if line.split()[:1] in (["causal"], ["final"])]
-    assert scored == [str(count)] * 2
-    assert json.loads((tmp_path / "run/metrics.json").read_text())["causal.scored"] == count
-    result = fgloc("compare", log, "-e", "ekf,batch", "-o", tmp_path / "two", "--jobs", 1)
-    assert result.exit_code == 0, result.output
-    lines = [line.split() for line in result.stdout.splitlines()]
-    assert [line[-2:] for line in lines if line[:1] == ["short"]] == [[str(count), "1/1"]] * 2
-    table = pl.read_csv(tmp_path / "two/results.csv")
-    assert table["causal.scored"].to_list() == [count, None]
-    assert table["final.scored"].to_list() == [count, count]
-    errors = pl.read_parquet(tmp_path / "run/estimates.parquet").filter(pl.col("kind") == "causal")["error_position"]
-    assert len(errors.drop_nulls()) == pytest.approx(count, abs=1)
-
-
-@pytest.mark.parametrize("command", ["run", "compare"])
-def test_where_estimates_lie_farther_apart_than_allowed_nothing_is_scored(fgloc, sparse_log, tmp_path, command):
-    log, count = sparse_log
-    result = fgloc(command, log, "-e", "ekf", "-o", tmp_path / "out", "--max-gap", 0.05, "--json")
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
-    scores = found if command == "run" else found["runs"][0]
-    # those alone that are met by a tick
-    assert scores["causal.scored"] < 0.2 * count
-    assert scores["scoring.max_gap"] == 0.05
-    refused = fgloc(command, log, "-e", "ekf", "-o", tmp_path / "none", "--max-gap", 0)
-    assert refused.exit_code == 2
-    assert refused.stderr.strip() == "error: max_gap is 0, expected a time above 0 s"
 
 
 @pytest.fixture

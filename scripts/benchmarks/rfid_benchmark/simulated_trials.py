@@ -44,7 +44,7 @@ class SimulatedTrial:
 
 @dataclass(frozen=True)
 class SimulatedTrialJob:
-    """Trials of a ``kind``, one with each of the ``seeds``; ``deadline`` [s]; ``sensors``: those used, None for all of the rig."""
+    """Trials of a ``kind``, one with each of the ``seeds``; ``deadline`` [s]."""
 
     kind: Kind
     simulation: SimulationSettings
@@ -52,7 +52,6 @@ class SimulatedTrialJob:
     estimator: str
     deadline: float
     settings: Mapping[str, Any] = field(default_factory=dict)
-    sensors: tuple[str, ...] | None = None
 
 
 class Clock:
@@ -82,7 +81,7 @@ def start_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
 def started(log: Log, job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     """The trial on the log of such a drive."""
     clock = Clock()
-    result = run(log, RunConfig(job.estimator, job.settings, job.sensors, prior="unknown", seed=seed), watch=clock)
+    result = run(log, RunConfig(job.estimator, job.settings, prior="unknown", seed=seed), watch=clock)
     first = float(log.streams["rfid"].t[0])
     good = is_right(result, log)
     claims = np.flatnonzero(np.array(result.status) == "localized")
@@ -105,7 +104,7 @@ def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     other = float(log.reference.t[np.argmax(away if away.any() else later)])
     before = cut(log, 0.0, BEFORE)
     carried = join(before, cut(log, other, other + after), gap=JUMP)
-    result = run(carried, RunConfig(job.estimator, job.settings, job.sensors, prior="reference", seed=seed))
+    result = run(carried, RunConfig(job.estimator, job.settings, prior="reference", seed=seed))
     stamps = carried.streams["rfid"].t
     first = float(stamps[stamps > max(before.streams["rfid"].t)][0])
     good = is_right(result, carried)
