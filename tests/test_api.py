@@ -33,16 +33,6 @@ def test_the_package_is_light_and_knows_its_verbs():
     assert done.stdout == "True True\n"
 
 
-def test_what_is_no_verb_is_no_attribute():
-    with pytest.raises(AttributeError, match="no attribute 'runn'"):
-        fgloc.runn  # noqa: B018
-
-
-def test_datasets_and_info(office):
-    assert "plaza2" in {dataset.name for dataset in fgloc.datasets()}
-    assert {"odometry", "rfid"} <= set(fgloc.info(office).streams)
-
-
 def test_a_run_has_the_scores_of_its_files(office, tmp_path):
     kept = fgloc.run(office, "ekf", sensors=["odometry", "bearing_range"], seed=2, out=tmp_path / "run")
     assert json.loads((tmp_path / "run/metrics.json").read_text())["final.position_rmse"] == pytest.approx(
@@ -131,15 +121,6 @@ def test_an_experiment_gives_its_table(tmp_path):
     assert "dead_reckoning" in page.read_text()
 
 
-def test_map_writes_a_world(office, tmp_path):
-    made = fgloc.build_map(office, tmp_path / "seen.world.toml", of="landmarks", estimator="ekf")
-    assert set(fgloc.read_world(tmp_path / "seen.world.toml").landmarks) == set(made.world.landmarks) != set()
-    assert (tmp_path / "seen.map.png").is_file()
-    assert "the robot starts at" in made.frame  # few landmarks in common with the given map
-    with pytest.raises(fgloc.InputError, match="exists already"):
-        fgloc.build_map(office, tmp_path / "seen.world.toml", of="landmarks", estimator="ekf")
-
-
 def test_another_rig_and_map_are_values_or_files(office, tmp_path):
     blind = office.rig.model_copy(update={"sensors": ("odometry",)})
     blind.write(tmp_path / "blind.rig.toml")
@@ -193,18 +174,6 @@ def test_a_bag_gets_a_manifest(tmp_path):
         fgloc.manifest(tmp_path / "drive.bag", tmp_path / "other/drive.toml")
 
 
-def test_what_there_is_to_choose_from(tmp_path):
-    settings = {one.name: {setting.key for setting in one.settings} for one in fgloc.known_estimators()}
-    assert "lag" in settings["smoother"]
-    assert "phase" in {column.name for column in fgloc.known_sensors()[2].tables["reads"]}
-    assert "topic" in {option.key.split(".")[-1] for one in fgloc.known_readers() for option in one.options}
-    assert fgloc.known_rigs()["plaza"] == fgloc.read_log("plaza2").rig
-    made = fgloc.new_rig("cart", antennas=2, out=tmp_path / "cart.rig.toml")
-    assert fgloc.Rig.read(tmp_path / "cart.rig.toml") == made
-    with pytest.raises(fgloc.InputError, match="exists already"):
-        fgloc.new_rig(out=tmp_path / "cart.rig.toml")
-
-
 def test_a_robot_seeks_its_place(tmp_path):
     told = []
     found = fgloc.active(
@@ -219,10 +188,3 @@ def test_a_robot_seeks_its_place(tmp_path):
     assert told == [(0, 1), (1, 1)]
     with pytest.raises(fgloc.InputError, match="unknown key max_meters: did you mean max_metres"):
         fgloc.active("symmetric", tmp_path / "other", changes={"max_meters": 1.0})
-
-
-def test_a_misspelt_name_of_a_log_is_told():
-    with pytest.raises(
-        fgloc.InputError, match="neither a file, nor a folder, nor a known data set: did you mean plaza2"
-    ):
-        fgloc.info("plazza2")

@@ -93,15 +93,6 @@ def test_what_cannot_be_loaded_is_one_line(install, place, why):
     assert str(error.value) == f"sensors: sonar of sonar-package cannot be loaded from {place}: {why}"
 
 
-@pytest.mark.usefixtures("sonar")
-def test_what_is_no_sensor_is_refused(install):
-    install(("sensors", "sonar", "sonar:Guess"))
-    with pytest.raises(
-        InputError, match=r"^sensors: sonar of sonar-package has no channels, which the interface requires$"
-    ):
-        registry.sensors()
-
-
 def test_a_name_stands_for_one_thing(install, sonar):
     install(("estimators", "ekf", "sonar:Guess"))
     with pytest.raises(
@@ -115,11 +106,6 @@ def test_a_name_stands_for_one_thing(install, sonar):
     install(("sensors", "sonar", "sonar:SENSOR"))
     with pytest.raises(InputError, match=r"^sensors: sonar and camera both have the channel sightings$"):
         registry.sensors()
-
-
-def test_an_unknown_channel_is_told_with_the_nearest():
-    with pytest.raises(InputError, match=r"^no sensor is called 'rfdi': did you mean rfid\?$"):
-        registry.sensor_of("rfdi")
 
 
 @pytest.mark.parametrize("name", SENSORS.own)

@@ -155,13 +155,6 @@ def test_a_clock_that_jumps_costs_no_ticks(log, name, far):
     assert result.config["tick_gap"] == 60.0
 
 
-def test_stamps_that_are_no_times_of_a_log(log):
-    for far in (np.nan, np.inf, 1e300):
-        stream = replace(log.streams["odometry"], t=np.append(log.streams["odometry"].t[:-1], far))
-        with pytest.raises(InputError, match="has a timestamp"):
-            run(replace(log, streams={"odometry": stream}), RunConfig("fake", prior="0,0,0"))
-
-
 def test_what_an_estimator_cannot_compute_is_one_line(log, fake, monkeypatch):
     def fail(_, measurement):
         if measurement.t > 0.5:
@@ -238,13 +231,6 @@ def test_a_log_that_tells_nothing_of_its_start_begins_at_the_origin(log, fake):
     # in a map of what its sensors see, the origin is a place like any other
     with pytest.raises(InputError, match="cannot start from an unknown pose"):
         run(replace(log, reference=None), RunConfig("fake"))
-
-
-def test_unknown_start_where_supported(log, fake, monkeypatch):
-    monkeypatch.setattr(fake, "supports_unknown_start", True)
-    result = run(log, RunConfig("fake", {"localized_at": 1.0}, prior="unknown"))
-    assert "initialize" not in [kind for kind, _ in fake.made.calls]
-    assert result.first_localized() == 10
 
 
 def test_same_seed_same_result(log):

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.sensors.rfid.map import Tag
-from factorgraph_loc.simulation import preset, textures
+from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.renderer import Renderer
 from factorgraph_loc.simulation.scene import ROOM_HEIGHT, make_scene
 from factorgraph_loc.simulation.settings import ImageSettings
 from factorgraph_loc.simulation.worlds import Plan, make_plan
 from factors.camera import model as reprojection
-from factors.camera.model import CameraModel
 
 MODEL = preset("office").rig.camera.model()
 BARREL = dataclasses.replace(MODEL, distortion=(-0.25, 0.05, 2e-3, -1e-3))
@@ -246,31 +245,3 @@ def test_nothing_but_black_is_seen_outside(room):
     camera = reprojection.camera_pose(MODEL, np.array((-9.0, -9.0, np.pi)))
     assert not renderer.image(*camera).any()
     assert np.isnan(renderer.hits(np.array(((320.0, 240.0),)), *camera)).all()
-
-
-def test_a_camera_in_a_wall_or_over_an_edge_or_nowhere_does_no_harm(room):
-    """Rays along a face and straight down, pixels that are none."""
-    renderer = Renderer(room, MODEL)
-    for position in ((4.0, 1.0, 1.0), (4.0, 3.0, 1.0), (6.0, 5.0, 0.0), (3.0, 4.5, 1.0)):
-        for angles in ((0.0, 0.0, np.pi / 2.0), (0.0, np.pi / 2.0, 0.0), (0.0, 0.0, 0.0)):
-            image = renderer.image(np.array(position), reprojection.mounting(*angles))
-            assert image.shape == (480, 640, 3)
-    camera = reprojection.camera_pose(MODEL, POSE)
-    assert np.isnan(renderer.hits(np.array(((np.nan, 3.0),)), *camera)[0]).all()
-    with pytest.raises(ValueError, match="expected finite numbers"):
-        renderer.image(np.full(3, np.nan), np.eye(3))
-
-
-def test_memory_of_a_large_building_is_bounded():
-    plan = make_plan(preset("warehouse", {"world": {"width": 100.0, "depth": 80.0}}).world, np.random.default_rng(0))
-    scene = make_scene(plan, (), np.random.default_rng(0))
-    assert scene.texels.nbytes < 300e6
-
-
-def test_another_image_size(room):
-    small = CameraModel(200.0, 200.0, 79.5, 59.5, 160, 120, position=MODEL.position, rotation=MODEL.rotation)
-    assert Renderer(room, small).image(*reprojection.camera_pose(small, POSE)).shape == (120, 160, 3)
-
-
-def test_tiles_cover_a_floor_where_texels_do_not_divide_them():
-    assert textures.floor(np.random.default_rng(0), 1101, 905, 0.005976).shape == (1101, 905, 3)
