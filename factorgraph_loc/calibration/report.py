@@ -6,16 +6,12 @@ from typing import Any
 
 from factorgraph_loc.calibration.calibrate import Calibration, Scores, estimator_for
 from factorgraph_loc.calibration.learn import calibrators
-from factorgraph_loc.drawing.markup import Rows, number, table, text
+from factorgraph_loc.drawing.pages import Part, Rows, number, sectioned
 from factorgraph_loc.fitting.constants import FittedConstant
 from factors.se2 import Array
 
 KINDS = ("causal", "final")
 FIGURES = {"position RMSE [m]": ("position_rmse", 3), "heading RMSE [rad]": ("heading_rmse", 4), "ANEES": ("anees", 1)}
-_STYLE = """body{font:15px/1.45 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}
-table{border-collapse:collapse;margin:1em 0}td,th{padding:.2em .7em;border-bottom:1px solid #ddd;text-align:right}
-th:first-child,td:last-child{text-align:left}tbody th{font-weight:normal}.wide{overflow-x:auto}img{max-width:100%}
-.doubt{background:#fff4d6;padding:.5em 1em;margin:.4em 0}"""
 
 
 def constants_table(constants: Sequence[FittedConstant]) -> Rows:
@@ -120,24 +116,17 @@ def _figures(values: Array) -> dict[str, float]:
 
 def page(calibration: Calibration) -> str:
     """The report as one HTML page with embedded plots."""
-    parts = [
-        f"<h1>Calibration of {text(calibration.rig.name)}</h1>",
-        f"<p>From {text(', '.join(calibration.logs))}. {text(_verdict(calibration))}</p>",
-        *(f'<p class="doubt">{text(doubt)}</p>' for doubt in calibration.doubts),
-        "<h2>Constants</h2>",
-        f"<p>{_how(calibration)}</p>",
-        table(*_long_constants(calibration)),
-        "<h2>Noise</h2>",
-        *(part for calibrator, told in calibration.told() for part in calibrator.told_noise(told)),
-        *(part for calibrator, told in calibration.told() for part in calibrator.told_section(told)),
-        *_judgements(calibration),
-        *_accuracy(calibration),
-    ]
+    sections: dict[str, Sequence[Part]] = {
+        "Constants": [_how(calibration), _long_constants(calibration)],
+        "Noise": [part for calibrator, told in calibration.told() for part in calibrator.report_noise(told)],
+    }
+    for calibrator, told in calibration.told():
+        sections |= calibrator.report_section(told)
+    sections |= _judgements(calibration) | _accuracy(calibration)
     for calibrator, told in reversed(list(calibration.told())):
-        parts += calibrator.told_residuals(told)
-    title = f"Calibration of {text(calibration.rig.name)}"
-    head = f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style></head>'
-    return f"{head}<body>\n" + "\n".join(parts) + "\n</body></html>\n"
+        sections |= calibrator.report_residuals(told)
+    lead = f"From {', '.join(calibration.logs)}. {_verdict(calibration)}"
+    return sectioned(f"Calibration of {calibration.rig.name}", lead, calibration.doubts, sections)
 
 
 def _how(calibration: Calibration) -> str:
@@ -157,21 +146,19 @@ def _how(calibration: Calibration) -> str:
     )
 
 
-def _accuracy(calibration: Calibration) -> list[str]:
+def _accuracy(calibration: Calibration) -> dict[str, Sequence[Part]]:
     """The accuracy of the judging estimator, if there is a reference."""
     if calibration.turns:
-        return []
+        return {}
     unseen = (
-        "The rows <i>from the other logs</i> are cross-validated: only the factor on the noise has used the log."
+        "The rows from the other logs are cross-validated: only the factor on the noise has used the log."
         if calibration.held_out
         else "With one log there is no cross-validation: test the rig on another log."
     )
-    return [
-        f"<h2>Accuracy of the {_estimator(calibration)}</h2>",
-        "<p>ANEES is ideal at 3 (at 2 without the reference's heading); above it the estimator is overconfident. "
-        f"{unseen}</p>",
-        table(*accuracy_table(calibration)),
-    ]
+    explained = (
+        "ANEES is ideal at 3 (at 2 without the reference's heading); above it the estimator is overconfident. " + unseen
+    )
+    return {f"Accuracy of the {_estimator(calibration)}": [explained, accuracy_table(calibration)]}
 
 
 def _verdict(calibration: Calibration) -> str:
@@ -198,17 +185,16 @@ def _long_constants(calibration: Calibration) -> Rows:
     return (*header, *parts, "differs between logs by", "why"), long
 
 
-def _judgements(calibration: Calibration) -> list[str]:
+def _judgements(calibration: Calibration) -> dict[str, Sequence[Part]]:
     if not calibration.judgements:
-        return []
+        return {}
     whose = "the other logs" if len(set(calibration.logs)) > 1 else "the other parts of the log"
-    return [
-        "<h2>Selection</h2>",
-        f"<p>The {_estimator(calibration)} ran on held-out stretches with each parameter as learnt from {whose} (new), and without "
+    explained = (
+        f"The {_estimator(calibration)} ran on held-out stretches with each parameter as learnt from {whose} (new), and without "
         "it (old). A parameter is accepted if it improves the score, which combines accuracy and consistency [nats per pose], "
-        "significantly, and increases no error by more than 2 %. Otherwise the rig keeps the input value.</p>",
-        table(*judgements_table(calibration)),
-    ]
+        "significantly, and increases no error by more than 2 %. Otherwise the rig keeps the input value."
+    )
+    return {"Selection": [explained, judgements_table(calibration)]}
 
 
 def _estimator(calibration: Calibration) -> str:

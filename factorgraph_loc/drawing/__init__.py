@@ -1,3 +1,3 @@
-"""The style of plots, and helpers for HTML pages."""
+"""The style of plots, and HTML pages from templates."""
 
-__all__ = ["figures", "markup"]
+__all__ = ["figures", "pages"]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from factorgraph_loc.drawing.pages import Picture
 from factorgraph_loc.text import plain
 
 if TYPE_CHECKING:
@@ -96,11 +97,22 @@ def drawing(figure: Figure) -> Iterator[None]:
         yield
 
 
-def png(figure: Figure) -> bytes:
-    """Return the figure as a PNG image."""
+def png(figure: Figure) -> Picture:
+    """Return the figure as a PNG image for a page."""
     out = io.BytesIO()
     _drawn(figure, _PAGE_DPI).save(out, format="PNG")
-    return out.getvalue()
+    return Picture.of("image/png", out.getvalue())
+
+
+def svg(figure: Figure) -> Picture:
+    """Return the figure as an SVG image for a page; the same figure gives the same bytes."""
+    from matplotlib import rc_context  # noqa: PLC0415
+
+    out = io.BytesIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "factorgraph-loc"}), drawing(figure):
+        _lay_out(figure)
+        figure.savefig(out, format="svg", metadata={"Creator": None, "Date": None, "Format": None, "Type": None})
+    return Picture.of("image/svg+xml", out.getvalue())
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -180,11 +180,11 @@ def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Tra
                 continue
             e = errors(trajectory, reference, track.max_gap)
             for row, (what, _) in enumerate(rows):
-                _distribution(axes[row, column], getattr(e, what), label=estimator, **style)
+                distribution(axes[row, column], getattr(e, what), label=estimator, **style)
     for row, (what, unit) in enumerate(rows):
         for axis in axes[row]:
             axis.set(xlabel=f"{what} error [{unit}]", ylabel="share of times below")
-        _same_range(axes[row])
+        same_range(axes[row])
     legend(figure, axes[0])
     return figure
 
@@ -197,7 +197,7 @@ def update_times(log: Log, tracks: Mapping[str, Track]) -> Figure:
         if track.causal is None:  # an offline estimator only collects in its updates
             axis.plot([], [], label=f"{estimator} (offline)", **style)
         else:
-            _distribution(axis, track.update_ms, label=estimator, **style)
+            distribution(axis, track.update_ms, label=estimator, **style)
     axis.set(xlabel="time per update [ms]", ylabel="share of updates below")
     legend(figure, axes[0])
     return figure
@@ -268,7 +268,8 @@ def _extent(e: Errors, trajectory: Trajectory, row: int) -> float:
     return 1.15 * float(np.percentile(values, 99.5)) + 1e-6 if len(values) else 1.0
 
 
-def _distribution(axis: Axes, values: Array, **style: Any) -> None:
+def distribution(axis: Axes, values: Array, **style: Any) -> None:
+    """Plot the cumulative distribution of values on a logarithmic axis."""
     values = np.sort(values[np.isfinite(values)])
     axis.set(xscale="log", ylim=(0.0, 1.0))
     if len(values):
@@ -276,8 +277,8 @@ def _distribution(axis: Axes, values: Array, **style: Any) -> None:
         axis.plot(np.maximum(values, 1e-6), np.arange(1, len(values) + 1) / len(values), linewidth=2.0, **style)
 
 
-def _same_range(axes: Any) -> None:
-    """The same x axis for causal and final, without the smallest hundredth of the errors."""
+def same_range(axes: Any) -> None:
+    """Give all axes the same x range, without the smallest hundredth of the values."""
     drawn = [line.get_xdata() for axis in axes for line in axis.lines]
     if drawn:
         low = min(float(np.percentile(x, 1.0)) for x in drawn)

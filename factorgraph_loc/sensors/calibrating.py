@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from factorgraph_loc.drawing.markup import Rows
+from factorgraph_loc.drawing.pages import Part, Rows
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fitting.constants import FittedConstant, describe
 from factorgraph_loc.fitting.robust import Constant, Fit, blocks, fit, folds, gains, is_worth
@@ -196,17 +196,17 @@ class Calibrator:
         """Additional tables."""
         return ()
 
-    def told_noise(self, _told: Told) -> Sequence[str]:
-        """HTML of the sensor's noise."""
+    def report_noise(self, _told: Told) -> Sequence[Part]:
+        """The report on the sensor's noise."""
         return ()
 
-    def told_section(self, _told: Told) -> Sequence[str]:
-        """HTML of an additional section."""
-        return ()
+    def report_section(self, _told: Told) -> dict[str, Sequence[Part]]:
+        """Additional sections of the report, by title."""
+        return {}
 
-    def told_residuals(self, _told: Told) -> Sequence[str]:
-        """HTML of the residuals."""
-        return ()
+    def report_residuals(self, _told: Told) -> dict[str, Sequence[Part]]:
+        """Sections of the report on the residuals, by title."""
+        return {}
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ def test_a_key_depends_on_what_a_run_imports_and_on_nothing_else(copied):
         "factorgraph_loc/drawing/figures.py",
         "factorgraph_loc/evaluation/plots.py",
         "factorgraph_loc/evaluation/report/page.py",
-        "factorgraph_loc/evaluation/report/assets/page.css",
+        "factorgraph_loc/drawing/templates/page.css",
         "factorgraph_loc/experiments/reporting.py",
         "factorgraph_loc/sensors/rfid/calibration/learn.py",
     ):

@@ -11,6 +11,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from factorgraph_loc.drawing import figures
+from factorgraph_loc.drawing.pages import Picture
+from factorgraph_loc.evaluation.report import plots
 from factorgraph_loc.experiments.execute import run_planned
 
 
@@ -60,8 +62,13 @@ def leave_blank(patch):
         with figures.drawing(figure):
             return Image.new("RGB", (round(figure.get_figwidth() * dpi), 1), "white")
 
+    def svg(figure):
+        with figures.drawing(figure):
+            return Picture.of("image/svg+xml", b"")
+
     def draw(*_):
         pytest.fail("a figure is drawn after all: blank_pictures has to replace what does it")
 
     patch.setattr(figures, "_drawn", drawn)
+    patch.setattr(plots, "svg", svg)
     patch.setattr(Figure, "draw", draw)

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from factorgraph_loc.evaluation.inference import Pooled
+
 DEFAULT = (
     "causal.position_rmse",
     "final.position_rmse",
@@ -33,6 +35,16 @@ class Metric:
     def text(self, value: float, *, sign: bool = False) -> str:
         """A formatted value without the unit."""
         return number(self.factor * value, sign=sign)
+
+    def range(self, least: float, most: float, *, sign: bool = False) -> str:
+        """A formatted range."""
+        return f"{self.text(least, sign=sign)} … {self.text(most, sign=sign)}"
+
+    def uncertainty(self, figure: Pooled) -> str:
+        """The interval, or else the range: ``[0.1, 0.2]`` or ``0.1 … 0.2``; empty for a single value."""
+        if figure.low is not None and figure.high is not None:
+            return f"[{self.text(figure.low)}, {self.text(figure.high)}]"
+        return self.range(figure.least, figure.most) if figure.count > 1 else ""
 
 
 def metric_of(key: str) -> Metric:

@@ -9,7 +9,6 @@ from typing import Any
 
 import polars as pl
 
-from factorgraph_loc.drawing.markup import Html, data
 from factorgraph_loc.evaluation.inference import (
     SIGNIFICANT,
     ByLog,
@@ -26,10 +25,9 @@ from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.report.scene import Scene
 from factorgraph_loc.evaluation.report.tracks import KINDS, Series
 from factorgraph_loc.evaluation.warned import label_of
-from factors.se2 import Array
 
-POSES = 200_000  # on the page, shared by all trajectories
-FEWEST, MOST = 60, 1200  # bounds for one trajectory
+POSES = 120_000  # on the page, shared by all trajectories
+FEWEST, MOST = 60, 1000  # bounds for one trajectory
 TRACKS = 1000  # maximum number of runs with trajectories; further logs appear in tables only
 _ESTIMATES, _CONFIG = "estimates.parquet", "config.toml"
 SWEEP = "sweep."
@@ -52,18 +50,17 @@ class RunFiles:
 class RunData:
     """The data read from all runs.
 
-    ``tracks``: packed trajectories of each log in ``logs``, as elements of the page. ``errors``: by kind, log and variant,
+    ``tracks``: by log, its scene and thinned trajectories, as plain values. ``errors``: by kind, then by variant and log,
     quantiles of the position error [m]. ``nees``: by variant and log, mean NEES of the causal poses per degree of freedom;
-    ``trust``: by variant, the mean over logs and its 95 % band for correct covariances. ``configs``: ``text`` of the
-    configuration of a ``run``; ``versions``: of the software used by the first run.
+    ``trust``: by variant, the mean over logs and its 95 % band for correct covariances. ``configs``: the configuration of each
+    drawn run, by its description; ``versions``: of the software used by the first run.
     """
 
-    tracks: list[Html] = field(default_factory=list)
-    logs: list[str] = field(default_factory=list)
-    errors: dict[str, list[list[list[float]]]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
+    tracks: dict[str, dict[str, Any]] = field(default_factory=dict)
+    errors: dict[str, dict[tuple[str, str], list[float]]] = field(default_factory=lambda: {kind: {} for kind in KINDS})
     nees: dict[tuple[str, str], float] = field(default_factory=dict)
     trust: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    configs: list[dict[str, str]] = field(default_factory=list)
+    configs: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
 
 
@@ -82,34 +79,30 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
     for log in results.logs:
         drawn: list[dict[str, Any]] = []
         scene: Scene | None = None
-        of_log: dict[str, list[list[float]]] = {kind: [] for kind in KINDS}
         for place, variant in enumerate(results.variants):
             row = chosen.get((variant, log))
             if row is None:
-                for quantiles in of_log.values():
-                    quantiles.append([])
                 continue
             files = runs(str(row["key"]))
             scene = scene or files.scene
-            series = tracks.read_series(files.read(_ESTIMATES), files.scene.t0_ns if files.scene else None)
+            series = _series(files)
             if left > 0:
-                packed = {kind: tracks.pack(s, poses) for kind, s in series.items()}
-                drawn.append({"v": place, "seed": row["seed"], **packed})
+                plain = {kind: tracks.thinned(s, poses) for kind, s in series.items()}
+                drawn.append({"v": place, "seed": row["seed"], **plain})
                 _add_config(found, f"{variant}, {log}, seed {row['seed']}", files.read(_CONFIG).decode())
             if (trust := _consistency(row, series)) is not None:
                 counts.setdefault(variant, []).append(trust)
                 found.nees[variant, log] = trust[0]
-            others = [other for other in results.runs(variant, log) if other is not row and other["status"] == "ok"]
-            every = [(row, _errors(series)), *((other, _read_errors(runs, other)) for other in others)]
-            for kind, quantiles in of_log.items():
-                scored = [e[kind] for one, e in every if kind in e and score(one, f"{kind}.position_rmse") is not None]
-                quantiles.append(tracks.quantiles(scored))
-        for kind, quantiles in of_log.items():
-            found.errors[kind].append(quantiles)
+            well = [one for one in results.runs(variant, log) if one["status"] == "ok"]
+            every = [(one, series if one is row else _series(runs(str(one["key"])))) for one in well]
+            for kind in KINDS:
+                scored = [
+                    s[kind].error for one, s in every if kind in s and score(one, f"{kind}.position_rmse") is not None
+                ]
+                if quantiles := tracks.quantiles(scored):
+                    found.errors[kind][variant, log] = quantiles
         if drawn:
-            content = {"scene": scene.content() if scene else None, "runs": drawn}
-            found.tracks.append(data(f"track-{len(found.logs)}", content))
-            found.logs.append(log)
+            found.tracks[log] = {"scene": scene.content() if scene else None, "runs": drawn}
             left -= len(drawn)
     for variant, values in counts.items():
         means, independent, dofs = zip(*values, strict=True)
@@ -118,12 +111,8 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
     return found
 
 
-def _read_errors(runs: Callable[[str], RunFiles], row: Row) -> dict[str, Array]:
-    return tracks.read_errors(runs(str(row["key"])).read(_ESTIMATES))
-
-
-def _errors(series: Mapping[str, Series]) -> dict[str, Array]:
-    return {kind: of.known_errors() for kind, of in series.items()}
+def _series(files: RunFiles) -> dict[str, Series]:
+    return tracks.read_series(files.read(_ESTIMATES), files.scene.t0_ns if files.scene else None)
 
 
 def _consistency(row: Row, series: Mapping[str, Series]) -> tuple[float, float, int] | None:
@@ -133,7 +122,7 @@ def _consistency(row: Row, series: Mapping[str, Series]) -> tuple[float, float, 
 
 
 def _add_config(found: RunData, run: str, text: str) -> None:
-    found.configs.append({"run": run, "text": text})
+    found.configs[run] = text
     if not found.versions:
         content = tomllib.loads(text)
         found.versions = {str(name): str(version) for name, version in content.get("versions", {}).items()}
@@ -161,6 +150,22 @@ class MetricComparison:
     reference: str
     contrasts: dict[str, Contrast]
     p: dict[str, float | None]
+
+    @property
+    def tied(self) -> list[str]:
+        """The variants that a test has not found to differ from the reference, where it could have."""
+        return [v for v, p in self.p.items() if self.can_tell and p is not None and not self.is_significant(v)]
+
+    @property
+    def different(self) -> list[str]:
+        """The variants that differ significantly from the reference."""
+        return [v for v in self.contrasts if self.is_significant(v)]
+
+    @property
+    def incomplete(self) -> list[str]:
+        """The variants that lack some of the logs of the best."""
+        assert self.best is not None
+        return [v for v, c in self.contrasts.items() if c.count < self.pooled[self.best].count]
 
     @property
     def can_tell(self) -> bool:

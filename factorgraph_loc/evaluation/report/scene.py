@@ -44,11 +44,11 @@ class Scene:
         )
 
     def content(self) -> dict[str, Any]:
-        """The scene as plain values, in millimetres."""
+        """The scene as plain values, to a millimetre."""
         return {
-            "walls": _millimetres(self.walls),
-            **{name: _millimetres(places) for name, places in self.layers.items()},
-            "reference": [_millimetres(piece) for piece in self.reference],
+            "walls": _plain(self.walls),
+            **{name: _plain(places) for name, places in self.layers.items()},
+            "reference": [_plain(piece) for piece in self.reference],
         }
 
     def write(self, path: Path) -> None:
@@ -60,23 +60,20 @@ class Scene:
         """Read the file of :meth:`write`. Raises OSError or ValueError if it is missing or damaged."""
         found = _SceneFile.model_validate_json(path.read_bytes())
         return cls(
-            walls=_metres(found.walls, 4),
-            layers={name: _metres(places, 2) for name, places in (found.__pydantic_extra__ or {}).items()},
-            reference=tuple(_metres(piece, 2) for piece in found.reference),
+            walls=np.array(found.walls).reshape(-1, 4),
+            layers={name: np.array(one).reshape(-1, 2) for name, one in (found.__pydantic_extra__ or {}).items()},
+            reference=tuple(np.array(piece).reshape(-1, 2) for piece in found.reference),
             t0_ns=found.t0_ns,
         )
 
 
-_Whole = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+class _SceneFile(BaseModel, extra="allow", allow_inf_nan=False):
+    """The stored file: coordinates [m], also of each layer of the map."""
 
-
-class _SceneFile(BaseModel, extra="allow"):
-    """The stored file: flattened coordinates [mm], also of each layer of the map."""
-
-    __pydantic_extra__: dict[str, list[_Whole]]
-    walls: list[_Whole]
-    reference: list[list[_Whole]]
-    t0_ns: _Whole
+    __pydantic_extra__: dict[str, list[tuple[float, float]]]
+    walls: list[tuple[float, float, float, float]]
+    reference: list[list[tuple[float, float]]]
+    t0_ns: Annotated[int, Field(ge=-(2**63), lt=2**63)]
 
 
 def _thinned(one: Marks) -> Array:
@@ -95,9 +92,5 @@ def _pieces(log: Log) -> tuple[Array, ...]:
     )
 
 
-def _millimetres(values: Array) -> list[int]:
-    return [int(v) for v in np.rint(1e3 * values).ravel()]
-
-
-def _metres(values: list[int], columns: int) -> Array:
-    return np.array(values, dtype=float).reshape(-1, columns) / 1e3
+def _plain(values: Array) -> list[list[float]]:
+    return [[round(v, 3) for v in row] for row in values.tolist()]

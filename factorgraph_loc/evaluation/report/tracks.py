@@ -1,9 +1,8 @@
-"""Trajectories and errors of runs, decimated and packed as small integers to limit the size of the page."""
+"""Trajectories and errors of runs, decimated and rounded to limit the size of the page."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -15,21 +14,7 @@ from factors.se2 import Array
 
 KINDS = ("causal", "final")
 LEVELS = np.linspace(0.0, 1.0, 51)  # of the plotted distribution of errors
-_COLUMNS = (
-    "kind",
-    "t_ns",
-    "x",
-    "y",
-    "cov_xx",
-    "cov_xy",
-    "cov_yy",
-    "cov_hh",
-    "error_position",
-    "error_heading",
-    "nees",
-    "status",
-)
-_LARGEST = 30000  # largest packed value, for four to five digits
+_NUMBERS = ("x", "y", "cov_xx", "cov_xy", "cov_yy", "error_position", "error_heading", "nees")
 
 
 @dataclass(frozen=True)
@@ -37,7 +22,7 @@ class Series:
     """One kind of trajectory of a run, N poses; NaN where unknown.
 
     ``t`` (N,) [s from the log's start]; ``x``, ``y`` [m]; ``error`` [m] and ``sigma`` [m]: twice the standard deviation in the
-    least certain direction; ``heading_error`` and ``heading_sigma`` (twice) [rad]; ``nees`` and its ``dof``.
+    least certain direction; ``nees`` and its ``dof``.
     """
 
     t: Array
@@ -45,14 +30,8 @@ class Series:
     y: Array
     error: Array
     sigma: Array
-    heading_error: Array
-    heading_sigma: Array
     nees: Array
     dof: int
-
-    def known_errors(self) -> Array:
-        """The position errors [m] of poses that have a reference."""
-        return _known(self.error)
 
 
 def read_series(estimates: bytes, t0_ns: int | None) -> dict[str, Series]:
@@ -60,31 +39,17 @@ def read_series(estimates: bytes, t0_ns: int | None) -> dict[str, Series]:
 
     Times are relative to ``t0_ns``, by default to the first tick.
     """
-    table = parse_estimates(estimates, NAME, _COLUMNS)
-    columns = {name: _numbers(table[name]) for name in _COLUMNS if name not in ("kind", "t_ns", "status")}
-    t_ns = table["t_ns"].to_numpy()
-    t = (t_ns - (int(t_ns.min(initial=2**62)) if t0_ns is None else t0_ns)) / 1e9
-    return {kind: _series(t[rows], {k: v[rows] for k, v in columns.items()}) for kind, rows in _kinds(table).items()}
-
-
-def read_errors(estimates: bytes) -> dict[str, Array]:
-    """The known position errors [m] of ``estimates.parquet`` by kind; see :func:`read_series`."""
-    table = parse_estimates(estimates, NAME, ("kind", "status", "error_position"))
-    errors = _numbers(table["error_position"])
-    return {kind: _known(errors[rows]) for kind, rows in _kinds(table).items()}
-
-
-def _kinds(table: pl.DataFrame) -> dict[str, slice]:
-    """The rows of each kind, which are contiguous."""
-    kind = table["kind"].to_numpy()
+    table = parse_estimates(estimates, NAME, ("kind", "t_ns", "status", *_NUMBERS))
+    start_ns = table["t_ns"].min() if t0_ns is None else t0_ns
     found = {}
-    for name in KINDS:
-        rows = np.flatnonzero(kind == name)
-        if name == "causal" and len(rows):
-            localized = np.flatnonzero(table["status"].to_numpy()[rows] == "localized")
-            rows = rows[localized[0] :] if len(localized) else rows[:0]
+    for kind in KINDS:
+        rows = table.filter(pl.col("kind") == kind)
+        if kind == "causal":
+            localized = (rows["status"] == "localized").arg_true()
+            rows = rows[int(localized[0]) :] if len(localized) else rows.clear()
         if len(rows):
-            found[name] = slice(int(rows[0]), int(rows[-1]) + 1)
+            t = ((rows["t_ns"] - start_ns) / 1e9).to_numpy()
+            found[kind] = _series(t, {name: _numbers(rows[name]) for name in _NUMBERS})
     return found
 
 
@@ -94,39 +59,29 @@ def _numbers(column: pl.Series) -> Array:
 
 def _series(t: Array, columns: Mapping[str, Array]) -> Series:
     xx, xy, yy = (columns[f"cov_{name}"] for name in ("xx", "xy", "yy"))
-    largest = (xx + yy) / 2.0 + np.sqrt(np.square((xx - yy) / 2.0) + np.square(xy))
     with np.errstate(invalid="ignore"):
-        sigma, heading_sigma = 2.0 * np.sqrt(largest), 2.0 * np.sqrt(columns["cov_hh"])
-    return Series(
-        t=t,
-        x=columns["x"],
-        y=columns["y"],
-        error=columns["error_position"],
-        sigma=sigma,
-        heading_error=columns["error_heading"],
-        heading_sigma=heading_sigma,
-        nees=columns["nees"],
-        dof=3 if np.isfinite(columns["error_heading"]).any() else 2,
-    )
+        sigma = 2.0 * np.sqrt((xx + yy) / 2.0 + np.sqrt(np.square((xx - yy) / 2.0) + np.square(xy)))
+    dof = 3 if np.isfinite(columns["error_heading"]).any() else 2
+    return Series(t, columns["x"], columns["y"], columns["error_position"], sigma, columns["nees"], dof)
 
 
-def pack(series: Series, count: int) -> dict[str, Any]:
-    """About ``count`` poses: of each interval of time those with the smallest and the largest position error."""
+def thinned(series: Series, count: int) -> dict[str, list[float | None]]:
+    """About ``count`` poses as plain values, to a millimetre and a millisecond; None where unknown.
+
+    ``t``, ``x``, ``y``, ``e`` (position error) and ``s`` (sigma). Of each interval of time there are the poses with the smallest
+    and with the largest error.
+    """
     keep = _thin(series.error, count)
+    columns = {"t": series.t, "x": series.x, "y": series.y, "e": series.error, "s": series.sigma}
     return {
-        "t": _pack(series.t[keep], deltas=True),
-        "x": _pack(series.x[keep], deltas=True),
-        "y": _pack(series.y[keep], deltas=True),
-        "e": _pack(series.error[keep]),
-        "s": _pack(series.sigma[keep]),
-        "h": _pack(np.degrees(series.heading_error[keep])),
-        "g": _pack(np.degrees(series.heading_sigma[keep])),
+        name: [round(v, 3) if math.isfinite(v) else None for v in values[keep].tolist()]
+        for name, values in columns.items()
     }
 
 
 def quantiles(errors: Sequence[Array]) -> list[float]:
     """Quantiles of the pooled errors of several runs at ``LEVELS``, with four digits."""
-    known = np.concatenate(errors) if errors else np.empty(0)
+    known = _known(np.concatenate(errors)) if errors else np.empty(0)
     return [float(f"{q:.4g}") for q in np.quantile(known, LEVELS)] if len(known) else []
 
 
@@ -151,17 +106,3 @@ def _thin(error: Array, count: int) -> NDArray[np.int64]:
     largest = np.argmax(np.where(known, padded, -math.inf), axis=1)
     starts = np.arange(0, len(error), size)
     return np.unique(np.concatenate((starts + least, starts + largest, [0, len(error) - 1])))
-
-
-def _pack(values: Array, *, deltas: bool = False) -> dict[str, Any]:
-    """Integers ``v`` in units of ``u``, a power of ten, null where unknown; with ``deltas`` as differences."""
-    known = _known(values)
-    largest = float(np.max(np.abs(known))) if len(known) else 0.0
-    unit = 10.0 ** math.ceil(math.log10(largest / _LARGEST)) if largest > 0.0 else 1.0
-    if deltas:
-        whole = np.rint(values / unit).astype(np.int64)
-        return {"u": unit, "d": np.diff(whole, prepend=0).tolist()}
-    return {
-        "u": unit,
-        "v": [round(v / unit) if math.isfinite(v) else None for v in values.tolist()] if len(known) else [],
-    }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,10 +12,9 @@ import polars as pl
 from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
-from factorgraph_loc.drawing.markup import Html, Rows, image, number, table, tag
+from factorgraph_loc.drawing.pages import Part, Rows, number, sectioned
 from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.pairing import pauses
-from factorgraph_loc.evaluation.report import remark, whole_page
 from factorgraph_loc.evaluation.trajectories.score import HOW, PoseErrors, TrajectoryScore
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import require_free, writing
@@ -170,27 +170,15 @@ def extents(score: TrajectoryScore) -> dict[str, str]:
 
 def page(score: TrajectoryScore) -> str:
     """The report as one HTML page."""
-    rmse, count = score.figures["ape.position_rmse"], len(score.estimate)
-    sections: list[tuple[str, str, list[Html]]] = [
-        ("errors", "Errors", [remark(EXPLAINED), table(*errors_table(score), class_="figures")]),
-        *(
-            (name, name.replace("-", " ").capitalize(), [remark(CAPTIONS[name]), image(png(figure))])
-            for name, figure in plots(score).items()
-        ),
-        ("comparison", "How they were compared", [table(("", ""), extents(score).items())]),
-    ]
-    if score.warnings:
-        sections.append(("warnings", "Warnings", [tag("p", warning) for warning in score.warnings]))
-    lead = tag(
-        "p",
-        f"The position error (RMSE) of {score.estimate.name} is {number(rmse)} m, over {count} poses of {score.reference.name}.",
+    lead = (
+        f"The position error (RMSE) of {score.estimate.name} is {number(score.figures['ape.position_rmse'])} m, over "
+        f"{len(score.estimate)} poses of {score.reference.name}."
     )
-    body = [
-        tag("section", lead, class_="lead", id="summary"),
-        *(tag("section", tag("h2", title), *content, id=f"{name}-section") for name, title, content in sections),
-    ]
-    links = [(f"{name}-section", title) for name, title, _ in sections]
-    return whole_page(f"{score.estimate.name} against {score.reference.name}", links, body)
+    sections: dict[str, Sequence[Part]] = {"Errors": [EXPLAINED, errors_table(score)]}
+    for name, figure in plots(score).items():
+        sections[name.replace("-", " ").capitalize()] = [CAPTIONS[name], png(figure)]
+    sections["How they were compared"] = [(("", ""), list(extents(score).items()))]
+    return sectioned(f"{score.estimate.name} against {score.reference.name}", lead, score.warnings, sections)
 
 
 def _association(score: TrajectoryScore) -> str:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
-from factorgraph_loc.drawing.markup import Rows, image, number, table
+from factorgraph_loc.drawing.pages import Part, Picture, Rows, number
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.fitting.robust import Fit, folds, gains
@@ -138,38 +138,40 @@ class LandmarkCalibrator(ConstantsCalibrator):
             },
         }
 
-    def told_noise(self, told: Told) -> list[str]:
+    def report_noise(self, told: Told) -> list[Part]:
         """The scatter, and the noise in the rig."""
         scatter, settings, trial = told.learnt.bearing_range, told.rig.bearing_range, told.trial
         if told.found is None or scatter is None or settings is None:
             return []
-        out = []
+        out: list[Part] = []
         if SCATTER not in told.accepted:
-            out.append("<p>The noise of the sightings is rejected: the rig keeps that of the input.</p>")
-        rows = [
+            out.append("The noise of the sightings is rejected: the rig keeps that of the input.")
+        rows: list[tuple[str, ...]] = [
             (f"{n} [{unit}]", number(getattr(scatter, n)), number(getattr(settings, n))) for n, unit in SIGMAS.items()
         ]
-        out.append(table(("noise of the sightings", "scatter", "in the rig"), rows))
+        out.append((("noise of the sightings", "scatter", "in the rig"), rows))
         if trial is not None and SCATTER in told.accepted:
             out.append(
-                f"<p>The scatter was multiplied by {trial.factor:.2f} to make the EKF consistent "
-                f"(ANEES over its ideal value: {trial.causal:.2f} causal, {trial.final:.2f} final).</p>"
+                f"The scatter was multiplied by {trial.factor:.2f} to make the EKF consistent "
+                f"(ANEES over its ideal value: {trial.causal:.2f} causal, {trial.final:.2f} final)."
             )
         return out
 
-    def told_residuals(self, told: Told) -> list[str]:
+    def report_residuals(self, told: Told) -> dict[str, Sequence[Part]]:
         """The residuals of the sightings and their autocorrelation."""
         if told.found is None:
-            return []
-        return [
-            "<h2>Correlation of consecutive errors</h2>",
-            "<p>Estimators assume independent errors. If the correlation is far above 0, many sightings contain little more "
-            "information than one, and the noise in the rig must be larger than the scatter.</p>",
-            table(*_correlations(told)),
-            "<h2>Residuals of the sightings</h2>",
-            image(sightings_figure(told.found.seen, told.learnt.bearing_range)),
-            image(correlation_figure(told.found.seen, told.details)),
-        ]
+            return {}
+        explained = (
+            "Estimators assume independent errors. If the correlation is far above 0, many sightings contain little more "
+            "information than one, and the noise in the rig must be larger than the scatter."
+        )
+        return {
+            "Correlation of consecutive errors": [explained, _correlations(told)],
+            "Residuals of the sightings": [
+                sightings_figure(told.found.seen, told.learnt.bearing_range),
+                correlation_figure(told.found.seen, told.details),
+            ],
+        }
 
 
 def _sightings(log: Log) -> Sightings:
@@ -195,7 +197,7 @@ def _correlations(told: Told) -> Rows:
 CALIBRATOR = LandmarkCalibrator()
 
 
-def sightings_figure(seen: Sequence[Sightings], settings: BearingRangeSettings) -> bytes:
+def sightings_figure(seen: Sequence[Sightings], settings: BearingRangeSettings) -> Picture:
     """Residuals of range and bearing: their distribution, over range, and over time."""
     errors = [one.errors(settings) for one in seen]
     rows = [(0, "range", "m"), (1, "bearing", "rad")]
@@ -226,7 +228,7 @@ def sightings_figure(seen: Sequence[Sightings], settings: BearingRangeSettings) 
     return png(figure)
 
 
-def correlation_figure(seen: Sequence[Sightings], correlations: Sequence[Correlation]) -> bytes:
+def correlation_figure(seen: Sequence[Sightings], correlations: Sequence[Correlation]) -> Picture:
     """Autocorrelation of the residuals of one landmark, for each log."""
     columns = [(0, "range"), (1, "bearing")]
     columns = [c for c in columns if any(np.isfinite(one.function[:, c[0]]).any() for one in correlations)]

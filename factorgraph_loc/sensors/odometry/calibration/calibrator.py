@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
-from factorgraph_loc.drawing.markup import Rows, image, number, table
+from factorgraph_loc.drawing.pages import Part, Picture, Rows, number
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.fitting.robust import Constant, Fit, folds, gains
@@ -155,33 +155,32 @@ class OdometryCalibrator(ConstantsCalibrator):
         ]
         return [(("wheels", "in the rig", "with its scales"), rows)] if rows else []
 
-    def told_noise(self, told: Told) -> list[str]:
+    def report_noise(self, told: Told) -> list[Part]:
         """The growth of each error."""
         noise: NoiseFit | None = told.details
         if noise is None:
             return []
-        out = []
+        out: list[Part] = []
         if NOISE not in told.accepted:
-            out.append("<p>The noise of the odometry below is rejected: the rig keeps that of the input.</p>")
+            out.append("The noise of the odometry below is rejected: the rig keeps that of the input.")
         rows = [
             (error, *(number(v) for v in (g.per_distance, g.per_rotation, g.per_time)))
             for error, g in noise.growth.items()
         ]
         header = ("error of the odometry [m, m, rad]", "per sqrt(m)", "per sqrt(rad)", "per sqrt(s)")
-        out.append(table(header, rows))
-        out += [table(*one) for one in self.tables(told)]
+        out += [(header, rows), *self.tables(told)]
         out.append(
-            f"<p>{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise was multiplied by "
-            f"{noise.widened:.2f}, so that it is valid for half a minute without landmarks.</p>"
+            f"{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise was multiplied by "
+            f"{noise.widened:.2f}, so that it is valid for half a minute without landmarks."
         )
         return out
 
-    def told_residuals(self, told: Told) -> list[str]:
+    def report_residuals(self, told: Told) -> dict[str, Sequence[Part]]:
         """Plots of the residuals of the windows."""
         if told.found is None:
-            return []
+            return {}
         figure = odometry_figure(told.found.parts, odometry_model(told.learnt))
-        return ["<h2>Residuals of the odometry</h2>", image(figure)]
+        return {"Residuals of the odometry": [figure]}
 
 
 def _wheels(rig: Rig) -> list[tuple[str, float, float]]:
@@ -197,7 +196,7 @@ def _wheels(rig: Rig) -> list[tuple[str, float, float]]:
 CALIBRATOR = OdometryCalibrator()
 
 
-def odometry_figure(windows: Sequence[Windows], model: OdometryModel) -> bytes:
+def odometry_figure(windows: Sequence[Windows], model: OdometryModel) -> Picture:
     """Residuals over windows: in time, over distance, and their growth with the length of the window."""
     figure, axes = grid(3, 3, 12.0)
     residuals = [one.residuals(model) for one in windows]

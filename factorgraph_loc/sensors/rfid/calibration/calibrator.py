@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from factorgraph_loc.drawing.markup import Rows, image, table, text
+from factorgraph_loc.drawing.pages import Part, Rows
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -189,22 +189,21 @@ class RfidCalibrator(Calibrator):
         tables = [report.offsets_table(found), report.models_table(found, accepted=MODEL in told.accepted)]
         return [*tables, report.tags_table(found)] if found.doubts else tables
 
-    def told_section(self, told: Told) -> list[str]:
+    def report_section(self, told: Told) -> dict[str, Sequence[Part]]:
         """The tables, and the accuracy of the models' predictions."""
         if told.found is None:
-            return []
+            return {}
         found = told.found.like
-        return [
-            "<h2>RFID</h2>",
-            f"<p>{text(report.tempering_text(found, told.rig))}</p>",
-            f"<p>{text(report.dead_text(found))}</p>",
-            *(table(*one) for one in self.tables(told)),
-            "<p>Observed frequency of reads against the probability predicted by a model that was fitted to other logs or "
-            "segments.</p>",
-            image(figures.reliability_figure(found)),
-            "<p>Probability of a read around the antenna (triangle): observed on the left, the model on the right.</p>",
-            image(figures.field_figure(found)),
+        parts: list[Part] = [
+            report.tempering_text(found, told.rig),
+            report.dead_text(found),
+            *self.tables(told),
+            "Observed frequency of reads against the probability predicted by a model that was fitted to other logs or segments.",
+            figures.reliability_figure(found),
+            "Probability of a read around the antenna (triangle): observed on the left, the model on the right.",
+            figures.field_figure(found),
         ]
+        return {"RFID": parts}
 
 
 CALIBRATOR = RfidCalibrator()

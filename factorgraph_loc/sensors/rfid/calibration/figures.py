@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
+from factorgraph_loc.drawing.pages import Picture
 from factorgraph_loc.fitting.shares import wilson
 from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge
 from factors.rfid.model import probability
@@ -22,7 +23,7 @@ VIEW = 6.0  # m around the antenna
 _STEP = 0.1  # m
 
 
-def reliability_figure(found: RfidKnowledge) -> bytes:
+def reliability_figure(found: RfidKnowledge) -> Picture:
     """Held-out predictions against observed frequencies of reads, and the number of reads per bin."""
     figure, axes = grid(1, 2, 4.5)
     predicted, observed, low, high, count = reliability(found)
@@ -45,7 +46,7 @@ def reliability_figure(found: RfidKnowledge) -> bytes:
     return png(figure)
 
 
-def field_figure(found: RfidKnowledge) -> bytes:
+def field_figure(found: RfidKnowledge) -> Picture:
     """Probability of a read around the antenna: observed, and by each model for tags facing towards and away from it."""
     facings = (1.0, 0.0, -1.0) if any(model.uses_facing for model in found.models) else (0.0,)
     figure, axes = grid(len(found.models), 1 + len(facings), 5.0 * len(found.models))

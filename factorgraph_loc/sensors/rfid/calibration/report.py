@@ -2,10 +2,9 @@
 
 from typing import Any
 
+from factorgraph_loc.drawing.pages import Rows
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge
-
-Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
 
 
 def offsets_table(found: RfidKnowledge) -> Rows:

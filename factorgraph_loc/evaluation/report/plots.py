@@ -1,0 +1,196 @@
+"""The charts of the page, drawn as SVG."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend, styles, svg
+from factorgraph_loc.drawing.pages import Picture
+from factorgraph_loc.evaluation.inference import pooled
+from factorgraph_loc.evaluation.plots import distribution, same_range
+from factorgraph_loc.evaluation.report.metrics import Metric
+from factorgraph_loc.evaluation.report.results import SWEEP, MetricComparison, Results, score
+from factorgraph_loc.evaluation.report.tracks import KINDS
+from factorgraph_loc.text import plain
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_GREY = "0.6"
+_NAME = 40  # maximum length of a name beside an axis
+
+
+@dataclass(frozen=True)
+class _Row:
+    """The ``values`` of the logs of a variant, their ``mark`` (median or mean), and the ``band`` in which it is expected."""
+
+    name: str
+    colour: str
+    values: Sequence[float]
+    mark: float
+    band: tuple[float, float] | None = None
+
+
+def ratios(results: Results, comparisons: Sequence[MetricComparison]) -> Picture | None:
+    """Ratio of each variant to the reference on each log, an axis for each metric; None if there are no ratios."""
+    panels = {}
+    for c in comparisons:
+        rows = []
+        for variant, colour in _coloured(results):
+            found = c.contrasts.get(variant)
+            values = [a / b for a, b in found.by_log.values() if a > 0.0 and b > 0.0] if found else []
+            if values:
+                is_grey = c.p[variant] is not None and not c.is_significant(variant)
+                rows.append(_Row(variant, _GREY if is_grey else colour, values, median(values)))
+        if rows:
+            panels[c.metric.title] = rows
+    return _dots(panels, f"times that of {plain(comparisons[0].reference, _NAME)}", "median over logs", ideal=1.0)
+
+
+def consistency(
+    results: Results, trust: Mapping[str, tuple[float, float, float]], nees: Mapping[tuple[str, str], float]
+) -> Picture | None:
+    """Mean NEES per degree of freedom on each log, the mean over logs, and its 95 % band; None without any."""
+    rows = []
+    for variant, colour in _coloured(results):
+        if variant in trust:
+            mean, *band = trust[variant]
+            values = [nees[variant, log] for log in results.logs if (variant, log) in nees]
+            rows.append(_Row(variant, colour, values, mean, (band[0], band[1])))
+    title = "ANEES of causal poses, per degree of freedom"
+    return _dots({"": rows} if rows else {}, title, "mean over logs", ideal=1.0)
+
+
+def times(results: Results, metric: Metric) -> Picture | None:
+    """A time, median over seeds, on each log; None without any."""
+    rows = []
+    for variant, colour in _coloured(results):
+        by_log = [
+            [v for v in seeds.values() if v is not None] for seeds in results.scores(metric.key, variant).values()
+        ]
+        values = [metric.factor * median(known) for known in by_log if known]
+        if values:
+            rows.append(_Row(variant, colour, values, median(values)))
+    return _dots({"": rows} if rows else {}, metric.heading, "median over logs")
+
+
+def distributions(results: Results, errors: Mapping[str, Mapping[tuple[str, str], Sequence[float]]]) -> Picture | None:
+    """Distribution of the position errors of each kind of estimate, over the logs that all variants with errors have."""
+    figure, axes = grid(1, len(KINDS), 5.5)
+    for axis, kind in zip(axes[0], KINDS, strict=True):
+        met = {variant for variant, _ in errors[kind]}
+        common = [log for log in results.logs if all((variant, log) in errors[kind] for variant in met)]
+        for variant, style in zip(results.variants, styles(), strict=False):
+            if variant in met and common:
+                distribution(
+                    axis, np.concatenate([errors[kind][variant, log] for log in common]), label=variant, **style
+                )
+        axis.set(xlabel="position error [m]", ylabel="share of times below")
+        axis.set_title(f"{kind}, {len(common)} log{'' if len(common) == 1 else 's'}")
+    if not any(axis.lines for axis in axes[0]):
+        return None
+    same_range(axes[0])
+    legend(figure, axes[0])
+    return svg(figure)
+
+
+def sweeps(results: Results, metrics: Sequence[Metric]) -> Picture | None:
+    """Each metric over the values of each swept setting that is a number; None if there are none."""
+    every = {(column, m): sweep(results, column, m) for column in results.sweeps for m in metrics}
+    panels = {key: lines for key, lines in every.items() if any(len(points) > 1 for points in lines.values())}
+    if not panels:
+        return None
+    figure, axes = _panels(len(panels), 4.5)
+    for axis, ((column, metric), lines) in zip(axes, panels.items(), strict=True):
+        for (name, points), style in zip(lines.items(), styles(), strict=False):
+            x, y, low, high = np.array(points).T
+            axis.errorbar(x, y, (y - low, high - y), label=name, marker="o", markersize=5, capsize=3, **style)
+        axis.set(xlabel=column.removeprefix(SWEEP), ylabel=metric.heading)
+    legend(figure, axes)
+    return svg(figure)
+
+
+def sweep(results: Results, column: str, metric: Metric) -> dict[str, list[tuple[float, float, float, float]]]:
+    """Value of the setting, pooled metric, and the bounds of its interval or range, by value. There is a line for each label
+    and combination of the other swept settings.
+    """
+    lines: dict[str, dict[float, dict[str, dict[int, float | None]]]] = {}
+    for variant in results.variants:
+        for row in results.of(variant):
+            value = row.get(column)
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                by_value = lines.setdefault(_line_name(results, variant, row, column), {})
+                by_value.setdefault(float(value), {}).setdefault(str(row["log"]), {})[row["seed"]] = score(
+                    row, metric.key
+                )
+    return {name: points for name, by_value in lines.items() if (points := list(_points(metric, by_value)))}
+
+
+def _points(
+    metric: Metric, by_value: Mapping[float, dict[str, dict[int, float | None]]]
+) -> Iterator[tuple[float, float, float, float]]:
+    for value, scores in sorted(by_value.items()):
+        found = pooled(scores, rms=metric.rms)
+        if found is not None:
+            low = found.least if found.low is None else found.low
+            high = found.most if found.high is None else found.high
+            yield value, metric.factor * found.value, metric.factor * low, metric.factor * high
+
+
+def _line_name(results: Results, variant: str, row: Mapping[str, Any], column: str) -> str:
+    """The label and the swept settings other than that of the axis."""
+    others = [c for c in results.sweeps if c != column and row.get(c) is not None]
+    label = results.variants[variant].label
+    return ", ".join([label, *(f"{c.rpartition('.')[2].replace('_', ' ')} {row[c]}" for c in others)])
+
+
+def _coloured(results: Results) -> list[tuple[str, str]]:
+    """The variants with their colours."""
+    return [(variant, COLOURS[place % len(COLOURS)]) for place, variant in enumerate(results.variants)]
+
+
+def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with so many axes, in two columns if there are several, each ``height`` high."""
+    columns = min(count, 2)
+    figure, axes = grid(math.ceil(count / columns), columns, height * math.ceil(count / columns))
+    for axis in axes.flat[count:]:
+        axis.remove()
+    return figure, list(axes.flat[:count])
+
+
+def _dots(panels: Mapping[str, Sequence[_Row]], title: str, mark: str, *, ideal: float | None = None) -> Picture | None:
+    """Rows of dots on a logarithmic axis, in panels by their title."""
+    if not panels:
+        return None
+    figure, axes = _panels(len(panels), 1.6 + 0.4 * max(map(len, panels.values())))
+    for axis, (name, rows) in zip(axes, panels.items(), strict=True):
+        if ideal is not None:
+            axis.axvline(ideal, color="0.4", linestyle=":", zorder=1)
+        for y, row in enumerate(rows):
+            if row.band is not None:
+                low, high = row.band
+                axis.barh(y, high - low, 0.7, low, color="0.85", label="95 % band for correct covariances", zorder=1)
+            axis.plot(row.values, [y] * len(row.values), "o", color=row.colour, alpha=0.5, label="a log")
+            axis.plot([row.mark] * 2, [y - 0.3, y + 0.3], color=row.colour, linewidth=3.0, label=mark)
+        axis.set(title=name, xlabel=title, xscale="log", ylim=(len(rows) - 0.5, -0.5))
+        axis.set_yticks(range(len(rows)), [plain(row.name, _NAME) for row in rows], parse_math=False)
+        _tick(axis)
+    legend(figure, axes)
+    return svg(figure)
+
+
+def _tick(axis: Axes) -> None:
+    """Label a logarithmic axis with plain numbers, also within a decade."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator  # noqa: PLC0415
+
+    low, high = axis.get_xlim()
+    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)) if high > 8.0 * low else MaxNLocator(6))
+    axis.xaxis.set_minor_locator(NullLocator())
+    axis.xaxis.set_major_formatter("{x:g}")
