@@ -5,13 +5,12 @@ CSV with any separator, with or without header, or JSON lines. The cells are rea
 import csv
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
-from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +33,7 @@ LEAST_UNIT = 1e-12  # minimum factor to our unit; the maximum is its reciprocal
 EpcCase = Literal["as written", "upper", "lower"]
 Alternatives = tuple[str, ...]  # columns of which one must be there
 Value = bool | int | str
+T = TypeVar("T")
 
 
 class ColumnMapping(FileModel):
@@ -90,10 +90,12 @@ class Mapped:
 
     def names(self, column: Column) -> list[str]:
         """The names (N) in the field that ``column`` describes; InputError if one is missing."""
-        for row, text in zip(self.cells.rows, self.texts(column.name), strict=True):
-            if not text:
-                raise bad_field(self.path, self.mapping.columns[column.name], text, column.doc, row=row)
-        return list(self.texts(column.name))
+        return self.cells.names(self.mapping.columns[column.name], column)
+
+    def invalid(self, field: str, i: int, expected: str) -> InputError:
+        """The error for cell ``i`` of a field."""
+        column = self.mapping.columns[field]
+        return bad_field(self.path, column, self.texts(field)[i], expected, row=self.cells.rows[i])
 
     def numbers(self, field: str, column: Column) -> Array:
         """The numbers (N,) in the field that ``column`` describes, in its unit; NaN if empty."""
@@ -110,9 +112,9 @@ class Mapped:
         if unit not in {*SECONDS, ISO}:
             expected = f"one of {', '.join(SECONDS)} or {ISO}"
             raise InputError(f"{self.path}: the unit of {field} is {quoted(unit)}, expected {expected}: units.{field}")
-        column, shift = self.mapping.columns[field], round(offset * 1e9)
+        shift = round(offset * 1e9)
         out = np.empty(len(self.cells.rows), dtype=np.int64)
-        for i, text in enumerate(self.cells.columns[column]):
+        for i, text in enumerate(self.texts(field)):
             try:
                 stamp = iso_nanoseconds(text) if unit == ISO else self._decimal(text, SECONDS[str(unit)])
                 if abs(stamp + shift) > LATEST:
@@ -122,7 +124,7 @@ class Mapped:
                 expected = f"a number of {unit} in {-most:g} to {most:g}"
                 if unit == ISO:
                     expected = "a date and time, 2026-01-31T12:00:00.5Z"
-                raise bad_field(self.path, column, text, expected, row=self.cells.rows[i]) from None
+                raise self.invalid(field, i, expected) from None
             out[i] = stamp + shift
         require_span([(self.path, self.cells.rows, out)])
         return out
@@ -168,13 +170,15 @@ def read_mapped(
     ]
     if either:
         needed.append(tuple(mapping.columns[field] for field in either if field in given))
-    if path.suffix.lower() in JSON_SUFFIXES:
-        cells, there, passed, unwanted = _read_json_lines(path, mapping, needed)
-    else:
-        cells, there, unwanted = _read_csv(path, mapping, needed)
-        passed = 0
-    if not cells.rows:
+    read = _read_json_lines if path.suffix.lower() in JSON_SUFFIXES else _read_csv
+    found = read(path, mapping, needed)
+    if not found.cells.rows:
         raise InputError(f"{path}: contains no rows{' as chosen by where' if mapping.where else ''}")
+    return found
+
+
+def _mapped(cells: Cells, mapping: ColumnMapping, there: Iterable[str], unwanted: int, passed: int = 0) -> Mapped:
+    """The ``cells`` of a file with the columns ``there`` by fields."""
     fields = tuple(field for field, column in mapping.columns.items() if column in cells.columns)
     left_out = tuple(name for name in there if name not in cells.columns and name not in mapping.where)
     return Mapped(cells, mapping, fields, passed, left_out, unwanted)
@@ -199,47 +203,49 @@ def iso_nanoseconds(text: str) -> int:
     return int(moment.timestamp()) * 10**9 + int((digits + "0" * 9)[:9])
 
 
-def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> tuple[Cells, Sequence[str], int]:
-    """The mapped cells of the chosen rows, the names of all columns, and the number of the other rows."""
+def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Mapped:
+    """The mapped cells of the chosen rows of a table."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = _split_comments(numbered)
     if not content:
         raise InputError(f"{path}: contains no rows")
-    parsed = _cells_of(path, content, mapping.separator)
-    first_row, first = next(parsed)
-    body: Iterator[tuple[int, list[str]]] = chain([(first_row, first)], parsed)
-    if not mapping.header:
-        kept = list(body)
-        numbers = {str(i + 1): i for i in range(max(len(parts) for _, parts in kept))}
-        of_numbers = {numbers[column]: values for column, values in mapping.chosen().items() if column in numbers}
-        # rows of other kinds may have other numbers of columns
-        first_row, first = next((one for one in kept if _is_chosen(one[1], of_numbers)), kept[0])
-        header = [str(i) for i in range(1, len(first) + 1)]
-        body = iter(kept)
-    else:
+    body = list(_cells_of(path, content, mapping.separator))
+    first_row, first = body[0]
+    if mapping.header:
         named = next(_cells_of(path, comments[-1:], mapping.separator), (0, []))[1]
         # a comment with as many names as there are columns is the header, unless the first row contains the names
         in_comment = _has(named, needed) or (len(named) == len(first) and not _has(first, needed))
         header = named if in_comment else first
-        body = body if in_comment else parsed
-    _require_columns(path, [*needed, *((column,) for column in mapping.where)], header, first_row)
-    chosen = {header.index(column): values for column, values in mapping.chosen().items()}
-    rows, table, unwanted = [], [], 0
+        body = body if in_comment else body[1:]
+    else:
+        # rows of other kinds may have other numbers of columns
+        chosen = _places(_numbers(max(len(parts) for _, parts in body)), mapping.chosen())
+        first_row, first = next((one for one in body if _is_chosen(one[1], chosen)), body[0])
+        header = _numbers(len(first))
+    _require_columns(path, mapping, needed, header, first_row)
+    chosen = _places(header, mapping.chosen())
+    rows, table = [], []
     for row, parts in body:
         if not _is_chosen(parts, chosen):
-            unwanted += 1
             continue
         if len(parts) != len(header):
             raise bad_field(path, "row", ",".join(parts), f"{len(header)} values: {','.join(header)}", row=row)
         rows.append(row)
         table.append(parts)
-    counts = Counter(header)
-    wanted = [column for column in mapping.columns.values() if column in counts]
-    if twice := [column for column in wanted if counts[column] > 1]:
-        raise InputError(f"{path}:{first_row}: has the column {quoted(twice[0])} more than once")
-    places = {column: header.index(column) for column in wanted}
-    columns = {column: [parts[place] for parts in table] for column, place in places.items()}
-    return Cells(path, rows, columns), header, unwanted
+    places = _places(header, dict.fromkeys(mapping.columns.values()))
+    columns = {header[i]: [parts[i] for parts in table] for i in places}
+    return _mapped(Cells(path, rows, columns), mapping, header, len(body) - len(rows))
+
+
+def _numbers(count: int) -> list[str]:
+    """The names of ``count`` columns without header."""
+    return [str(i) for i in range(1, count + 1)]
+
+
+def _places(header: Sequence[str], columns: Mapping[str, T]) -> dict[int, T]:
+    """The values of ``columns``, by the index of the column in the header; others are left out."""
+    at = {column: i for i, column in enumerate(header)}
+    return {at[column]: value for column, value in columns.items() if column in at}
 
 
 def _is_chosen(parts: Sequence[str], chosen: Mapping[int, set[str]]) -> bool:
@@ -270,53 +276,51 @@ def _has(names: Collection[str], needed: Sequence[Alternatives]) -> bool:
     return all(any(column in names for column in columns) for columns in needed)
 
 
-def _require_columns(path: Path, needed: Sequence[Alternatives], header: Sequence[str], row: int) -> None:
-    for columns in needed:
-        if not _has(header, [columns]):
+def _require_columns(
+    path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives], header: Sequence[str], row: int
+) -> None:
+    """InputError if a needed column is missing, or a mapped one is there twice."""
+    counts = Counter(header)
+    for columns in [*needed, *((column,) for column in mapping.where)]:
+        if not _has(counts, [columns]):
             raise InputError(f"{path}:{row}: has no column {quoted(columns[0])}, it has {listed(header)}")
-        if twice := [column for column in columns if list(header).count(column) > 1]:
-            raise InputError(f"{path}:{row}: has the column {quoted(twice[0])} more than once")
+    for column in (*mapping.columns.values(), *mapping.where):
+        if counts[column] > 1:
+            raise InputError(f"{path}:{row}: has the column {quoted(column)} more than once")
 
 
-def _read_json_lines(
-    path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
-) -> tuple[Cells, Collection[str], int, int]:
-    """The chosen objects of JSON lines (one object or a list of them per line) that have all ``needed`` columns, all columns of
-    these objects, the number of those that lack some, and of those not chosen."""
+def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Mapped:
+    """The mapped cells of the chosen objects of JSON lines (one object or a list of them per line) that have all ``needed``
+    columns."""
     rows: list[int] = []
     columns: dict[str, list[str]] = {column: [] for column in mapping.columns.values()}
     chosen = mapping.chosen()
-    passed, unwanted, seen = 0, 0, dict.fromkeys(columns, False)
+    passed, unwanted = 0, 0
+    seen: set[str] = set()
     keys: list[str] = []
     there: dict[str, None] = {}
-    for row, line in enumerate(read_text(path).splitlines(), start=1):
-        if not line.strip():
+    for row, entry in _objects(path):
+        if any(_text(_at(entry, column)) not in values for column, values in chosen.items()):
+            unwanted += 1
             continue
-        for entry in _objects(path, row, line):
-            if any(_text(_at(entry, column)) not in values for column, values in chosen.items()):
-                unwanted += 1
-                continue
-            found = {column: _at(entry, column) for column in columns}
-            keys = keys or sorted(_paths(entry))
-            seen |= {column: True for column, value in found.items() if value is not None}
-            if not _has([column for column, value in found.items() if value is not None], needed):
-                passed += 1
-                continue
-            rows.append(row)
-            there |= dict.fromkeys(_paths(entry))
-            for column, value in found.items():
-                if isinstance(value, (dict, list)):
-                    raise bad_field(path, column, value, "a number or a text", row=row)
-                columns[column].append(_text(value))
+        found = {column: _at(entry, column) for column in columns}
+        known = {column for column, value in found.items() if value is not None}
+        keys = keys or sorted(_paths(entry))
+        seen |= known
+        if not _has(known, needed):
+            passed += 1
+            continue
+        rows.append(row)
+        there |= dict.fromkeys(_paths(entry))
+        for column, value in found.items():
+            if isinstance(value, (dict, list)):
+                raise bad_field(path, column, value, "a number or a text", row=row)
+            columns[column].append(_text(value))
     for alternatives in needed:
-        if passed and not any(seen[column] for column in alternatives):
+        if passed and not seen.intersection(alternatives):
             raise InputError(f"{path}: no object has {quoted(alternatives[0])}, the first has {listed(keys)}")
-    return (
-        Cells(path, rows, {column: values for column, values in columns.items() if seen[column]}),
-        there,
-        passed,
-        unwanted,
-    )
+    cells = Cells(path, rows, {column: values for column, values in columns.items() if column in seen})
+    return _mapped(cells, mapping, there, unwanted, passed)
 
 
 def _text(value: Any) -> str:
@@ -326,12 +330,16 @@ def _text(value: Any) -> str:
     return "" if value is None else well_formed(str(value))
 
 
-def _objects(path: Path, row: int, line: str) -> list[dict[str, Any]]:
-    content = parse_json(line, f"{path}:{row}")
-    entries = content if isinstance(content, list) else [content]
-    if not all(isinstance(entry, dict) for entry in entries):
-        raise bad_field(path, "line", line.strip()[:80], "an object, or a list of objects", row=row)
-    return entries
+def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+    """The objects of JSON lines with their line numbers."""
+    for row, line in enumerate(read_text(path).splitlines(), start=1):
+        if not line.strip():
+            continue
+        content = parse_json(line, f"{path}:{row}")
+        entries = content if isinstance(content, list) else [content]
+        if not all(isinstance(entry, dict) for entry in entries):
+            raise bad_field(path, "line", line.strip()[:80], "an object, or a list of objects", row=row)
+        yield from ((row, entry) for entry in entries)
 
 
 def _at(entry: Mapping[str, Any], keys: str) -> Any:
@@ -350,56 +358,3 @@ def _paths(entry: Mapping[str, Any], before: str = "") -> Iterator[str]:
             yield from _paths(value, f"{before}{key}.")
         else:
             yield before + key
-
-
-@dataclass
-class _Choice:
-    """The rows that mappings choose of a file: ``names`` of the columns by which they do, the ``count`` of all rows, the line
-    numbers of those that are ``read``, and the number of ``others``."""
-
-    names: dict[str, None]
-    count: int
-    read: set[int]
-    others: int
-
-
-class Unread:
-    """Columns by file, and rows. Several mappings may read the same file; a column or a row that one of them reads is read."""
-
-    def __init__(self) -> None:
-        self._columns: dict[Path, tuple[str, ...]] = {}
-        self._choices: dict[Path, _Choice] = {}
-
-    def note(self, mapped: Mapped) -> None:
-        """Note what a mapping leaves out of its file."""
-        if mapped.unwanted:
-            self._note_choice(mapped)
-        before = self._columns.get(mapped.path, mapped.left_out)
-        self._columns[mapped.path] = tuple(name for name in before if name in mapped.left_out)
-
-    def _note_choice(self, mapped: Mapped) -> None:
-        names, rows = dict.fromkeys(mapped.mapping.where), mapped.rows.tolist()
-        before = self._choices.get(mapped.path)
-        if before is None:
-            count = mapped.unwanted + mapped.passed + len(rows)
-            self._choices[mapped.path] = _Choice(names, count, set(rows), mapped.unwanted)
-            return
-        before.names |= names
-        before.others -= sum(row not in before.read for row in rows)
-        before.read |= set(rows)
-
-    def warnings(self) -> list[str]:
-        """A line for each choice of rows, and one for all files with the same columns."""
-        files: dict[tuple[str, ...], list[Path]] = {}
-        for path, names in self._columns.items():
-            files.setdefault(names, []).append(path)
-        rows = [
-            f"{path.name}: {choice.others} of {choice.count} rows have another {listed(choice.names)} than where says"
-            for path, choice in self._choices.items()
-            if choice.others > 0
-        ]
-        return rows + [
-            f"{paths[0].name}{f' and {len(paths) - 1} more files' if paths[1:] else ''}: columns that are not read: {listed(names)}"
-            for names, paths in files.items()
-            if names
-        ]

@@ -40,7 +40,7 @@ class Cells:
         try:
             values = np.array([float(cell) if cell else np.nan for cell in cells])
         except ValueError:
-            i = next(i for i, cell in enumerate(cells) if cell and not _is_number(cell))
+            i = next(i for i, cell in enumerate(cells) if cell and not is_number(cell))
             raise bad_field(self.path, name, cells[i], "a number", row=self.rows[i]) from None
         if written := [i for i in np.flatnonzero(~np.isfinite(values)).tolist() if cells[i]]:
             raise bad_field(self.path, name, cells[written[0]], "a finite number", row=self.rows[written[0]])
@@ -50,8 +50,16 @@ class Cells:
         told.require(self.path, self.rows, values, name)
         return values if factor == 1.0 else values * factor
 
+    def names(self, name: str, column: Column) -> list[str]:
+        """The texts (N) of a column; InputError at the first that is empty."""
+        cells = self.columns[name]
+        if "" in cells:
+            raise bad_field(self.path, name, "", column.doc, row=self.rows[list(cells).index("")])
+        return list(cells)
 
-def _is_number(text: str) -> bool:
+
+def is_number(text: str) -> bool:
+    """Whether Python reads a text as a number."""
     try:
         float(text)
     except ValueError:
@@ -216,7 +224,7 @@ def _read_csv(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]
         np.array(cells.rows, dtype=np.int64),
         _stamps(path, cells.rows, cells.columns[STAMP.name]),
         {c.name: cells.numbers(c.name, c) for c in told if c.kind in NUMBERS},
-        {c.name: _texts(path, cells.rows, c, cells.columns[c.name]) for c in told if c.kind in NAMES},
+        {c.name: cells.names(c.name, c) for c in told if c.kind in NAMES},
         tuple(name for name in cells.columns if name not in shape),
     )
 
@@ -236,15 +244,6 @@ def _is_stamp(cell: str) -> bool:
         return abs(int(cell)) <= LATEST
     except ValueError:
         return False
-
-
-def _texts(path: Path, rows: Sequence[int], column: Column, cells: Sequence[str | None]) -> list[str]:
-    texts = []
-    for row, cell in zip(rows, cells, strict=True):
-        if not cell:
-            raise bad_field(path, column.name, cell, column.doc, row=row)
-        texts.append(cell)
-    return texts
 
 
 def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> TableRows:
@@ -274,5 +273,6 @@ def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Sh
         numbers[name] = column.cast(pl.Float64).to_numpy().copy()
         columns[name].require(path, rows, numbers[name])
     texts = [columns[name] for name in shape if columns[name].kind in NAMES]
-    names = {c.name: _texts(path, rows.tolist(), c, text_column(frame, c.name, path)) for c in texts}
+    cells = Cells(path, rows.tolist(), {c.name: text_column(frame, c.name, path) for c in texts})
+    names = {c.name: cells.names(c.name, c) for c in texts}
     return TableRows(path, rows, t_ns, numbers, names, tuple(name for name in frame.columns if name not in shape))

@@ -1,10 +1,13 @@
 """Motion between odometry poses or encoder counts, both of which may be reset during a log; radius and track of wheels."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.odometry.settings import DifferentialDrive, OdometrySettings
 from factors import se2
@@ -16,6 +19,24 @@ NEAR, ZERO = 0.05, 1e-6  # m: from the origin after a reset of odometry; and tol
 HELD = 1.0  # s for which the previous motion is continued across a reset
 COUNTERS = (2**8, 2**16, 2**32)  # ranges of encoders that wrap to 0
 TURNS, WAYS = {"left_angle", "left_rate"}, {"left", "left_speed"}  # columns of a mapped table
+
+
+class WheelSizes(FileModel):
+    """The sizes of a differential drive. Those of the rig ([odometry.wheels]) come before those given here."""
+
+    track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")] | None = None
+    """distance between the wheels"""
+    radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")] | None = None
+    """radius of the wheels, if they tell how they turn"""
+
+    def sizes(self, source: object, what: str, *, turns: bool) -> tuple[float, float]:
+        """Metres per unit, and the track [m]. ``turns``: whether the wheels tell how they turn. InputError if a size is missing,
+        which ``what`` needs."""
+        for name, value in {"track": self.track, **({"radius": self.radius} if turns else {})}.items():
+            if value is None:
+                raise InputError(f"{source}: {what} needs {name} [m], here or in [odometry.wheels] of the rig")
+        assert self.track is not None
+        return self.radius if turns and self.radius is not None else 1.0, self.track
 
 
 def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[str]) -> Array:
@@ -36,6 +57,11 @@ def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[s
         moves[i] = se2.exp(before * min(float(durations[i]), HELD))
     _tell(source, t_ns, anew, warnings)
     return moves
+
+
+def after_rest(moves: Array) -> Array:
+    """Motions (N - 1, 3) as increments (N, 3): the first row only defines the start."""
+    return np.vstack((np.zeros((1, 3)), moves))
 
 
 def between_ways(source: object, t_ns: Integers, ways: Array, scales: Array, warnings: list[str]) -> Array:

@@ -246,8 +246,7 @@ class Trajectory(Exchange):
     @classmethod
     def _of_path(cls, path: PosePath, t0_ns: int) -> Self:
         assert path.t_ns is not None
-        poses = on_floor(path.name, path.positions, path.rotations if path.has_rotations else None, [])
-        return cls((path.t_ns - t0_ns) / 1e9, poses, has_heading=path.has_rotations)
+        return cls((path.t_ns - t0_ns) / 1e9, path.on_floor([]), has_heading=path.has_rotations)
 
     def _write_tum(self, path: Path, t0_ns: int) -> None:
         write_tum(self, path, t0_ns)

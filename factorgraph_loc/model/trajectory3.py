@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import write_text
-from factorgraph_loc.model.planar import rotations_of
+from factorgraph_loc.model.planar import AS_IT_IS, Turned, on_floor, rotations_of
 from factorgraph_loc.model.trajectory import Exchange, Trajectory, decimal_seconds, neighbours
 from factors.se2 import Array, Integers
 
@@ -138,6 +138,10 @@ class PosePath:
         if self.t_ns is None:
             raise ValueError(f"{self.name} has no times")
         return Trajectory3((self.t_ns - t0_ns) / 1e9, self.positions, self.rotations)
+
+    def on_floor(self, warnings: list[str], turned: Turned = AS_IT_IS) -> Array:
+        """Planar poses (N, 3): see :func:`~factorgraph_loc.model.planar.on_floor`."""
+        return on_floor(self.name, self.positions, self.rotations if self.has_rotations else None, warnings, turned)
 
     def seen_from_above(self) -> PosePath:
         """The same poses at height 0, turned about the vertical axis only."""

@@ -82,10 +82,10 @@ def test_what_is_wrong_with_wheels(maker, refuse_drive, refused):
     add_topics(maker, [1.0, 1.0], [1.0, 1.0])
     topic = {"topic": "/left_wheel/speed"}
     refuse_drive(
-        maker, "odometry.wheels.radius is missing [m], here or in [odometry.wheels]", odometry=topic | {"wheels": PAIR}
+        maker, "odometry.wheels needs radius [m], here or in [odometry.wheels]", odometry=topic | {"wheels": PAIR}
     )
     for wheels, message in (
-        (PAIR | {"track": None, "unit": "m"}, "odometry.wheels.track is missing [m]"),
+        (PAIR | {"track": None, "unit": "m"}, "odometry.wheels needs track [m]"),
         (PAIR | {"left": "speed"}, "wheel is 'speed', which std_msgs/msg/Float64 lacks; its fields: data"),
         (PAIR | {"right_topic": "/right"}, "has no topic '/right'"),
         (PAIR | {"right_topic": None}, "odometry.wheels.right_topic is missing, as std_msgs/msg/Float64 has no joints"),

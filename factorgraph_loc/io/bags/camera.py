@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.models import FileModel, parse_model
+from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.files.temporary import locked, sweep, temporary_folder, writing
-from factorgraph_loc.io.bags.fields import Clock, Stamper, as_nanoseconds
+from factorgraph_loc.io.bags.fields import Stamper, TopicSettings, as_nanoseconds
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.stream import ImageStream
@@ -55,26 +55,19 @@ ENCODINGS: dict[str, tuple[type, int, Callable[[Pixels], Pixels]]] = {
 }
 
 
-class CameraTopic(FileModel):
+class CameraTopic(TopicSettings):
     """A topic of images."""
 
-    topic: str
-    """name of the topic"""
     info: str | None = None
     """topic with lens, size and frame of the camera"""
-    clock: Clock | None = None
-    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 class Images:
     """Collects the images of a topic. ``known``: whether they are in the cache folder, so that messages need not be read."""
 
     def __init__(self, bag: Bag, name: str, stamper: Stamper) -> None:
-        topic = bag.topic(name)
-        if topic.type not in {RAW, COMPRESSED}:
-            raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {RAW} or {COMPRESSED}")
         self._source = f"{bag.path} {name}"
-        self._compressed = topic.type == COMPRESSED
+        self._compressed = bag.topic(name, RAW, COMPRESSED).type == COMPRESSED
         self._folder = cache_folder() / "bags" / _key(bag.path, name)
         self._stamper = stamper
         self._t_ns: list[int] = []
@@ -83,7 +76,7 @@ class Images:
         sweep(self._folder.parent)
         self._rows = _read_whole(self._folder)
         self.known = bool(self._rows)
-        self._t_ns = [stamper.heard(header, received) for _, header, received, _ in self._rows]
+        self._t_ns = [stamper.choose(header, received) for _, header, received, _ in self._rows]
 
     def add(self, item: Stamped, t_ns: int) -> None:
         if self._written is None:
@@ -133,9 +126,7 @@ class Info:
     """Collects the first message that describes a camera."""
 
     def __init__(self, bag: Bag, name: str) -> None:
-        topic = bag.topic(name)
-        if topic.type != INFO:
-            raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {INFO}")
+        bag.topic(name, INFO)
         self._source = f"{bag.path} {name}"
         self._content: dict[str, Any] = {}
         self._notes: list[str] = []

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from itertools import repeat
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.io.bags.file import Bag, Stamped, Topic
 from factorgraph_loc.text import listed, quoted
 
@@ -33,6 +35,15 @@ TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # the latter in old bags
 APART = 0.5  # s; larger differences between topics are clock offsets, not delays
 
 
+class TopicSettings(FileModel):
+    """The settings that all topics have."""
+
+    topic: str
+    """name of the topic"""
+    clock: Clock | None = None
+    """timestamps of message headers or of receipt; by default as for the bag"""
+
+
 class Fields:
     """Some fields of the messages of a topic. ``rows``: tuples of their values, in the order of ``names``, one for each element of
     the lists in the paths, or one per message without lists."""
@@ -43,28 +54,21 @@ class Fields:
         store = bag.store(topic.name)
         for name, path in paths.items():
             check_path(store, topic, path, f"{self._where}: {name}")
-        self._single = [_getter(path) for path in paths.values() if LIST not in path]
-        self._lists = [_list_getters(path) for path in paths.values() if LIST in path]
-        order = [LIST in path for path in paths.values()]
-        places, singles, lists = [], 0, len(self._single)
-        for is_list in order:
-            places.append(lists if is_list else singles)
-            lists, singles = lists + is_list, singles + (not is_list)
-        self._places = tuple(places)
-        self.has_list = bool(self._lists)
+        self._getters = [(_list_getter(path) if LIST in path else _getter(path)) for path in paths.values()]
+        self._are_lists = [LIST in path for path in paths.values()]
+        self.has_list = any(self._are_lists)
 
     def rows(self, message: Any, row: int) -> list[Row]:
         """The rows of message number ``row``; InputError if its lists have different lengths."""
-        single = [get(message) for get in self._single]
-        if not self._lists:
-            return [tuple(single[i] for i in self._places)]
-        columns = [[inner(item) for item in outer(message)] for outer, inner in self._lists]
-        if len({len(column) for column in columns}) > 1:
-            lengths = ", ".join(str(len(column)) for column in columns)
-            raise InputError(
-                f"{self._where}: message {row} has lists of {lengths} elements, expected lists of one length"
-            )
-        return [tuple((*single, *items)[i] for i in self._places) for items in zip(*columns, strict=True)]
+        values = [get(message) for get in self._getters]
+        if not self.has_list:
+            return [tuple(values)]
+        lengths = [len(value) for value, is_list in zip(values, self._are_lists, strict=True) if is_list]
+        if len(set(lengths)) > 1:
+            told = ", ".join(map(str, lengths))
+            raise InputError(f"{self._where}: message {row} has lists of {told} elements, expected lists of one length")
+        columns = (v if is_list else repeat(v) for v, is_list in zip(values, self._are_lists, strict=True))
+        return list(zip(*columns, strict=False))  # as many as the lists have elements
 
 
 def check_path(store: Typestore, topic: Topic, path: str, where: str) -> None:
@@ -133,10 +137,11 @@ def _getter(path: str) -> Callable[[Any], Any]:
     return attrgetter(path) if path else lambda value: value
 
 
-def _list_getters(path: str) -> tuple[Callable[[Any], Sequence[Any]], Callable[[Any], Any]]:
-    """Getters of the list, and of a field of its elements."""
+def _list_getter(path: str) -> Callable[[Any], list[Any]]:
+    """A getter of a field of the elements of a list."""
     outer, _, inner = path.partition(LIST)
-    return attrgetter(outer), _getter(inner.lstrip("."))
+    get_list, get = attrgetter(outer), _getter(inner.lstrip("."))
+    return lambda message: [get(element) for element in get_list(message)]
 
 
 class Stamper:
@@ -155,14 +160,10 @@ class Stamper:
     def stamp(self, item: Stamped) -> int:
         if not self._before:
             return item.received
-        return self.choose(item.message.header.stamp, item.received)
+        return self.choose(as_nanoseconds(item.message.header.stamp, 1), item.received)
 
-    def choose(self, stamp: Any, received: int) -> int:
-        """The timestamp of a header or the time of receipt, by the clock."""
-        return self.heard(as_nanoseconds(stamp, 1), received)
-
-    def heard(self, in_header: int, received: int) -> int:
-        """As :meth:`choose`, with a header timestamp in nanoseconds."""
+    def choose(self, in_header: int, received: int) -> int:
+        """The timestamp of a header or the time of receipt [ns], by the clock."""
         self._any_set |= in_header != 0
         self._delays.append(received - in_header)
         return in_header if self.uses_header else received

@@ -149,18 +149,21 @@ class Bag:
         }
         self.duration = 0.0 if reader.start_time == NO_FILE else max(reader.end_time - 1 - reader.start_time, 0) / 1e9
 
-    def topic(self, name: str) -> Topic:
-        """A topic with messages; InputError if the bag lacks it or it is empty."""
+    def topic(self, name: str, *types: str) -> Topic:
+        """A topic with messages, of one of ``types`` if any are given; InputError if the bag lacks it."""
         if name not in self.topics:
             raise InputError(f"{self.path}: has no topic {quoted(name)}{nearest(name, list(self.topics))}")
         topic = self.topics[name]
         if not topic.count:
             raise InputError(f"{self.path}: topic {name} ({topic.type}) has no messages: leave it out of the manifest")
-        types = {connection.msgtype for connection in self._connections[name]}
-        if len(types) > 1:
+        found = {connection.msgtype for connection in self._connections[name]}
+        if len(found) > 1:
             raise InputError(
-                f"{self.path}: topic {name} has messages of {' and of '.join(sorted(types))}, expected one type"
+                f"{self.path}: topic {name} has messages of {' and of '.join(sorted(found))}, expected one type"
             )
+        if types and topic.type not in types:
+            expected = "one of " * (len(types) > 1) + ", ".join(types)
+            raise InputError(f"{self.path}: topic {name} is of type {topic.type}, expected {expected}")
         return topic
 
     def store(self, name: str) -> Typestore:

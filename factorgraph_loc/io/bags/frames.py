@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import scipy
@@ -14,11 +13,9 @@ import scipy
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import nearest
-from factorgraph_loc.io.bags.fields import TF, Stamper
-from factorgraph_loc.io.bags.file import Bag, Stamped
-from factorgraph_loc.io.bags.poses import ReferenceTopic, check_rotations, seven
-from factorgraph_loc.model.planar import on_floor
-from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.io.bags.fields import TF, Stamper, as_nanoseconds
+from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
+from factorgraph_loc.io.bags.poses import PoseTopic, check_rotations, seven
 from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3, path_of
 from factorgraph_loc.text import listed, quoted, told
 from factors.se2 import Array
@@ -31,9 +28,10 @@ WORLD = ("mocap", "vicon", "optitrack", "world", "map")  # what is measured come
 
 
 class StaticFrames:
-    """Collects static transforms: parent and pose of each frame."""
+    """Collects static transforms: parent and pose of each frame. ``base``: the frame of the robot."""
 
-    def __init__(self) -> None:
+    def __init__(self, base: str = ROBOT[0]) -> None:
+        self.base = base
         self.parents: dict[str, tuple[str, Array]] = {}
 
     def add(self, item: Stamped, t_ns: int) -> None:
@@ -43,18 +41,18 @@ class StaticFrames:
             parent = plain(transform.header.frame_id)
             self.parents[plain(transform.child_frame_id)] = (parent, matrices(values[None])[0])
 
-    def pose(self, frame: str, base: str) -> Array | None:
-        """The pose (4, 4) of ``frame`` in ``base``; None if no transforms connect them."""
-        ours, theirs = self._up(plain(frame)), self._up(plain(base))
+    def pose(self, frame: str) -> Array | None:
+        """The pose (4, 4) of ``frame`` on the robot; None if no transforms connect them."""
+        ours, theirs = self._up(plain(frame)), self._up(plain(self.base))
         common = next((name for name in ours if name in theirs), None)
         return None if common is None else np.linalg.inv(theirs[common]) @ ours[common]
 
-    def known(self, source: str, frame: str, base: str) -> Array:
+    def known(self, source: str, frame: str) -> Array:
         """As :meth:`pose`; InputError if no transforms connect the frames."""
-        pose = self.pose(frame, base)
+        pose = self.pose(frame)
         if pose is None:
             there = listed(sorted(self.parents)) or "none"
-            raise InputError(f"{source}: tf_static has no pose of {frame} on {base}; frames: {there}")
+            raise InputError(f"{source}: tf_static has no pose of {frame} on {self.base}; frames: {there}")
         return pose
 
     def _up(self, frame: str) -> dict[str, Array]:
@@ -67,71 +65,42 @@ class StaticFrames:
         return out
 
 
-@dataclass
-class _Edge:
-    """The transforms from a frame to its parent: timestamps and poses in order of arrival."""
-
-    parent: str
-    rows: array[int] = field(default_factory=lambda: array("q"))
-    t_ns: array[int] = field(default_factory=lambda: array("q"))
-    values: array[float] = field(default_factory=lambda: array("d"))
-
-
-class FramesTopic(Protocol):
-    """The options of a topic of transforms."""
-
-    @property
-    def topic(self) -> str: ...
-    @property
-    def parent(self) -> str | None: ...
-    @property
-    def child(self) -> str | None: ...
-
-
 class FrameReference:
     """Collects transforms, and composes the trajectory of the topic's ``child`` in its ``parent``. InputError if one of these two
     frames is missing."""
 
-    def __init__(self, bag: Bag, topic: FramesTopic, stamper: Stamper) -> None:
+    def __init__(self, bag: Bag, topic: PoseTopic, stamper: Stamper, static: StaticFrames) -> None:
         self._source = f"{bag.path} {topic.topic}"
         if topic.parent is None or topic.child is None:
             raise InputError(f"{self._source}: parent and child are missing: two frames, such as map and base_link")
         self._parent, self._child = plain(topic.parent), plain(topic.child)
-        self._stamper = stamper
-        self._edges: dict[str, _Edge] = {}
+        self._stamper, self._static = stamper, static
+        self._edges: dict[str, TopicRows] = {}  # from each frame to its parent, in order of arrival
+        self._parents: dict[str, str] = {}
 
     def add(self, item: Stamped, t_ns: int) -> None:
         for transform in item.message.transforms:
             child, parent = plain(transform.child_frame_id), plain(transform.header.frame_id)
-            edge = self._edges.setdefault(child, _Edge(parent))
-            edge.parent = parent
-            edge.rows.append(item.row)
-            edge.t_ns.append(self._stamper.choose(transform.header.stamp, t_ns))
-            edge.values.extend(seven(transform.transform, "translation", "rotation"))
+            self._parents[child] = parent
+            edge = self._edges.setdefault(child, TopicRows(self._source, 7))
+            stamp = self._stamper.choose(as_nanoseconds(transform.header.stamp, 1), t_ns)
+            edge.append(item, stamp, seven(transform.transform, "translation", "rotation"))
 
-    def trajectory(self, static: StaticFrames, t0_ns: int, topic: ReferenceTopic, warnings: list[str]) -> Trajectory:
-        """The poses of :meth:`in_space` on the floor."""
-        space = self.in_space(static, t0_ns, warnings)
-        flat = on_floor(self._source, space.positions, space.rotations, warnings, topic)
-        return Trajectory(space.t, flat, has_heading=topic.has_heading)
-
-    def path(self, static: StaticFrames, warnings: list[str]) -> PosePath:
-        """The poses of :meth:`in_space` with absolute times."""
-        t0_ns = min((edge.t_ns[0] for edge in self._edges.values()), default=0)
-        return path_of(self.in_space(static, t0_ns, warnings), self._source, t0_ns)
-
-    def in_space(self, static: StaticFrames, t0_ns: int, warnings: list[str]) -> Trajectory3:
-        """Poses at the timestamps of the most frequent transform where all are known; the others are interpolated."""
+    def path(self, warnings: list[str], t0_ns: int | None = None) -> PosePath:
+        """The poses at the timestamps of the most frequent transform where all are known; the others are interpolated, at times
+        after ``t0_ns``, by default that of the first transform."""
+        if t0_ns is None:
+            t0_ns = min((int(edge.t_ns[0]) for edge in self._edges.values()), default=0)
         moving: list[Trajectory3] = []
         steps: list[tuple[int, Array]] = []
         before: Array = np.eye(4)
-        for name in self._chain(static):
+        for name in self._chain():
             if name in self._edges:
                 steps.append((len(moving), before))
                 moving.append(self._edge(name, t0_ns, warnings))
                 before = np.eye(4)
             else:
-                before = static.parents[name][1] @ before
+                before = self._static.parents[name][1] @ before
         if not moving:
             raise InputError(f"{self._source}: {self._child} does not move in {self._parent}, expected frames that do")
         t = max(moving, key=len).t
@@ -147,14 +116,14 @@ class FrameReference:
             pose[:, :3, :3], pose[:, :3, 3] = at.rotations, at.positions
             poses = pose @ fixed @ poses
         poses = before @ poses
-        return Trajectory3(t, poses[:, :3, 3], poses[:, :3, :3])
+        return path_of(Trajectory3(t, poses[:, :3, 3], poses[:, :3, :3]), self._source, t0_ns)
 
-    def _chain(self, static: StaticFrames) -> list[str]:
+    def _chain(self) -> list[str]:
         """The frames from the child up to the parent, without the parent."""
         chain: list[str] = []
         frame = self._child
-        parents = {name: parent for name, (parent, _) in static.parents.items()}
-        parents |= {name: edge.parent for name, edge in self._edges.items()}
+        parents = {name: parent for name, (parent, _) in self._static.parents.items()}
+        parents |= self._parents
         while frame != self._parent:
             if frame not in parents or frame in chain:
                 known = sorted({*parents, *parents.values()})
@@ -171,9 +140,8 @@ class FrameReference:
 
     def _edge(self, name: str, t0_ns: int, warnings: list[str]) -> Trajectory3:
         edge = self._edges[name]
-        source = f"{self._source} {edge.parent} to {name}"
-        rows, t_ns = np.array(edge.rows, dtype=np.int64), np.array(edge.t_ns, dtype=np.int64)
-        values = np.array(edge.values).reshape(-1, 7)
+        source = f"{self._source} {self._parents[name]} to {name}"
+        rows, t_ns, values = edge.rows, edge.t_ns, edge.values
         check_rotations(source, rows, values)
         keep = checks.in_order(source, rows, t_ns, warnings)
         poses = matrices(values[keep])

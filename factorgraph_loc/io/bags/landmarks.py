@@ -7,12 +7,11 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.columns import POSES
-from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.io.bags.fields import Clock, leaves
+from factorgraph_loc.files.columns import POSES, Table
+from factorgraph_loc.io.bags.fields import TopicSettings, leaves
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.frames import StaticFrames
-from factorgraph_loc.io.bags.tables import RowsOfTopic
+from factorgraph_loc.io.bags.tables import DescribedRows, RowsOfTopic, TableTopic
 from factorgraph_loc.maps.markers import corner_names
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Axes, Turned
@@ -23,7 +22,6 @@ from factorgraph_loc.text import listed
 from factors.se2 import Array
 
 LandmarkField = Literal["landmark", "range", "bearing", "x", "y", "z"]
-PixelField = Literal["landmark", "u", "v"]
 CORNERS = "apriltag_msgs/msg/AprilTagDetectionArray"  # detections as pixels: centre and four corners
 
 CORNER_FIELDS = ("detections[].family", "detections[].id", "detections[].corners[].x", "detections[].corners[].y")
@@ -42,11 +40,9 @@ DETECTIONS: dict[str, tuple[str, str]] = {
 PLACES = tuple(replace(POSES[axis], may_lack=True) for axis in "xyz")  # in the sensor frame
 
 
-class LandmarkTopic(Turned):
+class LandmarkTopic(TopicSettings, Turned):
     """A topic of landmarks, such as those of common marker detectors."""
 
-    topic: str
-    """name of the topic"""
     fields: dict[LandmarkField, str] | None = None
     """paths of the landmark's name, and of its range and bearing, or of its position x, y, z in the sensor frame; known for
     common marker detectors"""
@@ -54,28 +50,14 @@ class LandmarkTopic(Turned):
     """axes of the sensor that point forward, left and up: body (x, y, z), optical (z, -x, -y), or such a list"""
     frame: str | None = None
     """frame of the sensor, whose pose is in tf_static; without it use axes and mounting"""
-    clock: Clock | None = None
-    """timestamps of message headers or of receipt; by default as for the bag"""
-
-
-class PixelTopic(FileModel):
-    """Named points in images. The corners of AprilTags need no ``fields``; their names are ``FAMILY-NUMBER/0`` to ``/3``, see
-    :func:`factorgraph_loc.maps.markers.corner_names`."""
-
-    topic: str
-    """name of the topic"""
-    fields: dict[PixelField, str] | None = None
-    """paths of landmark, u and v in a message; not for corners of AprilTags"""
-    clock: Clock | None = None
-    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 class Landmarks(RowsOfTopic):
     """Collects ranges and bearings of a topic, or the positions from which they are computed."""
 
-    def __init__(self, bag: Bag, options: LandmarkTopic) -> None:
+    def __init__(self, bag: Bag, options: LandmarkTopic, frames: StaticFrames) -> None:
         topic = bag.topic(options.topic)
-        self._options = options
+        self._options, self._frames = options, frames
         fields: dict[Any, str] = dict(options.fields or {})
         if not fields:
             if topic.type not in DETECTIONS:
@@ -93,48 +75,37 @@ class Landmarks(RowsOfTopic):
         columns = (BEARING_RANGE["landmark"], *PLACES) if self._places else BEARING_RANGE.columns[1:]
         super().__init__(bag, options.topic, fields, columns, {})
 
-    def stream(self, frames: StaticFrames, base: str, t0_ns: int, warnings: list[str]) -> Stream:
-        """Ranges along the floor and bearings, in the robot frame if ``frames`` contain the sensor's pose."""
-        rows = self.rows_of(self._polar(frames, base) if self._places else None)
+    def stream(self, t0_ns: int, warnings: list[str]) -> Stream:
+        """Ranges along the floor and bearings, in the robot frame if the sensor's pose is known."""
+        rows = self.rows_of(self._polar() if self._places else None)
         return stream_of(BEARING_RANGE, rows, t0_ns, warnings)
 
-    def _polar(self, frames: StaticFrames, base: str) -> dict[str, Array]:
+    def _polar(self) -> dict[str, Array]:
         places = self._rows.values
         for i, axis in enumerate("xyz"):
             checks.require_finite(self._rows.source, self._rows.rows, axis, places[:, i])
         pose = np.eye(4)
         if self._options.frame is not None:
-            pose = frames.known(self._rows.source, self._options.frame, base)
+            pose = self._frames.known(self._rows.source, self._options.frame)
         else:
             pose[:3, :3] = self._options.turned()
         x, y, _ = (places @ pose[:3, :3].T + pose[:3, 3]).T
         return {"range": np.hypot(x, y), "bearing": np.arctan2(y, x)}
 
 
-class PixelsOfPoints(RowsOfTopic):
-    """Collects the pixels of named points of a topic."""
+class Corners(RowsOfTopic):
+    """Collects the corners of AprilTags as pixels of named points. The names are ``FAMILY-NUMBER/0`` to ``/3``, see
+    :func:`factorgraph_loc.maps.markers.corner_names`."""
 
-    def __init__(self, bag: Bag, options: PixelTopic) -> None:
-        topic = bag.topic(options.topic)
-        self._corners = not options.fields
-        if self._corners and topic.type != CORNERS:
-            raise InputError(
-                f"{bag.path}: topic {topic.name} is of type {topic.type}: give its fields; known without: {CORNERS}"
-            )
-        if self._corners:
-            known = leaves(bag.store(topic.name), topic.type)
-            if lacking := [path for path in CORNER_FIELDS if path not in known]:
-                raise InputError(f"{bag.path}: topic {topic.name} ({topic.type}) lacks {listed(lacking)}")
-        fields = dict(options.fields or {})
-        if not self._corners and set(fields) != {"landmark", "u", "v"}:
-            raise InputError(f"{bag.path} {topic.name}: fields are {listed(fields)}, expected landmark, u and v")
-        super().__init__(bag, options.topic, fields, SIGHTINGS.columns[1:], {})
+    def __init__(self, bag: Bag, name: str) -> None:
+        topic = bag.topic(name, CORNERS)
+        known = leaves(bag.store(name), topic.type)
+        if lacking := [path for path in CORNER_FIELDS if path not in known]:
+            raise InputError(f"{bag.path}: topic {name} ({topic.type}) lacks {listed(lacking)}")
+        super().__init__(bag, name, {}, SIGHTINGS.columns[1:], {})
 
     def add(self, item: Stamped, t_ns: int) -> None:
         """Add the pixels of a message."""
-        if not self._corners:
-            super().add(item, t_ns)
-            return
         for found in item.message.detections:
             names = corner_names(f"{found.family}-{found.id}")
             # apriltag starts at the lower left corner and continues with the lower right one
@@ -145,3 +116,10 @@ class PixelsOfPoints(RowsOfTopic):
     def stream(self, t0_ns: int, warnings: list[str]) -> Stream:
         """The pixels as a stream; problems are an InputError or a warning."""
         return stream_of(SIGHTINGS, self.rows_of(), t0_ns, warnings)
+
+
+def rows_of_table(bag: Bag, options: TableTopic, table: Table) -> Corners | DescribedRows:
+    """The collector of a topic of rows of ``table``; the corners of AprilTags need no fields."""
+    if table.name == SIGHTINGS.name and not options.fields and bag.topic(options.topic).type == CORNERS:
+        return Corners(bag, options.topic)
+    return DescribedRows(bag, options, table)

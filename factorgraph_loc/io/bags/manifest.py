@@ -76,9 +76,13 @@ class Proposal:
     uses: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
-    def take(self, sensor: str, topic: Topic, **settings: Any) -> None:
-        self.options[sensor] = {"topic": topic.name, **settings}
-        self.uses[topic.name] = sensor
+    def take(self, sensor: str, topics: Sequence[Topic], **settings: Any) -> None:
+        """Use the first of ``topics``, if there is one, for a sensor, and note the others."""
+        if topics:
+            self.options[sensor] = {"topic": topics[0].name, **settings}
+            self.uses[topics[0].name] = sensor
+        if topics[1:]:
+            self.notes.append(f"{sensor} could also be {', '.join(topic.name for topic in topics[1:])}")
 
 
 def propose(bag: Bag) -> Proposal:
@@ -88,7 +92,7 @@ def propose(bag: Bag) -> Proposal:
     tree = tree_of(bag, out.notes)
     _motion(out, bag, topics, tree)
     _reference(out, topics, tree)
-    _one_of(out, "imu", [topic for topic in topics if topic.type == IMU])
+    out.take("imu", [topic for topic in topics if topic.type == IMU])
     _camera(out, topics)
     _tables(out, topics)
     custom = _custom(out, bag, topics)
@@ -146,8 +150,7 @@ def _motion(out: Proposal, bag: Bag, topics: Sequence[Topic], tree: Tree) -> Non
         out.notes.append(f"{ranked[0].name} and {pair} are taken for {NUMBERS[settings['use']]}; {MEASURE}")
     elif NOT_MEASURED.search(ranked[0].name):
         out.notes.append(f"{ranked[0].name} contains commanded velocities, not measured ones")
-    out.take("odometry", ranked[0], **settings)
-    _others(out, "odometry", ranked[1:])
+    out.take("odometry", ranked, **settings)
 
 
 def _has_no_pose(bag: Bag, topic: Topic) -> bool:
@@ -181,12 +184,11 @@ def _reference(out: Proposal, topics: Sequence[Topic], tree: Tree) -> None:
     poses = [topic for topic in topics if topic.type in {*POSES, POINT} and topic.name not in out.uses]
     named = [topic for topic in poses if TRUTH.search(topic.name)]
     if named:
-        out.take("reference", named[0])
-        _others(out, "reference", named[1:])
+        out.take("reference", named)
         return
     plain = [t for t in poses if t.type != ODOMETRY and not NOT_MEASURED.search(t.name)]
     if plain:
-        out.take("reference", plain[0])
+        out.take("reference", plain[:1])
         out.notes.append(f"{plain[0].name} is used as the reference: remove it if it is an estimate, not the truth")
     robot = tree.robot()
     world = None if robot is None else tree.above(robot, WORLD)
@@ -206,27 +208,25 @@ def _camera(out: Proposal, topics: Sequence[Topic]) -> None:
     if not images:
         return
     infos = {topic.name.rsplit("/", 1)[0]: topic for topic in topics if topic.type == INFO}
-    chosen = images[0]
-    place = chosen.name
+    place = images[0].name
     while place and place not in infos:  # the info of /camera/image_raw/compressed is /camera/camera_info
         place = place.rpartition("/")[0]
     settings = {"info": infos[place].name} if place in infos else {}
-    out.take("camera", chosen, **settings)
+    out.take("camera", images, **settings)
     if settings:
         out.uses[settings["info"]] = "camera: lens"
     else:
         out.notes.append("no CameraInfo belongs to the images: the rig has to describe the camera")
-    _others(out, "camera", images[1:])
 
 
 def _tables(out: Proposal, topics: Sequence[Topic]) -> None:
     for topic in topics:
         if topic.type in DETECTIONS and "bearing_range" not in out.options:
-            out.take("bearing_range", topic)
+            out.take("bearing_range", [topic])
         elif topic.type == CORNERS and "sightings" not in out.options:
-            out.take("sightings", topic)
+            out.take("sightings", [topic])
         elif topic.type == INITIAL_POSE[1] and topic.name == INITIAL_POSE[0]:
-            out.take("start", topic)
+            out.take("start", [topic])
 
 
 def _custom(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:
@@ -261,11 +261,10 @@ def _rfid(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
         out.notes.append(
             "rfid: each message is treated as one inventory round of its antenna, an empty one as a round without reads"
         )
-    out.take("rfid", topic, **settings)
+    out.take("rfid", [topic, *(other for other, _ in found if other is not topic)], **settings)
     doubtful = [name for name in UNITS if name in fields and name not in units]
     if doubtful:
         out.notes.append(f"rfid: {', '.join(doubtful)}: assumed to be in rad, Hz and us, set units otherwise")
-    _others(out, "rfid", [other for other, _ in found if other is not topic])
 
 
 def _ranges(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
@@ -273,11 +272,10 @@ def _ranges(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> Non
     found = [(t, fields) for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))]
     if found and "bearing_range" not in out.options:
         topic, fields = found[0]
-        out.take("bearing_range", topic, fields=fields)
+        out.take("bearing_range", [other for other, _ in found], fields=fields)
         out.notes.append(
             f"{topic.name} is taken for ranges [m] to landmarks of the map that {fields['landmark']} names"
         )
-        _others(out, "bearing_range", [other for other, _ in found[1:]])
 
 
 def range_fields(paths: Sequence[str]) -> dict[str, str]:
@@ -317,14 +315,3 @@ def _units(fields: Mapping[str, str]) -> dict[str, str]:
 
 def _plain(path: str) -> str:
     return path.rsplit(".", 1)[-1].removesuffix(LIST).replace("_", "").lower()
-
-
-def _one_of(out: Proposal, sensor: str, topics: Sequence[Topic]) -> None:
-    if topics:
-        out.take(sensor, topics[0])
-        _others(out, sensor, topics[1:])
-
-
-def _others(out: Proposal, sensor: str, topics: Sequence[Topic]) -> None:
-    if topics:
-        out.notes.append(f"{sensor} could also be {', '.join(topic.name for topic in topics)}")

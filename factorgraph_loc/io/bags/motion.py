@@ -5,20 +5,19 @@ topic, or joints of one message.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.models import FileModel, InUnit, nearest
+from factorgraph_loc.files.models import nearest
 from factorgraph_loc.io import motions
-from factorgraph_loc.io.bags.fields import TF, Clock, Fields, Stamper, as_number
+from factorgraph_loc.io.bags.fields import TF, Fields, Stamper, TopicSettings, as_number
 from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
 from factorgraph_loc.io.bags.frames import FrameReference, StaticFrames
-from factorgraph_loc.io.bags.poses import POSES, Poses
-from factorgraph_loc.model.planar import Turned, about_z, on_floor
+from factorgraph_loc.io.bags.poses import POSES, Poses, PoseTopic
+from factorgraph_loc.model.planar import Turned, about_z
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.text import quoted
 from factors.se2 import Array, Integers
@@ -31,7 +30,7 @@ IMU = "sensor_msgs/msg/Imu"
 Motion = IncrementStream | VelocityStream
 
 
-class WheelSettings(FileModel):
+class WheelSettings(motions.WheelSizes):
     """A differential drive. ``radius`` and ``track`` of the rig ([odometry.wheels]) come before those given here."""
 
     left: str
@@ -42,20 +41,6 @@ class WheelSettings(FileModel):
     """topic of the right wheel, if each wheel has a topic"""
     unit: Literal["rad", "m"] = "rad"
     """whether the wheels tell how they turn, or the way that they roll"""
-    radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")] | None = None
-    """radius of the wheels, if they tell how they turn"""
-    track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")] | None = None
-    """distance between the wheels"""
-
-    def sizes(self, source: str) -> tuple[float, float]:
-        """Metres per unit, and the track [m]. InputError if one of them is missing."""
-        needed = {"track": self.track} | ({"radius": self.radius} if self.unit == "rad" else {})
-        if lacking := [name for name, value in needed.items() if value is None]:
-            raise InputError(
-                f"{source}: odometry.wheels.{lacking[0]} is missing [m], here or in [odometry.wheels] of the rig"
-            )
-        assert self.track is not None
-        return 1.0 if self.unit == "m" or self.radius is None else self.radius, self.track
 
 
 class JointRows:
@@ -134,19 +119,6 @@ class TwoWheels:
         return t_ns[alone], left[keep][alone], right[near[keep]][alone]
 
 
-def wheel_motion(
-    rows: JointRows | TwoWheels, wheels: WheelSettings, column: str, warnings: list[str]
-) -> tuple[Integers, Array, bool]:
-    """Timestamps (N,) with velocities v, w (N, 2), or with motions (N - 1, 3) between them; and whether these are motions."""
-    source = rows.rows.source
-    size, track = wheels.sizes(source)
-    t_ns, left, right = rows.pairs(warnings)
-    turned = np.column_stack((left, right))
-    if column == "velocity":
-        return t_ns, motions.velocities_of_wheels(size * turned, track), False
-    return t_ns, motions.between_wheels(source, t_ns, size * turned, np.full(2, size), track, warnings), True
-
-
 def finite_columns(rows: TopicRows, names: Sequence[str], warnings: list[str]) -> tuple[Integers, list[Any]]:
     """Timestamps and columns of rows in order of time, all finite; InputError names the invalid message."""
     number, t_ns, values = rows.rows, rows.t_ns, rows.values
@@ -156,60 +128,35 @@ def finite_columns(rows: TopicRows, names: Sequence[str], warnings: list[str]) -
     return t_ns[keep], [values[keep, i] for i in range(len(names))]
 
 
-class OdometryTopic(Turned):
+class OdometryTopic(PoseTopic):
     """A topic of odometry, of tf with two frames, or of wheel joints."""
 
-    topic: str
-    """name of the topic"""
     use: Literal["pose", "twist"] = "pose"
     """the pose of odometry, as motion between messages, or its twist; for wheels, how far they turned, or how fast"""
-    parent: str | None = None
-    """frame of the odometry's origin, for tf"""
-    child: str | None = None
-    """frame of the robot, for tf"""
     wheels: WheelSettings | None = None
     """wheels of a topic of joints, or of two topics; topic is the one of the left wheel"""
-    clock: Clock | None = None
-    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
-class ImuTopic(Turned):
+class ImuTopic(TopicSettings, Turned):
     """A topic of an IMU: its turn rate about the robot's z axis."""
 
-    topic: str
-    """name of the topic"""
     frame: str | None = None
     """frame of the IMU, whose orientation is in tf_static; without it use axes and mounting"""
-    clock: Clock | None = None
-    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 class PoseMotion:
-    """Odometry from poses in its own frame: the motion between consecutive poses."""
+    """Odometry from poses in its own frame, or from transforms: the motion between consecutive poses."""
 
-    def __init__(self, bag: Bag, options: OdometryTopic) -> None:
-        self._poses = Poses(bag, options.topic, options)
-        self.add = self._poses.add
+    def __init__(self, poses: Poses | FrameReference, turned: Turned) -> None:
+        self._poses, self._turned = poses, turned
+        self.add = poses.add
 
     def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
         """Absolute timestamps (N,) and the stream, whose timestamps start at 0."""
-        t_ns, poses = self._poses.in_order(warnings)
-        return t_ns, increments(t_ns, motions.between_poses(self._poses.rows.source, t_ns, poses, warnings))
-
-
-class TransformMotion:
-    """Odometry from transforms: the motion of a frame in another one between consecutive transforms."""
-
-    def __init__(self, bag: Bag, options: OdometryTopic, stamper: Stamper, static: StaticFrames) -> None:
-        self._frames = FrameReference(bag, options, stamper)
-        self._source, self._turned, self._static = f"{bag.path} {options.topic}", options, static
-        self.add = self._frames.add
-
-    def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
-        path = self._frames.path(self._static, warnings)
+        path = self._poses.path(warnings)
         assert path.t_ns is not None
-        poses = on_floor(self._source, path.positions, path.rotations, warnings, self._turned)
-        return path.t_ns, increments(path.t_ns, motions.between_poses(self._source, path.t_ns, poses, warnings))
+        poses = path.on_floor(warnings, self._turned)
+        return path.t_ns, increments(path.t_ns, motions.between_poses(path.name, path.t_ns, poses, warnings))
 
 
 class TwistMotion:
@@ -239,10 +186,10 @@ class WheelMotion:
 
     def __init__(self, bag: Bag, options: OdometryTopic, wheels: WheelSettings) -> None:
         self._wheels = wheels
-        self._column = "position" if options.use == "pose" else "velocity"
+        self._are_speeds = options.use == "twist"
         self._rows: JointRows | TwoWheels
         if wheels.right_topic is None:
-            self._rows = JointRows(bag, options.topic, wheels, self._column)
+            self._rows = JointRows(bag, options.topic, wheels, "velocity" if self._are_speeds else "position")
         else:
             left, right = OneWheel(bag, options.topic, wheels.left), OneWheel(bag, wheels.right_topic, wheels.right)
             self._rows = TwoWheels(left, right)
@@ -254,47 +201,51 @@ class WheelMotion:
         return self._rows.right if isinstance(self._rows, TwoWheels) else None
 
     def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
-        t_ns, motion, moves = wheel_motion(self._rows, self._wheels, self._column, warnings)
-        if moves:
-            return t_ns, increments(t_ns, motion)
-        return t_ns, VelocityStream(checks.seconds(t_ns, int(t_ns[0])), *np.ascontiguousarray(motion.T))
+        source = self._rows.rows.source
+        size, track = self._wheels.sizes(source, "odometry.wheels", turns=self._wheels.unit == "rad")
+        t_ns, left, right = self._rows.pairs(warnings)
+        ways = size * np.column_stack((left, right))
+        if self._are_speeds:
+            v, w = np.ascontiguousarray(motions.velocities_of_wheels(ways, track).T)
+            return t_ns, VelocityStream(checks.seconds(t_ns, int(t_ns[0])), v, w)
+        moves = motions.between_wheels(source, t_ns, ways, np.full(2, size), track, warnings)
+        return t_ns, increments(t_ns, moves)
 
 
 class YawRates:
     """The turn rate of an IMU."""
 
-    def __init__(self, bag: Bag, options: ImuTopic) -> None:
-        topic = bag.topic(options.topic)
-        if topic.type != IMU:
-            raise InputError(f"{bag.path}: topic {topic.name} is of type {topic.type}, expected {IMU}")
+    def __init__(self, bag: Bag, options: ImuTopic, frames: StaticFrames) -> None:
+        topic = bag.topic(options.topic, IMU)
         if options.frame is not None and options.is_given():
             raise InputError(f"{bag.path} {topic.name}: tf_static has the frame, expected no axes or mounting")
-        self._options = options
+        self._options, self._frames = options, frames
         self._rows = TopicRows(f"{bag.path} {options.topic}", 3)
 
     def add(self, item: Stamped, t_ns: int) -> None:
         rate = item.message.angular_velocity
         self._rows.append(item, t_ns, (rate.x, rate.y, rate.z))
 
-    def stream(self, frames: StaticFrames, base: str, t0_ns: int, warnings: list[str]) -> YawRateStream:
+    def stream(self, t0_ns: int, warnings: list[str]) -> YawRateStream:
         """Turn rates about the robot's z axis; only the axes of the IMU that contribute must be finite."""
         turned = self._options.turned()
         if self._options.frame is not None:
-            turned = frames.known(self._rows.source, self._options.frame, base)[:3, :3]
+            turned = self._frames.known(self._rows.source, self._options.frame)[:3, :3]
         rows, t_ns = self._rows.rows, self._rows.t_ns
         w = about_z(self._rows.source, rows, self._rows.values, turned)
         keep = checks.in_order(self._rows.source, rows, t_ns, warnings)
         return YawRateStream(checks.seconds(t_ns[keep], t0_ns), w[keep])
 
 
-OdometryRows = PoseMotion | TransformMotion | TwistMotion | WheelMotion
+OdometryRows = PoseMotion | TwistMotion | WheelMotion
 
 
 def odometry(bag: Bag, options: OdometryTopic, stamper: Stamper, static: StaticFrames) -> OdometryRows:
     """The collector for an odometry topic, by message type."""
-    kind = bag.topic(options.topic).type
+    known = () if options.wheels else sorted({*POSES, *TWISTS, JOINTS, *TF})
+    kind = bag.topic(options.topic, *known).type
     if kind in TF:
-        return TransformMotion(bag, options, stamper, static)
+        return PoseMotion(FrameReference(bag, options, stamper, static), options)
     if options.parent is not None or options.child is not None:
         raise InputError(f"{bag.path} {options.topic}: odometry.parent and odometry.child are for tf, this is {kind}")
     poses = kind in POSES and not (kind == ODOMETRY and options.use == "twist")
@@ -308,15 +259,9 @@ def odometry(bag: Bag, options: OdometryTopic, stamper: Stamper, static: StaticF
                 f"{bag.path} {options.topic}: odometry.wheels.right_topic is missing, as {kind} has no joints"
             )
         return WheelMotion(bag, options, options.wheels)
-    if poses:
-        return PoseMotion(bag, options)
-    if kind in TWISTS or kind == ODOMETRY:
-        return TwistMotion(bag, options)
-    known = ", ".join(sorted({*POSES, *TWISTS, JOINTS, TF[0]}))
-    raise InputError(f"{bag.path}: topic {options.topic} is of type {kind}, expected one of {known}")
+    return PoseMotion(Poses(bag, options.topic), options) if poses else TwistMotion(bag, options)
 
 
 def increments(t_ns: Integers, moves: Array) -> IncrementStream:
     """The motions (N - 1, 3) between N timestamps as increments; the first row only defines the start."""
-    dx, dy, dtheta = np.vstack((np.zeros((1, 3)), moves)).T
-    return IncrementStream(checks.seconds(t_ns, int(t_ns[0])), dx, dy, dtheta)
+    return IncrementStream(checks.seconds(t_ns, int(t_ns[0])), *motions.after_rest(moves).T)

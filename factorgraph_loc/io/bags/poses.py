@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.errors import bad_field
 from factorgraph_loc.files import checks
-from factorgraph_loc.io.bags.fields import Clock
+from factorgraph_loc.io.bags.fields import TopicSettings
 from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
 from factorgraph_loc.model.log import StartPose
-from factorgraph_loc.model.planar import AS_IT_IS, Turned, on_floor, require_unit, rotations_of
-from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.planar import Turned, require_unit, rotations_of
 from factorgraph_loc.model.trajectory3 import PosePath
 from factors.se2 import Array, Integers
 
@@ -26,93 +25,62 @@ POSES: dict[str, Callable[[Any], Any]] = {
 }
 
 
-class ReferenceTopic(Turned):
+class PoseTopic(TopicSettings, Turned):
     """A topic of poses, or of tf with two frames."""
 
-    topic: str
-    """name of the topic"""
     parent: str | None = None
-    """frame of the world, for tf"""
+    """frame in which the poses are, for tf"""
     child: str | None = None
     """frame of the robot, for tf"""
+
+
+class ReferenceTopic(PoseTopic):
+    """The topic of the reference."""
+
     has_heading: bool = True
     """whether the heading means anything"""
-    clock: Clock | None = None
-    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
-class StartTopic(Turned):
+class StartTopic(TopicSettings, Turned):
     """A topic whose first pose with covariance is the known start."""
-
-    topic: str
-    """name of the topic"""
-    clock: Clock | None = None
-    """timestamps of message headers or of receipt; by default as for the bag"""
 
 
 class Poses:
     """Collects the poses of a topic; points are poses without heading."""
 
-    def __init__(self, bag: Bag, name: str, turned: Turned = AS_IT_IS) -> None:
-        topic = bag.topic(name)
-        self._turned = turned
+    def __init__(self, bag: Bag, name: str) -> None:
+        topic = bag.topic(name, *sorted({*POSES, POINT}))
         self._are_points = topic.type == POINT
-        if topic.type not in POSES and not self._are_points:
-            known = ", ".join(sorted({*POSES, POINT}))
-            raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected one of {known}")
         self._pose = POSES.get(topic.type, attrgetter("point"))
         # transforms have translation and rotation, poses position and orientation
         self._parts = (
             ("translation", "rotation") if topic.type.endswith("TransformStamped") else ("position", "orientation")
         )
-        self.rows = TopicRows(f"{bag.path} {name}", 7)
+        self._rows = TopicRows(f"{bag.path} {name}", 7)
 
     def add(self, item: Stamped, t_ns: int) -> None:
         pose = self._pose(item.message)
         if self._are_points:
-            self.rows.append(item, t_ns, (pose.x, pose.y, pose.z, 0.0, 0.0, 0.0, 1.0))
+            self._rows.append(item, t_ns, (pose.x, pose.y, pose.z, 0.0, 0.0, 0.0, 1.0))
         else:
-            self.rows.append(item, t_ns, seven(pose, *self._parts))
+            self._rows.append(item, t_ns, seven(pose, *self._parts))
 
-    def in_order(self, warnings: list[str]) -> tuple[Integers, Array]:
-        """Timestamps (N,) and planar poses (N, 3), the last one of equal timestamps; InputError names the invalid message."""
-        places = self._checked()[:, :3]
-        turns = None if self._are_points else self._rotations()
-        poses = on_floor(self.rows.source, places, turns, warnings, self._turned)
-        keep = self._kept(warnings)
-        return self.rows.t_ns[keep], poses[keep]
-
-    def in_space(self, warnings: list[str]) -> PosePath:
-        """The poses as they are; InputError names the invalid message."""
-        places = self._checked()[:, :3]
-        path = PosePath(self.rows.source, places, self._rotations(), self.rows.t_ns, not self._are_points)
-        return path.rows(self._kept(warnings))
-
-    def _checked(self) -> Array:
-        values = self.rows.values
-        check_rotations(self.rows.source, self.rows.rows, values)
-        return values
-
-    def _rotations(self) -> Array:
-        return rotations_of(self.rows.source, self.rows.rows, self.rows.values[:, 3:])
-
-    def _kept(self, warnings: list[str]) -> Integers:
-        return checks.in_order(self.rows.source, self.rows.rows, self.rows.t_ns, warnings)
-
-    def trajectory(self, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory:
-        t_ns, poses = self.in_order(warnings)
-        return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=has_heading and not self._are_points)
+    def path(self, warnings: list[str], t0_ns: int = 0) -> PosePath:
+        """The poses, the last one of equal timestamps; InputError names the invalid message."""
+        source, rows, t_ns, values = self._rows.source, self._rows.rows, self._rows.t_ns, self._rows.values
+        check_rotations(source, rows, values)
+        rotations = rotations_of(source, rows, values[:, 3:])
+        path = PosePath(source, values[:, :3], rotations, t_ns, not self._are_points)
+        return path.rows(checks.in_order(source, rows, t_ns, warnings))
 
 
 class Start:
     """Collects the first pose with covariance of a topic, the known start."""
 
-    def __init__(self, bag: Bag, name: str, turned: Turned = AS_IT_IS) -> None:
-        topic = bag.topic(name)
-        self._turned = turned
-        if topic.type != WITH_COVARIANCE:
-            raise InputError(f"{bag.path}: topic {name} is of type {topic.type}, expected {WITH_COVARIANCE}")
-        self._source = f"{bag.path} {name}"
+    def __init__(self, bag: Bag, options: StartTopic) -> None:
+        bag.topic(options.topic, WITH_COVARIANCE)
+        self._turned = options
+        self._source = f"{bag.path} {options.topic}"
         self._found: tuple[int, Array, Array] | None = None  # timestamp [ns], pose (1, 7), variances (3,)
 
     def add(self, item: Stamped, t_ns: int) -> None:
@@ -128,7 +96,7 @@ class Start:
         first = np.ones(1, dtype=np.int64)
         check_rotations(self._source, first, values)
         turns = rotations_of(self._source, first, values[:, 3:])
-        pose = on_floor(self._source, values[:, :3], turns, warnings, self._turned)[0]
+        pose = PosePath(self._source, values[:, :3], turns, None).on_floor(warnings, self._turned)[0]
         for name, variance in zip(("xx", "yy", "yaw"), variances.tolist(), strict=True):
             if not 0.0 < variance < np.inf:
                 raise bad_field(self._source, f"covariance {name}", variance, "more than 0", row=1)

@@ -6,24 +6,25 @@ The bag is read once; only the needed numbers of its messages are kept, and imag
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, add_fields, parse_model
 from factorgraph_loc.io.bags import fields as bag_clock
 from factorgraph_loc.io.bags.camera import CameraTopic, Images, Info
-from factorgraph_loc.io.bags.fields import TF, Clock, Stamper
+from factorgraph_loc.io.bags.fields import TF, Clock, Stamper, TopicSettings
 from factorgraph_loc.io.bags.file import Bag, Stamped, open_bag
-from factorgraph_loc.io.bags.frames import STATIC, FrameReference, StaticFrames
-from factorgraph_loc.io.bags.landmarks import Landmarks, LandmarkTopic, PixelsOfPoints, PixelTopic
+from factorgraph_loc.io.bags.frames import ROBOT, STATIC, FrameReference, StaticFrames
+from factorgraph_loc.io.bags.landmarks import Landmarks, LandmarkTopic, rows_of_table
 from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, WheelMotion, YawRates, odometry
-from factorgraph_loc.io.bags.poses import POINT, POSES, Poses, ReferenceTopic, Start, StartTopic
+from factorgraph_loc.io.bags.poses import POINT, POSES, Poses, PoseTopic, ReferenceTopic, Start, StartTopic
 from factorgraph_loc.io.bags.proposed import UNUSED
-from factorgraph_loc.io.bags.tables import DescribedRows, Reads, RfidTopic, TableTopic
+from factorgraph_loc.io.bags.tables import Reads, RfidTopic, TableTopic
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.model.log import NOT_READ, RIG_NOTES, Log
 from factorgraph_loc.model.measurement import Stream
@@ -42,26 +43,24 @@ from factors.se2 import Array
 FRAMES, WITHIN = ":", "."  # /tf:PARENT.CHILD
 
 
-def camera_of(info: Info, frames: StaticFrames, base: str, notes: list[str]) -> CameraSettings:
+def camera_of(info: Info, frames: StaticFrames, notes: list[str]) -> CameraSettings:
     """The camera of a ``CameraInfo``; it looks forward from the robot's origin if tf_static has no mounting."""
-    pose = frames.pose(info.frame, base)
+    pose = frames.pose(info.frame)
     if pose is None:
-        notes.append(f"tf_static has no mounting of {info.frame} on {base}")
+        notes.append(f"tf_static has no mounting of {info.frame} on {frames.base}")
         return info.settings({}, notes)
-    notes.append(f"tf_static has the mounting of {info.frame} on {base}")
+    notes.append(f"tf_static has the mounting of {info.frame} on {frames.base}")
     roll, pitch, yaw = angles_of_camera(pose[:3, :3])
     x, y, z = pose[:3, 3].tolist()
     return info.settings({"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}, notes)
 
 
-def antennas_of(
-    names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, base: str, notes: list[str]
-) -> RfidSettings:
+def antennas_of(names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, notes: list[str]) -> RfidSettings:
     """Antennas with frames ``given``, or frames of their names; the frame's x axis is the boresight. Others are at the origin."""
-    poses = {name: frames.pose(given.get(name, name), base) for name in sorted(names)}
+    poses = {name: frames.pose(given.get(name, name)) for name in sorted(names)}
     for verb, known in (("has the", True), ("has no", False)):
         if which := [name for name, pose in poses.items() if (pose is not None) == known]:
-            notes.append(f"tf_static {verb} mounting of antennas {', '.join(which)} on {base}")
+            notes.append(f"tf_static {verb} mounting of antennas {', '.join(which)} on {frames.base}")
     return RfidSettings(
         antennas={name: AntennaSettings() if p is None else _antenna(name, p) for name, p in poses.items()}
     )
@@ -88,7 +87,6 @@ class Options(FileModel):
     rfid: RfidTopic | None = None
     bearing_range: LandmarkTopic | None = None
     camera: CameraTopic | None = None
-    sightings: PixelTopic | None = None
     reference: ReferenceTopic | None = None
     start: StartTopic | None = None
     clock: Clock = "header"
@@ -100,22 +98,13 @@ class Options(FileModel):
 OTHERS = [
     tables[0] for name, (_, tables) in native_tables().items() if name not in {*Options.model_fields, "inventories"}
 ]
-add_fields(Options, {table.name: (TableTopic | None, None) for table in OTHERS}, after="sightings")
+add_fields(Options, {table.name: (TableTopic | None, None) for table in OTHERS}, after="camera")
 
 
 class Gatherer(Protocol):
     """Collects the needed data from the messages of one topic; messages are not kept, so they are validated here."""
 
     def add(self, item: Stamped, t_ns: int) -> None: ...
-
-
-class TimedTopic(Protocol):
-    """The common options of all topics."""
-
-    @property
-    def topic(self) -> str: ...
-    @property
-    def clock(self) -> Clock | None: ...
 
 
 G = TypeVar("G", bound=Gatherer)
@@ -139,7 +128,7 @@ class Listeners:
         if timed:
             self.stampers.append(stamper)
 
-    def listen(self, options: TimedTopic, gatherer: G) -> G:
+    def listen(self, options: TopicSettings, gatherer: G) -> G:
         """Register a collector for a topic and return it."""
         self.add(options.topic, gatherer, self.stamper(options.topic, options.clock))
         return gatherer
@@ -163,19 +152,10 @@ class Listeners:
             stamper.check()
 
 
-@dataclass
-class Gathered:
-    """The collectors of all sensors in the manifest."""
+class Streamed(Gatherer, Protocol):
+    """Collects the rows of a stream."""
 
-    imu: YawRates | None = None
-    rfid: Reads | None = None
-    bearing_range: Landmarks | None = None
-    camera: Images | None = None
-    info: Info | None = None
-    sightings: PixelsOfPoints | None = None
-    reference: Poses | FrameReference | None = None
-    start: Start | None = None
-    others: dict[str, DescribedRows] = field(default_factory=dict)
+    def stream(self, t0_ns: int, warnings: list[str]) -> Stream: ...
 
 
 def read(path: Path | None, options: Options) -> Log:
@@ -188,42 +168,43 @@ def read(path: Path | None, options: Options) -> Log:
 
 def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     listeners = Listeners(bag, options.clock)
-    frames = static_frames(listeners)
+    frames = static_frames(listeners, options.base_frame)
     stamper = listeners.stamper(options.odometry.topic, options.odometry.clock)
     motion = odometry(bag, options.odometry, stamper, frames)
     listeners.add(options.odometry.topic, motion, stamper)
     if isinstance(motion, WheelMotion) and motion.right is not None:
         listeners.add(motion.right.topic, motion.right, listeners.stamper(motion.right.topic, options.odometry.clock))
-    gathered = _listen(listeners, options)
-    if gathered.camera:
-        stack.callback(gathered.camera.discard)
+    sensors = _sensors(listeners, options, frames, stack)
+    info = None
+    if options.camera and options.camera.info:
+        info = Info(bag, options.camera.info)
+        listeners.add(options.camera.info, info, listeners.stamper(options.camera.info, None), timed=False)
+    told = options.reference
+    poses = _poses(listeners, told, frames) if told else None
+    start = listeners.listen(options.start, Start(bag, options.start)) if options.start else None
     listeners.run()
 
     clock, warnings = bag_clock.report(listeners.stampers, options.clock)
     t_ns, moved = motion.stream(warnings)
     t0_ns = int(t_ns[0])
-    streams: dict[str, Stream] = {"odometry": moved}
-    if gathered.imu:
-        streams["imu"] = gathered.imu.stream(frames, options.base_frame, t0_ns, warnings)
-    if gathered.rfid:
-        streams["rfid"] = gathered.rfid.rounds(warnings).stream(t0_ns)
-    if gathered.bearing_range:
-        streams["bearing_range"] = gathered.bearing_range.stream(frames, options.base_frame, t0_ns, warnings)
-    if gathered.camera:
-        streams["camera"] = gathered.camera.stream(t0_ns, warnings)
-    if gathered.sightings:
-        streams["sightings"] = gathered.sightings.stream(t0_ns, warnings)
-    streams |= {name: rows.stream(t0_ns, warnings) for name, rows in gathered.others.items()}
+    streams = {"odometry": moved} | {name: sensor.stream(t0_ns, warnings) for name, sensor in sensors.items()}
+    reference = None
+    if poses and told:
+        path = poses.path(warnings, t0_ns)
+        assert path.t_ns is not None
+        has_heading = told.has_heading and path.has_rotations
+        t = checks.seconds(path.t_ns, t0_ns)
+        reference = Trajectory(t, path.on_floor(warnings, told), has_heading=has_heading)
     notes: list[str] = []  # on the bag's own rig
-    rig = _rig(streams, gathered, options, frames, notes)
+    rig = _rig(streams, info, options, frames, notes)
     name = bag.path.resolve().stem
     return Log(
         name=name,
         rig=rig,
         world=World(name=name),
         streams=streams,
-        reference=_reference(gathered, options, frames, t0_ns, warnings),
-        start=gathered.start.pose(t0_ns, warnings) if gathered.start else None,
+        reference=reference,
+        start=start.pose(t0_ns, warnings) if start else None,
         t0_ns=t0_ns,
         warnings=tuple(warnings),
         metadata={"clock": clock}
@@ -238,77 +219,62 @@ def _left_out(bag: Bag, listeners: Listeners) -> str:
     return ", ".join(f"{topic.name} ({UNUSED.get(topic.type, topic.type)})" for topic in there)
 
 
-def static_frames(listeners: Listeners) -> StaticFrames:
+def static_frames(listeners: Listeners, base: str) -> StaticFrames:
     """Register a collector for the static transforms of the bag, if it has any, and return it."""
-    bag, frames = listeners.bag, StaticFrames()
+    bag, frames = listeners.bag, StaticFrames(base)
     if STATIC in bag.topics and bag.topics[STATIC].type in TF and bag.topics[STATIC].count:
         listeners.add(STATIC, frames, listeners.stamper(STATIC, None), timed=False)
     return frames
 
 
-def _listen(listeners: Listeners, options: Options) -> Gathered:
-    """Register collectors for the manifest's topics except odometry."""
-    bag, out = listeners.bag, Gathered()
+def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack: ExitStack) -> dict[str, Streamed]:
+    """Register collectors for the sensors in the manifest except odometry, and return them by name of stream."""
+    bag = listeners.bag
+    out: dict[str, Streamed] = {}
     if options.imu:
-        out.imu = listeners.listen(options.imu, YawRates(bag, options.imu))
+        out["imu"] = listeners.listen(options.imu, YawRates(bag, options.imu, frames))
     if options.rfid:
-        out.rfid = listeners.listen(options.rfid, Reads(bag, options.rfid))
+        out["rfid"] = listeners.listen(options.rfid, Reads(bag, options.rfid))
     if options.bearing_range:
-        out.bearing_range = listeners.listen(options.bearing_range, Landmarks(bag, options.bearing_range))
-    if options.sightings:
-        out.sightings = listeners.listen(options.sightings, PixelsOfPoints(bag, options.sightings))
+        out["bearing_range"] = listeners.listen(options.bearing_range, Landmarks(bag, options.bearing_range, frames))
+    if options.camera:
+        out["camera"] = images = _images(listeners, options.camera)
+        stack.callback(images.discard)
     for table in OTHERS:
         if (told := getattr(options, table.name)) is not None:
-            out.others[table.name] = listeners.listen(told, DescribedRows(bag, told, table))
-    if options.camera:
-        _listen_to_camera(listeners, options.camera, out)
-    if options.reference:
-        topic = options.reference
-        stamper = listeners.stamper(topic.topic, topic.clock)
-        if bag.topic(topic.topic).type not in TF:
-            out.reference = Poses(bag, topic.topic, topic)
-        else:
-            out.reference = FrameReference(bag, topic, stamper)
-        listeners.add(topic.topic, out.reference, stamper)
-    if options.start:
-        out.start = listeners.listen(options.start, Start(bag, options.start.topic, options.start))
+            out[table.name] = listeners.listen(told, rows_of_table(bag, told, table))
     return out
 
 
-def _listen_to_camera(listeners: Listeners, options: CameraTopic, out: Gathered) -> None:
+def _images(listeners: Listeners, options: CameraTopic) -> Images:
+    """Register a collector for images, if they have to be read, and return it."""
     stamper = listeners.stamper(options.topic, options.clock)
-    out.camera = Images(listeners.bag, options.topic, stamper)
-    if out.camera.known:
+    images = Images(listeners.bag, options.topic, stamper)
+    if images.known:
         listeners.stampers.append(stamper)
     else:
-        listeners.add(options.topic, out.camera, stamper)
-    if options.info:
-        out.info = Info(listeners.bag, options.info)
-        listeners.add(options.info, out.info, listeners.stamper(options.info, None), timed=False)
+        listeners.add(options.topic, images, stamper)
+    return images
 
 
-def _reference(
-    gathered: Gathered, options: Options, frames: StaticFrames, t0_ns: int, warnings: list[str]
-) -> Trajectory | None:
-    if options.reference is None:
-        return None
-    if isinstance(gathered.reference, FrameReference):
-        return gathered.reference.trajectory(frames, t0_ns, options.reference, warnings)
-    if gathered.reference is None:
-        return None
-    return gathered.reference.trajectory(t0_ns, options.reference.has_heading, warnings)
+def _poses(listeners: Listeners, options: PoseTopic, frames: StaticFrames) -> Poses | FrameReference:
+    """Register a collector for a topic of poses, or of tf with two frames, and return it."""
+    bag, stamper = listeners.bag, listeners.stamper(options.topic, options.clock)
+    is_tf = bag.topic(options.topic).type in TF
+    poses = FrameReference(bag, options, stamper, frames) if is_tf else Poses(bag, options.topic)
+    listeners.add(options.topic, poses, stamper)
+    return poses
 
 
 def _rig(
-    streams: dict[str, Stream], gathered: Gathered, options: Options, frames: StaticFrames, notes: list[str]
+    streams: dict[str, Stream], info: Info | None, options: Options, frames: StaticFrames, notes: list[str]
 ) -> Rig:
     """The rig from the bag; a rig in the manifest replaces it."""
-    base = options.base_frame
-    camera = camera_of(gathered.info, frames, base, notes) if gathered.info else None
+    camera = camera_of(info, frames, notes) if info else None
     reads = streams.get("rfid")
     rfid = None
     if options.rfid and isinstance(reads, RfidStream) and reads.antenna:
-        rfid = antennas_of(set(reads.antenna), options.rfid.frames, frames, base, notes)
+        rfid = antennas_of(set(reads.antenna), options.rfid.frames, frames, notes)
     usable = [name for name in streams if name not in {"camera", "sightings"} or camera is not None]
     return rig_of(usable, camera, rfid)
 
@@ -323,17 +289,10 @@ def read_trajectory(path: Path, topic: str) -> PosePath:
             told = listed(known) or "none has poses"
             raise InputError(f"{path}: is a bag, expected {path}:TOPIC, with one of its topics: {told}")
         listeners, warnings = Listeners(bag, "header"), list[str]()
-        stamper = listeners.stamper(name, None)
-        if bag.topic(name).type not in TF:
-            poses = Poses(bag, name)
-            listeners.add(name, poses, stamper)
-            listeners.run()
-            return replace(poses.in_space(warnings), warnings=tuple(warnings))
         parent, _, child = frames.partition(WITHIN)
-        if not parent or not child:
+        if bag.topic(name).type in TF and not (parent and child):
             raise InputError(f"{path}: {name} holds transforms, expected two frames too: {path}:{name}:map.base_link")
-        static = static_frames(listeners)
-        moving = FrameReference(bag, ReferenceTopic(topic=name, parent=parent, child=child), stamper)
-        listeners.add(name, moving, stamper)
+        static = static_frames(listeners, ROBOT[0])
+        poses = _poses(listeners, PoseTopic(topic=name, parent=parent, child=child), static)
         listeners.run()
-        return replace(moving.path(static, warnings), warnings=tuple(warnings))
+        return replace(poses.path(warnings), warnings=tuple(warnings))

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, Unread, read_mapped
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, read_mapped
 from factorgraph_loc.files.columns import ANGLE, STAMPS, Table, named
-from factorgraph_loc.files.models import FileModel, add_fields, inside
+from factorgraph_loc.files.models import FileModel, add_fields
 from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
 from factorgraph_loc.io.native import native
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
@@ -20,13 +20,13 @@ from factorgraph_loc.io.native.world_file import parse_world
 from factorgraph_loc.io.readers.mapped_poses import (
     OdometryFile,
     Offset,
-    PosesFile,
     ReferenceFile,
     odometry_stream,
     read_odometry,
     read_reference,
 )
 from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_reads, read_inventories
+from factorgraph_loc.io.readers.table_folder import TableFolder
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Turned, about_z
@@ -110,29 +110,27 @@ def read(path: Path | None, options: Options) -> Log:
         raise InputError(f"{path}: is not a folder: path in the manifest names the folder of the log's files")
     if options.odometry is None:
         raise InputError(f"{path}: odometry is missing in [options], which every estimator needs")
-    warnings: list[str] = []
-    unread = Unread()
-    odometry_path = inside(path, options.odometry.file, path)
-    times = _times(path, options.odometry)
-    odometry_t_ns, moves, increments = read_odometry(odometry_path, times, options.odometry, warnings, unread)
+    folder = TableFolder(path)
+    warnings = folder.warnings
+    odometry_t_ns, moves = read_odometry(folder, options.odometry)
     tables = {
-        name: _table(path, native_tables()[name][1], mapping, warnings, unread)
+        name: _table(folder, native_tables()[name][1], mapping)
         for name in ("imu", "camera", *OTHERS)
         if (mapping := getattr(options, name)) is not None
     }
-    rounds = _rounds(path, options, warnings, unread)
+    rounds = _rounds(folder, options)
     stamps = [odometry_t_ns, *(table.t_ns for table in tables.values()), *([rounds.end_ns] if rounds else [])]
     t0_ns = min(int(t_ns.min()) for t_ns in stamps)
-    streams: dict[str, Stream] = {"odometry": odometry_stream(odometry_t_ns, moves, increments, t0_ns)}
+    streams: dict[str, Stream] = {"odometry": odometry_stream(odometry_t_ns, moves, t0_ns)}
     if options.camera is not None:
-        folder = inside(path, options.camera.folder, path)
-        streams["camera"] = make_images(tables.pop("camera"), t0_ns, warnings, folder)
+        images = folder.file(options.camera.folder)
+        streams["camera"] = make_images(tables.pop("camera"), t0_ns, warnings, images)
     streams |= native.streams_of(tables, Reading(DEFAULT_RIG, t0_ns, warnings))
     if rounds:
         streams["rfid"] = rounds.stream(t0_ns)
     reference = None
     if (told := options.reference) is not None:
-        reference = read_reference(inside(path, told.file, path), _times(path, told), told, t0_ns, warnings, unread)
+        reference = read_reference(folder, told, t0_ns)
         if reference.t[0] > (stamps[0][-1] - t0_ns) / 1e9 or reference.t[-1] < (stamps[0][0] - t0_ns) / 1e9:
             warnings.append(
                 f"{told.file}: the reference and the odometry do not overlap: t = {reference.t[0]:.3f} s and "
@@ -146,28 +144,17 @@ def read(path: Path | None, options: Options) -> Log:
         streams=streams,
         reference=reference,
         t0_ns=t0_ns,
-        warnings=(*warnings, *unread.warnings()),
+        warnings=(*warnings, *folder.left_out()),
     )
 
 
-def _times(folder: Path, told: PosesFile) -> Path | None:
-    """The file of the stamps of poses in KITTI's format."""
-    return None if told.times is None else inside(folder, told.times, folder)
-
-
-def _table(
-    folder: Path, tables: Sequence[Table], mapping: SensorFile, warnings: list[str], unread: Unread
-) -> TableRows:
+def _table(folder: TableFolder, tables: Sequence[Table], mapping: SensorFile) -> TableRows:
     """A file in ``folder`` as one of ``tables`` of the native format."""
-    path = inside(folder, mapping.file, folder)
     shapes = tuple(shape for table in tables for shape in _shapes(table))
     columns = {column.name: column for table in tables for column in table.columns}
     if isinstance(mapping, ImuFile):
         shapes, columns = (*shapes, ("t", *RATES)), columns | {name: replace(RATE, name=name) for name in RATES}
-    mapped = read_mapped(path, mapping, shapes)
-    unread.note(mapped)
-    if mapped.passed:
-        warnings.append(f"{path}: {mapped.passed} objects without the columns of {tables[0].name} are skipped")
+    mapped = folder.read(mapping, shapes)
     known = [columns[name] for name in mapped.fields if name != "t"]
     names = {column.name: mapped.names(column) for column in known if column.kind in NAMES}
     unknown = {name: np.full(len(mapped.rows), np.nan) for name, column in columns.items() if column.may_lack}
@@ -179,22 +166,22 @@ def _table(
             numbers[column.name] = se2.wrap(numbers[column.name])  # others count from 0 to 2 pi
     if isinstance(mapping, ImuFile):
         numbers = {"w": _about_z(mapped, mapping, numbers)}
-    rows = TableRows(path, mapped.rows, mapped.stamps("t", mapping.clock_offset), numbers, names)
+    rows = TableRows(mapped.path, mapped.rows, mapped.stamps("t", mapping.clock_offset), numbers, names)
     if isinstance(mapping, NamedFile) and mapping.names is not None:
-        return _in_map(rows, folder, mapping.names, warnings)
+        return _in_map(rows, folder, mapping.names)
     return rows
 
 
-def _in_map(table: TableRows, folder: Path, naming: NamesFile, warnings: list[str]) -> TableRows:
+def _in_map(table: TableRows, folder: TableFolder, naming: NamesFile) -> TableRows:
     """The rows of a table with the names of the map, without the rows whose names the table of names lacks."""
-    path = inside(folder, naming.file, folder)
+    path = folder.file(naming.file)
     known = _names(path, naming)
     ((column, names),) = table.names.items()
     kept = np.flatnonzero([name in known for name in names])
     if not len(kept):
         raise InputError(f"{table.path}: no row has a {column} that {path.name} names, such as {listed(known)}")
     if skipped := len(names) - len(kept):
-        warnings.append(f"{table.path}: {skipped} rows have a {column} that {path.name} does not name: skipped")
+        folder.warnings.append(f"{table.path}: {skipped} rows have a {column} that {path.name} does not name: skipped")
     found = table.rows_at(kept)
     return replace(found, names={column: [known[name] for name in found.names[column]]})
 
@@ -203,9 +190,9 @@ def _names(path: Path, naming: NamesFile) -> dict[str, str]:
     """The names in the map by those in the table of a sensor; InputError if one occurs twice."""
     mapped = read_mapped(path, naming, (("file_name", "name"),))
     known: dict[str, str] = {}
-    for row, name, meaning in zip(mapped.rows, mapped.names(FILE_NAME), mapped.names(MAP_NAME), strict=True):
+    for i, (name, meaning) in enumerate(zip(mapped.names(FILE_NAME), mapped.names(MAP_NAME), strict=True)):
         if name in known:
-            raise bad_field(path, naming.columns["file_name"], name, "each name once", row=int(row))
+            raise mapped.invalid("file_name", i, "each name once")
         known[name] = meaning
     return known
 
@@ -228,26 +215,26 @@ def _about_z(mapped: Mapped, mapping: ImuFile, numbers: dict[str, Array]) -> Arr
     return numbers["w"]
 
 
-def _rounds(folder: Path, options: Options, warnings: list[str], unread: Unread) -> ReadsByRound | None:
+def _rounds(folder: TableFolder, options: Options) -> ReadsByRound | None:
+    path = folder.path
     files = [options.rfid] if options.rfid else list(options.readers.values())
     if options.rfid and options.readers:
-        raise InputError(f"{folder}: [options] has rfid and readers, expected one of them")
+        raise InputError(f"{path}: [options] has rfid and readers, expected one of them")
     if not files:
         if options.inventories is not None:
-            raise InputError(f"{folder}: [options] has inventories without rfid")
+            raise InputError(f"{path}: [options] has inventories without rfid")
         return None
-    tables = [read_all_reads(folder, told, warnings, unread) for told in files]
-    reads = tables[0] if len(tables) == 1 else joined(folder, tables)
+    tables = [read_all_reads(folder, told) for told in files]
+    reads = tables[0] if len(tables) == 1 else joined(path, tables)
     gaps = {told.round_gap for told in files if told.round_gap is not None}
     inventories = None
     if (mapping := options.inventories) is not None:
         if gaps:
-            raise InputError(f"{folder}: round_gap has no effect with inventories, which define the rounds")
+            raise InputError(f"{path}: round_gap has no effect with inventories, which define the rounds")
         antennas = {name: given for told in files for name, given in told.antennas.items()}
-        path = inside(folder, mapping.file, folder)
-        inventories = read_inventories(path, mapping, mapping.clock_offset, antennas, unread)
+        inventories = read_inventories(folder, mapping, mapping.clock_offset, antennas)
     if len(gaps) > 1:
         raise InputError(
-            f"{folder}: readers have round_gap {', '.join(f'{gap:g}' for gap in sorted(gaps))}, expected one"
+            f"{path}: readers have round_gap {', '.join(f'{gap:g}' for gap in sorted(gaps))}, expected one"
         )
-    return read_rounds(reads, inventories, gaps.pop() if gaps else ROUND_GAP, warnings)
+    return read_rounds(reads, inventories, gaps.pop() if gaps else ROUND_GAP, folder.warnings)

@@ -2,6 +2,7 @@
 per tag or per antenna."""
 
 import base64
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,19 +11,19 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import bounded
-from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, Mapped, Unread, in_case, read_mapped
+from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, Mapped, in_case, read_mapped
 from factorgraph_loc.files.columns import PURE, Column
-from factorgraph_loc.files.models import FileModel, InUnit, inside
+from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.files.tables import Cells, TableRows
+from factorgraph_loc.io.readers.table_folder import TableFolder
 from factorgraph_loc.sensors.rfid.columns import INVENTORIES, RFID
-from factorgraph_loc.sensors.rfid.tables import check_reads
+from factorgraph_loc.sensors.rfid.tables import SIGNALS, check_reads
 from factorgraph_loc.text import listed, quoted
 from factors.se2 import Array
 
 NAME = "the * of "  # and the pattern: the column of the names
-SIGNALS = ("rssi", "phase", "frequency")
 EPCS = ("epc", "epc_base64")
 OPTIONAL = (*SIGNALS, *EPCS, "channel", "last", "count")
 CHANNEL = Column("channel", "whole", PURE, 1.0, 1000.0, True, "the number of a channel")
@@ -96,12 +97,8 @@ def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Mapped
         raise InputError(f"{path}: with rssi = {quoted(pattern)} columns maps {listed(fixed)}, expected {expected}")
     units = {field: unit for field, unit in mapping.units.items() if field != "rssi"}
     narrow = read_mapped(path, mapping.model_copy(update={"columns": fixed, "units": units}), (tuple(fixed),))
-    before, _, after = pattern.partition("*")
-    names = {
-        column: column[len(before) : len(column) - len(after)]
-        for column in narrow.left_out
-        if column.startswith(before) and column.endswith(after) and len(column) > len(before) + len(after)
-    }
+    named = re.compile("(.+)".join(map(re.escape, pattern.split("*", 1))), re.DOTALL)
+    names = {column: found[1] for column in narrow.left_out if (found := named.fullmatch(column))}
     if not names:
         raise InputError(f"{path}: has no column {quoted(pattern)}, it has {listed(narrow.left_out)}")
     strengths = {f"{NAME}{column}": column for column in names}
@@ -168,22 +165,17 @@ class RfidFile(ColumnMapping):
         return {**content, "columns": columns, "units": units}
 
 
-def read_all_reads(folder: Path, options: RfidFile, warnings: list[str], unread: Unread) -> TableRows:
+def read_all_reads(folder: TableFolder, options: RfidFile) -> TableRows:
     """The reads of the file in ``folder``, or of all files that match a name with ``*``."""
     if "*" not in options.file:
-        return read_reads(inside(folder, options.file, folder), options, warnings, unread)
-    inside(folder, options.file.replace("*", "x"), folder)
-    with bounded.foreign(folder, f"rfid.file is {options.file[:80]!r}"):  # patterns that pathlib rejects
-        files = sorted(file for file in folder.glob(options.file) if file.is_file())
+        return read_reads(folder, folder.file(options.file), options)
+    folder.file(options.file.replace("*", "x"))
+    with bounded.foreign(folder.path, f"rfid.file is {options.file[:80]!r}"):  # patterns that pathlib rejects
+        files = sorted(file for file in folder.path.glob(options.file) if file.is_file())
     if not files:
-        raise InputError(f"{folder}: rfid.file is {quoted(options.file)}, expected the names of existing files")
-    return joined(
-        folder / options.file,
-        [
-            read_reads(inside(folder, str(file.relative_to(folder)), folder), options, warnings, unread)
-            for file in files
-        ],
-    )
+        raise InputError(f"{folder.path}: rfid.file is {quoted(options.file)}, expected the names of existing files")
+    tables = [read_reads(folder, folder.file(str(file.relative_to(folder.path))), options) for file in files]
+    return joined(folder.path / options.file, tables)
 
 
 def joined(path: Path, tables: Sequence[TableRows]) -> TableRows:
@@ -202,8 +194,8 @@ def _together(path: Path, tables: Sequence[TableRows]) -> TableRows:
     )
 
 
-def read_reads(path: Path, options: RfidFile, warnings: list[str], unread: Unread) -> TableRows:
-    """The reads as the table ``rfid`` of the native format. InputError names file, row and column.
+def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
+    """The reads of one file as the table ``rfid`` of the native format. InputError names file, row and column.
 
     A row that summarizes several reads gives two, the first one with the measured values; the times of the others are unknown.
     """
@@ -215,10 +207,9 @@ def read_reads(path: Path, options: RfidFile, warnings: list[str], unread: Unrea
     if {"channel", "frequency"} <= set(options.columns):
         raise InputError(f"{path}: columns maps frequency and channel, expected one of them")
     shapes = REQUIRED[0] if options.antenna is None else REQUIRED[1]
-    mapped = read_wide(path, options, options.antenna) if wide else read_mapped(path, options, shapes, OPTIONAL, EPCS)
-    unread.note(mapped)
-    if mapped.passed:
-        warnings.append(f"{path}: {mapped.passed} objects that are not reads are skipped")
+    mapped = folder.noted(
+        read_wide(path, options, options.antenna) if wide else read_mapped(path, options, shapes, OPTIONAL, EPCS)
+    )
     t_ns = mapped.stamps("t", options.clock_offset)
     antennas = [options.antenna] * len(t_ns) if options.antenna else mapped.names(RFID["antenna"])
     numbers = {name: _signal(mapped, name) for name in SIGNALS}
@@ -232,18 +223,17 @@ def read_reads(path: Path, options: RfidFile, warnings: list[str], unread: Unrea
         {"epc": _epcs(mapped, options.epc_case), "antenna": [options.antennas.get(str(a), str(a)) for a in antennas]},
     )
     check_reads(table)
-    return joined(path, [_with_last(table, mapped, options, warnings)])
+    return joined(path, [_with_last(table, mapped, options, folder.warnings)])
 
 
 def read_inventories(
-    path: Path, mapping: ColumnMapping, offset: float, antennas: Mapping[str, str], unread: Unread
+    folder: TableFolder, mapping: ColumnMapping, offset: float, antennas: Mapping[str, str]
 ) -> TableRows:
     """The rounds as the table ``inventories`` of the native format; ``antennas`` as for the reads."""
-    mapped = read_mapped(path, mapping, (("t", "antenna", "duration"),))
-    unread.note(mapped)
+    mapped = folder.read(mapping, (("t", "antenna", "duration"),))
     names = [antennas.get(name, name) for name in mapped.names(RFID["antenna"])]
     duration = mapped.numbers("duration", INVENTORIES["duration"])
-    return TableRows(path, mapped.rows, mapped.stamps("t", offset), {"duration": duration}, {"antenna": names})
+    return TableRows(mapped.path, mapped.rows, mapped.stamps("t", offset), {"duration": duration}, {"antenna": names})
 
 
 def _signal(mapped: Mapped, name: str) -> Array:
@@ -257,8 +247,8 @@ def _epcs(mapped: Mapped, case: EpcCase) -> list[str]:
         coded = mapped.texts("epc_base64")
         texts = [text or _from_base64(mapped, i, coded[i]) for i, text in enumerate(texts)]
     if "" in texts:
-        column = mapped.mapping.columns["epc" if "epc" in mapped.fields else "epc_base64"]
-        raise bad_field(mapped.path, column, "", RFID["epc"].doc, row=mapped.cells.rows[texts.index("")])
+        field = "epc" if "epc" in mapped.fields else "epc_base64"
+        raise mapped.invalid(field, texts.index(""), RFID["epc"].doc)
     plain = [text[2:-1] if text.startswith("b'") and text.endswith("'") else text for text in texts]
     return in_case(plain, case)
 
@@ -268,8 +258,7 @@ def _from_base64(mapped: Mapped, i: int, text: str) -> str:
     try:
         return base64.b64decode(text.translate(STANDARD) + "=" * (-len(text) % 4), validate=True).hex().upper()
     except ValueError:
-        column = mapped.mapping.columns["epc_base64"]
-        raise bad_field(mapped.path, column, text, "an EPC in base64", row=mapped.cells.rows[i]) from None
+        raise mapped.invalid("epc_base64", i, "an EPC in base64") from None
 
 
 def _frequencies(mapped: Mapped, channels: tuple[float, ...] | Channels | None) -> Array:
@@ -279,9 +268,7 @@ def _frequencies(mapped: Mapped, channels: tuple[float, ...] | Channels | None) 
     with np.errstate(invalid="ignore"):
         bad = np.flatnonzero(~(np.isnan(number) | ((number >= 1) & (number <= last) & (number == np.floor(number)))))
     if len(bad):
-        i = int(bad[0])
-        column = mapped.mapping.columns["channel"]
-        raise bad_field(mapped.path, column, float(number[i]), f"a channel of 1 to {last}", row=mapped.cells.rows[i])
+        raise mapped.invalid("channel", int(bad[0]), f"a channel of 1 to {last}")
     if isinstance(channels, Channels):
         return np.asarray((channels.first + (number - 1.0) * channels.step) * 1e6)
     table = np.array((*(channels or ()), np.nan)) * 1e6
@@ -299,11 +286,7 @@ def _with_last(table: TableRows, mapped: Mapped, options: RfidFile, warnings: li
     last_ns = mapped.stamps("last", options.clock_offset)
     wrong = np.flatnonzero(last_ns < table.t_ns)
     if len(wrong):
-        i = int(wrong[0])
-        column = mapped.mapping.columns["last"]
-        raise bad_field(
-            table.path, column, mapped.texts("last")[i], "a time not before the first", row=int(table.rows[i])
-        )
+        raise mapped.invalid("last", int(wrong[0]), "a time not before the first")
     several = last_ns > table.t_ns
     if "count" in mapped.fields:
         count = np.nan_to_num(mapped.numbers("count", COUNT), nan=1.0)

@@ -3,7 +3,7 @@
 Poses are quaternions in TUM and EuRoC files, and 3x4 matrices in KITTI files.
 """
 
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -14,9 +14,10 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
 from factorgraph_loc.files.columns import POSES, PURE, within
 from factorgraph_loc.files.models import FARTHEST, read_text
+from factorgraph_loc.files.tables import is_number
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.trajectory import read_tum_rows
-from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3
+from factorgraph_loc.model.trajectory3 import PosePath
 from factors.camera import model as reprojection
 from factors.se2 import Array, Integers
 
@@ -32,17 +33,17 @@ EXPECTED = (
 )
 
 
-def read_kitti(path: Path, times: Path) -> tuple[Integers, Integers, Trajectory3]:
-    """Rows (N,), timestamps (N,) [ns] and poses of a KITTI odometry file, whose timestamps are the lines of ``times``.
+def read_kitti(path: Path, times: Path) -> PosePath:
+    """The poses of a KITTI odometry file, whose timestamps are the lines of ``times``.
 
     The file's poses are those of a camera with z forward and y down, in the frame of the first one (Geiger, Lenz, Urtasun, "Are we
     ready for autonomous driving?", CVPR 2012). They are converted to x forward and z up. InputError names file and row.
     """
-    rows, matrices = read_matrices(path)
-    t_ns = stamps_of(path, len(rows), times)
+    matrices = read_matrices(path)
+    t_ns = stamps_of(path, len(matrices), times)
     u, _, vt = np.linalg.svd(matrices[:, :, :3])
     ahead = reprojection.FORWARD
-    return rows, t_ns, Trajectory3((t_ns - t_ns[0]) / 1e9, matrices[:, :, 3] @ ahead.T, ahead @ (u @ vt) @ ahead.T)
+    return PosePath(str(path), matrices[:, :, 3] @ ahead.T, ahead @ (u @ vt) @ ahead.T, t_ns)
 
 
 def stamps_of(path: Path, count: int, times: Path) -> Integers:
@@ -53,21 +54,20 @@ def stamps_of(path: Path, count: int, times: Path) -> Integers:
     return stamps[:count]
 
 
-def read_matrices(path: Path) -> tuple[Integers, Array]:
-    """Rows (N,) and poses (N, 3, 4), rotation and position, of a file in KITTI's format, as they are written. InputError names
-    file and row."""
+def read_matrices(path: Path) -> Array:
+    """The poses (N, 3, 4), rotation and position, of a file in KITTI's format, as they are written. InputError names file and
+    row."""
     columns = {field: str(i) for i, field in enumerate(MATRIX, start=1)}
     mapping = ColumnMapping(file=path.name, columns=columns, separator=" ", header=False)
     mapped = read_mapped(path, mapping, (MATRIX,))
-    rows = mapped.rows
     matrices = np.column_stack([mapped.numbers(field, ENTRY) for field in MATRIX]).reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
     off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((off > ORTHONORMAL) | (np.linalg.det(rotations) < 0.0))
     if len(bad):
         i = int(bad[0])
-        raise bad_field(path, "rotation", rotations[i].tolist(), "an orthonormal matrix", row=int(rows[i]))
-    return rows, matrices
+        raise bad_field(path, "rotation", rotations[i].tolist(), "an orthonormal matrix", row=mapped.cells.rows[i])
+    return matrices
 
 
 def read_times(path: Path) -> Integers:
@@ -83,57 +83,40 @@ def read_times(path: Path) -> Integers:
     return t_ns
 
 
-def read_poses(
-    path: Path, columns: Sequence[str], *, unit: str, separator: Literal[",", " "], warnings: list[str]
-) -> tuple[Integers, Trajectory3]:
-    """Timestamps (N,) [ns] and poses, in seconds after the first, of a file with ``columns`` t, x, y, z, qx, qy, qz, qw in any
-    order; the last one of equal timestamps. InputError names file and row."""
-    named = {name: str(i) for i, name in enumerate(columns, start=1)}
-    told = ColumnMapping(file=path.name, columns=named, units={"t": unit}, separator=separator, header=False)
-    mapped = read_mapped(path, told, (tuple(columns),))
-    numbers = {name: mapped.numbers(name, POSES[name]) for name in columns if name != "t"}
-    t_ns = mapped.stamps("t")
-    rotations = rotations_of(path, mapped.rows, np.column_stack([numbers[name] for name in ("qx", "qy", "qz", "qw")]))
-    positions = np.column_stack([numbers[name] for name in "xyz"])
-    keep = checks.in_order(path, mapped.rows, t_ns, warnings)
-    t_ns = t_ns[keep]
-    return t_ns, Trajectory3((t_ns - t_ns[0]) / 1e9, positions[keep], rotations[keep])
+def read_euroc_rows(path: Path) -> tuple[Integers, Integers, Array]:
+    """The rows of a EuRoC file in any order, as :func:`~factorgraph_loc.model.trajectory.read_tum_rows`."""
+    named = {name: str(i) for i, name in enumerate(EUROC, start=1)}
+    mapping = ColumnMapping(file=path.name, columns=named, units={"t": "ns"}, separator=",", header=False)
+    mapped = read_mapped(path, mapping, (EUROC,))
+    table = np.column_stack([mapped.numbers(name, POSES[name]) for name in TUM[1:]])
+    return mapped.rows, mapped.stamps("t"), table
 
 
-def read_pose_file(path: Path) -> PosePath:
-    """The poses in a file of TUM, KITTI or EuRoC format. InputError names file and row."""
-    row, first = _first_row(path)
-    kind = _format(first)
-    warnings: list[str] = []
+def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
+    """The poses in a file of TUM, KITTI or EuRoC format, by default the one that its first row has; the last one of equal
+    timestamps. InputError names file and row."""
     if kind is None:
-        raise bad_field(path, "row", first, EXPECTED, row=row)
-    if kind == "euroc":
-        t_ns, poses = read_poses(path, EUROC, unit="ns", separator=",", warnings=warnings)
-        return PosePath(str(path), poses.positions, poses.rotations, t_ns, warnings=tuple(warnings))
+        row, first = _first_row(path)
+        kind = _format(first)
+        if kind is None:
+            raise bad_field(path, "row", first, EXPECTED, row=row)
     if kind == "kitti":
-        _, matrices = read_matrices(path)
+        matrices = read_matrices(path)
         return PosePath(str(path), matrices[:, :, 3], matrices[:, :, :3], None)
-    rows, t_ns, table = read_tum_rows(path)
+    warnings: list[str] = []
+    rows, t_ns, table = read_euroc_rows(path) if kind == "euroc" else read_tum_rows(path)
     rotations = rotations_of(path, rows, table[:, 3:])
     keep = checks.in_order(path, rows, t_ns, warnings)
-    return PosePath(str(path), table[:, :3], rotations, t_ns, warnings=tuple(warnings)).rows(keep)
+    return replace(PosePath(str(path), table[:, :3], rotations, t_ns).rows(keep), warnings=tuple(warnings))
 
 
 def is_pose_file(path: Path) -> bool:
     """Whether the first row of a file has numbers alone, as many as one of the formats has."""
     try:
         _, first = _first_row(path)
-        return _format(first) is not None and all(map(_is_number, first.replace(",", " ").split()))
+        return _format(first) is not None and all(map(is_number, first.replace(",", " ").split()))
     except InputError:
         return False
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _format(first: str) -> Format | None:

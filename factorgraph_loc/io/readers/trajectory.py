@@ -14,10 +14,9 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import inside, read_text
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
-from factorgraph_loc.io.readers.mapped_poses import after_rest
 from factorgraph_loc.io.readers.pose_file import EUROC, read_pose_file, stamps_of
 from factorgraph_loc.model.log import NOT_READ, Log
-from factorgraph_loc.model.planar import Turned, on_floor
+from factorgraph_loc.model.planar import Turned
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import PosePath
@@ -54,10 +53,10 @@ def read(path: Path | None, options: Options) -> Log:
     names = _columns_after(path, len(EUROC))
     left_out = {NOT_READ: listed(names)} if names else {}
     bare = Log(path.stem, Rig(name=path.stem, sensors=()), World(name=path.stem), {}, t0_ns=t0_ns, metadata=left_out)
-    poses = on_floor(path, found.positions, found.rotations, warnings, options)
+    poses = found.on_floor(warnings, options)
     if options.use == "reference":
         return replace(bare, reference=Trajectory(t, poses), warnings=tuple(warnings))
-    moves = after_rest(motions.between_poses(path, t_ns, poses, warnings))
+    moves = motions.after_rest(motions.between_poses(path, t_ns, poses, warnings))
     odometry = IncrementStream(t, *moves.T)
     return replace(bare, rig=DEFAULT_RIG, streams={"odometry": odometry}, warnings=tuple(warnings))
 
