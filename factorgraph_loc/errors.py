@@ -1,6 +1,16 @@
 """Exceptions caused by user input. The command line prints their message as one line and exits with their code."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from factorgraph_loc.text import one_line, plain, quoted, told
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 class FglocError(Exception):
@@ -26,6 +36,21 @@ def bad_field(file: object, field: str, value: object, expected: str, *, row: in
     """The error for an invalid field: file, row (as line number), field, value and the expected value."""
     where = f"{plain(file)}:{row}" if row is not None else plain(file)
     return InputError(f"{where}: {plain(field)} is {quoted(value)}, expected {expected}")
+
+
+def require(
+    valid: NDArray[np.bool_],
+    file: object,
+    rows: Sequence[int] | NDArray[np.int64],
+    field: str,
+    values: NDArray[Any],
+    expected: str,
+) -> None:
+    """The error of :func:`bad_field` at the first of ``values`` (N, ...) that is not ``valid`` (N,); ``rows`` (N,): line numbers in
+    ``file``."""
+    if not valid.all():
+        i = int(valid.argmin())
+        raise bad_field(file, field, values[i].tolist(), expected, row=int(rows[i]))
 
 
 def unusable(error: OSError) -> InputError:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from factorgraph_loc.errors import bad_field
+from factorgraph_loc.errors import bad_field, require
 from factorgraph_loc.files.columns import SECONDS
 from factors.odometry.model import composed
 from factors.se2 import Array, Integers
@@ -15,16 +15,12 @@ ROUNDING = 1e-6  # s; tolerance of differences of timestamps
 
 def require_finite(source: object, rows: Integers, field: str, values: Array) -> None:
     """InputError at the first of ``values`` (N,) that is NaN or infinite; ``rows`` (N,): row numbers in ``source``."""
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad):
-        raise bad_field(source, field, float(values[bad[0]]), "a finite number", row=int(rows[bad[0]]))
+    require(np.isfinite(values), source, rows, field, values, "a finite number")
 
 
 def require_above_zero(source: object, rows: Integers, field: str, values: Array) -> None:
     """InputError at the first of ``values`` (N,) that is not positive; NaN (not measured) is valid."""
-    bad = np.flatnonzero(values <= 0.0)
-    if len(bad):
-        raise bad_field(source, field, float(values[bad[0]]), "more than 0", row=int(rows[bad[0]]))
+    require(~(values <= 0.0), source, rows, field, values, "more than 0")
 
 
 def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.columns import LATEST, Column, require_span
-from factorgraph_loc.files.models import FileModel, nearest, parse_json, read_text
+from factorgraph_loc.files.models import FileModel, InUnit, nearest, parse_json, read_text
 from factorgraph_loc.files.tables import Cells
 from factorgraph_loc.text import listed, quoted, told, well_formed
 from factors.se2 import Array
@@ -34,6 +34,17 @@ EpcCase = Literal["as written", "upper", "lower"]
 Alternatives = tuple[str, ...]  # columns of which one must be there
 Value = bool | int | str
 T = TypeVar("T")
+
+
+class ReadNames(FileModel):
+    """The names in a table or topic of RFID reads."""
+
+    antenna: str | None = None
+    """name of the only antenna, if the reads do not name it"""
+    antennas: dict[str, str] = Field(default_factory=dict)
+    """names in the rig of those of the reads"""
+    epc_case: EpcCase = "as written"
+    """letter case in which EPCs are compared with the map"""
 
 
 class ColumnMapping(FileModel):
@@ -61,6 +72,13 @@ class ColumnMapping(FileModel):
             column: {_text(value) for value in (values if isinstance(values, tuple) else (values,))}
             for column, values in self.where.items()
         }
+
+
+class TimedMapping(ColumnMapping):
+    """A table of another program with timestamps."""
+
+    clock_offset: Annotated[float, Field(ge=-1e10, le=1e10), InUnit("s")] = 0.0
+    """added to all timestamps"""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.errors import bad_field
+from factorgraph_loc.errors import bad_field, require
 from factorgraph_loc.files.models import FARTHEST
 from factorgraph_loc.files.settings import bound_text
 from factorgraph_loc.plugins import Place
@@ -108,11 +108,8 @@ class Column:
     ) -> None:
         """InputError at the first invalid one of ``values`` (N,), in our unit; ``rows`` (N,): row numbers in ``source``; ``name``:
         the column's name there."""
-        bad = self.outside(values)
-        if bad.any():
-            i = int(np.argmax(bad))
-            expected = self.expected + (", or nothing" if self.may_lack else "")
-            raise bad_field(source, name or self.name, values[i].item(), expected, row=int(rows[i]))
+        expected = self.expected + (", or nothing" if self.may_lack else "")
+        require(~self.outside(values), source, rows, name or self.name, values, expected)
 
 
 @dataclass(frozen=True)
@@ -140,20 +137,25 @@ class Table:
         return tuple((*always, *(n for c in choices for n in c)) for choices in itertools.product(*self.optional))
 
 
-def require_span(tables: Iterable[tuple[object, Sequence[int] | Integers | None, Integers]]) -> None:
-    """InputError if timestamps of tables, (source, rows (N,) or None, timestamps (N,) [ns]), are more than :data:`MAX_SPAN` apart;
-    it names the one that is farthest from the median."""
-    filled = [(source, rows, t_ns) for source, rows, t_ns in tables if len(t_ns)]
-    first, last = min(int(t.min()) for _, _, t in filled), max(int(t.max()) for _, _, t in filled)
-    if last - first <= MAX_SPAN * 1e9:
-        return
-    stamps = np.concatenate([t_ns for _, _, t_ns in filled])
-    middle = int(np.sort(stamps)[len(stamps) // 2])
-    far = [np.abs(t_ns - middle) for _, _, t_ns in filled]
-    source, rows, t_ns = filled[int(np.argmax([distances.max() for distances in far]))]
-    i = int(np.argmax(np.abs(t_ns - middle)))
-    expected = f"one at most {MAX_SPAN / 86_400.0:g} days from all others of the log, most are near {middle} ns"
-    raise bad_field(source, "stamp", f"{int(t_ns[i])} ns", expected, row=int(rows[i]) if rows is not None else None)
+def farthest(tables: Sequence[Array | Integers], most: float) -> tuple[int, int, float] | None:
+    """The table and the row of the timestamp that is farthest from the median of ``tables``, and the median; None if no two are
+    more than ``most`` apart."""
+    stamps = np.sort(np.concatenate(tables))
+    if not len(stamps) or stamps[-1] - stamps[0] <= most:
+        return None
+    middle = stamps[len(stamps) // 2]
+    table = int(np.argmax([np.abs(t - middle).max(initial=0) for t in tables]))
+    return table, int(np.argmax(np.abs(tables[table] - middle))), middle.item()
+
+
+def require_span(tables: Sequence[tuple[object, Sequence[int] | Integers, Integers]]) -> None:
+    """InputError if timestamps of tables, (source, rows (N,), timestamps (N,) [ns]), are more than :data:`MAX_SPAN` apart; it names
+    the one that is farthest from the median."""
+    if found := farthest([t_ns for _, _, t_ns in tables], MAX_SPAN * 1e9):
+        table, i, middle = found
+        source, rows, t_ns = tables[table]
+        expected = f"one at most {MAX_SPAN / 86_400.0:g} days from all others of the log, most are near {middle} ns"
+        raise bad_field(source, "stamp", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
 
 
 def number(

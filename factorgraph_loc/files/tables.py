@@ -37,11 +37,14 @@ class Cells:
         InputError at the first cell that is no number, not finite, or outside of the column's bounds.
         """
         cells = self.columns[name]
+        found: list[float] = []
         try:
-            values = np.array([float(cell) if cell else np.nan for cell in cells])
+            for cell in cells:
+                found.append(float(cell) if cell else math.nan)
         except ValueError:
-            i = next(i for i, cell in enumerate(cells) if cell and not is_number(cell))
+            i = len(found)
             raise bad_field(self.path, name, cells[i], "a number", row=self.rows[i]) from None
+        values = np.array(found, dtype=float)
         if written := [i for i in np.flatnonzero(~np.isfinite(values)).tolist() if cells[i]]:
             raise bad_field(self.path, name, cells[written[0]], "a finite number", row=self.rows[written[0]])
         told, factor = column.in_unit(unit)
@@ -56,15 +59,6 @@ class Cells:
         if "" in cells:
             raise bad_field(self.path, name, "", column.doc, row=self.rows[list(cells).index("")])
         return list(cells)
-
-
-def is_number(text: str) -> bool:
-    """Whether Python reads a text as a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def read_cells(path: Path, shapes: Sequence[Shape]) -> tuple[Cells, Shape]:
@@ -230,20 +224,16 @@ def _read_csv(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]
 
 
 def _stamps(path: Path, rows: Sequence[int], cells: Sequence[str]) -> Integers:
+    stamps: list[int] = []
     try:
-        stamps = np.array([int(cell) for cell in cells], dtype=np.int64)
+        for cell in cells:
+            if abs(stamp := int(cell)) > LATEST:
+                raise OverflowError
+            stamps.append(stamp)
     except (ValueError, OverflowError):
-        i = next(i for i, cell in enumerate(cells) if not _is_stamp(cell))
+        i = len(stamps)
         raise bad_field(path, STAMP.name, cells[i], STAMP.expected, row=rows[i]) from None
-    STAMP.require(path, rows, stamps)
-    return stamps
-
-
-def _is_stamp(cell: str) -> bool:
-    try:
-        return abs(int(cell)) <= LATEST
-    except ValueError:
-        return False
+    return np.array(stamps, dtype=np.int64)
 
 
 def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> TableRows:

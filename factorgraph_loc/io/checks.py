@@ -6,11 +6,10 @@ Readers check what they can attribute to a file and row; values computed from se
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.checks import ROUNDING
-from factorgraph_loc.files.columns import MAX_SPAN, POSES, Column
+from factorgraph_loc.files.columns import MAX_SPAN, POSES, Column, farthest
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.registry import channels
@@ -55,11 +54,9 @@ def require_one_span(log: Log) -> None:
             raise InputError(f"{log.name}: {name} has a timestamp that is not a finite number")
     first, last = log.span()
     expected = f"one at most {MAX_SPAN / 86_400.0:g} days from all others of the log"
-    if last - first > MAX_SPAN:
-        stamps: NDArray[np.float64] = np.sort(np.concatenate(list(filled.values())))
-        middle = float(stamps[len(stamps) // 2])
-        name, t = max(filled.items(), key=lambda item: float(np.abs(item[1] - middle).max()))
-        i = int(np.argmax(np.abs(t - middle)))
+    if found := farthest(list(filled.values()), MAX_SPAN):
+        table, i, middle = found
+        name, t = list(filled.items())[table]
         where = f"{log.name}: {name} has a timestamp {t[i] - middle:+.0f} s from most others in row {i + 1}"
         raise InputError(f"{where}, expected {expected}: do their clocks agree?")
     if log.start is not None and not last - MAX_SPAN <= log.start.t <= first + MAX_SPAN:

@@ -32,11 +32,10 @@ class WheelSizes(FileModel):
     def sizes(self, source: object, what: str, *, turns: bool) -> tuple[float, float]:
         """Metres per unit, and the track [m]. ``turns``: whether the wheels tell how they turn. InputError if a size is missing,
         which ``what`` needs."""
-        for name, value in {"track": self.track, **({"radius": self.radius} if turns else {})}.items():
-            if value is None:
-                raise InputError(f"{source}: {what} needs {name} [m], here or in [odometry.wheels] of the rig")
-        assert self.track is not None
-        return self.radius if turns and self.radius is not None else 1.0, self.track
+        if self.track is None or (turns and self.radius is None):
+            lacking = "track" if self.track is None else "radius"
+            raise InputError(f"{source}: {what} needs {lacking} [m], here or in [odometry.wheels] of the rig")
+        return self.radius if turns and self.radius else 1.0, self.track
 
 
 def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[str]) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
-from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.errors import InputError, require
 from factorgraph_loc.files.models import FileModel, InUnit
 from factors.se2 import Array
 
@@ -104,10 +104,8 @@ def require_unit(source: object, rows: Integers, quaternions: Array) -> None:
     """InputError if one of the quaternions (N, 4) is not a unit quaternion."""
     with np.errstate(over="ignore"):
         length = np.sqrt(np.sum(quaternions**2, axis=1))
-    bad = np.flatnonzero(~(np.abs(length - 1.0) <= UNIT))
-    if len(bad):
-        i = int(bad[0])
-        raise bad_field(source, "length of the quaternion", float(length[i]), "1, a unit quaternion", row=int(rows[i]))
+    valid = np.abs(length - 1.0) <= UNIT
+    require(valid, source, rows, "length of the quaternion", length, "1, a unit quaternion")
 
 
 def on_floor(
@@ -146,7 +144,6 @@ def about_z(source: object, rows: Integers, rates: Array, turned: Array) -> Arra
     """
     needed = np.flatnonzero(np.abs(turned[2]) > NEGLIGIBLE)
     for i in needed.tolist():
-        if len(bad := np.flatnonzero(~np.isfinite(rates[:, i]))):
-            row = int(rows[bad[0]])
-            raise bad_field(source, f"turn rate about {'xyz'[i]}", float(rates[bad[0], i]), "a finite number", row=row)
+        valid = np.isfinite(rates[:, i])
+        require(valid, source, rows, f"turn rate about {'xyz'[i]}", rates[:, i], "a finite number")
     return np.asarray(rates[:, needed] @ turned[2, needed])

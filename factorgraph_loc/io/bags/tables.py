@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.column_mapping import SECONDS, EpcCase, in_case
+from factorgraph_loc.files.column_mapping import SECONDS, ReadNames, in_case
 from factorgraph_loc.files.columns import LATEST, Column, Table
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
@@ -95,19 +95,13 @@ class DescribedRows(RowsOfTopic):
         return stream_of(self._table, self.rows_of(), t0_ns, warnings)
 
 
-class RfidTopic(TopicSettings):
+class RfidTopic(TopicSettings, ReadNames):
     """A topic of reads."""
 
     fields: dict[ReadField, str]
     """paths of the EPC, the antenna and other values in a message"""
     units: dict[Literal["rssi", "phase", "frequency", "stamp"], str | float] = Field(default_factory=dict)
     """units of rssi, phase, frequency and stamp, if not dBm, rad, Hz and us; or factors"""
-    antenna: str | None = None
-    """name of the only antenna, if messages do not name it"""
-    antennas: dict[str, str] = Field(default_factory=dict)
-    """names in the rig of those in messages"""
-    epc_case: EpcCase = "as written"
-    """letter case in which EPCs are compared with the map"""
     frames: dict[str, str] = Field(default_factory=dict)
     """frames of antennas in tf_static, if named differently"""
     rounds: Literal["gaps", "message"] = "gaps"

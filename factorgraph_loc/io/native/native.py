@@ -16,13 +16,13 @@ from factorgraph_loc.files.temporary import sweep, temporary_folder, writing
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig, write_rig
 from factorgraph_loc.io.native.world_file import parse_world, read_world, write_world
 from factorgraph_loc.io.readers.manifests import StartSettings
+from factorgraph_loc.io.readers.pose_file import read_pose_file
 from factorgraph_loc.maps.points import POINTS_SUFFIX
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.measurement import Stream
-from factorgraph_loc.model.planar import on_floor, rotations_of
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.sections import layers
-from factorgraph_loc.model.trajectory import Trajectory, read_tum_rows, write_tum
+from factorgraph_loc.model.trajectory import Trajectory, write_tum
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.registry import Channel, channel
 from factorgraph_loc.sensors.tables import Reading, Writing, assemble, disassemble, native_tables
@@ -132,10 +132,10 @@ def streams_of(tables: Mapping[str, TableRows], reading: Reading) -> dict[str, S
 def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory | None:
     if not path.is_file():
         return None
-    rows, t_ns, table = read_tum_rows(inside(path.parent, path.name, path.parent))
-    poses = on_floor(path, table[:, :3], rotations_of(path, rows, table[:, 3:]), warnings)
-    keep = checks.in_order(path, rows, t_ns, warnings)
-    return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=has_heading)
+    found = read_pose_file(inside(path.parent, path.name, path.parent), "tum")
+    warnings += found.warnings
+    assert found.t_ns is not None
+    return Trajectory(checks.seconds(found.t_ns, t0_ns), found.on_floor(warnings), has_heading=has_heading)
 
 
 def write_native(

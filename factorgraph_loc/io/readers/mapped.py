@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, read_mapped
+from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, TimedMapping, read_mapped
 from factorgraph_loc.files.columns import ANGLE, STAMPS, Table, named
 from factorgraph_loc.files.models import FileModel, add_fields
 from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
@@ -19,13 +19,12 @@ from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.io.native.world_file import parse_world
 from factorgraph_loc.io.readers.mapped_poses import (
     OdometryFile,
-    Offset,
     ReferenceFile,
     odometry_stream,
     read_odometry,
     read_reference,
 )
-from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_reads, read_inventories
+from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_reads
 from factorgraph_loc.io.readers.table_folder import TableFolder
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
@@ -48,34 +47,23 @@ class NamesFile(ColumnMapping):
     """A table of names. ``columns``: ``file_name``, a name in the table of the sensor, and ``name``, that in the map."""
 
 
-class SensorFile(ColumnMapping):
-    """A table of a sensor."""
-
-    clock_offset: Offset = 0.0
-    """added to all timestamps"""
-
-
-class NamedFile(SensorFile):
+class NamedFile(TimedMapping):
     """A table of a sensor that names things of the map."""
 
     names: NamesFile | None = None
     """table of the names in the map by those in the file; rows with other names are skipped"""
 
 
-class ImuFile(SensorFile, Turned):
+class ImuFile(TimedMapping, Turned):
     """``columns``: t and w, the turn rate about the vertical axis; or wx, wy and wz, about axes whose orientation is given by
     ``axes`` and ``mounting``."""
 
 
-class ImageFile(SensorFile):
+class ImageFile(TimedMapping):
     """The table of images."""
 
     folder: str = "."
     """folder of the images, by default that of the log"""
-
-
-class InventoryFile(SensorFile):
-    """``columns``: t (the end of a round), antenna, duration. Antenna names are those of ``rfid``."""
 
 
 class Options(FileModel):
@@ -85,7 +73,8 @@ class Options(FileModel):
     imu: ImuFile | None = None
     rfid: RfidFile | None = None
     readers: dict[str, RfidFile] = Field(default_factory=dict)
-    inventories: InventoryFile | None = None
+    inventories: TimedMapping | None = None
+    """table of inventory rounds: t (the end of a round), antenna, duration; antennas are named as in rfid"""
     camera: ImageFile | None = None
     reference: ReferenceFile | None = None
     world: dict[str, Any] = Field(default_factory=dict)
@@ -99,7 +88,7 @@ def _has_names(tables: Sequence[Table]) -> bool:
 OTHERS = [name for name in native_tables() if name not in Options.model_fields]  # tables that need a mapping only
 add_fields(
     Options,
-    {name: ((NamedFile if _has_names(native_tables()[name][1]) else SensorFile) | None, None) for name in OTHERS},
+    {name: ((NamedFile if _has_names(native_tables()[name][1]) else TimedMapping) | None, None) for name in OTHERS},
     after="camera",
 )
 
@@ -148,7 +137,7 @@ def read(path: Path | None, options: Options) -> Log:
     )
 
 
-def _table(folder: TableFolder, tables: Sequence[Table], mapping: SensorFile) -> TableRows:
+def _table(folder: TableFolder, tables: Sequence[Table], mapping: TimedMapping) -> TableRows:
     """A file in ``folder`` as one of ``tables`` of the native format."""
     shapes = tuple(shape for table in tables for shape in _shapes(table))
     columns = {column.name: column for table in tables for column in table.columns}
@@ -232,7 +221,9 @@ def _rounds(folder: TableFolder, options: Options) -> ReadsByRound | None:
         if gaps:
             raise InputError(f"{path}: round_gap has no effect with inventories, which define the rounds")
         antennas = {name: given for told in files for name, given in told.antennas.items()}
-        inventories = read_inventories(folder, mapping, mapping.clock_offset, antennas)
+        inventories = _table(folder, native_tables()["inventories"][1], mapping)
+        named = [antennas.get(name, name) for name in inventories.names["antenna"]]
+        inventories = replace(inventories, names={"antenna": named})
     if len(gaps) > 1:
         raise InputError(
             f"{path}: readers have round_gap {', '.join(f'{gap:g}' for gap in sorted(gaps))}, expected one"

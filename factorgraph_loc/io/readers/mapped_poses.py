@@ -1,16 +1,15 @@
 """Odometry and references from mapped columns: velocities, motions, poses or distances of two wheels."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.errors import InputError, require
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped
+from factorgraph_loc.files.column_mapping import Mapped, TimedMapping
 from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
-from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.readers.pose_file import read_kitti, read_pose_file
 from factorgraph_loc.io.readers.table_folder import TableFolder
@@ -21,8 +20,6 @@ from factorgraph_loc.sensors.odometry.tables import INCREMENTS, VELOCITIES, WAYS
 from factorgraph_loc.sensors.odometry.tables import WHEELS as WHEEL_COLUMNS
 from factors import se2
 from factors.se2 import Array, Integers
-
-Offset = Annotated[float, Field(ge=-1e10, le=1e10), InUnit("s")]
 
 QUATERNION = ("qx", "qy", "qz", "qw")
 POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION), ("t", "x", "y", "z", *QUATERNION))
@@ -38,7 +35,7 @@ LEAST_AROUND = 300.0  # rad between rows, which no robot can rotate
 COLUMNS = {c.name: c for table in (VELOCITIES, INCREMENTS, WAYS, WHEEL_COLUMNS, POSE_COLUMNS) for c in table.columns}
 
 
-class PosesFile(ColumnMapping, Turned):
+class PosesFile(TimedMapping, Turned):
     """A file with poses."""
 
     format: Literal["columns", "tum", "kitti", "euroc"] = "columns"
@@ -47,8 +44,6 @@ class PosesFile(ColumnMapping, Turned):
     """column of the file for each field, if the format is columns"""
     times: str | None = None
     """file of the times of a KITTI file"""
-    clock_offset: Offset = 0.0
-    """added to all timestamps"""
 
     def in_format(self) -> bool:
         """Whether the file is in the format of another program."""
@@ -163,8 +158,6 @@ def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turne
         raise InputError(f"{path}: axes and mounting apply to poses with a quaternion, expected columns qx, qy, qz, qw")
     heading = columns.get("heading", np.zeros(len(rows)))
     around = np.abs(np.diff(heading, prepend=heading[0]))
-    if degrees := np.flatnonzero((around > LEAST_AROUND) & (around < 360.0)).tolist():
-        i = degrees[0]
-        expected = 'radians; it seems to wrap at 360: units.heading = "deg"'
-        raise bad_field(path, "heading", float(heading[i]), expected, row=int(rows[i]))
+    valid = ~((around > LEAST_AROUND) & (around < 360.0))
+    require(valid, path, rows, "heading", heading, 'radians; it seems to wrap at 360: units.heading = "deg"')
     return np.column_stack((columns["x"], columns["y"], se2.wrap(heading)))

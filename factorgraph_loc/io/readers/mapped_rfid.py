@@ -3,7 +3,7 @@ per tag or per antenna."""
 
 import base64
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,12 +13,20 @@ from pydantic import Field, model_validator
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import bounded
-from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, Mapped, in_case, read_mapped
+from factorgraph_loc.files.column_mapping import (
+    ColumnMapping,
+    EpcCase,
+    Mapped,
+    ReadNames,
+    TimedMapping,
+    in_case,
+    read_mapped,
+)
 from factorgraph_loc.files.columns import PURE, Column
 from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.files.tables import Cells, TableRows
 from factorgraph_loc.io.readers.table_folder import TableFolder
-from factorgraph_loc.sensors.rfid.columns import INVENTORIES, RFID
+from factorgraph_loc.sensors.rfid.columns import RFID
 from factorgraph_loc.sensors.rfid.tables import SIGNALS, check_reads
 from factorgraph_loc.text import listed, quoted
 from factors.se2 import Array
@@ -127,7 +135,7 @@ class Channels(FileModel):
     """frequency from one channel to the next"""
 
 
-class RfidFile(ColumnMapping):
+class RfidFile(TimedMapping, ReadNames):
     """``columns``: t (or the first of several reads), epc or epc_base64, antenna, rssi (with ``*``: a column per tag or antenna),
     phase, frequency or channel, and, if a row summarizes several reads, ``last`` and ``count``."""
 
@@ -135,18 +143,10 @@ class RfidFile(ColumnMapping):
     """column of the file for each field, besides those of the preset"""
     preset: Literal["impinj_itemtest", "impinj_iot", "sllurp_log", "sllurp_reports"] | None = None
     """columns and units of a known tool, which those given here override"""
-    antenna: str | None = None
-    """name of the only antenna"""
-    antennas: dict[str, str] = Field(default_factory=dict)
-    """names in the rig of those in the file"""
     channels: tuple[Annotated[float, Field(gt=100.0, lt=10_000.0), InUnit("MHz")], ...] | Channels | None = None
     """frequencies of channels 1, 2, ..."""
-    epc_case: EpcCase = "as written"
-    """letter case in which EPCs are compared with the map"""
     round_gap: Annotated[float, Field(gt=0.0, le=10.0), InUnit("s")] | None = None
     """gap between reads that ends an inventory round"""
-    clock_offset: Annotated[float, Field(ge=-1e10, le=1e10), InUnit("s")] = 0.0
-    """added to all timestamps"""
 
     @model_validator(mode="before")
     @classmethod
@@ -224,16 +224,6 @@ def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
     )
     check_reads(table)
     return joined(path, [_with_last(table, mapped, options, folder.warnings)])
-
-
-def read_inventories(
-    folder: TableFolder, mapping: ColumnMapping, offset: float, antennas: Mapping[str, str]
-) -> TableRows:
-    """The rounds as the table ``inventories`` of the native format; ``antennas`` as for the reads."""
-    mapped = folder.read(mapping, (("t", "antenna", "duration"),))
-    names = [antennas.get(name, name) for name in mapped.names(RFID["antenna"])]
-    duration = mapped.numbers("duration", INVENTORIES["duration"])
-    return TableRows(mapped.path, mapped.rows, mapped.stamps("t", offset), {"duration": duration}, {"antenna": names})
 
 
 def _signal(mapped: Mapped, name: str) -> Array:

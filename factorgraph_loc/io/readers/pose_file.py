@@ -9,12 +9,11 @@ from typing import Literal
 
 import numpy as np
 
-from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.errors import InputError, bad_field, require
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
 from factorgraph_loc.files.columns import POSES, PURE, within
 from factorgraph_loc.files.models import FARTHEST, read_text
-from factorgraph_loc.files.tables import is_number
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.trajectory import read_tum_rows
 from factorgraph_loc.model.trajectory3 import PosePath
@@ -63,10 +62,8 @@ def read_matrices(path: Path) -> Array:
     matrices = np.column_stack([mapped.numbers(field, ENTRY) for field in MATRIX]).reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
     off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
-    bad = np.flatnonzero((off > ORTHONORMAL) | (np.linalg.det(rotations) < 0.0))
-    if len(bad):
-        i = int(bad[0])
-        raise bad_field(path, "rotation", rotations[i].tolist(), "an orthonormal matrix", row=mapped.cells.rows[i])
+    valid = ~((off > ORTHONORMAL) | (np.linalg.det(rotations) < 0.0))
+    require(valid, path, mapped.rows, "rotation", rotations, "an orthonormal matrix")
     return matrices
 
 
@@ -75,11 +72,7 @@ def read_times(path: Path) -> Integers:
     columns = ColumnMapping(file=path.name, columns={"t": "1"}, units={"t": "s"}, separator=" ", header=False)
     mapped = read_mapped(path, columns, (("t",),))
     t_ns = mapped.stamps("t")
-    stuck = np.flatnonzero(np.diff(t_ns) <= 0) + 1
-    if len(stuck):
-        i = int(stuck[0])
-        expected = f"a timestamp after that of the row before, {int(t_ns[i - 1])} ns"
-        raise bad_field(path, "time", f"{int(t_ns[i])} ns", expected, row=int(mapped.rows[i]))
+    require(np.diff(t_ns) > 0, path, mapped.rows[1:], "time", t_ns[1:], "nanoseconds after those of the row before")
     return t_ns
 
 
@@ -114,8 +107,8 @@ def is_pose_file(path: Path) -> bool:
     """Whether the first row of a file has numbers alone, as many as one of the formats has."""
     try:
         _, first = _first_row(path)
-        return _format(first) is not None and all(map(is_number, first.replace(",", " ").split()))
-    except InputError:
+        return _format(first) is not None and bool([float(part) for part in first.replace(",", " ").split()])
+    except (InputError, ValueError):
         return False
 
 
