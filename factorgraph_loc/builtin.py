@@ -1,6 +1,6 @@
-"""The module paths of the sensors, estimators, mappers and readers of this project, and of the functions for its files."""
+"""The module paths of the sensors, estimators, mappers and readers of this project."""
 
-from factorgraph_loc.plugins import ESTIMATORS, FILES, MAPPERS, READERS, SENSORS
+from factorgraph_loc.plugins import ESTIMATORS, MAPPERS, READERS, SENSORS
 
 SENSORS.own |= {
     "odometry": "factorgraph_loc.sensors.odometry:SENSOR",
@@ -26,16 +26,4 @@ READERS.own |= {
     "plaza": "factorgraph_loc.io.readers.plaza",
     "rosbag": "factorgraph_loc.io.bags.rosbag",
     "trajectory": "factorgraph_loc.io.readers.trajectory",
-}
-FILES |= {
-    "read_rig": "factorgraph_loc.io.native.rig_file:read_rig",
-    "write_rig": "factorgraph_loc.io.native.rig_file:write_rig",
-    "read_world": "factorgraph_loc.io.native.world_file:read_world",
-    "write_world": "factorgraph_loc.io.native.world_file:write_world",
-    "read_trajectory": "factorgraph_loc.io.trajectories:read_trajectory",
-    "write_kitti": "factorgraph_loc.exports.trajectories:write_kitti",
-    "to_evo": "factorgraph_loc.io.trajectories:to_evo",
-    "from_evo": "factorgraph_loc.io.trajectories:from_evo",
-    "to_ros": "factorgraph_loc.io.trajectories:to_ros",
-    "from_ros": "factorgraph_loc.io.trajectories:from_ros",
 }

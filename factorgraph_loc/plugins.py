@@ -1,7 +1,8 @@
 """Registries of sensors, estimators, readers and mappers by name, loaded lazily.
 
 Those of this project are listed in :mod:`factorgraph_loc.builtin`. Other packages register theirs by entry points of the groups
-``factorgraph_loc.sensors``, ``factorgraph_loc.estimators``, ``factorgraph_loc.readers`` and ``factorgraph_loc.mappers``.
+``factorgraph_loc.sensors``, ``factorgraph_loc.estimators``, ``factorgraph_loc.readers`` and ``factorgraph_loc.mappers``. Further
+names that commands offer are here too, because this module is imported fast.
 """
 
 from __future__ import annotations
@@ -87,4 +88,21 @@ SENSORS = Group("sensors", "channels", "settings", "layers")
 ESTIMATORS = Group("estimators", "process", "estimate")
 READERS = Group("readers", "Options", "read")
 MAPPERS = Group("mappers")
-FILES: dict[str, Place] = {}  # what reads, writes and converts the values of `model`, by the name of the function
+
+MAP_ESTIMATORS = ("batch", "smoother", "ekf")  # those that estimate landmarks
+ACTIVE_ESTIMATORS = ("active_mcl", "particle_filter", "smoother")  # of robots that plan their paths
+PRESETS = {  # of simulations, each with its world
+    "office": "Rooms on both sides of a corridor, doors, furniture; tags on walls and furniture.",
+    "sparse": "The same with fewer tags.",
+    "bursty": "The same as office; each antenna loses each tag for 2 s on average, a fifth of the time.",
+    "corridor": "One corridor, the same from both ends; tags evenly on both sides.",
+    "warehouse": "Rows of shelves with tags.",
+    "symmetric": "Corridors in the shape of an H with a half-turn symmetry; three tags hang in them.",
+}
+POLICIES = {  # of active robots, each with the path that it chooses
+    "information": "The largest expected reduction of entropy minus the cost.",
+    "paper_literal": "The same with the sign as printed in the paper.",
+    "random": "Any of the arcs, short straight paths and turns in place, to its end.",
+    "patrol": "Straight on until a wall is near, then where most is free; back only if nothing else is free.",
+    "nearest_tags": "Towards the nearest tags, on average over the belief.",
+}

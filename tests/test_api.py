@@ -123,12 +123,12 @@ def test_an_experiment_gives_its_table(tmp_path):
 
 def test_another_rig_and_map_are_values_or_files(office, tmp_path):
     blind = office.rig.model_copy(update={"sensors": ("odometry",)})
-    blind.write(tmp_path / "blind.rig.toml")
+    fgloc.write_rig(blind, tmp_path / "blind.rig.toml")
     moved = {
         name: mark.model_copy(update={"x": mark.x + 1.0}) for name, mark in office.world.of(fgloc.Landmark).items()
     }
     world = office.world.model_copy(update={"landmarks": moved})
-    world.write(tmp_path / "moved.world.toml")
+    fgloc.write_world(world, tmp_path / "moved.world.toml")
     fgloc.convert(office, tmp_path / "log")
     straight = fgloc.run(office, "ekf", sensors=["odometry"]).result.final.poses
     used = {"sensors": ["odometry", "bearing_range"]}
@@ -149,7 +149,7 @@ def test_stored_results_are_written_for_other_programs(office, tmp_path):
     assert files == [tmp_path / "ekf.kitti", tmp_path / "ekf.times.txt"]
     assert all(file.is_file() for file in files)
     assert fgloc.export([tmp_path / "ekf", office], tmp_path / "ekf.tum") == [tmp_path / "ekf.tum"]
-    read = fgloc.Trajectory.read(tmp_path / "ekf.tum", office.t0_ns)
+    read = fgloc.Trajectory.of(fgloc.read_trajectory(tmp_path / "ekf.tum"), office.t0_ns)
     assert read.poses == pytest.approx(run.result.final.poses, abs=1e-8)
     with pytest.raises(fgloc.InputError, match=r"has the suffix '.csv', expected one of .mcap"):
         fgloc.export(office, tmp_path / "ekf.csv")

@@ -80,8 +80,9 @@ def test_a_script_makes_writes_reads_and_runs_a_log(tmp_path):
     assert (tmp_path / "copy/odometry.parquet").is_file()
     found = fgloc.run(read, "ekf").result
     assert found.final.poses[-1] == pytest.approx((0.95, 0.0, 0.0), abs=0.1)
-    fgloc.write_tum(found.final, str(tmp_path / "ekf.tum"))
-    assert fgloc.read_tum(str(tmp_path / "ekf.tum")).poses == pytest.approx(found.final.poses, abs=1e-8)
+    fgloc.write_trajectory(found.final, str(tmp_path / "ekf.tum"))
+    read = fgloc.Trajectory.of(fgloc.read_trajectory(str(tmp_path / "ekf.tum")))
+    assert read.poses == pytest.approx(found.final.poses, abs=1e-8)
 
 
 def test_a_script_keeps_rig_map_and_grid(tmp_path):

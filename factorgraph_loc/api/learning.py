@@ -17,6 +17,7 @@ from factorgraph_loc.files.temporary import of_system, temporary_folder, writing
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
+from factorgraph_loc.plugins import MAP_ESTIMATORS
 
 RIG = ".rig.toml"
 FEATURES = ("colour", "sift", "orb")
@@ -55,7 +56,7 @@ def build_map(
     out: str | Path,
     *,
     of: str | None = None,
-    estimator: str = maps.MAPPERS[0],
+    estimator: str = MAP_ESTIMATORS[0],
     settings: Settings | None = None,
     extend: bool = False,
     poses: str | None = None,

@@ -16,12 +16,11 @@ from factorgraph_loc.io.native import rig_file as first
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig, rig_text
 from factorgraph_loc.io.readers import reader
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.planning.policies import POLICIES
 from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
+from factorgraph_loc.plugins import ESTIMATORS, POLICIES, PRESETS, READERS, SENSORS
 from factorgraph_loc.sensors.registry import about, sections_of, sensor
 from factorgraph_loc.sensors.tables import tables_of_sensor
-from factorgraph_loc.simulation.settings import ABOUT, PRESETS, SimulationSettings, preset
+from factorgraph_loc.simulation.settings import SimulationSettings, preset
 
 ADVICE = "`fgloc sensors NAME` prints all keys of a sensor, with bounds."
 
@@ -105,14 +104,12 @@ def known_presets() -> list[PresetDescription]:
 def describe_preset(name: str) -> PresetDescription:
     """The description of a preset of simulations; InputError for an unknown one."""
     settings = settings_in(SimulationSettings, default=preset(name))
-    return PresetDescription(name, ABOUT[name], tuple(s for s in settings if not s.key.startswith("rig.")))
+    return PresetDescription(name, PRESETS[name], tuple(s for s in settings if not s.key.startswith("rig.")))
 
 
 def known_policies() -> PoliciesDescription:
     """The policies of active robots, and the settings of their runs."""
-    return PoliciesDescription(
-        {name: about for name, (about, _) in POLICIES.items()}, tuple(settings_in(ActiveSettings))
-    )
+    return PoliciesDescription(POLICIES, tuple(settings_in(ActiveSettings)))
 
 
 def known_rigs() -> dict[str, Rig]:

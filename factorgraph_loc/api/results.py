@@ -12,7 +12,7 @@ from factorgraph_loc.exports.points import write_bundle, write_ply
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 from factorgraph_loc.exports.ros import write_mcap
 from factorgraph_loc.exports.runs import Particles, StoredRun, find_runs, is_results, read_runs
-from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write_g2o
+from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write_g2o, write_trajectory
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
@@ -127,7 +127,7 @@ def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
         sensors = run.folder.config.sensors or log.rig.sensors
         write_g2o(pose_graph(log, run.final, sensors, run.landmarks), out)
     else:
-        _trajectory(log, runs, out).write(out, log.t0_ns)
+        write_trajectory(_trajectory(log, runs, out), out, log.t0_ns)
     return [out, out.with_name(out.stem + TIMES_SUFFIX)] if out.suffix == ".kitti" else [out]
 
 

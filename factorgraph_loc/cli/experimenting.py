@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from factorgraph_loc.cli import completion, show
-from factorgraph_loc.cli.options import DataRoot, Json, Out, Overwrite, key_and_value, parse_list
-from factorgraph_loc.cli.simulating import nested_changes
+from factorgraph_loc.cli.options import DataRoot, Json, Out, Overwrite, key_and_value, nested_changes, parse_list
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.seeds import parse_seeds
+from factorgraph_loc.plugins import ACTIVE_ESTIMATORS, POLICIES
 
 if TYPE_CHECKING:
     from factorgraph_loc.experiments.experiment import Prepared
@@ -255,7 +255,7 @@ def active(
         str,
         typer.Option(
             metavar="A,B",
-            help=f"{', '.join(completion.POLICIES)}; the others are compared with the first.",
+            help=f"{', '.join(POLICIES)}; the others are compared with the first.",
             autocompletion=completion.policies,
         ),
     ] = "information",
@@ -265,7 +265,7 @@ def active(
             "--estimator",
             "-e",
             metavar="A,B",
-            help=f"{', '.join(completion.ACTIVE_ESTIMATORS)}.",
+            help=f"{', '.join(ACTIVE_ESTIMATORS)}.",
             autocompletion=completion.active_estimators,
         ),
     ] = "active_mcl",
@@ -293,7 +293,7 @@ def active(
     from factorgraph_loc.experiments.active import seek
 
     chosen = parse_seeds(seeds)
-    simulation, settings = active_settings(world, nested_changes({"max_metres": max_metres}, set_ or []))
+    simulation, settings = active_settings(world, nested_changes(set_ or (), {"max_metres": max_metres}))
     show.first_use()
     with show.progress("runs", counted=True) as report:
         results = seek(

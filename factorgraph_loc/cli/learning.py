@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from factorgraph_loc.cli import show
+from factorgraph_loc.cli import completion, show
 from factorgraph_loc.cli.options import (
     Json,
     LogName,
@@ -23,11 +23,11 @@ from factorgraph_loc.cli.options import (
     parse_settings,
     takes_log_options,
 )
+from factorgraph_loc.plugins import MAP_ESTIMATORS
 
 OutRig = Annotated[
     Path, typer.Option("--out", "-o", metavar="OUT.rig.toml", help="The rig to write; a report is written next to it.")
 ]
-MAPPERS = ("batch", "smoother", "ekf")  # as in factorgraph_loc.experiments.maps
 OutWorld = Annotated[
     Path,
     typer.Option("--out", "-o", metavar="OUT.world.toml", help="The map to write; a picture is written next to it."),
@@ -83,10 +83,10 @@ def map_(
             "--estimator",
             "-e",
             metavar="NAME",
-            help=f"One of {', '.join(MAPPERS)}.",
-            autocompletion=lambda incomplete: [name for name in MAPPERS if name.startswith(incomplete)],
+            help=f"One of {', '.join(MAP_ESTIMATORS)}.",
+            autocompletion=completion.map_estimator,
         ),
-    ] = MAPPERS[0],
+    ] = MAP_ESTIMATORS[0],
     extend: Annotated[bool, typer.Option("--extend", help="Keep the log's map and add what it lacks.")] = False,
     of: Annotated[
         str | None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
@@ -14,7 +14,7 @@ import typer
 from factorgraph_loc.cli import completion
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.scoring import Alignment
-from factorgraph_loc.text import listed, plain, quoted
+from factorgraph_loc.text import listed, quoted
 
 if TYPE_CHECKING:
     from factorgraph_loc.model.log import Log
@@ -128,21 +128,19 @@ class LogOptions:
         """The logs of several names; a name may refer to several logs."""
         from factorgraph_loc.io.readers import load
 
-        options = dict(key_and_value(text, "--reader-option") for text in self.reader_option or ())
-        return [
-            log
-            for name in names
-            for log in load(
-                name, data_root=self.data_root, reader=self.reader, options=options, rig=self.rig, world=self.world
-            )
-        ]
+        return [log for name in names for log in load(name, **self._given())]
 
     def load_one(self, name: str) -> Log:
         """The log of a name that must refer to one log."""
-        logs = self.load([name])
-        if len(logs) > 1:
-            raise InputError(f"{name} refers to {len(logs)} logs, expected one: {listed(log.name for log in logs)}")
-        return logs[0]
+        from factorgraph_loc.io.readers import read_log
+
+        return read_log(name, **self._given())
+
+    def _given(self) -> dict[str, Any]:
+        options = dict(key_and_value(text, "--reader-option") for text in self.reader_option or ())
+        given = vars(self) | {"options": options}
+        del given["reader_option"]
+        return given
 
 
 def takes_log_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -173,36 +171,41 @@ def parse_settings(
 ) -> dict[str, dict[str, Any]]:
     """``smoother.lag=10`` as {"smoother": {"lag": 10}}; InputError for an estimator that is not run. ``others``: names that are
     no estimators."""
+    from factorgraph_loc.files.models import set_key
     from factorgraph_loc.fusion.registry import check_names
 
-    settings: dict[str, dict[str, Any]] = {name: {} for name in (*estimators, *others)}
+    settings: dict[str, Any] = {name: {} for name in (*estimators, *others)}
     for text in texts:
-        name, value = key_and_value(text, "--set")
-        estimator, *keys = name.split(".")
-        if not keys or not all(keys):
+        key, value = key_and_value(text, "--set")
+        estimator, dot, _ = key.partition(".")
+        if not dot or not all(key.split(".")):
             raise InputError(f"--set is {quoted(text)}, expected NAME.key=value, such as smoother.lag=10")
         if estimator not in others:
             check_names([estimator])
         if estimator not in settings:
             raise InputError(f"--set is {quoted(text)}, but {estimator} is not run here; run: {listed(estimators)}")
-        table = settings[estimator]
-        for key in keys[:-1]:
-            table = table.setdefault(key, {})
-            if not isinstance(table, dict):
-                raise InputError(f"--set is {quoted(text)}, but {plain(key)} is set to {quoted(table)} already")
-        table[keys[-1]] = value
+        set_key(settings, key, value, "--set")
     return settings
+
+
+def nested_changes(texts: Sequence[str], named: Mapping[str, float | None]) -> dict[str, Any]:
+    """The values of ``--set`` as nested tables, and those of options by their dotted key."""
+    from factorgraph_loc.files.models import set_key
+
+    changes: dict[str, Any] = {}
+    options = [(key, value) for key, value in named.items() if value is not None]
+    for key, value in (*(key_and_value(text, "--set") for text in texts), *options):
+        set_key(changes, key, value, "--set")
+    return changes
 
 
 def key_and_value(text: str, option: str) -> tuple[str, Any]:
     """``a.b=3`` as ("a.b", 3)."""
-    from factorgraph_loc.files.models import DEEPEST, is_utf8
+    from factorgraph_loc.files.models import is_utf8
 
     key, equals, value = text.partition("=")
     if not equals or not key.strip() or not value.strip() or not is_utf8(text):
         raise InputError(f"{option} is {quoted(text)}, expected KEY=VALUE")
-    if key.count(".") >= DEEPEST:
-        raise InputError(f"{option} is {quoted(text)}, expected a key of at most {DEEPEST} parts")
     return key.strip(), _scalar(value.strip())
 
 

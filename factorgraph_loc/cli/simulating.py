@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from factorgraph_loc.cli import completion, show
-from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, key_and_value
+from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, nested_changes
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.seeds import parse_seeds
-from factorgraph_loc.text import plain, quoted
-
-if TYPE_CHECKING:
-    from factorgraph_loc.simulation import SimulationSettings
+from factorgraph_loc.plugins import PRESETS
 
 
 def simulate(
@@ -22,7 +19,7 @@ def simulate(
         str,
         typer.Argument(
             metavar="PRESET",
-            help=f"{', '.join(completion.PRESETS)}, or a TOML file.",
+            help=f"{', '.join(PRESETS)}, or a TOML file.",
             autocompletion=completion.preset,
         ),
     ],
@@ -69,13 +66,13 @@ def simulate(
     chosen = [seed] if seeds is None else list(parse_seeds(seeds))
     from factorgraph_loc.api import logs
     from factorgraph_loc.files.models import file_name
-    from factorgraph_loc.simulation import recorded_looks
+    from factorgraph_loc.simulation import named_settings, recorded_looks
 
     named = {"drive.duration": duration, "world.tags": tags, "images.rate": image_rate, "world_seed": world_seed}
-    changes = nested_changes(named, set_ or [])
+    changes = nested_changes(set_ or (), named)
     if "images" in changes and not images:
         raise InputError("--image-rate and --set images.KEY configure images, expected --images with them")
-    settings = settings_of(what, changes)
+    settings = named_settings(what, changes)
     looks = None
     if recorded is not None:
         looks = recorded_looks(LogOptions(data_root=data_root).load([recorded]))
@@ -92,29 +89,3 @@ def simulate(
         written.append({"log": log.name, "seed": number, "span": last - first, "folder": str(folder)})
     if json:
         show.document(written[0] if seeds is None else written)
-
-
-def settings_of(what: str, changes: dict[str, Any]) -> SimulationSettings:
-    """The settings of a preset, or of a file if the name looks like one."""
-    from factorgraph_loc.simulation import named_settings
-
-    return named_settings(what, changes)
-
-
-def nested_changes(named: dict[str, float | None], texts: list[str]) -> dict[str, Any]:
-    """The options as nested tables; named options come before ``--set``."""
-    changes: dict[str, Any] = {}
-    pairs = [key_and_value(text, "--set") for text in texts]
-    pairs += [(key, value) for key, value in named.items() if value is not None]
-    for name, value in pairs:
-        *tables, key = name.split(".")
-        inner = changes
-        for i, table in enumerate(tables, start=1):
-            inner = inner.setdefault(table, {})
-            if not isinstance(inner, dict):
-                above = plain(".".join(tables[:i]))
-                raise InputError(
-                    f"--set is {above}={quoted(inner)}, expected a key below {above}, such as {plain(name)}"
-                )
-        inner[key] = value
-    return changes

@@ -32,9 +32,9 @@ from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files.models import file_name, nearest, write_text, write_toml
 from factorgraph_loc.files.tables import read_parquet, write_parquet
 from factorgraph_loc.files.temporary import require_free, writing
-from factorgraph_loc.planning.closed_loop import ESTIMATORS, ActiveRun, run_active
-from factorgraph_loc.planning.policies import POLICIES
+from factorgraph_loc.planning.closed_loop import ActiveRun, run_active
 from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.plugins import ACTIVE_ESTIMATORS, POLICIES
 from factorgraph_loc.processes import run_each
 from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.text import plain_lines, quoted, told
@@ -116,7 +116,7 @@ def seek(
     without ``overwrite``; and if all runs are refused for their input.
     """
     _check_names("policy", policies, tuple(POLICIES))
-    _check_names("estimator", estimators, ESTIMATORS)
+    _check_names("estimator", estimators, ACTIVE_ESTIMATORS)
     settings = ActiveSettings() if settings is None else settings
     check_free(out, overwrite=overwrite)
     with writing(out):

@@ -15,7 +15,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.seeds import LARGEST_SEED, MOST_SEEDS, parse_seeds
-from factorgraph_loc.files.models import DEEPEST, FileModel, check_content, nearest, parse_model, read_toml
+from factorgraph_loc.files.models import FileModel, check_content, nearest, parse_model, read_toml, set_key
 from factorgraph_loc.model.scoring import LONGEST, MAX_GAP, SHORTEST, TICK_GAP
 from factorgraph_loc.text import listed, plain, quoted
 
@@ -254,7 +254,7 @@ def _change(content: dict[str, Any], key: str, value: Any, source: object) -> No
     """Set a dotted key of the file's content; see :func:`read_experiment`."""
     first, _, rest = key.partition(".")
     if first in Experiment.model_fields:
-        _set(content, key, value, source)
+        set_key(content, key, value, source)
         return
     logs = [one for one in _tables(content, "logs", "log", source) if "simulate" in one]
     estimators = _tables(content, "estimators", "name", source)
@@ -265,7 +265,7 @@ def _change(content: dict[str, Any], key: str, value: Any, source: object) -> No
             f"{source}: no key {plain(key)}{nearest(first, [*Experiment.model_fields, SIMULATION, *labels])}"
         )
     for entry in chosen:
-        _set(entry, f"settings.{rest}", value, source)
+        set_key(entry, f"settings.{rest}", value, source)
 
 
 def _tables(content: dict[str, Any], key: str, named: str, source: object) -> list[dict[str, Any]]:
@@ -277,17 +277,6 @@ def _tables(content: dict[str, Any], key: str, named: str, source: object) -> li
     if wrong := [one for one in found if not isinstance(one, dict)]:
         raise InputError(f"{source}: {key} has {quoted(wrong[0])}, expected names or tables")
     return found
-
-
-def _set(table: dict[str, Any], key: str, value: Any, source: object) -> None:
-    *parts, last = key.split(".")
-    if len(parts) >= DEEPEST:
-        raise InputError(f"{source}: {plain(key)} has {len(parts) + 1} parts, expected at most {DEEPEST}")
-    for part in parts:
-        table = table.setdefault(part, {})
-        if not isinstance(table, dict):
-            raise InputError(f"{source}: no key {plain(key)}, as {plain(part)} is {quoted(table)}")
-    table[last] = value
 
 
 def canonical(settings: Mapping[str, Any]) -> str:

@@ -28,6 +28,7 @@ from factorgraph_loc.mapping.tag_mapping import MadeTags
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.world import World
+from factorgraph_loc.plugins import MAP_ESTIMATORS
 from factorgraph_loc.sensors.camera.frontend import with_features
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.landmarks import mapping as landmarks_mapping
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
 
 SUFFIX = ".world.toml"
 POINTS = "points"
-MAPPERS = ("batch", "smoother", "ekf")  # the estimators that estimate landmarks
 TURN_SIGMA, SHIFT_SIGMA = 0.01, 0.02  # rad, m: of a reference without covariances, for points
 HEIGHTS = (-10.0, 20.0)  # m
 OF_REFERENCE = "that of the reference"
@@ -72,7 +72,7 @@ class MapOptions:
     """
 
     of: str | None = None
-    estimator: str = MAPPERS[0]
+    estimator: str = MAP_ESTIMATORS[0]
     settings: Mapping[str, Any] = field(default_factory=dict)
     extend: bool = False
     poses: str | None = None
@@ -133,7 +133,7 @@ def make_map(log: Log, options: MapOptions | None = None, stages: Stages = silen
 
 def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points"]:
     """What is mapped. Raises InputError for options of another kind of map."""
-    of_landmarks = bool(options.settings) or options.estimator != MAPPERS[0]
+    of_landmarks = bool(options.settings) or options.estimator != MAP_ESTIMATORS[0]
     of_tags = options.tag_height is not None
     of_others = of_landmarks or of_tags
     of, there = options.of, _mappable(log)
@@ -164,9 +164,9 @@ def _mappable(log: Log) -> dict[str, str]:
 
 def _of_landmarks(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     estimator, settings = options.estimator, dict(options.settings)
-    if estimator not in MAPPERS:
+    if estimator not in MAP_ESTIMATORS:
         raise InputError(
-            f"--estimator is {quoted(estimator)}, expected one that estimates landmarks: {', '.join(MAPPERS)}"
+            f"--estimator is {quoted(estimator)}, expected one that estimates landmarks: {', '.join(MAP_ESTIMATORS)}"
         )
     if "landmarks" in settings:
         raise InputError(f"--set is {estimator}.landmarks, but a map is made without the log's map, or with --extend")

@@ -29,7 +29,7 @@ from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import Alignment
-from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory
+from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory, write_tum
 from factorgraph_loc.model.world import World
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
@@ -104,8 +104,8 @@ def _keep(result: RunResult, log: Log, align: Alignment) -> Path | None:
 def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: Path) -> None:
     """Write the files of a run with these scores into an empty folder; see :func:`write_run`."""
     causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
-    result.final.write(folder / "final.tum", log.t0_ns)
-    causal.write(folder / "causal.tum", log.t0_ns)
+    write_tum(result.final, folder / "final.tum", log.t0_ns)
+    write_tum(causal, folder / "causal.tum", log.t0_ns)
     write_parquet(estimates(result, log), folder / "estimates.parquet")
     write_toml(folder / "config.toml", result.config)
     write_text(folder / "learnt.json", _json(learnt_tables(result.learnt)))

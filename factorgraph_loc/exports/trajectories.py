@@ -21,7 +21,7 @@ from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory import Trajectory, write_tum
 from factorgraph_loc.model.trajectory3 import Trajectory3, upright
 from factorgraph_loc.sensors.landmarks.located import located_landmarks
 from factorgraph_loc.sensors.odometry.motion import whole_motion
@@ -30,6 +30,7 @@ from factorgraph_loc.text import listed
 from factors.motion import Increment
 from factors.se2 import Array
 
+KITTI = ".kitti"
 TIMES_SUFFIX = ".times.txt"
 LEAST = 1e-12  # m^2 or rad^2: least variance of an edge, for a finite information
 
@@ -42,6 +43,15 @@ def matrices(trajectory: Trajectory | Trajectory3) -> Array:
     out[:, :, :3] = upright(trajectory.poses[:, 2])
     out[:, :2, 3] = trajectory.poses[:, :2]
     return out
+
+
+def write_trajectory(trajectory: Trajectory | Trajectory3, path: str | Path, t0_ns: int = 0) -> None:
+    """Write a trajectory, whose times count from ``t0_ns``, in TUM format, or in KITTI format with times beside it if the name ends
+    with .kitti."""
+    if Path(path).suffix == KITTI:
+        write_kitti(trajectory, Path(path))
+    else:
+        write_tum(trajectory, path, t0_ns)
 
 
 def write_kitti(trajectory: Trajectory | Trajectory3, path: Path) -> Path:

@@ -226,6 +226,19 @@ def nearest(word: str, known: list[str]) -> str:
     return f"; known: {listed(sorted(known), 2 * LISTED)}" if known else ""
 
 
+def set_key(content: dict[str, Any], key: str, value: Any, source: object) -> None:
+    """Set the value of a key with dots in nested tables, which are made where they are missing. InputError if a part of the key is
+    set to something else, or the key has more than :data:`DEEPEST` parts."""
+    *tables, last = key.split(".")
+    if len(tables) >= DEEPEST:
+        raise InputError(f"{source}: {plain(key)} has {len(tables) + 1} parts, expected at most {DEEPEST}")
+    for i, name in enumerate(tables, start=1):
+        content = content.setdefault(name, {})
+        if not isinstance(content, dict):
+            raise InputError(f"{source}: no key {plain(key)}, as {plain('.'.join(tables[:i]))} is {quoted(content)}")
+    content[last] = value
+
+
 def inside(root: Path, name: str, source: object, *others: Path, expected: str = "one below it") -> Path:
     """The path ``name`` below ``root``, or below one of the folders ``others``, with links resolved; it need not exist.
 

@@ -20,7 +20,8 @@ from factorgraph_loc.io.readers import read_log
 from factorgraph_loc.io.readers.pose_file import read_pose_file
 from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.planar import rotations_of
-from factorgraph_loc.model.trajectory3 import PosePath, path_of, require_poses
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3, path_of, require_poses
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
 
@@ -65,14 +66,14 @@ def _reference(log: str) -> PosePath:
     return path_of(found.reference, log, found.t0_ns)
 
 
-def to_evo(path: PosePath) -> Any:
-    """The poses as evo's ``PoseTrajectory3D``. InputError if evo is not installed, or a pose is not finite."""
+def to_evo(trajectory: Trajectory | Trajectory3, t0_ns: int = 0) -> Any:
+    """A trajectory, whose times count from ``t0_ns``, as evo's ``PoseTrajectory3D``. InputError if evo is not installed, or
+    a pose is not finite."""
     try:
         from evo.core.trajectory import PoseTrajectory3D  # type: ignore[import-untyped] # noqa: PLC0415
     except ImportError as error:
         raise InputError("trajectories of evo need evo: pip install evo") from error
-    require_poses(path)
-    turns = path.in_space(0).quaternions()
+    path, turns = _posed(trajectory, t0_ns)
     return PoseTrajectory3D(path.positions, np.roll(turns, 1, axis=1), path.seconds())  # evo has w first
 
 
@@ -88,11 +89,11 @@ def from_evo(trajectory: Any) -> PosePath:
     return _path("the trajectory of evo", table, t_ns)
 
 
-def to_ros(path: PosePath, frame_id: str) -> Any:
-    """The poses as a ``nav_msgs/Path``. InputError if neither ROS 2 nor rosbags is there, or a pose is not finite."""
+def to_ros(trajectory: Trajectory | Trajectory3, frame_id: str = "map", t0_ns: int = 0) -> Any:
+    """A trajectory, whose times count from ``t0_ns``, as a ``nav_msgs/Path``: of ROS 2 where its environment is sourced, else of
+    rosbags. InputError if there is neither, or a pose is not finite."""
     make = _messages()
-    require_poses(path)
-    trajectory = path.in_space(0)
+    path, turns = _posed(trajectory, t0_ns)
 
     def header(t_ns: int) -> Any:
         stamp = make("builtin_interfaces", "Time", sec=t_ns // 10**9, nanosec=t_ns % 10**9)
@@ -100,9 +101,7 @@ def to_ros(path: PosePath, frame_id: str) -> Any:
 
     poses = []
     assert path.t_ns is not None
-    for t_ns, place, turn in zip(
-        path.t_ns.tolist(), trajectory.positions.tolist(), trajectory.quaternions().tolist(), strict=True
-    ):
+    for t_ns, place, turn in zip(path.t_ns.tolist(), path.positions.tolist(), turns.tolist(), strict=True):
         position = make("geometry_msgs", "Point", **dict(zip("xyz", place, strict=True)))
         orientation = make("geometry_msgs", "Quaternion", **dict(zip("xyzw", turn, strict=True)))
         pose = make("geometry_msgs", "Pose", position=position, orientation=orientation)
@@ -111,7 +110,11 @@ def to_ros(path: PosePath, frame_id: str) -> Any:
 
 
 def from_ros(messages: Any) -> PosePath:
-    """The poses of a ``nav_msgs/Path``, or of several stamped messages. InputError names the invalid message."""
+    """The poses of a ``nav_msgs/Path``, or of several messages: ``PoseStamped``, ``PoseWithCovarianceStamped``, ``Odometry``,
+    ``TransformStamped``, or ``PointStamped`` without rotations.
+
+    Messages of rclpy or rosbags, for example; their headers have the times. InputError names the invalid message.
+    """
     given: Iterable[Any] = getattr(messages, "poses", messages)
     rows, stamps, points = [], [], set()
     for i, message in enumerate(given, start=1):
@@ -125,6 +128,13 @@ def from_ros(messages: Any) -> PosePath:
         points.add(hasattr(message, "point"))
     path = _path("the messages", np.array(rows, dtype=float).reshape(-1, 7), np.array(stamps, dtype=np.int64))
     return path if points != {True} else PosePath(path.name, path.positions, path.rotations, path.t_ns, False)
+
+
+def _posed(trajectory: Trajectory | Trajectory3, t0_ns: int) -> tuple[PosePath, Array]:
+    """The poses of a trajectory, and their quaternions (N, 4). InputError if there are none, or one is not finite."""
+    path = path_of(trajectory, "the trajectory", t0_ns)
+    require_poses(path)
+    return path, path.in_space(0).quaternions()
 
 
 def _seven(message: Any) -> tuple[float, ...]:

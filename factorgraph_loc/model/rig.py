@@ -13,7 +13,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, add_fields
 from factorgraph_loc.model.sections import sections, sections_of_channels
 from factorgraph_loc.model.settings import NOTHING, Estimated, SensorSettings
-from factorgraph_loc.plugins import FILES, load
+from factorgraph_loc.plugins import load
 
 S = TypeVar("S", bound=FileModel)
 
@@ -31,16 +31,6 @@ class Rig(FileModel):
 
         def __init__(self, **values: Any) -> None: ...
         def __getattr__(self, section: str) -> Any: ...
-
-    @classmethod
-    def read(cls, path: str | Path) -> Rig:
-        """Read ``NAME.rig.toml``; InputError names file, key and expected value."""
-        rig: Rig = load(FILES["read_rig"])(path)
-        return rig
-
-    def write(self, path: str | Path) -> None:
-        """Write ``NAME.rig.toml``, and its grids to the same folder."""
-        load(FILES["write_rig"])(self, path)
 
     def find(self, kind: type[S], section: str | None = None) -> S | None:
         """The settings of class ``kind``, or None; ``section`` selects one if several have the same class."""

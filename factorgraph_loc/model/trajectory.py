@@ -1,13 +1,12 @@
-"""Planar trajectories with covariances, interpolation and the TUM text format; reading, writing and conversion of trajectories,
-alike for those on a floor and in space."""
+"""Planar trajectories with covariances, interpolation and the TUM text format; what they have in common with those in space."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +14,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.columns import LATEST, POSES
 from factorgraph_loc.files.models import read_text, write_text
-from factorgraph_loc.model.planar import on_floor, rotations_of
-from factorgraph_loc.plugins import FILES, load
+from factorgraph_loc.model.planar import on_floor
 from factors import se2
 from factors.se2 import Array, Integers
 
@@ -26,7 +24,6 @@ if TYPE_CHECKING:
     from factorgraph_loc.model.trajectory3 import PosePath
 
 
-KITTI = ".kitti"
 COVARIANCES = {  # columns of tables: entries of a covariance of (x, y, heading)
     "cov_xx": (0, 0),
     "cov_xy": (0, 1),
@@ -38,51 +35,21 @@ COVARIANCES = {  # columns of tables: entries of a covariance of (x, y, heading)
 
 
 class Exchange:
-    """What trajectories have in common: files, tables, and the types of other programs.
+    """What trajectories have in common: conversion from poses with absolute times, from arrays and from tables, and back.
 
-    Times are seconds after ``t0_ns``, nanoseconds since 1970; files, evo and ROS messages have absolute times.
+    Times are seconds after ``t0_ns``, nanoseconds since 1970.
     """
 
-    @classmethod
-    def read(cls, source: str | Path, t0_ns: int = 0) -> Self:
-        """The trajectory that ``source`` names, as for ``fgloc score``: a file in TUM or EuRoC format, ``BAG:TOPIC``,
-        ``BAG:/tf:PARENT.CHILD``, the folder of a run, or a log with a reference.
-
-        InputError describes what is invalid in one line: also poses without times (KITTI).
-        """
-        return cls._of(load(FILES["read_trajectory"])(source), t0_ns)
-
-    def write(self, path: str | Path, t0_ns: int = 0) -> None:
-        """Write a file in TUM format, or in KITTI format with times beside it if the name ends with .kitti."""
-        if Path(path).suffix == KITTI:
-            load(FILES["write_kitti"])(self, Path(path))
-        else:
-            self._write_tum(Path(path), t0_ns)
+    t: Array
 
     @classmethod
-    def from_evo(cls, trajectory: Any, t0_ns: int = 0) -> Self:
-        """A trajectory of evo (``PoseTrajectory3D``). InputError if it has no times, or they do not increase."""
-        return cls._of(load(FILES["from_evo"])(trajectory), t0_ns)
-
-    def to_evo(self, t0_ns: int = 0) -> Any:
-        """The trajectory as evo's ``PoseTrajectory3D``; InputError if evo is not installed."""
-        return load(FILES["to_evo"])(self._path(t0_ns))
-
-    @classmethod
-    def from_ros(cls, messages: Any, t0_ns: int = 0) -> Self:
-        """The poses of a ``nav_msgs/Path``, or of several messages: ``PoseStamped``, ``PoseWithCovarianceStamped``, ``Odometry``,
-        ``TransformStamped``, or ``PointStamped`` without rotations.
-
-        Messages of rclpy or rosbags, for example; their headers have the times. InputError names the invalid message.
-        """
-        return cls._of(load(FILES["from_ros"])(messages), t0_ns)
-
-    def to_ros(self, frame_id: str = "map", t0_ns: int = 0) -> Any:
-        """The trajectory as a ``nav_msgs/Path``, of ROS 2 where its environment is sourced, else of the library rosbags.
-
-        InputError if there is neither.
-        """
-        return load(FILES["to_ros"])(self._path(t0_ns), frame_id)
+    def of(cls, path: PosePath, t0_ns: int = 0) -> Self:
+        """The poses of a path. InputError if it has no times, as in KITTI files, or they do not increase; for a trajectory on the
+        floor also if heights vary."""
+        if path.t_ns is None:
+            raise InputError(f"{path.name}: has poses without times, expected poses with times")
+        require_times(path.name, path.t_ns)
+        return cls._of_path((path.t_ns - t0_ns) / 1e9, path)
 
     @classmethod
     def from_numpy(cls, table: Array) -> Self:
@@ -125,23 +92,12 @@ class Exchange:
 
     @classmethod
     @abstractmethod
-    def _of_path(cls, path: PosePath, t0_ns: int) -> Self:
-        """The trajectory with the poses of a path, whose times increase."""
+    def _of_path(cls, t: Array, path: PosePath) -> Self:
+        """The trajectory with the poses of a path at the times ``t``."""
 
     @abstractmethod
-    def _write_tum(self, path: Path, t0_ns: int) -> None: ...
-
-    def _path(self, t0_ns: int) -> PosePath:
-        from factorgraph_loc.model.trajectory3 import path_of  # noqa: PLC0415 - which imports trajectories
-
-        return path_of(self, "the trajectory", t0_ns)  # type: ignore[arg-type]
-
-    @classmethod
-    def _of(cls, path: PosePath, t0_ns: int) -> Self:
-        if path.t_ns is None:
-            raise InputError(f"{path.name}: has poses without times, expected poses with times")
-        require_times(path.name, path.t_ns)
-        return cls._of_path(path, t0_ns)
+    def _tum(self) -> Iterator[str]:
+        """The poses as rows of a TUM file without times."""
 
 
 def numbers(table: pl.DataFrame, names: Iterable[str]) -> Array:
@@ -244,12 +200,12 @@ class Trajectory(Exchange):
         return cls(rows[:, 0], rows[:, 1:])
 
     @classmethod
-    def _of_path(cls, path: PosePath, t0_ns: int) -> Self:
-        assert path.t_ns is not None
-        return cls((path.t_ns - t0_ns) / 1e9, path.on_floor([]), has_heading=path.has_rotations)
+    def _of_path(cls, t: Array, path: PosePath) -> Self:
+        return cls(t, path.on_floor([]), has_heading=path.has_rotations)
 
-    def _write_tum(self, path: Path, t0_ns: int) -> None:
-        write_tum(self, path, t0_ns)
+    def _tum(self) -> Iterator[str]:
+        for x, y, heading in self.poses:
+            yield f"{x:.9f} {y:.9f} 0 0 0 {np.sin(heading / 2.0):.12f} {np.cos(heading / 2.0):.12f}"
 
 
 def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integers, Array, NDArray[np.bool_]]:
@@ -268,21 +224,6 @@ def averaged(covariances: Array, before: Integers, after: Integers, fraction: Ar
     """Covariances (M, D, D) interpolated in ``covariances`` (N, D, D): see :func:`neighbours`."""
     weight = fraction[:, None, None]
     return np.asarray((1.0 - weight) * covariances[before] + weight * covariances[after])
-
-
-def read_tum(path: str | Path, t0_ns: int = 0, *, has_heading: bool = True) -> Trajectory:
-    """Read a TUM file (``t x y z qx qy qz qw``, absolute seconds) as planar poses, in seconds after ``t0_ns``.
-
-    InputError names file and row if a row is invalid or timestamps do not increase; also if heights vary by more than
-    :data:`factorgraph_loc.model.planar.MOST`.
-    """
-    rows, t_ns, table = read_tum_rows(Path(path))
-    poses = on_floor(path, table[:, :3], rotations_of(path, rows, table[:, 3:]), [])
-    stuck = np.flatnonzero(np.diff(t_ns) <= 0) + 1
-    if len(stuck):
-        i = int(stuck[0])
-        raise bad_field(path, "t", f"{t_ns[i]} ns", "a stamp after that of the row before", row=int(rows[i]))
-    return Trajectory(np.asarray((t_ns - t0_ns) / 1e9, dtype=float), poses, has_heading=has_heading)
 
 
 def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
@@ -316,12 +257,9 @@ def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
     return numbers, np.array(stamps, dtype=np.int64), table
 
 
-def write_tum(trajectory: Trajectory, path: str | Path, t0_ns: int = 0) -> None:
+def write_tum(trajectory: Exchange, path: str | Path, t0_ns: int = 0) -> None:
     """Write a TUM file with absolute timestamps in decimal seconds."""
-    rows = []
-    for t, (x, y, heading) in zip(trajectory.t, trajectory.poses, strict=True):
-        qz, qw = np.sin(heading / 2.0), np.cos(heading / 2.0)
-        rows.append(f"{decimal_seconds(t, t0_ns)} {x:.9f} {y:.9f} 0 0 0 {qz:.12f} {qw:.12f}\n")
+    rows = [f"{decimal_seconds(t, t0_ns)} {row}\n" for t, row in zip(trajectory.t, trajectory._tum(), strict=True)]
     write_text(Path(path), "".join(rows))
 
 

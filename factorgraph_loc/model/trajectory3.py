@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -11,9 +11,8 @@ import scipy
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.models import write_text
 from factorgraph_loc.model.planar import AS_IT_IS, Turned, on_floor, rotations_of
-from factorgraph_loc.model.trajectory import Exchange, Trajectory, decimal_seconds, neighbours
+from factorgraph_loc.model.trajectory import Exchange, Trajectory, neighbours
 from factors.se2 import Array, Integers
 
 _FLAT = 1e-9  # m and sines within which poses are planar
@@ -83,16 +82,12 @@ class Trajectory3(Exchange):
         return cls(rows[:, 0], rows[:, 1:4], rotations)
 
     @classmethod
-    def _of_path(cls, path: PosePath, t0_ns: int) -> Self:
-        assert path.t_ns is not None
-        return cls((path.t_ns - t0_ns) / 1e9, path.positions, path.rotations)
+    def _of_path(cls, t: Array, path: PosePath) -> Self:
+        return cls(t, path.positions, path.rotations)
 
-    def _write_tum(self, path: Path, t0_ns: int) -> None:
-        rows = []
-        for t, place, turn in zip(self.t.tolist(), self.positions, self.quaternions(), strict=True):
-            numbers = [*(f"{value:.9f}" for value in place), *(f"{value:.12f}" for value in turn)]
-            rows.append(f"{decimal_seconds(t, t0_ns)} {' '.join(numbers)}\n")
-        write_text(path, "".join(rows))
+    def _tum(self) -> Iterator[str]:
+        for place, turn in zip(self.positions, self.quaternions(), strict=True):
+            yield " ".join((*(f"{value:.9f}" for value in place), *(f"{value:.12f}" for value in turn)))
 
 
 @dataclass(frozen=True)

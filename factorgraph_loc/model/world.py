@@ -5,7 +5,6 @@ A layer may be kept in a table next to the file, such as ``NAME.tags.csv``; poin
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -14,7 +13,7 @@ from pydantic import ConfigDict, Field
 from factorgraph_loc.files.models import Coordinate, FileModel, add_fields
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.sections import layers
-from factorgraph_loc.plugins import FILES, load
+from factorgraph_loc.plugins import load
 from factors.se2 import Array
 
 L = TypeVar("L", bound=FileModel)
@@ -34,16 +33,6 @@ class World(FileModel):
 
         def __init__(self, **values: Any) -> None: ...
         def __getattr__(self, layer: str) -> Any: ...
-
-    @classmethod
-    def read(cls, path: str | Path) -> World:
-        """Read ``NAME.world.toml`` with its tables; InputError names file, key and expected value."""
-        world: World = load(FILES["read_world"])(path)
-        return world
-
-    def write(self, path: str | Path) -> None:
-        """Write ``NAME.world.toml``, and its tables and points to the same folder."""
-        load(FILES["write_world"])(self, path)
 
     def of(self, kind: type[L]) -> dict[str, L]:
         """The layer whose elements have class ``kind``."""

@@ -26,6 +26,7 @@ from factorgraph_loc.planning.policies import Choice, Policy, Situation, make_po
 from factorgraph_loc.planning.robot import SimulatedRobot
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.plugins import ACTIVE_ESTIMATORS
 from factorgraph_loc.sensors.odometry.simulation import RATE
 from factorgraph_loc.sensors.registry import sensors
 from factorgraph_loc.simulation.settings import SimulationSettings
@@ -35,7 +36,6 @@ from factorgraph_loc.text import quoted
 from factors import se2
 from factors.se2 import Array
 
-ESTIMATORS = ("active_mcl", "particle_filter", "smoother")
 NEXT, NEXT_HEADING = 3.0, 1.0  # m, rad: modes closer to each other are one place
 SHOWN = 300  # particles of a belief that are stored
 SPREAD = 2000  # samples of a belief without particles
@@ -299,8 +299,10 @@ def _estimator(name: str, setup: model_setup.Setup, settings: ActiveSettings) ->
     if name == "active_mcl":
         space = free_space(setup.world, max(settings.clearance - SLACK, 0.0))
         return ActiveMcl(setup, ActiveMclSettings(particles=settings.particles), space)
-    if name not in ESTIMATORS:
-        raise InputError(f"no estimator of active runs is called {quoted(name)}{nearest(name, list(ESTIMATORS))}")
+    if name not in ACTIVE_ESTIMATORS:
+        raise InputError(
+            f"no estimator of active runs is called {quoted(name)}{nearest(name, list(ACTIVE_ESTIMATORS))}"
+        )
     return registry.create(name, setup, registry.settings_of(name, {}))
 
 

@@ -25,6 +25,7 @@ from factorgraph_loc.planning.information import expected_gain, fisher_gain, has
 from factorgraph_loc.planning.paths import STEP, Path
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.plugins import POLICIES
 from factorgraph_loc.text import quoted
 from factors import se2
 from factors.se2 import Array
@@ -214,13 +215,12 @@ class NearestTags:
         return Choice(s.candidates[int(np.argmax(values))], s.settings.policy.replan, values)
 
 
-# what each policy does, and how it is made
-POLICIES: Mapping[str, tuple[str, Callable[[], Policy]]] = {
-    "information": ("The largest expected reduction of entropy minus the cost.", Information),
-    "paper_literal": ("The same with the sign as printed in the paper.", partial(Information, sign=-1.0)),
-    "random": ("Any of the arcs, short straight paths and turns in place, to its end.", Random),
-    "patrol": ("Straight on until a wall is near, then where most is free; back only if nothing else is free.", Patrol),
-    "nearest_tags": ("Towards the nearest tags, on average over the belief.", NearestTags),
+_MAKERS: Mapping[str, Callable[[], Policy]] = {
+    "information": Information,
+    "paper_literal": partial(Information, sign=-1.0),
+    "random": Random,
+    "patrol": Patrol,
+    "nearest_tags": NearestTags,
 }
 
 
@@ -228,7 +228,7 @@ def make_policy(name: str) -> Policy:
     """A policy by name. Raises InputError for an unknown name."""
     if name not in POLICIES:
         raise InputError(f"no policy is called {quoted(name)}{nearest(name, list(POLICIES))}")
-    return POLICIES[name][1]()
+    return _MAKERS[name]()
 
 
 def usable(paths: Sequence[Path], free: Array, sight: float) -> tuple[tuple[Path, ...], Array]:

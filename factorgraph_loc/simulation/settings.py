@@ -219,15 +219,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     },
 }
 
-ABOUT: Mapping[str, str] = {
-    "office": "Rooms on both sides of a corridor, doors, furniture; tags on walls and furniture.",
-    "sparse": "The same with fewer tags.",
-    "bursty": "The same as office; each antenna loses each tag for 2 s on average, a fifth of the time.",
-    "corridor": "One corridor, the same from both ends; tags evenly on both sides.",
-    "warehouse": "Rows of shelves with tags.",
-    "symmetric": "Corridors in the shape of an H with a half-turn symmetry; three tags hang in them.",
-}
-
 
 def preset(name: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
     """The settings of a preset, with ``changes`` as nested tables. Raises InputError for a wrong preset, key or value."""

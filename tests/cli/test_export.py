@@ -6,11 +6,11 @@ import gtsam
 import numpy as np
 import pytest
 from evo.tools import file_interface
+from tum_files import read_tum
 
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.readers import load
-from factorgraph_loc.model.trajectory import read_tum
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,7 @@ import pytest
 
 from factorgraph_loc.fusion.registry import settings_of
 from factorgraph_loc.io.readers import reader
-from factorgraph_loc.planning.policies import POLICIES
-from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
+from factorgraph_loc.plugins import ESTIMATORS, POLICIES, READERS, SENSORS
 from factorgraph_loc.sensors.registry import channels
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc.io.native.world_file import read_world, write_world
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
@@ -93,7 +93,7 @@ def test_a_map_goes_to_g2o(fgloc, gallery_on_disk, tmp_path):
 
 
 def test_points_without_descriptors_do_not_go_to_g2o(fgloc, gallery_on_disk, tmp_path):
-    World(points=PointMap.of(["door"], np.ones((1, 3)))).write(tmp_path / "a.world.toml")
+    write_world(World(points=PointMap.of(["door"], np.ones((1, 3)))), tmp_path / "a.world.toml")
     out = tmp_path / "a.g2o"
     result = fgloc("export", gallery_on_disk(), "--world", tmp_path / "a.world.toml", "-o", out)
     assert result.exit_code == 2

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import polars as pl
 import pytest
+from tum_files import read_tum
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.experiments.run import run
 from factorgraph_loc.model.belief import Learnt
-from factorgraph_loc.model.trajectory import read_tum
 
 RUN_FILES = {
     "final.tum",

@@ -12,8 +12,9 @@ from evo.core.trajectory import Plane
 from evo.tools import file_interface
 from pose_files import T0, wander, write
 from scipy.spatial.transform import Rotation
+from tum_files import read_tum
 
-from factorgraph_loc import InputError, Trajectory, Trajectory3, read_tum, score
+from factorgraph_loc import InputError, Trajectory, Trajectory3, score
 from factorgraph_loc.evaluation import metrics
 from factorgraph_loc.model.scoring import ALIGNMENTS
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from tum_files import read_tum
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import save_run, write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.belief import LearntPoint
-from factorgraph_loc.model.trajectory import read_tum
 
 COLUMNS = [
     "kind",

@@ -31,6 +31,7 @@ def in_use():
     """What is imported, by whom: by our modules, by the package of another that the docs show, by commands, and by readers of the
     docs."""
     found = {(module, *found) for module in MODULES for found in named(module)}
+    found |= {("factorgraph_loc", *found) for found in names_in(ROOT / "factorgraph_loc/__init__.pyi")}
     found |= {
         ("", *found) for path in sorted((ROOT / "tests/compass/package").rglob("*.py")) for found in names_in(path)
     }
