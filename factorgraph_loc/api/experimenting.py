@@ -10,6 +10,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.active import ActiveResults, seek
 from factorgraph_loc.experiments.cluster import on_cluster
 from factorgraph_loc.experiments.experiment import Done, Prepared, prepare, run_experiment
+from factorgraph_loc.experiments.plan import MOST_RUNS
 from factorgraph_loc.experiments.reporting import report_experiment
 from factorgraph_loc.files.models import nearest, parse_model
 from factorgraph_loc.planning.settings import ActiveSettings
@@ -48,9 +49,23 @@ def experiment(
     instead. ``verify``: check the checksums of stored results and repeat damaged runs. ``progress`` is called with the numbers of
     finished, all and failed runs. A failed run is recorded as a row and in ``failures``; it raises nothing.
     """
-    prepared = _prepared(file, changes, out, data_root, verify=verify)
-    executor = None if scheduler is None else on_cluster(scheduler, prepared, again=retry_failed)
-    return run_experiment(prepared, jobs=jobs, again=retry_failed, executor=executor, progress=progress)
+    plan = prepared(file, changes, out, data_root, verify=verify)
+    return execute(plan, jobs=jobs, scheduler=scheduler, retry_failed=retry_failed, progress=progress)
+
+
+def execute(
+    plan: Prepared,
+    *,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    retry_failed: bool = False,
+    progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
+) -> Done:
+    """Execute the runs of an experiment that is prepared. For the arguments see :func:`experiment`."""
+    if scheduler is not None and jobs is not None:
+        raise InputError("--jobs applies to this machine, but --scheduler names a cluster: expected one of them")
+    executor = None if scheduler is None else on_cluster(scheduler, plan, again=retry_failed)
+    return run_experiment(plan, jobs=jobs, again=retry_failed, executor=executor, progress=progress)
 
 
 def status(
@@ -62,20 +77,16 @@ def status(
     verify: bool = False,
 ) -> ExperimentStatus:
     """How many runs of an experiment file are done, failed, missing or damaged. For the arguments see :func:`experiment`."""
-    return status_of(_prepared(file, changes, out, data_root, verify=verify))
-
-
-def status_of(prepared: Prepared) -> ExperimentStatus:
-    """The status of an experiment that is prepared."""
-    counts = {run.label: dict.fromkeys(STATES, 0) for run in prepared.runs}
-    for run in prepared.runs:
-        counts[run.label][prepared.states[run.key]] += 1
+    plan = prepared(file, changes, out, data_root, verify=verify)
+    counts = {run.label: dict.fromkeys(STATES, 0) for run in plan.runs}
+    for run in plan.runs:
+        counts[run.label][plan.states[run.key]] += 1
     failures = [
-        {"log": run.log, "label": run.label, "seed": run.seed, **dict(run.sweep), **prepared.store.row(run.key)}
-        for run in prepared.runs
-        if prepared.states[run.key] == "failed"
+        {"log": run.log, "label": run.label, "seed": run.seed, **dict(run.sweep), **plan.store.row(run.key)}
+        for run in plan.runs
+        if plan.states[run.key] == "failed"
     ]
-    return ExperimentStatus(prepared.folder, counts, failures, [run.shown for run in prepared.damaged()])
+    return ExperimentStatus(plan.folder, counts, failures, [run.shown for run in plan.damaged()])
 
 
 def report(
@@ -91,7 +102,7 @@ def report(
 
     Damaged results are listed on the page and left out. For the other arguments see :func:`experiment`.
     """
-    return report_experiment(_prepared(file, changes, out, data_root), None if page is None else Path(page)).page
+    return report_experiment(prepared(file, changes, out, data_root), None if page is None else Path(page)).page
 
 
 def active(
@@ -112,7 +123,7 @@ def active(
     settings of robot, policy or world, such as ``{"policy": {"horizon": 8}, "max_metres": 50}``. ``out``: folder for tables and
     plots. See :func:`factorgraph_loc.experiments.active.seek`.
     """
-    simulation, settings = active_settings(world, changes or {})
+    simulation, settings = _active_settings(world, changes or {})
     return seek(
         simulation,
         list(policies),
@@ -126,7 +137,7 @@ def active(
     )
 
 
-def active_settings(
+def _active_settings(
     world: str | Path | SimulationSettings, changes: Settings
 ) -> tuple[SimulationSettings, ActiveSettings]:
     """Split the changes into settings of the world and of the run; no key belongs to both."""
@@ -142,13 +153,16 @@ def active_settings(
     return simulation, parse_model(ActiveSettings, run, "the settings")
 
 
-def _prepared(
+def prepared(
     file: str | Path,
     changes: Settings | None,
     out: str | Path | None,
     data_root: str | Path | None,
     *,
     verify: bool = False,
+    most: int = MOST_RUNS,
 ) -> Prepared:
+    """An experiment with its plan and the states of its runs. TooManyRunsError for more than ``most`` runs; for the other arguments
+    see :func:`experiment`."""
     folder, root = None if out is None else Path(out), None if data_root is None else str(data_root)
-    return prepare(Path(file), list((changes or {}).items()), data_root=root, out=folder, verify=verify)
+    return prepare(Path(file), list((changes or {}).items()), data_root=root, out=folder, verify=verify, most=most)

@@ -17,10 +17,9 @@ from factorgraph_loc.files.temporary import of_system, temporary_folder, writing
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
-from factorgraph_loc.plugins import MAP_ESTIMATORS
+from factorgraph_loc.plugins import FEATURES, MAP_ESTIMATORS
 
 RIG = ".rig.toml"
-FEATURES = ("colour", "sift", "orb")
 
 
 def calibrate(
@@ -67,14 +66,16 @@ def build_map(
     rig: RigLike | None = None,
     world: WorldLike | None = None,
     overwrite: bool = False,
+    stages: maps.Stages = maps.silent,
 ) -> maps.MadeMap:
     """Estimate a map of landmarks, RFID tags or points from a log. Writes ``out`` (``NAME.world.toml``) and a picture next to it.
 
-    For the arguments see :class:`~factorgraph_loc.experiments.maps.MapOptions`.
+    For the arguments see :class:`~factorgraph_loc.experiments.maps.MapOptions`; for ``stages``, which shows the progress, see
+    :func:`~factorgraph_loc.experiments.maps.make_map`.
     """
     maps.picture_beside(Path(out), overwrite=overwrite)
     options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead, points or {})
-    made = maps.make_map(one(log, rig, world), options)
+    made = maps.make_map(one(log, rig, world), options, stages)
     made.write(Path(out), overwrite=overwrite)
     return made
 

@@ -14,6 +14,8 @@ from factorgraph_loc.experiments import output
 from factorgraph_loc.experiments import run as running
 from factorgraph_loc.experiments.learning import run_and_learn
 from factorgraph_loc.experiments.run import RunConfig
+from factorgraph_loc.fitting.constants import FittedConstant
+from factorgraph_loc.fusion.registry import for_final_only
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
 from factorgraph_loc.text import listed
@@ -21,10 +23,12 @@ from factorgraph_loc.text import listed
 
 @dataclass(frozen=True)
 class Run:
-    """The outcome of a run: its ``result``, and its ``scores`` as in ``metrics.json``."""
+    """The outcome of a run: its ``result``, its ``scores`` as in ``metrics.json``, and the constants of the rig that were
+    ``learnt`` from the log, if asked for."""
 
     result: RunResult
     scores: dict[str, Any]
+    learnt: tuple[FittedConstant, ...] = ()
 
     def __repr__(self) -> str:
         done = {"log": self.result.log, "estimator": self.result.config["estimator"], "status": "ok"}
@@ -45,6 +49,7 @@ def run(
     tick_gap: float = TICK_GAP,
     learn: bool = False,
     align: Alignment = "none",
+    final_only: bool = False,
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
@@ -52,21 +57,26 @@ def run(
     """Run one estimator on one log and score the result.
 
     For the arguments see :class:`~factorgraph_loc.experiments.run.RunConfig`. ``learn``: learn the rig from the log itself, for
-    the final trajectory alone. ``align``: also score after this alignment with the reference. ``out``: folder for the files that
-    ``fgloc run`` writes.
+    the final trajectory alone. ``final_only``: make no causal estimates. ``align``: also score after this alignment with the
+    reference. ``out``: folder for the files that ``fgloc run`` writes.
     """
     if out is not None:
         output.check_free(Path(out), overwrite=overwrite)
+    given = {estimator: settings or {}}
+    chosen = (for_final_only(given) if final_only else given)[estimator]
     loaded = one(log, rig, world)
-    config = RunConfig(
-        estimator, settings or {}, None if sensors is None else tuple(sensors), prior, seed, max_gap, tick_gap
-    )
-    result = run_and_learn(loaded, config, progress).result if learn else running.run(loaded, config, progress)
+    config = RunConfig(estimator, chosen, None if sensors is None else tuple(sensors), prior, seed, max_gap, tick_gap)
+    learnt: tuple[FittedConstant, ...] = ()
+    if learn:
+        learning = run_and_learn(loaded, config, progress)
+        result, learnt = learning.result, tuple(learning.turns.knowledge.constants)
+    else:
+        result = running.run(loaded, config, progress)
     if out is None:
-        return Run(result, score(result, loaded, align))
+        return Run(result, score(result, loaded, align), learnt)
     scores = output.save_run(result, loaded, Path(out), align=align, overwrite=overwrite)
     write_plots(result, loaded, Path(out))
-    return Run(result, scores)
+    return Run(result, scores, learnt)
 
 
 def compare(
@@ -84,25 +94,27 @@ def compare(
     tick_gap: float = TICK_GAP,
     align: Alignment = "none",
     rpe: bool = False,
+    final_only: bool = False,
     jobs: int | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> comparing.Comparison:
     """Run several estimators on several logs with each seed, in ``jobs`` processes, and write tables and plots to ``out``.
 
-    ``settings`` are given per estimator. ``align``, ``rpe``: what is scored and shown further. See
+    ``settings`` are given per estimator. ``align``, ``rpe``: what is scored and shown further. ``final_only``: make no causal
+    estimates, where an estimator can do without. See
     :func:`factorgraph_loc.experiments.compare.compare`.
     """
     comparing.check_free(Path(out), overwrite=overwrite)
-    named = settings or {}
-    if others := [name for name in named if name not in estimators]:
+    if others := [name for name in settings or {} if name not in estimators]:
         raise InputError(f"settings are given for {others[0]}, which is not run here; run: {listed(estimators)}")
+    named: Mapping[str, Settings] = {name: (settings or {}).get(name, {}) for name in estimators}
+    if final_only:
+        named = for_final_only(named)
     used = None if sensors is None else tuple(sensors)
     chosen = list(seeds)
     configs = [
-        RunConfig(name, named.get(name, {}), used, prior, seed, max_gap, tick_gap)
-        for name in estimators
-        for seed in chosen
+        RunConfig(name, named[name], used, prior, seed, max_gap, tick_gap) for name in estimators for seed in chosen
     ]
     return comparing.compare(
         every(logs, rig, world),

@@ -23,9 +23,9 @@ def _some_of(names: Callable[[], Iterable[str]]) -> Completion:
     """Completes the last of several comma-separated names, without repetition."""
 
     def complete(incomplete: str) -> list[str]:
-        before, comma, last = incomplete.rpartition(",")
-        there = before.split(",")
-        return [f"{before}{comma}{name}" for name in names() if name.startswith(last) and name not in there]
+        first, comma, last = incomplete.rpartition(",")
+        chosen = first.split(",")
+        return [f"{first}{comma}{name}" for name in names() if name.startswith(last) and name not in chosen]
 
     return complete
 

@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from factorgraph_loc.cli import completion, show
-from factorgraph_loc.cli.options import DataRoot, Json, Out, Overwrite, key_and_value, nested_changes, parse_list
+from factorgraph_loc.cli.options import (
+    DataRoot,
+    Jobs,
+    Json,
+    Out,
+    Overwrite,
+    Seeds,
+    key_and_value,
+    nested_changes,
+    parse_list,
+)
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.seeds import parse_seeds
 from factorgraph_loc.plugins import ACTIVE_ESTIMATORS, POLICIES
@@ -44,7 +54,7 @@ def run(
     file: File,
     set_: Changes = None,
     out: OutFolder = None,
-    jobs: Annotated[int | None, typer.Option(help="Number of processes; by default one per core.", min=1)] = None,
+    jobs: Jobs = None,
     scheduler: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that executes the runs."),
@@ -59,30 +69,28 @@ def run(
     json: Json = False,
 ) -> None:
     """Execute the runs of an experiment that have no result yet; can be interrupted and resumed at any time."""
-    from factorgraph_loc.experiments.cluster import on_cluster
-    from factorgraph_loc.experiments.experiment import run_experiment
-    from factorgraph_loc.experiments.plan import TooManyRunsError
+    from factorgraph_loc.api import experimenting
+    from factorgraph_loc.experiments.plan import MOST_RUNS, TooManyRunsError
 
-    if scheduler is not None and jobs is not None:
-        raise InputError("--jobs applies to this machine, but --scheduler names a cluster: expected one of them")
-    if yes or dry_run:
-        prepared = _prepared(file, set_, out, data_root, verify=verify)
-    else:
-        try:
-            prepared = _prepared(file, set_, out, data_root, verify=verify, most=MANY)
-        except TooManyRunsError as error:
-            raise InputError(f"{error}: confirm with --yes, or list them with --dry-run") from error
+    try:
+        prepared = experimenting.prepared(
+            file, _changes(set_), out, data_root, verify=verify, most=MOST_RUNS if yes or dry_run else MANY
+        )
+    except TooManyRunsError as error:
+        if yes or dry_run:
+            raise
+        raise InputError(f"{error}: confirm with --yes, or list them with --dry-run") from error
     if dry_run:
         _print_plan(prepared, jobs, retry_failed, json)
         return
     try:
         show.first_use()
         with show.progress("runs", counted=True) as bar:
-            done = run_experiment(
+            done = experimenting.execute(
                 prepared,
                 jobs=jobs,
-                again=retry_failed,
-                executor=None if scheduler is None else on_cluster(scheduler, prepared, again=retry_failed),
+                scheduler=scheduler,
+                retry_failed=retry_failed,
                 progress=lambda done, total, failed: bar(done, total, f"{failed} failed" if failed else ""),
             )
     except KeyboardInterrupt as stop:
@@ -115,16 +123,16 @@ def status(
     json: Json = False,
 ) -> None:
     """Show how many runs of an experiment are done, failed, missing or damaged."""
-    from factorgraph_loc.api.experimenting import STATES, status_of
+    from factorgraph_loc.api import experimenting
 
-    found = status_of(_prepared(file, set_, out, data_root, verify=verify))
+    found = experimenting.status(file, changes=_changes(set_), out=out, data_root=data_root, verify=verify)
     if json:
         show.document(vars(found) | {"folder": str(found.folder)})
         return
     by_label = {label: list(counts.values()) for label, counts in found.labels.items()}
     total = [sum(numbers) for numbers in zip(*by_label.values(), strict=True)]
     rows = [[label, *map(str, numbers)] for label, numbers in (*by_label.items(), ("(all)", total))]
-    show.table(["label", *STATES], rows)
+    show.table(["label", *experimenting.STATES], rows)
     _print_damaged(found.damaged, file)
     for one in found.failures:
         show.line(f"failed: {one['log']}, {one['label']}, seed {one['seed']}: {one['kind']}: {one['reason']}")
@@ -142,9 +150,10 @@ def report(
     json: Json = False,
 ) -> None:
     """Write the stored results of an experiment as one HTML page; damaged ones are left out."""
+    from factorgraph_loc.api.experimenting import prepared
     from factorgraph_loc.experiments.reporting import report_experiment
 
-    written = report_experiment(_prepared(file, set_, out, data_root), page)
+    written = report_experiment(prepared(file, _changes(set_), out, data_root), page)
     if json:
         show.document({"page": str(written.page), "damaged": written.damaged})
         return
@@ -152,21 +161,8 @@ def report(
     _print_damaged(written.damaged, file, "left out")
 
 
-def _prepared(
-    file: Path,
-    changes: list[str] | None,
-    out: Path | None,
-    data_root: Path | None,
-    *,
-    verify: bool = False,
-    most: int | None = None,
-) -> Prepared:
-    from factorgraph_loc.experiments.experiment import prepare
-    from factorgraph_loc.experiments.plan import MOST_RUNS
-
-    pairs = [key_and_value(text, "--set") for text in changes or ()]
-    root = None if data_root is None else str(data_root)
-    return prepare(file, pairs, data_root=root, out=out, verify=verify, most=most or MOST_RUNS)
+def _changes(texts: list[str] | None) -> dict[str, Any]:
+    return dict(key_and_value(text, "--set") for text in texts or ())
 
 
 def _print_plan(prepared: Prepared, jobs: int | None, again: bool, json: bool) -> None:
@@ -269,7 +265,7 @@ def active(
             autocompletion=completion.active_estimators,
         ),
     ] = "active_mcl",
-    seeds: Annotated[str, typer.Option(metavar="FIRST:END", help="Seeds, END not included; or one number.")] = "0",
+    seeds: Seeds = "0",
     max_metres: Annotated[
         float | None, typer.Option(metavar="M", help="Path length after which a robot gives up [m]; by default 100.")
     ] = None,
@@ -283,26 +279,23 @@ def active(
             autocompletion=completion.active_setting,
         ),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(help="Number of processes; by default one per core.", min=1)] = None,
+    jobs: Jobs = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Drive simulated robots from an unknown start until they are localized, and compare policies on the same seeds."""
-    from factorgraph_loc.api.experimenting import active_settings
+    from factorgraph_loc.api import experimenting
     from factorgraph_loc.evaluation.active import difference_cells, differences, summaries, summary_cells
-    from factorgraph_loc.experiments.active import seek
 
-    chosen = parse_seeds(seeds)
-    simulation, settings = active_settings(world, nested_changes(set_ or (), {"max_metres": max_metres}))
     show.first_use()
     with show.progress("runs", counted=True) as report:
-        results = seek(
-            simulation,
-            parse_list(policy),
-            parse_list(estimator),
-            chosen,
+        results = experimenting.active(
+            world,
             out,
-            settings,
+            policies=parse_list(policy),
+            estimators=parse_list(estimator),
+            seeds=parse_seeds(seeds),
+            changes=nested_changes(set_ or (), {"max_metres": max_metres}),
             jobs=jobs,
             overwrite=overwrite,
             progress=report,

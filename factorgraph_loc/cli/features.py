@@ -8,10 +8,11 @@ import typer
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import Json, Out, Overwrite, parse_list
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.plugins import FEATURES
 from factorgraph_loc.text import quoted
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Point features of images and their quality.")
-ALL = "colour,sift,orb,fast_hessian,harris_laplace,hessian_laplace"
+ALL = ",".join(FEATURES)
 
 
 @app.command()
@@ -30,19 +31,14 @@ def evaluate(
     json: Json = False,
 ) -> None:
     """Compare features on images of planar scenes: repeatability, matching, estimated homography, time."""
+    from factorgraph_loc.api import learning
     from factorgraph_loc.evaluation.features import scores as evaluation
-    from factorgraph_loc.evaluation.features.feature_evaluation import feature
-    from factorgraph_loc.evaluation.features.sequences import find_sequences
 
     names = list(dict.fromkeys(parse_list(features)))
     if not names:
         raise InputError(f"--features is {quoted(features)}, expected names such as {ALL}")
-    chosen = [feature(name, count) for name in names]
-    evaluation.check_free(out, overwrite=overwrite)  # before the computation
-    sequences = find_sequences(images)
     with show.progress("evaluating", counted=True) as progress:
-        scores = evaluation.evaluate_all(sequences, chosen, progress)
-    evaluation.write_scores(scores, out)
+        scores = learning.features(images, out, features=names, count=count, overwrite=overwrite, progress=progress)
     if json:
         show.document(scores.rows)
         return

@@ -3,34 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from factorgraph_loc.cli import show
-from factorgraph_loc.cli.options import (
-    DataRoot,
-    Json,
-    LogName,
-    LogOptions,
-    takes_log_options,
-)
+from factorgraph_loc.cli.options import DataRoot, Json, LogName, LogOptions, takes_options
 from factorgraph_loc.errors import InputError
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.inspect import Inspection, StreamSummary
+    from factorgraph_loc.io.bags.proposed import TopicUse
     from factorgraph_loc.model.log import Log
 
 BagPath = Annotated[Path, typer.Argument(metavar="BAG", help="A .bag, .mcap or .db3, or the folder of a ROS 2 bag.")]
-
-
-class Format(StrEnum):
-    """Format of the tables of a native log."""
-
-    csv = "csv"
-    parquet = "parquet"
 
 
 def datasets(data_root: DataRoot = None, json: Json = False) -> None:
@@ -45,7 +32,7 @@ def datasets(data_root: DataRoot = None, json: Json = False) -> None:
     show.table(("name", "reader", "present", "title"), rows)
 
 
-@takes_log_options
+@takes_options
 def info(
     log: LogName,
     *,
@@ -86,23 +73,23 @@ def info(
         show.line(f"wrote {out}")
 
 
-@takes_log_options
+@takes_options
 def convert(
     log: LogName,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write.")],
-    format: Annotated[Format, typer.Option(help="Format of the tables.")] = Format.csv,
+    format: Annotated[Literal["csv", "parquet"], typer.Option(help="Format of the tables.")] = "csv",
     *,
     source: LogOptions,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the log that OUT is.")] = False,
     json: Json = False,
 ) -> None:
     """Write a log as a folder in the native format."""
-    from factorgraph_loc.io.native.native import write_native
+    from factorgraph_loc.api import logs
 
     loaded = source.load_one(log)
     for warning in loaded.warnings:
         show.note(f"warning: {warning}")
-    write_native(loaded, out, format.value, overwrite=overwrite)
+    logs.convert(loaded, out, format=format, overwrite=overwrite)
     if json:
         names = sorted(path.name for path in out.iterdir())
         show.document({"log": loaded.name, "folder": str(out), "files": names})
@@ -205,13 +192,11 @@ def info_of_bag(bag: Path, json: Json) -> None:
     show.fields({"bag": str(bag), "duration": f"{found.duration:.1f} s"})
     show.line()
     header = ("topic", "type", "messages", "rate [Hz]", "looks like")
-    show.table(header, [_topic_row(t.topic, t.type, t.messages, t.rate, t.use, t.unused) for t in found.topics])
+    show.table(header, [_topic_row(topic) for topic in found.topics])
     show.line()
     show.line(f"`fgloc manifest {bag} > run.toml` proposes a manifest; then `fgloc info run.toml` shows the content")
 
 
-def _topic_row(
-    name: str, kind: str, count: int, rate: float | None, use: str | None, unused: str | None
-) -> tuple[str, ...]:
-    told = use or (f"{unused}, not used" if unused else "")
-    return (name, kind, str(count), "" if rate is None else f"{rate:.1f}", told)
+def _topic_row(t: TopicUse) -> tuple[str, ...]:
+    use = t.use or (f"{t.unused}, not used" if t.unused else "")
+    return (t.topic, t.type, str(t.messages), "" if t.rate is None else f"{t.rate:.1f}", use)

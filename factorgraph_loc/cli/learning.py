@@ -21,7 +21,7 @@ from factorgraph_loc.cli.options import (
     Prior,
     Settings,
     parse_settings,
-    takes_log_options,
+    takes_options,
 )
 from factorgraph_loc.plugins import MAP_ESTIMATORS
 
@@ -35,7 +35,7 @@ OutWorld = Annotated[
 COLUMNS = ("given x [m]", "y [m]", "learnt x [m]", "y [m]", "sigma [m]", "distance [m]", "verdict")
 
 
-@takes_log_options
+@takes_options
 def calibrate(
     logs: LogNames,
     out: OutRig,
@@ -73,7 +73,7 @@ def calibrate(
     show.line(f"the rig is in {out}, the report in {page}")
 
 
-@takes_log_options
+@takes_options
 def map_(
     log: LogName,
     out: OutWorld,
@@ -118,16 +118,27 @@ def map_(
     json: Json = False,
 ) -> None:
     """Make a map of the landmarks, RFID tags or points in a log; compare it with the log's map of landmarks or tags, if any."""
+    from factorgraph_loc.api import learning
     from factorgraph_loc.experiments import maps
 
     picture = maps.picture_beside(out, overwrite=overwrite)  # before the log is read
     loaded = source.load_one(log)
     settings = parse_settings(set_ or (), [estimator], [maps.POINTS])
-    options = maps.MapOptions(
-        of, estimator, settings[estimator], extend, poses, tag_height, prior, drop_dead, settings[maps.POINTS]
+    made = learning.build_map(
+        loaded,
+        out,
+        of=of,
+        estimator=estimator,
+        settings=settings[estimator],
+        extend=extend,
+        poses=poses,
+        tag_height=tag_height,
+        prior=prior,
+        drop_dead=drop_dead,
+        points=settings[maps.POINTS],
+        overwrite=overwrite,
+        stages=partial(show.progress, counted=False),
     )
-    made = maps.make_map(loaded, options, partial(show.progress, counted=False))
-    made.write(out, overwrite=overwrite)
     for warning in made.warnings:
         show.note(f"warning: {warning}")
     if json:

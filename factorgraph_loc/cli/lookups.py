@@ -9,6 +9,7 @@ import typer
 
 from factorgraph_loc.cli import completion, show
 from factorgraph_loc.cli.options import Json
+from factorgraph_loc.plugins import PRESETS
 
 if TYPE_CHECKING:
     from factorgraph_loc.api.lookups import SensorDescription
@@ -16,124 +17,83 @@ if TYPE_CHECKING:
     from factorgraph_loc.files.settings import Setting
     from factorgraph_loc.fusion.registry import Description
 
-DURATION = "drive.duration"
+
+def _name(what: str, complete: completion.Completion) -> Any:
+    return typer.Argument(metavar="NAME", help=f"Print the {what} of this one.", autocompletion=complete)
 
 
-def estimators(
-    name: Annotated[
-        str | None,
-        typer.Argument(metavar="NAME", help="Print the settings of this one.", autocompletion=completion.estimator),
-    ] = None,
-    json: Json = False,
-) -> None:
+def estimators(name: Annotated[str | None, _name("settings", completion.estimator)] = None, json: Json = False) -> None:
     """List the estimators, or the settings of one."""
     from factorgraph_loc.api.lookups import known_estimators
     from factorgraph_loc.fusion.registry import describe
 
-    if name is not None:
-        found = describe(name)
-        settings = found.settings
-        if json:
-            show.document(found)
-            return
-        about = {"estimator": name, "what it is": found.about, "estimates": _estimates(found)}
-        show.fields(about | {"sensors": ", ".join(found.sensors)})
-        show.line()
-        _print_settings(settings)
-        if settings:
-            show.line()
-            show.line(f"to change one: fgloc run LOG -e {name} --set {name}.{settings[0].key}=VALUE")
+    if name is None:
+        known = known_estimators()
+        rows = [(e.name, _estimates(e), e.about, ", ".join(e.sensors)) for e in known]
+        _print_list(json, known, ("name", "estimates", "what it is", "sensors"), rows, ("what it is", "sensors"))
         return
-    known = known_estimators()
+    estimator = describe(name)
     if json:
-        show.document(known)
+        show.document(estimator)
         return
-    rows = [(one.name, _estimates(one), one.about, ", ".join(one.sensors)) for one in known]
-    show.table(("name", "estimates", "what it is", "sensors"), rows, wrapped=("what it is", "sensors"))
+    about = {"estimator": name, "what it is": estimator.about, "estimates": _estimates(estimator)}
+    show.fields(about | {"sensors": ", ".join(estimator.sensors)})
+    show.line()
+    first = estimator.settings[0].key if estimator.settings else ""
+    _print_settings(estimator.settings, f"to change one: fgloc run LOG -e {name} --set {name}.{first}=VALUE")
 
 
-def readers(
-    name: Annotated[
-        str | None,
-        typer.Argument(metavar="NAME", help="Print the options of this one.", autocompletion=completion.reader),
-    ] = None,
-    json: Json = False,
-) -> None:
+def readers(name: Annotated[str | None, _name("options", completion.reader)] = None, json: Json = False) -> None:
     """List the readers of logs, or the options of one."""
     from factorgraph_loc.api.lookups import describe_reader, known_readers
 
-    if name is not None:
-        found = describe_reader(name)
-        if json:
-            show.document(found)
-            return
-        show.fields({"reader": name, "format": found.about})
-        show.line()
-        _print_settings(found.options, "option")
-        if found.options:
-            show.line()
-            show.line("options are in [options] of a manifest, or --reader-option KEY=VALUE")
+    if name is None:
+        known = known_readers()
+        _print_list(json, known, ("name", "format"), [(r.name, r.about) for r in known], ("format",))
         return
-    known = known_readers()
+    reader = describe_reader(name)
     if json:
-        show.document(known)
-    else:
-        show.table(("name", "format"), [(one.name, one.about) for one in known], wrapped=("format",))
+        show.document(reader)
+        return
+    show.fields({"reader": name, "format": reader.about})
+    show.line()
+    hint = "options are in [options] of a manifest, or --reader-option KEY=VALUE"
+    _print_settings(reader.options, hint, "option")
 
 
 def sensors(
-    name: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="NAME", help="Print the tables and settings of this one.", autocompletion=completion.sensor
-        ),
-    ] = None,
-    json: Json = False,
+    name: Annotated[str | None, _name("tables and settings", completion.sensor)] = None, json: Json = False
 ) -> None:
     """List the sensors, or the tables and the rig's settings of one."""
     from factorgraph_loc.api.lookups import describe_sensor, known_sensors
 
-    if name is not None:
-        sensor = describe_sensor(name)
-        if json:
-            show.document(_document(sensor))
-        else:
-            _print_sensor(sensor)
-        return
-    known = known_sensors()
-    if json:
-        show.document([_summary(sensor) for sensor in known])
-        return
-    rows = [(s.name, s.about, ", ".join(s.channels), _sections(s)) for s in known]
-    show.table(("name", "what it is", "--sensors", "rig"), rows, wrapped=("what it is", "--sensors"))
-
-
-def presets(
-    name: Annotated[
-        str | None,
-        typer.Argument(metavar="NAME", help="Print the settings of this one.", autocompletion=completion.preset),
-    ] = None,
-    json: Json = False,
-) -> None:
-    """List the presets of simulated logs, or the settings of one."""
-    from factorgraph_loc.api.lookups import describe_preset, known_presets
-
-    if name is not None:
-        found = describe_preset(name)
-        if json:
-            show.document(found)
-            return
-        show.fields({"preset": name, "world": found.about, "rig": f"fgloc rigs show {name}; --set rig.KEY=VALUE"})
-        show.line()
-        _print_settings(found.settings)
-        show.line()
-        show.line(f"to change one: fgloc simulate {name} --set {DURATION}=VALUE, or a file of settings")
-        return
-    known = known_presets()
-    if json:
-        show.document([{"name": one.name, "about": one.about} for one in known])
+    if name is None:
+        known = known_sensors()
+        rows = [(s.name, s.about, ", ".join(s.channels), _sections(s)) for s in known]
+        header = ("name", "what it is", "--sensors", "rig")
+        _print_list(json, [_summary(sensor) for sensor in known], header, rows, ("what it is", "--sensors"))
+    elif json:
+        show.document(_document(describe_sensor(name)))
     else:
-        show.table(("name", "world"), [(one.name, one.about) for one in known], wrapped=("world",))
+        _print_sensor(describe_sensor(name))
+
+
+def presets(name: Annotated[str | None, _name("settings", completion.preset)] = None, json: Json = False) -> None:
+    """List the presets of simulated logs, or the settings of one."""
+    from factorgraph_loc.api.lookups import describe_preset
+
+    if name is None:
+        known = [{"name": name, "about": about} for name, about in PRESETS.items()]
+        _print_list(json, known, ("name", "world"), [*PRESETS.items()], ("world",))
+        return
+    preset = describe_preset(name)
+    if json:
+        show.document(preset)
+        return
+    show.fields({"preset": name, "world": preset.about, "rig": f"fgloc rigs show {name}; --set rig.KEY=VALUE"})
+    show.line()
+    hint = f"to change one: fgloc simulate {name} --set drive.duration=VALUE, or a file of settings"
+    _print_settings(preset.settings, hint)
 
 
 def policies(json: Json = False) -> None:
@@ -141,16 +101,20 @@ def policies(json: Json = False) -> None:
     from factorgraph_loc.api.lookups import known_policies
 
     known = known_policies()
+    _print_list(json, known, ("policy", "next path"), [*known.policies.items()], ("next path",))
+    if not json:
+        show.line()
+        hint = "to change one: fgloc active WORLD --set policy.horizon=VALUE; settings of the world as in fgloc presets WORLD"
+        _print_settings(known.settings, hint)
+
+
+def _print_list(
+    json: bool, document: Any, header: Sequence[str], rows: Sequence[Sequence[str]], wrapped: Sequence[str]
+) -> None:
     if json:
-        show.document(known)
-        return
-    show.table(("policy", "next path"), [*known.policies.items()], wrapped=("next path",))
-    show.line()
-    _print_settings(known.settings)
-    show.line()
-    show.line(
-        "to change one: fgloc active WORLD --set policy.horizon=VALUE; settings of the world as in fgloc presets WORLD"
-    )
+        show.document(document)
+    else:
+        show.table(header, rows, wrapped)
 
 
 def _summary(sensor: SensorDescription) -> dict[str, Any]:
@@ -158,22 +122,14 @@ def _summary(sensor: SensorDescription) -> dict[str, Any]:
 
 
 def _document(sensor: SensorDescription) -> dict[str, Any]:
-    tables = [
-        {"name": name, "columns": [_column(column) for column in columns]} for name, columns in sensor.tables.items()
-    ]
+    tables = [{"name": name, "columns": [_column(one) for one in columns]} for name, columns in sensor.tables.items()]
     return {**_summary(sensor), "tables": tables, "settings": sensor.rig}
 
 
 def _column(column: Column) -> dict[str, Any]:
-    return {
-        "name": column.name,
-        "kind": column.kind,
-        "unit": column.unit,
-        "low": column.low if column.units else None,
-        "high": column.high if column.units else None,
-        "may_lack": column.may_lack,
-        "meaning": column.doc,
-    }
+    low, high = (column.low, column.high) if column.units else (None, None)
+    about = {"name": column.name, "kind": column.kind, "unit": column.unit, "low": low, "high": high}
+    return about | {"may_lack": column.may_lack, "meaning": column.doc}
 
 
 def _print_sensor(sensor: SensorDescription) -> None:
@@ -196,14 +152,17 @@ def _sections(sensor: SensorDescription) -> str:
     return ", ".join(f"[{section}]" for section in sensor.rig)
 
 
-def _print_settings(settings: Sequence[Setting], word: str = "setting") -> None:
+def _print_settings(settings: Sequence[Setting], hint: str = "", word: str = "setting") -> None:
     from factorgraph_loc.files.settings import default_text, values_text
 
-    if settings:
-        rows = [(s.key, default_text(s), values_text(s), s.meaning) for s in settings]
-        show.table((word, "default", "values", "what it is"), rows, wrapped=("values", "what it is"))
-    else:
+    if not settings:
         show.line(f"no {word}s")
+        return
+    rows = [(s.key, default_text(s), values_text(s), s.meaning) for s in settings]
+    show.table((word, "default", "values", "what it is"), rows, wrapped=("values", "what it is"))
+    if hint:
+        show.line()
+        show.line(hint)
 
 
 def _estimates(found: Description) -> str:

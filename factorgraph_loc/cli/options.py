@@ -13,7 +13,7 @@ import typer
 
 from factorgraph_loc.cli import completion
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.model.scoring import Alignment
+from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
 from factorgraph_loc.text import listed, quoted
 
 if TYPE_CHECKING:
@@ -87,6 +87,8 @@ Prior = Annotated[
         autocompletion=completion.prior,
     ),
 ]
+Seeds = Annotated[str, typer.Option(metavar="FIRST:END", help="Seeds, END not included; or one number.")]
+Jobs = Annotated[int | None, typer.Option(help="Number of processes; by default one per core.", min=1)]
 MaxGap = Annotated[
     float,
     typer.Option(metavar="SECONDS", help="Longest time between estimates across which scoring interpolates."),
@@ -143,21 +145,49 @@ class LogOptions:
         return given
 
 
-def takes_log_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the options of :class:`LogOptions` on the command line, in place of its parameter ``source``."""
+@dataclass(frozen=True)
+class RunOptions:
+    """The options of runs."""
+
+    sensors: Sensors = None
+    prior: Prior = None
+    set_: Settings = None
+    max_gap: MaxGap = MAX_GAP
+    tick_gap: TickGap = TICK_GAP
+    align: Align = "none"
+    rpe: Rpe = False
+    final_only: FinalOnly = False
+    overwrite: Overwrite = False
+
+    def given(self) -> dict[str, Any]:
+        """The arguments of ``run`` and ``compare`` of the Python interface, except the settings."""
+        given = {key: value for key, value in vars(self).items() if key not in ("set_", "rpe")}
+        return given | {"sensors": parse_list(self.sensors) if self.sensors else None}
+
+
+def takes_options(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with the fields of :class:`LogOptions` and :class:`RunOptions` on the command line, in place of its parameters of
+    these types."""
     given = inspect.signature(command, eval_str=True)
-    hints = get_type_hints(LogOptions, include_extras=True)
-    defaults = {field.name: field.default for field in fields(LogOptions)}
-    options = [given.parameters["source"].replace(name=n, default=d, annotation=hints[n]) for n, d in defaults.items()]
-    told = [one for p in given.parameters.values() for one in (options if p.name == "source" else [p])]
+    groups = {p.name: p.annotation for p in given.parameters.values() if p.annotation in (LogOptions, RunOptions)}
+    parameters: list[inspect.Parameter] = []
+    for parameter in given.parameters.values():
+        if kind := groups.get(parameter.name):
+            hints = get_type_hints(kind, include_extras=True)
+            parameters += [
+                parameter.replace(name=f.name, default=f.default, annotation=hints[f.name]) for f in fields(kind)
+            ]
+        else:
+            parameters.append(parameter)
 
     @wraps(command)
     def expanded(**values: Any) -> None:
-        source = LogOptions(**{name: values.pop(name) for name in defaults})
-        command(**values, source=source)
+        for name, kind in groups.items():
+            values[name] = kind(**{field.name: values.pop(field.name) for field in fields(kind)})
+        command(**values)
 
-    expanded.__signature__ = given.replace(parameters=told)  # type: ignore[attr-defined] # what Typer reads
-    expanded.__annotations__ = {one.name: one.annotation for one in told}
+    expanded.__signature__ = given.replace(parameters=parameters)  # type: ignore[attr-defined] # what Typer reads
+    expanded.__annotations__ = {p.name: p.annotation for p in parameters}
     return expanded
 
 

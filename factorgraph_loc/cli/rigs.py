@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import typer
 
@@ -16,7 +17,9 @@ from factorgraph_loc.text import quoted
 
 T = TypeVar("T")
 MOST_ANTENNAS = 64
-DRIVES = ("differential", "omnidirectional", "none")
+DRIVES: dict[str, Any] = {name: name for name in ("differential", "omnidirectional", "none")}
+COUNTS = {str(count): count for count in range(MOST_ANTENNAS + 1)}
+YES = {"yes": True, "no": False}
 app = typer.Typer(rich_markup_mode=None)
 
 
@@ -75,13 +78,14 @@ def new(
 
     asks = not json and sys.stdin.isatty() and sys.stderr.isatty()
     robot = RobotOptions(
-        _value("--odometry", odometry, "differential", _drive, asks and f"odometry: {', '.join(DRIVES)}"),
-        _value("--imu", None if imu is None else "yes" if imu else "no", "no", _yes, asks and "gyro: yes, no"),
-        _value("--landmarks", landmarks, "none", _metres, asks and "landmarks: noise of a range in m, or none"),
-        _value("--antennas", antennas, "0", _count, asks and "RFID antennas: how many"),
-        _value("--camera", camera, "none", _size, asks and "camera: size of its images, such as 640x480, or none"),
+        _value("--odometry", odometry, "differential", f"one of {', '.join(DRIVES)}", DRIVES.__getitem__, asks),
+        _value("--imu", None if imu is None else "yes" if imu else "no", "no", "yes or no", YES.__getitem__, asks),
+        _value("--landmarks", landmarks, "none", "the noise of a range in m, or none", _metres, asks),
+        _value("--antennas", antennas, "0", f"a whole number from 0 to {MOST_ANTENNAS}", COUNTS.__getitem__, asks),
+        _value("--camera", camera, "none", "a size such as 640x480, or none", _size, asks),
     )
-    file = _value("--out", None if out is None else str(out), "robot.rig.toml" if asks else "", _file, asks and "file")
+    given, name = None if out is None else str(out), "robot.rig.toml" if asks else ""
+    file = _value("--out", given, name, "the file to write, such as robot.rig.toml", _file, asks)
     rig, remarks = new_rig(file.name.removesuffix(".toml").removesuffix(".rig"), robot)
     write_new_rig(rig, remarks, file, overwrite=overwrite)
     if json:
@@ -92,56 +96,36 @@ def new(
     show.line(f"wrote {file}; use it by --rig {file}, or name it in run.toml of a log")
 
 
-def _value(
-    option: str, given: str | None, default: str, parse: Callable[[str, str], T], question: str | Literal[False]
-) -> T:
-    """The value of an option: what is given, else the answer to a question, if there is one, else the default."""
-    if given is not None or not question:
-        return parse(option, default if given is None else given)
+def _value(option: str, given: str | None, default: str, expected: str, parse: Callable[[str], T], asks: bool) -> T:
+    """The value of an option: what is given, else the answer to a question if it ``asks``, else the default. ``parse`` raises
+    KeyError or ValueError for what is not ``expected``."""
     while True:
-        print(f"{question} [{default}]: ", end="", file=sys.stderr, flush=True)
+        text = default if given is None else given
+        if given is None and asks:
+            print(f"{option.removeprefix('--')}: {expected} [{default}]: ", end="", file=sys.stderr, flush=True)
+            text = sys.stdin.readline().strip() or default
         try:
-            return parse(option, sys.stdin.readline().strip() or default)
-        except InputError as error:
-            show.note(str(error))
+            return parse(text)
+        except (KeyError, ValueError) as error:
+            wrong = f"{option} is {quoted(text) if text else 'missing'}, expected {expected}"
+            if given is not None or not asks:
+                raise InputError(wrong) from error
+            show.note(wrong)
 
 
-def _drive(option: str, text: str) -> Any:
-    if text not in DRIVES:
-        raise InputError(f"{option} is {quoted(text)}, expected one of {', '.join(DRIVES)}")
-    return text
+def _metres(text: str) -> float | None:
+    return None if text == "none" else float(text)
 
 
-def _yes(option: str, text: str) -> bool:
-    if text not in ("yes", "no"):
-        raise InputError(f"{option} is {quoted(text)}, expected yes or no")
-    return text == "yes"
-
-
-def _metres(option: str, text: str) -> float | None:
-    try:
-        return None if text == "none" else float(text)
-    except ValueError as error:
-        raise InputError(f"{option} is {quoted(text)}, expected the noise of a range in m, or none") from error
-
-
-def _count(option: str, text: str) -> int:
-    if not text.isascii() or not text.isdigit() or len(text) > 3 or int(text) > MOST_ANTENNAS:
-        raise InputError(f"{option} is {quoted(text)}, expected a whole number from 0 to {MOST_ANTENNAS}")
-    return int(text)
-
-
-def _size(option: str, text: str) -> tuple[int, int] | None:
+def _size(text: str) -> tuple[int, int] | None:
     if text == "none":
         return None
-    sides = text.split("x")
-    if len(sides) != 2 or not all(side.isascii() and side.isdigit() and len(side) <= 6 for side in sides):
-        raise InputError(f"{option} is {quoted(text)}, expected a size such as 640x480, or none")
-    return int(sides[0]), int(sides[1])
+    if not (size := re.fullmatch("([0-9]{1,6})x([0-9]{1,6})", text)):
+        raise ValueError
+    return int(size[1]), int(size[2])
 
 
-def _file(option: str, text: str) -> Path:
+def _file(text: str) -> Path:
     if not text.endswith(".toml"):
-        given = quoted(text) if text else "missing"
-        raise InputError(f"{option} is {given}, expected the file to write, such as robot.rig.toml")
+        raise ValueError
     return Path(text)

@@ -10,28 +10,21 @@ import typer
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import (
-    Align,
     Estimator,
     Estimators,
-    FinalOnly,
+    Jobs,
     Json,
     LogName,
     LogNames,
     LogOptions,
-    MaxGap,
     Out,
-    Overwrite,
-    Prior,
-    Rpe,
-    Sensors,
-    Settings,
-    TickGap,
+    RunOptions,
+    Seeds,
     parse_list,
     parse_settings,
-    takes_log_options,
+    takes_options,
 )
 from factorgraph_loc.experiments.seeds import parse_seeds
-from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP
 
 if TYPE_CHECKING:
     from factorgraph_loc.model.result import RunResult
@@ -49,69 +42,58 @@ COLUMNS = {
 }
 
 
-@takes_log_options
+@takes_options
 def run(
     log: LogName,
     estimator: Estimator,
     out: Out,
-    sensors: Sensors = None,
-    prior: Prior = None,
-    seed: Annotated[int, typer.Option(help="Seed of the random generator.", min=0)] = 0,
-    set_: Settings = None,
     *,
     source: LogOptions,
-    max_gap: MaxGap = MAX_GAP,
-    tick_gap: TickGap = TICK_GAP,
+    options: RunOptions,
+    seed: Annotated[int, typer.Option(help="Seed of the random generator.", min=0)] = 0,
     learn: Annotated[
         bool,
         typer.Option(
             "--learn", help="Learn the rig from the log itself, without its reference, for the final trajectory."
         ),
     ] = False,
-    align: Align = "none",
-    rpe: Rpe = False,
-    final_only: FinalOnly = False,
-    overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Run one estimator on one log; write trajectories, estimates, scores and plots."""
-    from factorgraph_loc.evaluation.plots import write_plots
-    from factorgraph_loc.experiments import run as experiment
-    from factorgraph_loc.experiments.learning import run_and_learn
-    from factorgraph_loc.experiments.output import MAP, check_free, save_run
-    from factorgraph_loc.fusion.registry import check_names, for_final_only
+    from factorgraph_loc.api import running
+    from factorgraph_loc.experiments.output import MAP, check_free
+    from factorgraph_loc.fusion.registry import check_names
 
     check_names([estimator])
-    check_free(out, overwrite=overwrite)  # before the computation
-    settings = parse_settings(set_ or (), [estimator])
-    if final_only:
-        settings = for_final_only(settings)
+    check_free(out, overwrite=options.overwrite)  # before the log is read
+    settings = parse_settings(options.set_ or (), [estimator])
     loaded = source.load_one(log)
-    config = experiment.RunConfig(
-        estimator, settings[estimator], parse_list(sensors) if sensors else None, prior, seed, max_gap, tick_gap
-    )
     show.first_use()
     with show.progress(estimator, counted=False) as report:
-        if learn:
-            learning = run_and_learn(loaded, config, lambda share: report(share, 1.0))
-            result, learnt = learning.result, learning.turns.knowledge.constants
-        else:
-            result, learnt = experiment.run(loaded, config, lambda share: report(share, 1.0)), ()
-    scores = save_run(result, loaded, out, align=align, overwrite=overwrite)
-    write_plots(result, loaded, out)
+        found = running.run(
+            loaded,
+            estimator,
+            settings=settings[estimator],
+            seed=seed,
+            learn=learn,
+            out=out,
+            progress=lambda share: report(share, 1.0),
+            **options.given(),
+        )
+    result, scores = found.result, found.scores
     show.warnings(scores["warnings"])
     if json:
         show.document(scores)
         return
     _print_accuracy(scores)
-    _print_further(scores, rpe=rpe)
+    _print_further(scores, rpe=options.rpe)
     _print_consistency(scores)
     _print_learnt(result)
-    if learnt:
+    if found.learnt:
         from factorgraph_loc.calibration.report import constants_table
 
         show.line("learnt from the log, for the final trajectory alone:")
-        show.table(*constants_table(learnt))
+        show.table(*constants_table(found.learnt))
     _print_events(result)
     _print_effort(scores)
     show.line()
@@ -120,48 +102,42 @@ def run(
         show.line(f"a map of the {len(result.learnt.points or ())} points that were found is in {out / MAP}")
 
 
-@takes_log_options
+@takes_options
 def compare(
     logs: LogNames,
     estimators: Estimators,
     out: Out,
-    seeds: Annotated[str, typer.Option(metavar="FIRST:END", help="Seeds, END not included; or one number.")] = "0",
-    jobs: Annotated[int | None, typer.Option(help="Number of processes; by default one per core.", min=1)] = None,
-    sensors: Sensors = None,
-    prior: Prior = None,
-    set_: Settings = None,
+    seeds: Seeds = "0",
+    jobs: Jobs = None,
     *,
     source: LogOptions,
-    max_gap: MaxGap = MAX_GAP,
-    tick_gap: TickGap = TICK_GAP,
-    align: Align = "none",
-    rpe: Rpe = False,
-    final_only: FinalOnly = False,
-    overwrite: Overwrite = False,
+    options: RunOptions,
     json: Json = False,
 ) -> None:
     """Run several estimators on several logs; write a table and plots."""
+    from factorgraph_loc.api import running
     from factorgraph_loc.evaluation.tables import comparison_table, further_tables, unscored, verdict
-    from factorgraph_loc.experiments import compare as experiment
-    from factorgraph_loc.experiments.run import RunConfig
-    from factorgraph_loc.fusion.registry import check_names, for_final_only
+    from factorgraph_loc.experiments.compare import check_free
+    from factorgraph_loc.fusion.registry import check_names
 
     names = parse_list(estimators)
     check_names(names)
-    experiment.check_free(out, overwrite=overwrite)  # before the logs are read
-    settings = parse_settings(set_ or (), names)
-    if final_only:
-        settings = for_final_only(settings)
+    check_free(out, overwrite=options.overwrite)  # before the logs are read
+    settings = parse_settings(options.set_ or (), names)
     chosen = parse_seeds(seeds)
     loaded = source.load(logs)
-    used = parse_list(sensors) if sensors else None
-    configs = [
-        RunConfig(name, settings[name], used, prior, seed, max_gap, tick_gap) for name in names for seed in chosen
-    ]
     show.first_use()
     with show.progress("runs", counted=True) as report:
-        comparison = experiment.compare(
-            loaded, configs, out, align=align, rpe=rpe, jobs=jobs, overwrite=overwrite, progress=report
+        comparison = running.compare(
+            loaded,
+            names,
+            out,
+            settings=settings,
+            seeds=chosen,
+            rpe=options.rpe,
+            jobs=jobs,
+            progress=report,
+            **options.given(),
         )
     show.warnings(comparison.warnings)
     for failure in comparison.failures:
@@ -170,7 +146,7 @@ def compare(
         show.document({"runs": comparison.rows, "failures": comparison.failures, "warnings": comparison.warnings})
     else:
         show.rich_table(comparison_table(comparison.rows))
-        for title, columns in further_tables(comparison.rows, rpe=rpe).items():
+        for title, columns in further_tables(comparison.rows, rpe=options.rpe).items():
             show.line(f"{title}:")
             show.rich_table(comparison_table(comparison.rows, columns))
         for line in (*unscored(comparison.rows), *verdict(comparison.rows)):

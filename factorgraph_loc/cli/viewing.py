@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from factorgraph_loc.cli import show
-from factorgraph_loc.cli.options import Json, LogOptions, takes_log_options
+from factorgraph_loc.cli.options import Json, LogOptions, takes_options
 
 if TYPE_CHECKING:
     from factorgraph_loc.exports.runs import Particles, StoredRun
@@ -27,7 +27,7 @@ What = Annotated[
 ]
 
 
-@takes_log_options
+@takes_options
 def view(
     what: What,
     rrd: Annotated[
@@ -82,7 +82,7 @@ def shown(log: Log, runs: list[StoredRun]) -> dict[str, Any]:
     return {"log": log.name, "runs": {run.name: str(run.folder.path) for run in runs}}
 
 
-@takes_log_options
+@takes_options
 def export(
     what: What,
     out: Annotated[

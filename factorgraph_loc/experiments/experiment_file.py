@@ -243,13 +243,6 @@ def read_experiment(path: Path, changes: Sequence[tuple[str, Any]] = ()) -> Expe
     return parse_model(Experiment, content, path)
 
 
-def nested(key: str, value: Any) -> dict[str, Any]:
-    """``a.b`` and 3 as {"a": {"b": 3}}."""
-    for part in reversed(key.split(".")):
-        value = {part: value}
-    return dict(value)
-
-
 def _change(content: dict[str, Any], key: str, value: Any, source: object) -> None:
     """Set a dotted key of the file's content; see :func:`read_experiment`."""
     first, _, rest = key.partition(".")

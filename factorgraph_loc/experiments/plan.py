@@ -18,12 +18,11 @@ from factorgraph_loc.experiments.experiment_file import (
     Scalar,
     Sweep,
     canonical,
-    nested,
 )
 from factorgraph_loc.experiments.keys import Facts, FileDigests, run_key
 from factorgraph_loc.experiments.log_source import LogSource, RecordedSource, SimulatedSource, recorded_sources
 from factorgraph_loc.files.data_root import named_path
-from factorgraph_loc.files.models import nearest
+from factorgraph_loc.files.models import nearest, set_key
 from factorgraph_loc.text import quoted
 
 if TYPE_CHECKING:
@@ -270,7 +269,7 @@ def _simulated(entry: LogEntry, point: Mapping[str, Any]) -> list[SimulatedSourc
     assert entry.simulate is not None
     settings = json.loads(canonical(entry.settings))
     for key, value in point.items():
-        _merge(settings, nested(key.partition(".")[2], value))
+        set_key(settings, key.partition(".")[2], value, "the sweep")
     return [SimulatedSource(entry.simulate, canonical(settings), seed) for seed in entry.seeds]
 
 
@@ -285,16 +284,8 @@ def _settings(entry: EstimatorEntry, point: Mapping[str, Any]) -> dict[str, Any]
     """The settings of an estimator at a point of the sweep."""
     settings: dict[str, Any] = json.loads(canonical(entry.settings))
     for key, value in _part(point, (entry.shown, entry.name)).items():
-        _merge(settings, nested(key.partition(".")[2], value))
+        set_key(settings, key.partition(".")[2], value, "the sweep")
     return settings
-
-
-def _merge(into: dict[str, Any], changes: Mapping[str, Any]) -> None:
-    for key, value in changes.items():
-        if isinstance(value, Mapping) and isinstance(into.get(key), dict):
-            _merge(into[key], value)
-        else:
-            into[key] = value
 
 
 def _part(point: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:

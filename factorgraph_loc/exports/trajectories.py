@@ -46,8 +46,8 @@ def matrices(trajectory: Trajectory | Trajectory3) -> Array:
 
 
 def write_trajectory(trajectory: Trajectory | Trajectory3, path: str | Path, t0_ns: int = 0) -> None:
-    """Write a trajectory, whose times count from ``t0_ns``, in TUM format, or in KITTI format with times beside it if the name ends
-    with .kitti."""
+    """Write a trajectory, whose times count from ``t0_ns``, in TUM format, or in KITTI format with a file of times if the name
+    ends with .kitti."""
     if Path(path).suffix == KITTI:
         write_kitti(trajectory, Path(path))
     else:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.columns import LATEST, POSES
 from factorgraph_loc.files.models import read_text, write_text
-from factorgraph_loc.model.planar import on_floor
 from factors import se2
 from factors.se2 import Array, Integers
 
@@ -35,7 +34,7 @@ COVARIANCES = {  # columns of tables: entries of a covariance of (x, y, heading)
 
 
 class Exchange:
-    """What trajectories have in common: conversion from poses with absolute times, from arrays and from tables, and back.
+    """The common base of trajectories: made from poses with absolute times, from arrays and from tables.
 
     Times are seconds after ``t0_ns``, nanoseconds since 1970.
     """

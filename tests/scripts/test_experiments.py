@@ -1,6 +1,7 @@
 """The experiment files, and the example of how to script one."""
 
 import re
+from copy import deepcopy
 from pathlib import Path
 
 import polars as pl
@@ -9,11 +10,11 @@ from in_short import runs_here  # noqa: F401 - a fixture
 from recorded_logs import CONVERTED
 from scripts_here import run_script
 
-from factorgraph_loc.experiments.experiment_file import SIMULATION, nested, read_experiment
+from factorgraph_loc.experiments.experiment_file import SIMULATION, read_experiment
+from factorgraph_loc.files.models import set_key
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.fusion.registry import settings_of
 from factorgraph_loc.simulation import preset
-from factorgraph_loc.simulation.settings import merged
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "scripts/experiments").glob("*.toml"))
@@ -25,21 +26,21 @@ def test_an_experiment_file_is_valid_down_to_its_settings(file):
     assert experiment.name == file.stem
     for point in experiment.sweep.points():
         for entry in experiment.estimators:
-            settings = dict(entry.settings)
+            settings = deepcopy(dict(entry.settings))
             for key, value in point.items():
                 first, _, rest = key.partition(".")
                 if first == entry.shown:
-                    settings = merged(settings, nested(rest, value))
+                    set_key(settings, rest, value, file)
             settings_of(entry.name, settings)
         for log in experiment.logs:
             if log.log is not None:
                 assert any(Path(name).match(Path(log.log).name) for name in (*manifests(), *CONVERTED)), log.log
                 continue
-            settings = dict(log.settings)
+            settings = deepcopy(dict(log.settings))
             for key, value in point.items():
                 first, _, rest = key.partition(".")
                 if first == SIMULATION:
-                    settings = merged(settings, nested(rest, value))
+                    set_key(settings, rest, value, file)
             preset(log.simulate, settings)
 
 

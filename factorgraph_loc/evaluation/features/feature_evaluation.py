@@ -38,7 +38,6 @@ from factorgraph_loc.vision.matching import RATIO, distance_matrix, nearest_neig
 from factors.se2 import Array
 
 THRESHOLDS = np.arange(1.0, 11.0)  # px, of the homography's error
-FEATURES = ("colour", "sift", "orb", "fast_hessian", "harris_laplace", "hessian_laplace")
 
 _INLIER = 3.0  # px, of the robust fit
 _CONFIDENCE, _ITERATIONS = 0.9999, 10_000
