@@ -1,4 +1,4 @@
-"""The report of a score as one HTML page and as files, with plots of both trajectories and of the errors over time and by size."""
+"""The report of a score as one HTML page and as files, with plots of both trajectories and of the errors."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
 from factorgraph_loc.drawing.pages import Part, Rows, number, sectioned
 from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.pairing import pauses
-from factorgraph_loc.evaluation.trajectories.score import HOW, PoseErrors, TrajectoryScore
+from factorgraph_loc.evaluation.trajectories.score import HOW, TrajectoryScore
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import require_free, writing
 from factors.se2 import Array
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 ESTIMATE, REFERENCE = "estimate", "reference"
@@ -35,25 +34,11 @@ ERRORS = {
     "rotation per second [rad]": "rpe_per_s.rotation",
 }
 EXPLAINED = (
-    "Absolute: between poses of the two, after the alignment. Per metre and per second: between the motions of the two over pieces "
-    "of that length, not divided by it. Rotations are the angle between two orientations. 95 %: this share of the errors is "
-    "smaller; std: their standard deviation."
+    "Absolute: between poses of the two, after the alignment. Per metre and per second: between the motions of the two over "
+    "pieces of that length, not divided by it, plotted at the end of each piece. Rotations are the angle between two "
+    "orientations. 95 %: this share of the errors is smaller; std: their standard deviation."
 )
-CAPTIONS = {
-    "trajectories": "Both trajectories at the compared poses, the estimate after its alignment.",
-    "errors": "Absolute errors, and the share of poses whose error is below a value.",
-    "relative-errors": "Relative errors over a metre of path and over a second, each at the end of its piece.",
-}
 FILES = ("errors.csv", "report.html", "score.json")  # the last one is written last
-PLOTS = ("trajectories.png", "errors.png", "relative-errors.png")
-
-
-def plots(score: TrajectoryScore) -> dict[str, Figure]:
-    """The plots by name: ``trajectories``, ``errors``, and ``relative-errors`` where there are any."""
-    drawn = {"trajectories": _trajectories(score), "errors": _absolute(score)}
-    if any(errors is not None and len(errors.position) for errors in (score.rpe_per_m, score.rpe_per_s)):
-        drawn["relative-errors"] = _relative(score)
-    return drawn
 
 
 def _trajectories(score: TrajectoryScore) -> Figure:
@@ -64,14 +49,15 @@ def _trajectories(score: TrajectoryScore) -> Figure:
     height = float(np.clip((14.0 if flat else 7.0) * depth / width + 1.5, 5.0, 10.0))
     figure, axes = grid(1, 1 if flat else 2, height, "trajectories, at the compared poses")
     x, label = _over(score)
+    breaks = pauses(x) if score.seconds() is not None else np.empty(0, dtype=np.int64)  # NaN interrupts a line
     for path, look, name in (
         (score.reference, {"color": "0.75", "linewidth": 4.0}, REFERENCE),
         (score.estimate, {"color": COLOURS[0], "linewidth": 1.2}, ESTIMATE),
     ):
-        broken = _broken(score, path.positions)
-        axes[0, 0].plot(*broken[:, :2].T, label=name, **look)
+        positions = np.insert(path.positions, breaks, np.nan, axis=0)
+        axes[0, 0].plot(*positions[:, :2].T, label=name, **look)
         if not flat:
-            axes[0, 1].plot(_broken(score, x), broken[:, 2], label=name, **look)
+            axes[0, 1].plot(np.insert(x, breaks, np.nan), positions[:, 2], label=name, **look)
     axes[0, 0].plot(
         *score.estimate.positions[0, :2], "o", color=COLOURS[0], markersize=5, label="start of the estimate"
     )
@@ -83,60 +69,31 @@ def _trajectories(score: TrajectoryScore) -> Figure:
     return figure
 
 
-def _absolute(score: TrajectoryScore) -> Figure:
-    rows = _kinds(score.ape)
-    figure, axes = grid(len(rows), 2, 3.5 * len(rows), "absolute errors")
+def _errors(score: TrajectoryScore) -> Figure:
+    """Each error over time, and the distribution of the absolute ones."""
+    kinds = {"absolute": score.ape, "over 1 m of path": score.rpe_per_m, "over 1 s": score.rpe_per_s}
+    known = {name: errors for name, errors in kinds.items() if errors is not None and len(errors.position)}
+    units = {"position": "m"} if score.ape.rotation is None else {"position": "m", "rotation": "rad"}
+    figure, axes = grid(len(units), len(known) + 1, 3.5 * len(units), "errors")
     x, label = _over(score)
-    for (left, right), (what, unit, values) in zip(axes, rows, strict=True):
-        left.plot(_broken(score, x), _broken(score, values), color=COLOURS[0], linewidth=1.2, label="error")
-        left.axhline(np.sqrt(np.mean(values**2)), color=COLOURS[1], linestyle="--", linewidth=1.2, label="RMSE")
-        left.set(xlabel=label, ylabel=f"{what} error [{unit}]")
-        left.set_ylim(bottom=0.0)
-        _distribution(right, values, f"{what} error [{unit}]")
-    legend(figure, axes[0])
-    return figure
-
-
-def _relative(score: TrajectoryScore) -> Figure:
-    kinds = [
-        (over, errors)
-        for over, errors in (("1 m", score.rpe_per_m), ("1 s", score.rpe_per_s))
-        if errors is not None and len(errors.position)
-    ]
-    figure, axes = grid(2, len(kinds), 7.0, "relative errors")
-    x, label = _over(score)
-    for (upper, lower), (over, errors) in zip(axes.T, kinds, strict=True):
-        upper.set_title(f"over {over}{' of path' if over == '1 m' else ''}")
-        for axis, (what, unit, values) in zip((upper, lower), _kinds(errors), strict=True):
-            axis.plot(x[errors.ends], values, ".", color=COLOURS[0], markersize=4, label="error at the end of a piece")
+    for row, (what, unit) in zip(axes, units.items(), strict=True):
+        for axis, (name, errors) in zip(row, known.items(), strict=False):
+            values = getattr(errors, what)
+            axis.plot(x[errors.ends], values, ".", color=COLOURS[0], markersize=4, label="error")
             axis.axhline(np.sqrt(np.mean(values**2)), color=COLOURS[1], linestyle="--", linewidth=1.2, label="RMSE")
-            axis.set(xlabel=label, ylabel=f"{what} error [{unit}]")
+            axis.set(title=name, xlabel=label, ylabel=f"{what} error [{unit}]")
             axis.set_ylim(bottom=0.0)
+        absolute = np.sort(getattr(score.ape, what))
+        row[-1].plot(absolute, np.arange(1, len(absolute) + 1) / len(absolute), color=COLOURS[0])
+        row[-1].set(ylim=(0.0, 1.0), xlabel=f"absolute {what} error [{unit}]", ylabel="share of poses below")
     legend(figure, axes[0])
     return figure
-
-
-def _kinds(errors: PoseErrors) -> list[tuple[str, str, Array]]:
-    kinds = [("position", "m", errors.position)]
-    return kinds if errors.rotation is None else [*kinds, ("rotation", "rad", errors.rotation)]
 
 
 def _over(score: TrajectoryScore) -> tuple[Array, str]:
     """What the errors are plotted over: times (N,), or the numbers of the poses, and its label."""
     t = score.seconds()
     return (np.arange(1.0, len(score.estimate) + 1), "number of the pose") if t is None else (t, "time [s]")
-
-
-def _broken(score: TrajectoryScore, values: Array) -> Array:
-    """Values (N, ...) with a row of NaN in each gap in time, which interrupts the line."""
-    t = score.seconds()
-    return values if t is None else np.insert(values, pauses(t), np.nan, axis=0)
-
-
-def _distribution(axis: Axes, values: Array, label: str) -> None:
-    axis.plot(np.sort(values), np.arange(1, len(values) + 1) / len(values), color=COLOURS[0], linewidth=2.0)
-    axis.set_xlim(left=0.0)
-    axis.set(ylim=(0.0, 1.0), xlabel=label, ylabel="share of poses below")
 
 
 def errors_table(score: TrajectoryScore) -> Rows:
@@ -174,10 +131,11 @@ def page(score: TrajectoryScore) -> str:
         f"The position error (RMSE) of {score.estimate.name} is {number(score.figures['ape.position_rmse'])} m, over "
         f"{len(score.estimate)} poses of {score.reference.name}."
     )
-    sections: dict[str, Sequence[Part]] = {"Errors": [EXPLAINED, errors_table(score)]}
-    for name, figure in plots(score).items():
-        sections[name.replace("-", " ").capitalize()] = [CAPTIONS[name], png(figure)]
-    sections["How they were compared"] = [(("", ""), list(extents(score).items()))]
+    sections: dict[str, Sequence[Part]] = {
+        "Errors": [EXPLAINED, errors_table(score), png(_errors(score))],
+        "Trajectories": ["At the compared poses, the estimate after its alignment.", png(_trajectories(score))],
+        "How they were compared": [(("", ""), list(extents(score).items()))],
+    }
     return sectioned(f"{score.estimate.name} against {score.reference.name}", lead, score.warnings, sections)
 
 
@@ -216,10 +174,10 @@ def write_score(score: TrajectoryScore, out: Path) -> None:
     """
     with writing(out):
         (out / "plots").mkdir(parents=True, exist_ok=True)
-        for name in (*reversed(FILES), *(f"plots/{plot}" for plot in PLOTS)):
+        for name in reversed(FILES):
             (out / name).unlink(missing_ok=True)
-        for name, figure in plots(score).items():
-            write_picture(figure, out / "plots" / f"{name}.png")
+        write_picture(_trajectories(score), out / "plots" / "trajectories.png")
+        write_picture(_errors(score), out / "plots" / "errors.png")
         write_text(out / FILES[0], errors_of(score).write_csv())
         write_text(out / FILES[1], page(score))
         write_text(out / FILES[2], json.dumps(score.document(), indent=2, allow_nan=False) + "\n")
