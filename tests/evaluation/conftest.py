@@ -54,14 +54,11 @@ class Made:
         return RunFiles({"estimates.parquet": self.tables[key], "config.toml": self.config}.__getitem__, self.scene)
 
 
+ANGLES = np.linspace(0.0, 5.0, 50)
 SCENE = Scene(
-    walls=np.array([[-7.0, -7.0, 7.0, -7.0], [7.0, -7.0, 7.0, 7.0]]),
-    layers={
-        "landmarks": np.array([[0.0, 0.0], [6.0, 2.0]]),
-        "tags": np.array([[-6.0, 1.0]]),
-        "points": np.empty((0, 2)),
-    },
-    reference=(np.column_stack((5.0 * np.cos(np.linspace(0, 5, 50)), 5.0 * np.sin(np.linspace(0, 5, 50)))),),
+    walls=[(-7.0, -7.0, 7.0, -7.0), (7.0, -7.0, 7.0, 7.0)],
+    layers={"landmarks": [(0.0, 0.0), (6.0, 2.0)], "tags": [(-6.0, 1.0)], "points": []},
+    reference=[np.column_stack((5.0 * np.cos(ANGLES), 5.0 * np.sin(ANGLES))).tolist()],
 )
 
 

@@ -110,9 +110,10 @@ class Viewer {
 
   // corners of map and reference; of the trajectories where there is neither
   bounds() {
-    const { walls, reference, points, ...layers } = this.scene || { walls: [], reference: [] };
+    const { walls, reference, layers } = this.scene || { walls: [], reference: [], layers: {} };
+    const { points, ...near } = layers; // points may be far away
     const ends = walls.flatMap(([a, b, c, d]) => [[a, b], [c, d]]);
-    const known = [...ends, ...reference.flat(), ...Object.values(layers).flat()];
+    const known = [...ends, ...reference.flat(), ...Object.values(near).flat()];
     const places = known.length ? known : this.shown.flatMap((run) => run.x.map((x, i) => [x, run.y[i]]));
     const least = (axis) => places.reduce((low, place) => Math.min(low, place[axis]), Infinity);
     const most = (axis) => places.reduce((high, place) => Math.max(high, place[axis]), -Infinity);
@@ -152,7 +153,7 @@ class Viewer {
 
   drawScene() {
     const g = svg("g", { class: "scene" }, this.plan);
-    const { walls, reference, ...layers } = this.scene;
+    const { walls, reference, layers } = this.scene;
     const draw = (name, d) => svg("path", { d, class: name }, g);
     for (const piece of reference) draw("reference", "M" + piece.map((p) => p.join(" ")).join("L"));
     draw("walls", walls.map(([a, b, c, d]) => `M${a} ${b}L${c} ${d}`).join(""));

@@ -50,7 +50,7 @@ def write_report(
     if not len(rows):
         raise InputError(f"there are no runs to report on{f' ({len(damaged)} are damaged)' if damaged else ''}")
     results = Results(rows)
-    labels = {variant.label: name for name, variant in reversed(results.variants.items())}
+    labels = {label: name for name, label in reversed(results.variants.items())}
     if baseline is not None and baseline not in labels:
         raise InputError(f"the baseline is {quoted(baseline)}, expected one of {listed(sorted(labels))}")
     reference = labels[baseline] if baseline else next(iter(results.variants))

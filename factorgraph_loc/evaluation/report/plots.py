@@ -15,7 +15,7 @@ from factorgraph_loc.drawing.pages import Picture
 from factorgraph_loc.evaluation.inference import pooled
 from factorgraph_loc.evaluation.plots import distribution, same_range
 from factorgraph_loc.evaluation.report.metrics import Metric
-from factorgraph_loc.evaluation.report.results import SWEEP, MetricComparison, Results, score
+from factorgraph_loc.evaluation.report.results import SWEEP, MetricComparison, Results, score, short_name
 from factorgraph_loc.evaluation.report.tracks import KINDS
 from factorgraph_loc.text import plain
 
@@ -147,8 +147,7 @@ def _points(
 def _line_name(results: Results, variant: str, row: Mapping[str, Any], column: str) -> str:
     """The label and the swept settings other than that of the axis."""
     others = [c for c in results.sweeps if c != column and row.get(c) is not None]
-    label = results.variants[variant].label
-    return ", ".join([label, *(f"{c.rpartition('.')[2].replace('_', ' ')} {row[c]}" for c in others)])
+    return ", ".join([results.variants[variant], *(f"{short_name(c)} {row[c]}" for c in others)])
 
 
 def _coloured(results: Results) -> list[tuple[str, str]]:

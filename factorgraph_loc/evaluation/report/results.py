@@ -102,7 +102,7 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
                 if quantiles := tracks.quantiles(scored):
                     found.errors[kind][variant, log] = quantiles
         if drawn:
-            found.tracks[log] = {"scene": scene.content() if scene else None, "runs": drawn}
+            found.tracks[log] = {"scene": scene.model_dump() if scene else None, "runs": drawn}
             left -= len(drawn)
     for variant, values in counts.items():
         means, independent, dofs = zip(*values, strict=True)
@@ -126,15 +126,6 @@ def _add_config(found: RunData, run: str, text: str) -> None:
     if not found.versions:
         content = tomllib.loads(text)
         found.versions = {str(name): str(version) for name, version in content.get("versions", {}).items()}
-
-
-@dataclass(frozen=True)
-class Variant:
-    """What is compared: a ``label``, its difference from others of that label; ``swept``: its settings by dotted name."""
-
-    name: str
-    label: str
-    swept: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -180,26 +171,26 @@ class MetricComparison:
 
 
 class Results:
-    """``variants`` by name, in the order of the rows; ``logs``: names of the logs by their label on the page; ``rows``: all of
-    them, as dictionaries.
+    """The rows of an experiment, by variant and log.
 
-    For each value of a swept setting of the simulation, a simulated log is listed separately; intervals and tests count these as
-    one.
+    ``variants``: the label of each by its name on the page, in the order of the rows; ``logs``: the name of each log by its
+    label on the page; ``rows``: all of them, as dictionaries. For each value of a swept setting of the simulation, a simulated
+    log is listed separately; intervals and tests count these as one.
     """
 
     def __init__(self, rows: pl.DataFrame) -> None:
         self.rows: Sequence[Row] = rows.to_dicts()
         self.sweeps = [c for c in rows.columns if c.startswith(SWEEP) and rows[c].drop_nulls().n_unique() > 1]
         several = _labels_with_several_sensors(self.rows)
-        self.variants: dict[str, Variant] = {}
+        self.variants: dict[str, str] = {}
         self.logs: dict[str, str] = {}
         self._runs: dict[tuple[str, str], list[Row]] = {}
         self._pooled: dict[tuple[str, str], Pooled | None] = {}
         for row in self.rows:
             variant, log = self._variant(row, several), self._log(row)
-            self.variants.setdefault(variant.name, variant)
+            self.variants.setdefault(variant, label_of(row))
             self.logs.setdefault(log, str(row["log"]))
-            self._runs.setdefault((variant.name, log), []).append(row)
+            self._runs.setdefault((variant, log), []).append(row)
 
     def runs(self, variant: str, log: str) -> list[Row]:
         """The rows of a variant on a log."""
@@ -258,24 +249,27 @@ class Results:
             self._pooled[key] = pooled(scores, rms=metric.rms, alike=self.logs)
         return self._pooled[key]
 
-    def _variant(self, row: Row, several: set[str]) -> Variant:
+    def _variant(self, row: Row, several: set[str]) -> str:
         label = label_of(row)
-        parts = [", ".join(_sensors(row)) or "the rig's sensors"] if label in several else []
-        swept = {
-            column.removeprefix(SWEEP): row[column]
-            for column in self.sweeps
-            if row.get(column) is not None and not _of_log(column)
-        }
-        parts += [f"{_short(key)} {_value(value)}" for key, value in swept.items()]
-        return Variant(f"{label} ({'; '.join(parts)})" if parts else label, label, swept)
+        sensors = [", ".join(_sensors(row)) or "the rig's sensors"] if label in several else []
+        return _named(label, [*sensors, *self._swept(row, of_log=False)])
 
     def _log(self, row: Row) -> str:
-        swept = [
-            f"{_short(c.removeprefix(SWEEP))} {_value(row[c])}"
-            for c in self.sweeps
-            if _of_log(c) and row.get(c) is not None
-        ]
-        return f"{row['log']} ({'; '.join(swept)})" if swept else str(row["log"])
+        return _named(str(row["log"]), self._swept(row, of_log=True))
+
+    def _swept(self, row: Row, *, of_log: bool) -> list[str]:
+        """The swept settings of a run, of its log or of its estimator, as ``name value``."""
+        known = [c for c in self.sweeps if row.get(c) is not None and of_log == c.startswith(f"{SWEEP}{SIMULATION}.")]
+        return [f"{short_name(c)} {f'{row[c]:g}' if isinstance(row[c], float) else row[c]}" for c in known]
+
+
+def _named(name: str, parts: Sequence[str]) -> str:
+    return f"{name} ({'; '.join(parts)})" if parts else name
+
+
+def short_name(key: str) -> str:
+    """The last word of a dotted name."""
+    return key.rpartition(".")[2].replace("_", " ")
 
 
 def score(row: Row, metric: str) -> float | None:
@@ -317,16 +311,3 @@ def _labels_with_several_sensors(rows: Sequence[Row]) -> set[str]:
 def _sensors(row: Row) -> tuple[str, ...]:
     sensors = row.get("sensors") or ()
     return tuple(sensors.split(",") if isinstance(sensors, str) else sensors)
-
-
-def _of_log(column: str) -> bool:
-    return column.removeprefix(SWEEP).partition(".")[0] == SIMULATION
-
-
-def _short(key: str) -> str:
-    """The last word of a dotted name."""
-    return key.rpartition(".")[2].replace("_", " ")
-
-
-def _value(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
