@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _STYLES = ("-", "--", ":", "-.")  # a second cue beside colour
-_WIDTH, _DPI, _PAGE_DPI = 16.0, 100, 80
+_WIDTH, _DPI = 16.0, 100
 _TITLE, _LINES = 80, 3  # maximum length of a line of text, and number of lines
 _LABEL, _LEGEND, _SIGN = 60, 190, 13  # maximum length of a label, and of a line of the legend with its signs
 
@@ -99,9 +99,7 @@ def drawing(figure: Figure) -> Iterator[None]:
 
 def png(figure: Figure) -> Picture:
     """Return the figure as a PNG image for a page."""
-    out = io.BytesIO()
-    _drawn(figure, _PAGE_DPI).save(out, format="PNG")
-    return Picture.of("image/png", out.getvalue())
+    return Picture.of("image/png", _png(figure))
 
 
 def svg(figure: Figure) -> Picture:
@@ -116,23 +114,28 @@ def svg(figure: Figure) -> Picture:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write the figure as a PNG with a palette, a third of the size of one in full colour.
+    """Write the figure as a PNG."""
+    path.write_bytes(_png(figure))
+
+
+def _png(figure: Figure) -> bytes:
+    """A PNG with a palette, a third of the size of one in full colour.
 
     The octree quantizer keeps the colours of thin lines, which the default (median cut) blends.
     """
     from PIL.Image import Dither, Quantize  # noqa: PLC0415
 
     out = io.BytesIO()
-    _drawn(figure, _DPI).quantize(256, method=Quantize.FASTOCTREE, dither=Dither.NONE).save(out, format="PNG")
-    path.write_bytes(out.getvalue())
+    _drawn(figure).quantize(256, method=Quantize.FASTOCTREE, dither=Dither.NONE).save(out, format="PNG")
+    return out.getvalue()
 
 
-def _drawn(figure: Figure, dpi: float) -> Image:
+def _drawn(figure: Figure) -> Image:
     """The figure as an image in full colour."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from PIL.Image import fromarray  # noqa: PLC0415
 
-    figure.set_dpi(dpi)
+    figure.set_dpi(_DPI)
     canvas: Any = FigureCanvasAgg(figure)
     with drawing(figure):
         _lay_out(figure)

@@ -58,9 +58,9 @@ def blank_pictures(monkeypatch):
 def leave_blank(patch):
     """What ``blank_pictures`` does, for fixtures that last longer than a test."""
 
-    def drawn(figure, dpi):
+    def drawn(figure):
         with figures.drawing(figure):
-            return Image.new("RGB", (round(figure.get_figwidth() * dpi), 1), "white")
+            return Image.new("RGB", (round(figure.get_figwidth() * 100), 1), "white")
 
     def svg(figure):
         with figures.drawing(figure):

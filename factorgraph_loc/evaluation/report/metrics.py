@@ -90,6 +90,7 @@ _OTHERS = {
         Metric("time_to_localized", "localized after", "s"),
     )
 }
+TIMINGS = tuple(key for key in _OTHERS if key.startswith("timing."))
 
 
 def number(value: float, *, sign: bool = False) -> str:

@@ -14,7 +14,7 @@ from factorgraph_loc.drawing.pages import render
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import plots, tables
 from factorgraph_loc.evaluation.report.cautions import cautions
-from factorgraph_loc.evaluation.report.metrics import DEFAULT, Metric, metric_of
+from factorgraph_loc.evaluation.report.metrics import DEFAULT, TIMINGS, Metric, metric_of
 from factorgraph_loc.evaluation.report.results import Results, RunFiles, read_runs, score
 from factorgraph_loc.evaluation.report.tables import p_value
 from factorgraph_loc.evaluation.warned import WARNINGS
@@ -90,7 +90,7 @@ def _compared(results: Results, metrics: Sequence[Metric], baseline: str) -> dic
     """Values from the rows of the runs alone."""
     best = [results.compare(metric) for metric in metrics]
     against = [results.compare(metric, baseline) for metric in metrics]
-    times = _known(results, tables.TIMINGS, whole=False)
+    times = _known(results, TIMINGS, whole=False)
     return {
         "metrics": metrics,
         "baseline": baseline,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.report.results import SWEEP, MetricComparison, Results, score, short_name
 from factorgraph_loc.evaluation.report.tracks import KINDS
 from factorgraph_loc.text import plain
+from factors.se2 import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,7 +45,7 @@ def ratios(results: Results, comparisons: Sequence[MetricComparison]) -> Picture
     panels = {}
     for c in comparisons:
         rows = []
-        for variant, colour in _coloured(results):
+        for variant, colour in zip(results.variants, cycle(COLOURS), strict=False):
             found = c.contrasts.get(variant)
             values = [a / b for a, b in found.by_log.values() if a > 0.0 and b > 0.0] if found else []
             if values:
@@ -59,7 +61,7 @@ def consistency(
 ) -> Picture | None:
     """Mean NEES per degree of freedom on each log, the mean over logs, and its 95 % band; None without any."""
     rows = []
-    for variant, colour in _coloured(results):
+    for variant, colour in zip(results.variants, cycle(COLOURS), strict=False):
         if variant in trust:
             mean, *band = trust[variant]
             values = [nees[variant, log] for log in results.logs if (variant, log) in nees]
@@ -71,7 +73,7 @@ def consistency(
 def times(results: Results, metric: Metric) -> Picture | None:
     """A time, median over seeds, on each log; None without any."""
     rows = []
-    for variant, colour in _coloured(results):
+    for variant, colour in zip(results.variants, cycle(COLOURS), strict=False):
         by_log = [
             [v for v in seeds.values() if v is not None] for seeds in results.scores(metric.key, variant).values()
         ]
@@ -81,7 +83,7 @@ def times(results: Results, metric: Metric) -> Picture | None:
     return _dots({"": rows} if rows else {}, metric.heading, "median over logs")
 
 
-def distributions(results: Results, errors: Mapping[str, Mapping[tuple[str, str], Sequence[float]]]) -> Picture | None:
+def distributions(results: Results, errors: Mapping[str, Mapping[tuple[str, str], Array]]) -> Picture | None:
     """Distribution of the position errors of each kind of estimate, over the logs that all variants with errors have."""
     figure, axes = grid(1, len(KINDS), 5.5)
     for axis, kind in zip(axes[0], KINDS, strict=True):
@@ -111,7 +113,8 @@ def sweeps(results: Results, metrics: Sequence[Metric]) -> Picture | None:
     for axis, ((column, metric), lines) in zip(axes, panels.items(), strict=True):
         for (name, points), style in zip(lines.items(), styles(), strict=False):
             x, y, low, high = np.array(points).T
-            axis.errorbar(x, y, (y - low, high - y), label=name, marker="o", markersize=5, capsize=3, **style)
+            axis.plot(x, y, label=name, marker="o", markersize=5, **style)
+            axis.vlines(x, low, high, color=style["color"], linewidth=1.0)
         axis.set(xlabel=column.removeprefix(SWEEP), ylabel=metric.heading)
     legend(figure, axes)
     return svg(figure)
@@ -148,11 +151,6 @@ def _line_name(results: Results, variant: str, row: Mapping[str, Any], column: s
     """The label and the swept settings other than that of the axis."""
     others = [c for c in results.sweeps if c != column and row.get(c) is not None]
     return ", ".join([results.variants[variant], *(f"{short_name(c)} {row[c]}" for c in others)])
-
-
-def _coloured(results: Results) -> list[tuple[str, str]]:
-    """The variants with their colours."""
-    return [(variant, COLOURS[place % len(COLOURS)]) for place, variant in enumerate(results.variants)]
 
 
 def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:

@@ -25,6 +25,7 @@ from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.report.scene import Scene
 from factorgraph_loc.evaluation.report.tracks import KINDS, Series
 from factorgraph_loc.evaluation.warned import label_of
+from factors.se2 import Array
 
 POSES = 120_000  # on the page, shared by all trajectories
 FEWEST, MOST = 60, 1000  # bounds for one trajectory
@@ -57,7 +58,7 @@ class RunData:
     """
 
     tracks: dict[str, dict[str, Any]] = field(default_factory=dict)
-    errors: dict[str, dict[tuple[str, str], list[float]]] = field(default_factory=lambda: {kind: {} for kind in KINDS})
+    errors: dict[str, dict[tuple[str, str], Array]] = field(default_factory=lambda: {kind: {} for kind in KINDS})
     nees: dict[tuple[str, str], float] = field(default_factory=dict)
     trust: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     configs: dict[str, str] = field(default_factory=dict)
@@ -90,7 +91,8 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
                 plain = {kind: tracks.thinned(s, poses) for kind, s in series.items()}
                 drawn.append({"v": place, "seed": row["seed"], **plain})
                 _add_config(found, f"{variant}, {log}, seed {row['seed']}", files.read(_CONFIG).decode())
-            if (trust := _consistency(row, series)) is not None:
+            trust = tracks.consistency(series["causal"]) if "causal" in series else None
+            if trust is not None and score(row, "causal.position_rmse") is not None:
                 counts.setdefault(variant, []).append(trust)
                 found.nees[variant, log] = trust[0]
             well = [one for one in results.runs(variant, log) if one["status"] == "ok"]
@@ -99,7 +101,7 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
                 scored = [
                     s[kind].error for one, s in every if kind in s and score(one, f"{kind}.position_rmse") is not None
                 ]
-                if quantiles := tracks.quantiles(scored):
+                if len(quantiles := tracks.quantiles(scored)):
                     found.errors[kind][variant, log] = quantiles
         if drawn:
             found.tracks[log] = {"scene": scene.model_dump() if scene else None, "runs": drawn}
@@ -113,12 +115,6 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
 
 def _series(files: RunFiles) -> dict[str, Series]:
     return tracks.read_series(files.read(_ESTIMATES), files.scene.t0_ns if files.scene else None)
-
-
-def _consistency(row: Row, series: Mapping[str, Series]) -> tuple[float, float, int] | None:
-    if "causal" not in series or score(row, "causal.position_rmse") is None:
-        return None
-    return tracks.consistency(series["causal"])
 
 
 def _add_config(found: RunData, run: str, text: str) -> None:

@@ -10,14 +10,6 @@ from factorgraph_loc.evaluation.tables import counted
 from factorgraph_loc.evaluation.warned import by_text, label_of
 from factorgraph_loc.fitting.shares import wilson
 
-TIMINGS = (
-    "timing.update_ms_median",
-    "timing.update_ms_p99",
-    "timing.update_ms_max",
-    "timing.real_time_factor",
-    "timing.final_seconds",
-    "timing.peak_memory_mb",
-)
 _NONE = "–"
 
 

@@ -79,10 +79,10 @@ def thinned(series: Series, count: int) -> dict[str, list[float | None]]:
     }
 
 
-def quantiles(errors: Sequence[Array]) -> list[float]:
-    """Quantiles of the pooled errors of several runs at ``LEVELS``, with four digits."""
+def quantiles(errors: Sequence[Array]) -> Array:
+    """Quantiles of the pooled errors of several runs at ``LEVELS``; empty without any error."""
     known = _known(np.concatenate(errors)) if errors else np.empty(0)
-    return [float(f"{q:.4g}") for q in np.quantile(known, LEVELS)] if len(known) else []
+    return np.quantile(known, LEVELS) if len(known) else known
 
 
 def consistency(series: Series) -> tuple[float, float, int] | None:

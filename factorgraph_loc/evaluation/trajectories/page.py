@@ -153,12 +153,9 @@ def _alignment(score: TrajectoryScore) -> str:
     if how == "none":
         return "none"
     turn = Rotation.from_matrix(transform.rotation).as_rotvec()
-    told = f"{how}: translation {_vector(transform.translation)} m, rotation vector {_vector(turn)} rad"
+    translation, vector = (tuple((np.round(values, 4) + 0.0).tolist()) for values in (transform.translation, turn))
+    told = f"{how}: translation {translation} m, rotation vector {vector} rad"
     return f"{told}, scale {transform.scale:.5f}" if how == "sim3" else told
-
-
-def _vector(values: Array) -> str:
-    return f"({', '.join(f'{round(value, 4) + 0.0:.4f}' for value in values)})"
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:
