@@ -48,6 +48,8 @@ def test_a_run_has_the_scores_of_its_files(office, tmp_path):
     assert alone.result.final.poses == pytest.approx(kept.result.final.poses, abs=0.0)
     with pytest.raises(fgloc.InputError, match="holds results already"):
         fgloc.run(office, "ekf", out=tmp_path / "run")
+    with pytest.raises(fgloc.InputError, match="--final-only changes nothing for ekf, expected smoother"):
+        fgloc.run(office, "ekf", final_only=True)
 
 
 def test_compare_takes_names_and_settings_by_estimator(office, tmp_path):
@@ -108,6 +110,8 @@ def test_an_experiment_gives_its_table(tmp_path):
     assert table["duration"].to_list() == [6.0, 6.0]
     assert table.equals(done.rows)
     assert told == [(0, 2, 0), (1, 2, 0), (2, 2, 0)]
+    with pytest.raises(fgloc.InputError, match="--jobs applies to this machine, but --scheduler names a cluster"):
+        fgloc.experiment(tmp_path / "drives.toml", out=tmp_path / "out", jobs=1, scheduler="127.0.0.1:1")
     found = fgloc.status(
         tmp_path / "drives.toml", changes={"simulation.drive.duration": 6.0}, out=tmp_path / "out", verify=True
     )
