@@ -5,9 +5,10 @@ from pathlib import Path
 from factorgraph_loc.evaluation.trajectories.page import check_free, write_score
 from factorgraph_loc.evaluation.trajectories.score import TrajectoryScore, score_paths
 from factorgraph_loc.io.trajectories import read_trajectory
+from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.scoring import MAX_DIFF, MAX_GAP, Alignment, Association
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3, path_of
+from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
 
 TrajectoryLike = Trajectory | Trajectory3 | str | Path
 

@@ -21,8 +21,9 @@ from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.pose_path import upright
 from factorgraph_loc.model.trajectory import Trajectory, write_tum
-from factorgraph_loc.model.trajectory3 import Trajectory3, upright
+from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.landmarks.located import located_landmarks
 from factorgraph_loc.sensors.odometry.motion import whole_motion
 from factorgraph_loc.sensors.registry import moving

@@ -20,8 +20,9 @@ from factorgraph_loc.io.readers import read_log
 from factorgraph_loc.io.readers.pose_file import read_pose_file
 from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.planar import rotations_of
+from factorgraph_loc.model.pose_path import PosePath, require_poses
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3, path_of, require_poses
+from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
 
@@ -134,7 +135,7 @@ def _posed(trajectory: Trajectory | Trajectory3, t0_ns: int) -> tuple[PosePath, 
     """The poses of a trajectory, and their quaternions (N, 4). InputError if there are none, or one is not finite."""
     path = path_of(trajectory, "the trajectory", t0_ns)
     require_poses(path)
-    return path, path.in_space(0).quaternions()
+    return path, Trajectory3.of(path).quaternions()
 
 
 def _seven(message: Any) -> tuple[float, ...]:

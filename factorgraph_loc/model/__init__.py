@@ -6,6 +6,7 @@ __all__ = [
     "log",
     "measurement",
     "planar",
+    "pose_path",
     "reliability",
     "result",
     "rig",

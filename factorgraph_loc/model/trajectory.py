@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.columns import LATEST, POSES
 from factorgraph_loc.files.models import read_text, write_text
+from factorgraph_loc.model.pose_path import PosePath
 from factors import se2
 from factors.se2 import Array, Integers
 
 if TYPE_CHECKING:
     import polars as pl
-
-    from factorgraph_loc.model.trajectory3 import PosePath
 
 
 COVARIANCES = {  # columns of tables: entries of a covariance of (x, y, heading)

@@ -10,12 +10,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.model.planar import AS_IT_IS, Turned, on_floor, rotations_of
+from factorgraph_loc.model.planar import rotations_of
+from factorgraph_loc.model.pose_path import PosePath, upright
 from factorgraph_loc.model.trajectory import Exchange, Trajectory, neighbours
 from factors.se2 import Array, Integers
-
-_FLAT = 1e-9  # m and sines within which poses are planar
 
 
 @dataclass(frozen=True)
@@ -90,60 +88,6 @@ class Trajectory3(Exchange):
             yield " ".join((*(f"{value:.9f}" for value in place), *(f"{value:.12f}" for value in turn)))
 
 
-@dataclass(frozen=True)
-class PosePath:
-    """A sequence of poses: ``positions`` (N, 3) [m] and ``rotations`` (N, 3, 3) in a world frame.
-
-    ``t_ns`` (N,): absolute times [ns], strictly increasing, or None if only the order of the poses is known. ``has_rotations`` is
-    False if the rotations are meaningless. ``warnings``: one line for each problem that a reader corrected.
-    """
-
-    name: str
-    positions: Array
-    rotations: Array
-    t_ns: Integers | None
-    has_rotations: bool = True
-    warnings: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-    @property
-    def is_planar(self) -> bool:
-        """Whether all poses have one height and stand upright."""
-        return bool(np.ptp(self.positions[:, 2]) <= _FLAT and np.all(np.abs(self.rotations[:, 2, :2]) <= _FLAT))
-
-    def seconds(self) -> Array:
-        """The times (N,) in seconds since 1970, each the float nearest to it. ValueError if they are unknown."""
-        if self.t_ns is None:
-            raise ValueError(f"{self.name} has no times")
-        return np.array([t / 10**9 for t in self.t_ns.tolist()])
-
-    def rows(self, which: Integers) -> PosePath:
-        """The poses with indices ``which``."""
-        t_ns = None if self.t_ns is None else self.t_ns[which]
-        return replace(self, positions=self.positions[which], rotations=self.rotations[which], t_ns=t_ns)
-
-    def planar(self, t0_ns: int) -> Trajectory:
-        """The poses seen from above, in seconds after ``t0_ns``: x, y and the direction of the robot's x axis."""
-        return replace(self.in_space(t0_ns).planar(), has_heading=self.has_rotations)
-
-    def in_space(self, t0_ns: int) -> Trajectory3:
-        """The poses as a trajectory, in seconds after ``t0_ns``. ValueError if their times are unknown."""
-        if self.t_ns is None:
-            raise ValueError(f"{self.name} has no times")
-        return Trajectory3((self.t_ns - t0_ns) / 1e9, self.positions, self.rotations)
-
-    def on_floor(self, warnings: list[str], turned: Turned = AS_IT_IS) -> Array:
-        """Planar poses (N, 3): see :func:`~factorgraph_loc.model.planar.on_floor`."""
-        return on_floor(self.name, self.positions, self.rotations if self.has_rotations else None, warnings, turned)
-
-    def seen_from_above(self) -> PosePath:
-        """The same poses at height 0, turned about the vertical axis only."""
-        headings = np.arctan2(self.rotations[:, 1, 0], self.rotations[:, 0, 0])
-        return replace(self, positions=self.positions * (1.0, 1.0, 0.0), rotations=upright(headings))
-
-
 def path_of(trajectory: Trajectory | Trajectory3, name: str, t0_ns: int = 0) -> PosePath:
     """The poses of a trajectory whose times count from ``t0_ns``; those of a planar one have height 0."""
     t_ns = np.rint(trajectory.t * 1e9).astype(np.int64) + t0_ns
@@ -152,22 +96,3 @@ def path_of(trajectory: Trajectory | Trajectory3, name: str, t0_ns: int = 0) -> 
     headings = trajectory.poses[:, 2] if trajectory.has_heading else np.zeros(len(trajectory))
     positions = np.column_stack((trajectory.poses[:, :2], np.zeros(len(trajectory))))
     return PosePath(name, positions, upright(headings), t_ns, trajectory.has_heading)
-
-
-def require_poses(path: PosePath) -> None:
-    """InputError if there are no poses, or one is not finite."""
-    if not len(path):
-        raise InputError(f"{path.name}: contains no poses, expected at least one")
-    known = np.isfinite(path.positions).all(axis=1) & np.isfinite(path.rotations).all(axis=(1, 2))
-    if not known.all():
-        raise InputError(f"{path.name}: pose {int(np.argmin(known)) + 1} is not finite, expected finite numbers")
-
-
-def upright(headings: Array) -> Array:
-    """Rotations (N, 3, 3) by ``headings`` (N,) about the vertical axis."""
-    out = np.zeros((len(headings), 3, 3))
-    out[:, 0, 0] = out[:, 1, 1] = np.cos(headings)
-    out[:, 1, 0] = np.sin(headings)
-    out[:, 0, 1] = -np.sin(headings)
-    out[:, 2, 2] = 1.0
-    return out

@@ -13,8 +13,9 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.pairing import align_points, pairs, pairs_in_space, pauses
+from factorgraph_loc.model.pose_path import PosePath, upright
 from factorgraph_loc.model.scoring import Alignment, Association
-from factorgraph_loc.model.trajectory3 import PosePath, path_of, upright
+from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
 from factors.se2 import Array, Integers
 
 FEWEST = 3  # pairs that define an alignment by least squares
@@ -79,8 +80,10 @@ def _nearest(estimate: Array, reference: Array, max_diff: float) -> tuple[Intege
 def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> Associated:
     assert estimate.t_ns is not None
     t0_ns = int(estimate.t_ns[0])
+    ours, theirs = Trajectory3.of(estimate, t0_ns), Trajectory3.of(reference, t0_ns)
     if estimate.is_planar or reference.is_planar:
-        above, true = estimate.planar(t0_ns), reference.planar(t0_ns)
+        above = replace(ours.planar(), has_heading=estimate.has_rotations)
+        true = replace(theirs.planar(), has_heading=reference.has_rotations)
         pair = pairs(above, true, max_gap)
         known = np.isfinite(pair.poses[:, 0])
         kept = np.flatnonzero(known)
@@ -88,7 +91,7 @@ def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> As
         found = path_of(replace(above, t=pair.t[kept], poses=pair.poses[kept]), estimate.name, t0_ns)
         truth = path_of(replace(true, t=pair.t[kept], poses=pair.truth[kept]), reference.name, t0_ns)
         return Associated(found, truth, np.asarray(gaps, dtype=np.int64), from_reference=True)
-    space, true3 = pairs_in_space(estimate.in_space(t0_ns), reference.in_space(t0_ns), max_gap)
+    space, true3 = pairs_in_space(ours, theirs, max_gap)
     paths = path_of(space, estimate.name, t0_ns), path_of(true3, reference.name, t0_ns)
     return Associated(*paths, pauses(true3.t), from_reference=True)
 

@@ -17,6 +17,7 @@ from factorgraph_loc.evaluation import metrics
 from factorgraph_loc.evaluation.pairing import TOLERANCE, pauses, rms
 from factorgraph_loc.evaluation.trajectories.association import Similarity, alignment, associate
 from factorgraph_loc.model.planar import MOST, RISE
+from factorgraph_loc.model.pose_path import PosePath, require_poses
 from factorgraph_loc.model.scoring import (
     ALIGNMENTS,
     ASSOCIATIONS,
@@ -26,7 +27,6 @@ from factorgraph_loc.model.scoring import (
     Association,
     check_max_gap,
 )
-from factorgraph_loc.model.trajectory3 import PosePath, require_poses
 from factorgraph_loc.text import listed, quoted
 from factors.se2 import Array, Integers
 

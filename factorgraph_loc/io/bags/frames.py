@@ -16,7 +16,8 @@ from factorgraph_loc.files.models import nearest
 from factorgraph_loc.io.bags.fields import TF, Stamper, as_nanoseconds
 from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
 from factorgraph_loc.io.bags.poses import PoseTopic, check_rotations, seven
-from factorgraph_loc.model.trajectory3 import PosePath, Trajectory3, path_of
+from factorgraph_loc.model.pose_path import PosePath
+from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
 from factorgraph_loc.text import listed, quoted, told
 from factors.se2 import Array
 

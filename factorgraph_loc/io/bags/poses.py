@@ -12,7 +12,7 @@ from factorgraph_loc.io.bags.fields import TopicSettings
 from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.planar import Turned, require_unit, rotations_of
-from factorgraph_loc.model.trajectory3 import PosePath
+from factorgraph_loc.model.pose_path import PosePath
 from factors.se2 import Array, Integers
 
 POINT = "geometry_msgs/msg/PointStamped"

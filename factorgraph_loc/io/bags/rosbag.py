@@ -28,9 +28,9 @@ from factorgraph_loc.io.bags.tables import Reads, RfidTopic, TableTopic
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.model.log import NOT_READ, RIG_NOTES, Log
 from factorgraph_loc.model.measurement import Stream
+from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import PosePath
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings

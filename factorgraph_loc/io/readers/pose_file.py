@@ -15,8 +15,8 @@ from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
 from factorgraph_loc.files.columns import POSES, PURE, within
 from factorgraph_loc.files.models import FARTHEST, read_text
 from factorgraph_loc.model.planar import rotations_of
+from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.trajectory import read_tum_rows
-from factorgraph_loc.model.trajectory3 import PosePath
 from factors.camera import model as reprojection
 from factors.se2 import Array, Integers
 

@@ -17,9 +17,9 @@ from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.io.readers.pose_file import EUROC, read_pose_file, stamps_of
 from factorgraph_loc.model.log import NOT_READ, Log
 from factorgraph_loc.model.planar import Turned
+from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import PosePath
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.text import listed
