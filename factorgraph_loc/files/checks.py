@@ -1,6 +1,6 @@
 """Checks that all readers apply to their rows: an InputError with the row, or a warning if the data can be corrected."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterable, Sequence
 
 import numpy as np
 
@@ -13,9 +13,11 @@ MAX_LATE_NS = 500_000_000  # the delay that estimators can handle
 ROUNDING = 1e-6  # s; tolerance of differences of timestamps
 
 
-def require_finite(source: object, rows: Integers, field: str, values: Array) -> None:
-    """InputError at the first of ``values`` (N,) that is NaN or infinite; ``rows`` (N,): row numbers in ``source``."""
-    require(np.isfinite(values), source, rows, field, values, "a finite number")
+def require_finite(source: object, rows: Integers, names: Sequence[str], table: Array) -> None:
+    """InputError at a number of ``table`` (N, K) that is NaN or infinite; ``rows`` (N,): row numbers in ``source``; ``names``: of
+    the K columns."""
+    for name, values in zip(names, table.T, strict=True):
+        require(np.isfinite(values), source, rows, name, values, "a finite number")
 
 
 def require_above_zero(source: object, rows: Integers, field: str, values: Array) -> None:
@@ -70,21 +72,28 @@ def arrivals(
 
 def images_in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:
     """Indices (M,) of the images to keep, in order of arrival: the last one of equal timestamps (N,)."""
-    arrivals(source, rows, t_ns, warnings)
-    last = {t: i for i, t in enumerate(t_ns.tolist())}
-    if dropped := len(t_ns) - len(last):
-        warnings.append(f"{source}: {dropped} rows have the timestamp of a later row and are skipped")
-    return np.array(sorted(last.values()), dtype=np.int64)
+    return _last_in_order(
+        source, rows, t_ns, t_ns.tolist(), "have the timestamp of a later row and are skipped", warnings
+    )
 
 
 def sightings_in_order(
     source: object, rows: Integers, t_ns: Integers, landmarks: Sequence[str], warnings: list[str]
 ) -> Integers:
     """Indices (M,) of the sightings to keep, in order of arrival: the last one of a landmark at a timestamp."""
+    seen = zip(t_ns.tolist(), landmarks, strict=True)
+    what = "see a landmark that a later row sees at the same timestamp: skipped"
+    return _last_in_order(source, rows, t_ns, seen, what, warnings)
+
+
+def _last_in_order(
+    source: object, rows: Integers, t_ns: Integers, keys: Iterable[Hashable], what: str, warnings: list[str]
+) -> Integers:
+    """Indices (M,) of the last row of each of the ``keys`` (N,), in order; ``what``: what the others do."""
     arrivals(source, rows, t_ns, warnings)
-    last = {key: i for i, key in enumerate(zip(t_ns.tolist(), landmarks, strict=True))}
+    last = {key: i for i, key in enumerate(keys)}
     if dropped := len(t_ns) - len(last):
-        warnings.append(f"{source}: {dropped} rows see a landmark that a later row sees at the same timestamp: skipped")
+        warnings.append(f"{source}: {dropped} rows {what}")
     return np.array(sorted(last.values()), dtype=np.int64)
 
 

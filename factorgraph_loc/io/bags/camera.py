@@ -63,16 +63,17 @@ class CameraTopic(TopicSettings):
 
 
 class Images:
-    """Collects the images of a topic. ``known``: whether they are in the cache folder, so that messages need not be read."""
+    """Collects the images of a topic. ``known``: whether they are in the cache folder, so that messages need not be read;
+    ``stack``: holds the temporary folder of new images."""
 
-    def __init__(self, bag: Bag, name: str, stamper: Stamper) -> None:
+    def __init__(self, bag: Bag, name: str, stamper: Stamper, stack: ExitStack) -> None:
         self._source = f"{bag.path} {name}"
         self._compressed = bag.topic(name, RAW, COMPRESSED).type == COMPRESSED
         self._folder = cache_folder() / "bags" / _key(bag.path, name)
         self._stamper = stamper
         self._t_ns: list[int] = []
         self._written: Path | None = None  # folder of newly extracted images
-        self._held = ExitStack()
+        self._stack = stack
         sweep(self._folder.parent)
         self._rows = _read_whole(self._folder)
         self.known = bool(self._rows)
@@ -82,7 +83,7 @@ class Images:
         if self._written is None:
             with writing(self._folder):
                 self._folder.parent.mkdir(parents=True, exist_ok=True)
-                self._written = self._held.enter_context(temporary_folder(self._folder)) / "images"
+                self._written = self._stack.enter_context(temporary_folder(self._folder)) / "images"
                 self._written.mkdir()
         where = f"{self._source}:{item.row}"
         if self._compressed:
@@ -111,15 +112,9 @@ class Images:
                         if self._folder.exists():
                             self._folder.rename(self._written.with_name("damaged"))
                         self._written.rename(self._folder)
-            self.discard()
         rows, t_ns = np.array([row[0] for row in self._rows], dtype=np.int64), np.array(self._t_ns, dtype=np.int64)
         keep = checks.images_in_order(self._source, rows, t_ns, warnings)
         return ImageStream(checks.seconds(t_ns[keep], t0_ns), [self._folder / self._rows[i][-1] for i in keep.tolist()])
-
-    def discard(self) -> None:
-        """Remove partly extracted images."""
-        self._held.close()
-        self._written = None
 
 
 class Info:

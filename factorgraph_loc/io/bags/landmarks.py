@@ -82,8 +82,7 @@ class Landmarks(RowsOfTopic):
 
     def _polar(self) -> dict[str, Array]:
         places = self._rows.values
-        for i, axis in enumerate("xyz"):
-            checks.require_finite(self._rows.source, self._rows.rows, axis, places[:, i])
+        checks.require_finite(self._rows.source, self._rows.rows, "xyz", places)
         pose = np.eye(4)
         if self._options.frame is not None:
             pose = self._frames.known(self._rows.source, self._options.frame)

@@ -122,8 +122,7 @@ class TwoWheels:
 def finite_columns(rows: TopicRows, names: Sequence[str], warnings: list[str]) -> tuple[Integers, list[Any]]:
     """Timestamps and columns of rows in order of time, all finite; InputError names the invalid message."""
     number, t_ns, values = rows.rows, rows.t_ns, rows.values
-    for i, name in enumerate(names):
-        checks.require_finite(rows.source, number, name, values[:, i])
+    checks.require_finite(rows.source, number, names, values)
     keep = checks.in_order(rows.source, number, t_ns, warnings)
     return t_ns[keep], [values[keep, i] for i in range(len(names))]
 

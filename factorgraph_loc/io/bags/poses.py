@@ -111,6 +111,5 @@ def seven(pose: Any, position: str = "position", orientation: str = "orientation
 
 def check_rotations(source: str, rows: Integers, table: Array) -> None:
     """InputError if positions and quaternions (N, 7) are not finite, or a quaternion is not a unit quaternion."""
-    for i, name in enumerate(("x", "y", "z", "qx", "qy", "qz", "qw")):
-        checks.require_finite(source, rows, name, table[:, i])
+    checks.require_finite(source, rows, ("x", "y", "z", "qx", "qy", "qz", "qw"), table)
     require_unit(source, rows, table[:, 3:])

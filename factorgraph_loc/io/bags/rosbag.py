@@ -238,18 +238,17 @@ def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack
     if options.bearing_range:
         out["bearing_range"] = listeners.listen(options.bearing_range, Landmarks(bag, options.bearing_range, frames))
     if options.camera:
-        out["camera"] = images = _images(listeners, options.camera)
-        stack.callback(images.discard)
+        out["camera"] = _images(listeners, options.camera, stack)
     for table in OTHERS:
         if (told := getattr(options, table.name)) is not None:
             out[table.name] = listeners.listen(told, rows_of_table(bag, told, table))
     return out
 
 
-def _images(listeners: Listeners, options: CameraTopic) -> Images:
+def _images(listeners: Listeners, options: CameraTopic, stack: ExitStack) -> Images:
     """Register a collector for images, if they have to be read, and return it."""
     stamper = listeners.stamper(options.topic, options.clock)
-    images = Images(listeners.bag, options.topic, stamper)
+    images = Images(listeners.bag, options.topic, stamper, stack)
     if images.known:
         listeners.stampers.append(stamper)
     else:

@@ -45,8 +45,7 @@ def read(path: Path | None, options: Options) -> Log:
     fields, others = read_matlab(file, FIELDS)
     warnings: list[str] = []
     for name, columns in (("GT", "t x y heading"), ("DR", "t distance dtheta"), ("TD", "t 2 beacon range")):
-        for i, column in enumerate(columns.split()):
-            checks.require_finite(f"{file}:{name}", rows_of(fields[name]), column, fields[name][:, i])
+        checks.require_finite(f"{file}:{name}", rows_of(fields[name]), columns.split(), fields[name])
     truth, truth_ns = kept_in_order(f"{file}:GT", fields["GT"], warnings)
     t0_ns = int(truth_ns[0])
     poses = truth[:, 1:].copy()

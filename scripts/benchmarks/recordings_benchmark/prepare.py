@@ -124,8 +124,9 @@ def _trajectory(recording: Recording, paths: list[Path]) -> Log:
 
 
 def _kitti(path: Path, times: Path) -> Trajectory:
-    _, t_ns, poses = read_kitti(path, times)
-    return Trajectory(t_ns / 1e9, poses.planar().poses)
+    found = read_kitti(path, times)
+    assert found.t_ns is not None
+    return Trajectory(found.t_ns / 1e9, found.planar(0).poses)
 
 
 def _stamped(path: Path, form: str, axis: int) -> Trajectory:
