@@ -1,5 +1,4 @@
-"""Access to fields of ROS messages by path: ``tag.epc``, or ``reads[].tag.epc`` for a list; their timestamps, those in headers
-(time of measurement) or those of the recording.
+"""Access to fields of ROS messages by path: ``tag.epc``, or ``reads[].tag.epc`` for a list.
 
 Paths are checked against the message type before messages are read; errors list the available fields.
 """
@@ -7,7 +6,6 @@ Paths are checked against the message type before messages are read; errors list
 from __future__ import annotations
 
 import math
-from array import array
 from collections.abc import Callable, Mapping
 from itertools import repeat
 from operator import attrgetter
@@ -17,7 +15,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel
-from factorgraph_loc.io.bags.file import Bag, Stamped, Topic
+from factorgraph_loc.io.bags.file import Bag, Topic
 from factorgraph_loc.text import listed, quoted
 
 if TYPE_CHECKING:
@@ -32,7 +30,6 @@ DEPTH = 6  # nesting levels of messages
 Row = tuple[Any, ...]
 Clock = Literal["header", "receive"]
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # the latter in old bags
-APART = 0.5  # s; larger differences between topics are clock offsets, not delays
 
 
 class TopicSettings(FileModel):
@@ -142,61 +139,3 @@ def _list_getter(path: str) -> Callable[[Any], list[Any]]:
     outer, _, inner = path.partition(LIST)
     get_list, get = attrgetter(outer), _getter(inner.lstrip("."))
     return lambda message: [get(element) for element in get_list(message)]
-
-
-class Stamper:
-    """Timestamps of the messages of one topic [ns], by a ``clock``; the time of receipt for messages without a header. For tf,
-    whose headers are nested, use :meth:`choose`."""
-
-    def __init__(self, bag: Bag, topic: Topic, clock: Clock) -> None:
-        self.topic = topic
-        self._before = has_header(bag, topic)
-        self.has_header = self._before or topic.type in TF
-        self._where = f"{bag.path}: topic {topic.name}"
-        self.uses_header = self.has_header and clock == "header"
-        self._delays = array("q")
-        self._any_set = False
-
-    def stamp(self, item: Stamped) -> int:
-        if not self._before:
-            return item.received
-        return self.choose(as_nanoseconds(item.message.header.stamp, 1), item.received)
-
-    def choose(self, in_header: int, received: int) -> int:
-        """The timestamp of a header or the time of receipt [ns], by the clock."""
-        self._any_set |= in_header != 0
-        self._delays.append(received - in_header)
-        return in_header if self.uses_header else received
-
-    def check(self) -> None:
-        """InputError if headers are used but all their timestamps are 0."""
-        if self.uses_header and len(self._delays) > 1 and not self._any_set:
-            raise InputError(f'{self._where}: the stamps of all headers are 0: set clock = "receive" in the manifest')
-
-    def delay(self) -> float | None:
-        """Median delay of receipt after the header's timestamp [s]; None without valid headers."""
-        if not self._any_set:
-            return None
-        return float(np.median(np.frombuffer(self._delays, dtype=np.int64))) / 1e9
-
-
-def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[str]]:
-    """A line on the clock used and the delays found, and warnings."""
-    delays = {s.topic.name: delay for s in stampers if (delay := s.delay()) is not None}
-    line = "header stamps" if clock == "header" else "time of receipt"
-    if bare := sorted({s.topic.name for s in stampers if not s.has_header}):
-        line += f"; without headers, as received: {', '.join(bare)}" if clock == "header" else ""
-    if delays:
-        line += "; received after the header's stamp (median): "
-        line += ", ".join(f"{name} {delay:.3f} s" for name, delay in sorted(delays.items()))
-    warnings = []
-    # the delay is 0 if the recorder sets both timestamps
-    compared = {s.topic.name: s.delay() if s.uses_header else 0.0 for s in stampers}
-    known = {name: delay for name, delay in compared.items() if delay is not None}
-    if known and max(known.values()) - min(known.values()) > APART:
-        low, high = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
-        warnings.append(
-            f"the clocks of {low} and {high} differ by {known[high] - known[low]:.3f} s: "
-            "choose clock in the manifest, or set time_offset in the rig"
-        )
-    return line, warnings

@@ -13,9 +13,10 @@ import scipy
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import nearest
-from factorgraph_loc.io.bags.fields import TF, Stamper, as_nanoseconds
+from factorgraph_loc.io.bags.fields import TF, as_nanoseconds
 from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
-from factorgraph_loc.io.bags.poses import PoseTopic, check_rotations, seven
+from factorgraph_loc.io.bags.listeners import Listeners, Stamper
+from factorgraph_loc.io.bags.poses import Poses, PoseTopic, check_rotations, seven
 from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
 from factorgraph_loc.text import listed, quoted, told
@@ -147,6 +148,23 @@ class FrameReference:
         keep = checks.in_order(source, rows, t_ns, warnings)
         poses = matrices(values[keep])
         return Trajectory3(checks.seconds(t_ns[keep], t0_ns), poses[:, :3, 3], poses[:, :3, :3])
+
+
+def static_frames(listeners: Listeners, base: str) -> StaticFrames:
+    """Register a collector for the static transforms of the bag, if it has any, and return it."""
+    bag, frames = listeners.bag, StaticFrames(base)
+    if STATIC in bag.topics and bag.topics[STATIC].type in TF and bag.topics[STATIC].count:
+        listeners.add(STATIC, frames, listeners.stamper(STATIC, None), timed=False)
+    return frames
+
+
+def poses_of_topic(listeners: Listeners, options: PoseTopic, frames: StaticFrames) -> Poses | FrameReference:
+    """Register a collector for a topic of poses, or of tf with two frames, and return it."""
+    bag, stamper = listeners.bag, listeners.stamper(options.topic, options.clock)
+    is_tf = bag.topic(options.topic).type in TF
+    poses = FrameReference(bag, options, stamper, frames) if is_tf else Poses(bag, options.topic)
+    listeners.add(options.topic, poses, stamper)
+    return poses
 
 
 def plain(frame: str) -> str:

@@ -13,9 +13,10 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import nearest
 from factorgraph_loc.io import motions
-from factorgraph_loc.io.bags.fields import TF, Fields, Stamper, TopicSettings, as_number
+from factorgraph_loc.io.bags.fields import TF, Fields, TopicSettings, as_number
 from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
-from factorgraph_loc.io.bags.frames import FrameReference, StaticFrames
+from factorgraph_loc.io.bags.frames import FrameReference, StaticFrames, poses_of_topic
+from factorgraph_loc.io.bags.listeners import Listeners
 from factorgraph_loc.io.bags.poses import POSES, Poses, PoseTopic
 from factorgraph_loc.model.planar import Turned, about_z
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
@@ -80,7 +81,6 @@ class OneWheel:
     """Collects a number from each message of a topic."""
 
     def __init__(self, bag: Bag, topic: str, path: str) -> None:
-        self.topic = topic
         self._fields = Fields(bag, bag.topic(topic), {"wheel": path})
         self.rows = TopicRows(f"{bag.path} {topic}", 1)
         if self._fields.has_list:
@@ -96,15 +96,13 @@ class OneWheel:
 class TwoWheels:
     """The numbers of two topics, in pairs with the nearest stamps. A pair has the later one, when both are known."""
 
-    def __init__(self, left: OneWheel, right: OneWheel) -> None:
-        self.left, self.right = left, right
-        self.add = left.add
-        self.rows = left.rows
+    def __init__(self, left: TopicRows, right: TopicRows) -> None:
+        self.rows, self._right = left, right
 
     def pairs(self, warnings: list[str]) -> tuple[Integers, Array, Array]:
         """Timestamps (N,), left and right (N,). InputError if the topics have no time in common."""
-        l_ns, (left,) = finite_columns(self.left.rows, ("wheel",), warnings)
-        r_ns, (right,) = finite_columns(self.right.rows, ("wheel",), warnings)
+        l_ns, (left,) = finite_columns(self.rows, ("wheel",), warnings)
+        r_ns, (right,) = finite_columns(self._right, ("wheel",), warnings)
         after = np.clip(np.searchsorted(r_ns, l_ns), 0, len(r_ns) - 1)
         before = np.maximum(after - 1, 0)
         near = np.where(np.abs(r_ns[before] - l_ns) <= np.abs(r_ns[after] - l_ns), before, after)
@@ -112,9 +110,9 @@ class TwoWheels:
         keep = np.flatnonzero(np.abs(r_ns[near] - l_ns) <= APART * usual)
         t_ns = np.maximum(l_ns, r_ns[near])[keep]
         if not len(t_ns):
-            raise InputError(f"{self.left.rows.source} and {self.right.rows.source}: no messages are near in time")
+            raise InputError(f"{self.rows.source} and {self._right.source}: no messages are near in time")
         if lost := len(l_ns) - len(keep):
-            warnings.append(f"{self.left.rows.source}: {lost} messages have none of the right wheel near in time")
+            warnings.append(f"{self.rows.source}: {lost} messages have none of the right wheel near in time")
         alone = np.append(np.diff(t_ns) > 0, True)  # the last one of equal stamps
         return t_ns[alone], left[keep][alone], right[near[keep]][alone]
 
@@ -148,7 +146,6 @@ class PoseMotion:
 
     def __init__(self, poses: Poses | FrameReference, turned: Turned) -> None:
         self._poses, self._turned = poses, turned
-        self.add = poses.add
 
     def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
         """Absolute timestamps (N,) and the stream, whose timestamps start at 0."""
@@ -183,21 +180,19 @@ class TwistMotion:
 class WheelMotion:
     """Odometry from the angles or angular velocities of two wheels, of joints or with a topic each."""
 
-    def __init__(self, bag: Bag, options: OdometryTopic, wheels: WheelSettings) -> None:
+    def __init__(self, listeners: Listeners, options: OdometryTopic, wheels: WheelSettings) -> None:
+        bag = listeners.bag
         self._wheels = wheels
         self._are_speeds = options.use == "twist"
         self._rows: JointRows | TwoWheels
         if wheels.right_topic is None:
-            self._rows = JointRows(bag, options.topic, wheels, "velocity" if self._are_speeds else "position")
+            rows = JointRows(bag, options.topic, wheels, "velocity" if self._are_speeds else "position")
+            self._rows = listeners.listen(options, rows)
         else:
-            left, right = OneWheel(bag, options.topic, wheels.left), OneWheel(bag, wheels.right_topic, wheels.right)
-            self._rows = TwoWheels(left, right)
-        self.add = self._rows.add
-
-    @property
-    def right(self) -> OneWheel | None:
-        """The collector of the right wheel's own topic, if there is one."""
-        return self._rows.right if isinstance(self._rows, TwoWheels) else None
+            left = listeners.listen(options, OneWheel(bag, options.topic, wheels.left))
+            of_right = options.model_copy(update={"topic": wheels.right_topic})
+            right = listeners.listen(of_right, OneWheel(bag, wheels.right_topic, wheels.right))
+            self._rows = TwoWheels(left.rows, right.rows)
 
     def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
         source = self._rows.rows.source
@@ -236,29 +231,27 @@ class YawRates:
         return YawRateStream(checks.seconds(t_ns[keep], t0_ns), w[keep])
 
 
-OdometryRows = PoseMotion | TwistMotion | WheelMotion
-
-
-def odometry(bag: Bag, options: OdometryTopic, stamper: Stamper, static: StaticFrames) -> OdometryRows:
-    """The collector for an odometry topic, by message type."""
+def odometry(
+    listeners: Listeners, options: OdometryTopic, static: StaticFrames
+) -> PoseMotion | TwistMotion | WheelMotion:
+    """Register the collectors of an odometry topic, by message type, and return its motion."""
+    bag, source = listeners.bag, f"{listeners.bag.path} {options.topic}"
     known = () if options.wheels else sorted({*POSES, *TWISTS, JOINTS, *TF})
     kind = bag.topic(options.topic, *known).type
-    if kind in TF:
-        return PoseMotion(FrameReference(bag, options, stamper, static), options)
-    if options.parent is not None or options.child is not None:
-        raise InputError(f"{bag.path} {options.topic}: odometry.parent and odometry.child are for tf, this is {kind}")
-    poses = kind in POSES and not (kind == ODOMETRY and options.use == "twist")
+    if kind not in TF and (options.parent is not None or options.child is not None):
+        raise InputError(f"{source}: odometry.parent and odometry.child are for tf, this is {kind}")
+    poses = kind in TF or (kind in POSES and not (kind == ODOMETRY and options.use == "twist"))
     if options.is_given() and not poses:
-        raise InputError(f"{bag.path} {options.topic}: axes and mounting are for odometry that comes as poses")
+        raise InputError(f"{source}: axes and mounting are for odometry that comes as poses")
     if kind == JOINTS and options.wheels is None:
-        raise InputError(f"{bag.path} {options.topic}: odometry.wheels is missing: left, right, radius and track")
-    if options.wheels is not None:
+        raise InputError(f"{source}: odometry.wheels is missing: left, right, radius and track")
+    if options.wheels is not None and kind not in TF:
         if kind != JOINTS and options.wheels.right_topic is None:
-            raise InputError(
-                f"{bag.path} {options.topic}: odometry.wheels.right_topic is missing, as {kind} has no joints"
-            )
-        return WheelMotion(bag, options, options.wheels)
-    return PoseMotion(Poses(bag, options.topic), options) if poses else TwistMotion(bag, options)
+            raise InputError(f"{source}: odometry.wheels.right_topic is missing, as {kind} has no joints")
+        return WheelMotion(listeners, options, options.wheels)
+    if poses:
+        return PoseMotion(poses_of_topic(listeners, options, static), options)
+    return listeners.listen(options, TwistMotion(bag, options))
 
 
 def increments(t_ns: Integers, moves: Array) -> IncrementStream:

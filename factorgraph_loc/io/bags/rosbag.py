@@ -8,21 +8,21 @@ from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, add_fields, parse_model
-from factorgraph_loc.io.bags import fields as bag_clock
 from factorgraph_loc.io.bags.camera import CameraTopic, Images, Info
-from factorgraph_loc.io.bags.fields import TF, Clock, Stamper, TopicSettings
-from factorgraph_loc.io.bags.file import Bag, Stamped, open_bag
-from factorgraph_loc.io.bags.frames import ROBOT, STATIC, FrameReference, StaticFrames
+from factorgraph_loc.io.bags.fields import TF, Clock
+from factorgraph_loc.io.bags.file import Bag, open_bag
+from factorgraph_loc.io.bags.frames import ROBOT, STATIC, StaticFrames, poses_of_topic, static_frames
 from factorgraph_loc.io.bags.landmarks import Landmarks, LandmarkTopic, rows_of_table
-from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, WheelMotion, YawRates, odometry
-from factorgraph_loc.io.bags.poses import POINT, POSES, Poses, PoseTopic, ReferenceTopic, Start, StartTopic
+from factorgraph_loc.io.bags.listeners import Gatherer, Listeners, report
+from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, YawRates, odometry
+from factorgraph_loc.io.bags.poses import POINT, POSES, PoseTopic, ReferenceTopic, Start, StartTopic
 from factorgraph_loc.io.bags.proposed import UNUSED
 from factorgraph_loc.io.bags.tables import Reads, RfidTopic, TableTopic
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
@@ -36,7 +36,7 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.tables import native_tables
-from factorgraph_loc.text import listed, plain, told
+from factorgraph_loc.text import listed, plain
 from factors.camera.model import angles_of_camera
 from factors.se2 import Array
 
@@ -101,57 +101,6 @@ OTHERS = [
 add_fields(Options, {table.name: (TableTopic | None, None) for table in OTHERS}, after="camera")
 
 
-class Gatherer(Protocol):
-    """Collects the needed data from the messages of one topic; messages are not kept, so they are validated here."""
-
-    def add(self, item: Stamped, t_ns: int) -> None: ...
-
-
-G = TypeVar("G", bound=Gatherer)
-
-
-class Listeners:
-    """The collectors of each topic, with their clocks."""
-
-    def __init__(self, bag: Bag, clock: Clock) -> None:
-        self.bag, self.clock = bag, clock
-        self.stampers: list[Stamper] = []
-        self._of: dict[str, list[tuple[Stamper, Gatherer]]] = {}
-
-    def stamper(self, topic: str, clock: Clock | None) -> Stamper:
-        """The timestamps of a topic, by its own clock or that of the bag."""
-        return Stamper(self.bag, self.bag.topic(topic), clock or self.clock)
-
-    def add(self, topic: str, gatherer: Gatherer, stamper: Stamper, *, timed: bool = True) -> None:
-        """Register a collector. ``timed``: whether timestamps of the topic are meaningful."""
-        self._of.setdefault(topic, []).append((stamper, gatherer))
-        if timed:
-            self.stampers.append(stamper)
-
-    def listen(self, options: TopicSettings, gatherer: G) -> G:
-        """Register a collector for a topic and return it."""
-        self.add(options.topic, gatherer, self.stamper(options.topic, options.clock))
-        return gatherer
-
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """The topics that are read."""
-        return tuple(self._of)
-
-    def run(self) -> None:
-        """Read the bag."""
-        for item in self.bag.messages(list(self._of)):
-            for stamper, gatherer in self._of[item.topic]:
-                try:
-                    gatherer.add(item, stamper.stamp(item))
-                except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-                    kind = self.bag.topics[item.topic].type
-                    where = f"{self.bag.path} {item.topic}:{item.row}"
-                    raise InputError(f"{where}: {kind} is defined in the bag unlike in ROS: {told(error)}") from error
-        for stamper in self.stampers:
-            stamper.check()
-
-
 class Streamed(Gatherer, Protocol):
     """Collects the rows of a stream."""
 
@@ -169,22 +118,18 @@ def read(path: Path | None, options: Options) -> Log:
 def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     listeners = Listeners(bag, options.clock)
     frames = static_frames(listeners, options.base_frame)
-    stamper = listeners.stamper(options.odometry.topic, options.odometry.clock)
-    motion = odometry(bag, options.odometry, stamper, frames)
-    listeners.add(options.odometry.topic, motion, stamper)
-    if isinstance(motion, WheelMotion) and motion.right is not None:
-        listeners.add(motion.right.topic, motion.right, listeners.stamper(motion.right.topic, options.odometry.clock))
+    motion = odometry(listeners, options.odometry, frames)
     sensors = _sensors(listeners, options, frames, stack)
     info = None
     if options.camera and options.camera.info:
         info = Info(bag, options.camera.info)
         listeners.add(options.camera.info, info, listeners.stamper(options.camera.info, None), timed=False)
     told = options.reference
-    poses = _poses(listeners, told, frames) if told else None
+    poses = poses_of_topic(listeners, told, frames) if told else None
     start = listeners.listen(options.start, Start(bag, options.start)) if options.start else None
     listeners.run()
 
-    clock, warnings = bag_clock.report(listeners.stampers, options.clock)
+    clock, warnings = report(listeners.stampers, options.clock)
     t_ns, moved = motion.stream(warnings)
     t0_ns = int(t_ns[0])
     streams = {"odometry": moved} | {name: sensor.stream(t0_ns, warnings) for name, sensor in sensors.items()}
@@ -219,14 +164,6 @@ def _left_out(bag: Bag, listeners: Listeners) -> str:
     return ", ".join(f"{topic.name} ({UNUSED.get(topic.type, topic.type)})" for topic in there)
 
 
-def static_frames(listeners: Listeners, base: str) -> StaticFrames:
-    """Register a collector for the static transforms of the bag, if it has any, and return it."""
-    bag, frames = listeners.bag, StaticFrames(base)
-    if STATIC in bag.topics and bag.topics[STATIC].type in TF and bag.topics[STATIC].count:
-        listeners.add(STATIC, frames, listeners.stamper(STATIC, None), timed=False)
-    return frames
-
-
 def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack: ExitStack) -> dict[str, Streamed]:
     """Register collectors for the sensors in the manifest except odometry, and return them by name of stream."""
     bag = listeners.bag
@@ -256,15 +193,6 @@ def _images(listeners: Listeners, options: CameraTopic, stack: ExitStack) -> Ima
     return images
 
 
-def _poses(listeners: Listeners, options: PoseTopic, frames: StaticFrames) -> Poses | FrameReference:
-    """Register a collector for a topic of poses, or of tf with two frames, and return it."""
-    bag, stamper = listeners.bag, listeners.stamper(options.topic, options.clock)
-    is_tf = bag.topic(options.topic).type in TF
-    poses = FrameReference(bag, options, stamper, frames) if is_tf else Poses(bag, options.topic)
-    listeners.add(options.topic, poses, stamper)
-    return poses
-
-
 def _rig(
     streams: dict[str, Stream], info: Info | None, options: Options, frames: StaticFrames, notes: list[str]
 ) -> Rig:
@@ -292,6 +220,6 @@ def read_trajectory(path: Path, topic: str) -> PosePath:
         if bag.topic(name).type in TF and not (parent and child):
             raise InputError(f"{path}: {name} holds transforms, expected two frames too: {path}:{name}:map.base_link")
         static = static_frames(listeners, ROBOT[0])
-        poses = _poses(listeners, PoseTopic(topic=name, parent=parent, child=child), static)
+        poses = poses_of_topic(listeners, PoseTopic(topic=name, parent=parent, child=child), static)
         listeners.run()
         return replace(poses.path(warnings), warnings=tuple(warnings))
