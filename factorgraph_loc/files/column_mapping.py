@@ -28,7 +28,6 @@ COMMENT = ("#", "//")
 SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten of a nanosecond
 ISO = "iso"
 MOST_DIGITS = 20  # of a timestamp before its decimal point
-LEAST_UNIT = 1e-12  # minimum factor to our unit; the maximum is its reciprocal
 
 EpcCase = Literal["as written", "upper", "lower"]
 Alternatives = tuple[str, ...]  # columns of which one must be there
@@ -122,7 +121,7 @@ class Mapped:
         if self.mapping.decimal == ",":
             plain = [text.replace(",", ".") for text in cells.columns[name]]
             cells = Cells(cells.path, cells.rows, {name: plain})
-        return cells.numbers(name, column, self._unit(field, column.units))
+        return cells.numbers(name, column, self.mapping.units.get(field, 1.0))
 
     def stamps(self, field: str, offset: float = 0.0) -> NDArray[np.int64]:
         """The timestamps (N,) of a field in nanoseconds, plus ``offset`` [s]. Times without a zone are UTC."""
@@ -153,13 +152,6 @@ class Mapped:
         if not number.is_finite() or number.adjusted() > MOST_DIGITS:  # checked before the digits are expanded
             raise OverflowError
         return round(number.scaleb(power))
-
-    def _unit(self, field: str, units: Mapping[str, float]) -> str | float:
-        unit = self.mapping.units.get(field, next(iter(units)))
-        if unit in units if isinstance(unit, str) else LEAST_UNIT <= abs(unit) <= 1.0 / LEAST_UNIT:
-            return unit
-        expected = f"one of {', '.join(units)}, or a number of them, at least {LEAST_UNIT:g}"
-        raise InputError(f"{self.path}: the unit of {field} is {quoted(unit)}, expected {expected}")
 
 
 def read_mapped(

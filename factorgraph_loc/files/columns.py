@@ -16,10 +16,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.errors import bad_field, require
+from factorgraph_loc.errors import InputError, bad_field, require
 from factorgraph_loc.files.models import FARTHEST
 from factorgraph_loc.files.settings import bound_text
 from factorgraph_loc.plugins import Place
+from factorgraph_loc.text import quoted
 from factors.se2 import Array
 
 Integers = NDArray[np.int64]
@@ -34,6 +35,7 @@ DURATION = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 STAMPS = {"ns": 1.0, "us": 1e3, "ms": 1e6, "s": 1e9}
 PIXELS = {"px": 1.0}
 PURE = {"1": 1.0}
+LEAST_UNIT = 1e-12  # minimum factor to our unit; the maximum is its reciprocal
 
 LATEST = 4_600_000_000_000_000_000  # ns, 145 years: differences of two timestamps fit into 64 bits
 MAX_SPAN = 30 * 86_400.0  # s between two timestamps of one log
@@ -89,9 +91,13 @@ class Column:
         )
         return f"{what}{of} in {self.low:.6g} to {self.high:.6g}"
 
-    def in_unit(self, unit: str | float) -> tuple[Column, float]:
-        """The column in one of its units, or in one with a given factor; and the factor. KeyError if there is no such unit."""
-        factor = self.units[unit] if isinstance(unit, str) else unit
+    def in_unit(self, unit: str | float, source: object = "") -> tuple[Column, float]:
+        """The column in one of its units, or in one with a given factor; and the factor. InputError, which names ``source``, for an
+        unknown unit."""
+        factor = self.units.get(unit, 0.0) if isinstance(unit, str) else float(unit)
+        if not LEAST_UNIT <= abs(factor) <= 1.0 / LEAST_UNIT:
+            expected = f"one of {', '.join(self.units)}, or a number of them, at least {LEAST_UNIT:g}"
+            raise InputError(f"{source}: the unit of {self.name} is {quoted(unit)}, expected {expected}")
         name = unit if isinstance(unit, str) else f"{factor:g} {next(iter(self.units))}"
         low, high = sorted((self.low / factor, self.high / factor))
         return (self if factor == 1.0 else replace(self, units={name: 1.0}, low=low, high=high)), factor

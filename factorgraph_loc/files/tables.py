@@ -47,7 +47,7 @@ class Cells:
         values = np.array(found, dtype=float)
         if written := [i for i in np.flatnonzero(~np.isfinite(values)).tolist() if cells[i]]:
             raise bad_field(self.path, name, cells[written[0]], "a finite number", row=self.rows[written[0]])
-        told, factor = column.in_unit(unit)
+        told, factor = column.in_unit(unit, self.path)
         if not column.may_lack and "" in cells:
             raise bad_field(self.path, name, "", told.expected, row=self.rows[list(cells).index("")])
         told.require(self.path, self.rows, values, name)

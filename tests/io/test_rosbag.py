@@ -116,7 +116,9 @@ def test_names_and_units_of_the_messages_become_those_of_the_map(mcap, read, ref
     reads = read(mcap, rfid=rfid | {"units": {"phase": "deg", "rssi": 0.5}}).streams["rfid"]
     assert (reads.epc, reads.antenna) == (["e2aa", "e2bb", "e2aa"], ["front", "front", "2"])
     assert reads.rssi.tolist() == [-30.25, -30.5, -25.0]
-    refuse(mcap, "units.phase is 'degrees', expected one of rad, deg", rfid=rfid | {"units": {"phase": "degrees"}})
+    refuse(
+        mcap, "the unit of phase is 'degrees', expected one of rad, deg", rfid=rfid | {"units": {"phase": "degrees"}}
+    )
 
 
 def test_types_are_compiled_once_however_often_a_bag_is_read(mcap, monkeypatch):

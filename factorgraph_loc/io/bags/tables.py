@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.column_mapping import SECONDS, ReadNames, in_case
-from factorgraph_loc.files.columns import LATEST, Column, Table
+from factorgraph_loc.files.column_mapping import ReadNames, in_case
+from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
 from factorgraph_loc.io.bags.fields import LIST, Fields, TopicSettings, as_nanoseconds, as_number, as_text
@@ -26,7 +26,7 @@ from factors.se2 import Array
 
 ReadField = Literal["epc", "antenna", "rssi", "phase", "frequency", "stamp"]
 READ = [RFID[name] for name in ("epc", "antenna", *native_rfid.SIGNALS)]
-STAMP_UNITS = {"us": 1e3} | {name: 10.0**power for name, power in SECONDS.items()}
+STAMP_OF_READ = replace(STAMP, name="stamp")
 
 
 class TableTopic(TopicSettings):
@@ -34,23 +34,30 @@ class TableTopic(TopicSettings):
 
     fields: dict[str, str] = Field(default_factory=dict)
     """path of each column of the table, by default a field with its name"""
-    units: dict[str, float] = Field(default_factory=dict)
-    """factors to our units, by column"""
+    units: dict[str, str | float] = Field(default_factory=dict)
+    """unit of each column, or a factor to ours"""
 
 
 class RowsOfTopic:
     """Collects rows of a topic: ``columns`` of names and of numbers, by the ``fields`` of its messages; missing numbers are NaN.
-    ``units``: factors by column."""
+    ``units``: names or factors by column."""
 
     def __init__(
-        self, bag: Bag, topic: str, fields: Mapping[Any, str], columns: Sequence[Column], units: Mapping[str, float]
+        self,
+        bag: Bag,
+        topic: str,
+        fields: Mapping[Any, str],
+        columns: Sequence[Column],
+        units: Mapping[Any, str | float],
     ) -> None:
         self._fields = Fields(bag, bag.topic(topic), fields)
         self._named = [column for column in columns if column.kind in NAMES]
-        self._numbered = [column.name for column in columns if column.kind in NUMBERS]
-        self._units = [units.get(name, 1.0) for name in self._numbered]
+        numbered = [column for column in columns if column.kind in NUMBERS]
+        self._numbered = [column.name for column in numbered]
+        source = f"{bag.path} {topic}"
+        self._units = [column.in_unit(units.get(column.name, 1.0), source)[1] for column in numbered]
         self._names: dict[str, list[str]] = {column.name: [] for column in self._named}
-        self._rows = TopicRows(f"{bag.path} {topic}", len(self._numbered))
+        self._rows = TopicRows(source, len(numbered))
 
     def add(self, item: Stamped, t_ns: int) -> None:
         """Add the rows of a message."""
@@ -120,9 +127,8 @@ class Reads(RowsOfTopic):
             raise InputError(f"{source}: fields.epc is missing")
         if ("antenna" in options.fields) == (options.antenna is not None):
             raise InputError(f"{source}: expected either fields.antenna, or antenna, the name of the only one")
-        units = {name: _factor(source, options, name, RFID[name].units) for name in native_rfid.SIGNALS}
-        super().__init__(bag, options.topic, options.fields, READ, units)
-        self._stamp_unit = round(_factor(source, options, "stamp", STAMP_UNITS))
+        super().__init__(bag, options.topic, options.fields, READ, options.units)
+        self._stamp_unit = round(STAMP_OF_READ.in_unit(options.units.get("stamp", "us"), source)[1])
         # the antenna of a message without reads
         self._listening = None
         if options.antenna is None and LIST not in options.fields["antenna"]:
@@ -187,13 +193,3 @@ class Reads(RowsOfTopic):
             return self._options.antenna
         name = super()._name(column, found, row)
         return self._options.antennas.get(name, name)
-
-
-def _factor(source: str, options: RfidTopic, field: Any, units: Mapping[str, float]) -> float:
-    """The unit factor of a field of reads, by default that of the first of ``units``."""
-    unit = options.units.get(field, next(iter(units)))
-    if not isinstance(unit, str):
-        return float(unit)
-    if unit not in units:
-        raise bad_field(source, f"units.{field}", unit, f"one of {', '.join(units)}, or a number")
-    return units[unit]

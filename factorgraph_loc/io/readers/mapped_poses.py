@@ -91,7 +91,7 @@ def read_odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers,
         wheels = size * np.column_stack([kept[name] for name in pair])
         if side in ("left_speed", "left_rate"):
             return t_ns, motions.velocities_of_wheels(wheels, track)
-        scales = size * np.array([_scale(options, name) for name in pair])
+        scales = size * np.array([COLUMNS[name].in_unit(options.units.get(name, 1.0))[1] for name in pair])
         moves = motions.between_wheels(path, t_ns, wheels, scales, track, warnings)
     else:
         poses = _planar(path, mapped.rows[keep], kept, options, warnings)
@@ -141,12 +141,6 @@ def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array
 
 def _columns(mapped: Mapped, offset: float) -> tuple[Integers, dict[str, Array]]:
     return mapped.stamps("t", offset), {n: mapped.numbers(n, COLUMNS[n]) for n in mapped.fields if n != "t"}
-
-
-def _scale(options: OdometryFile, field: str) -> float:
-    """Metres or radians per unit of a column, or per tick of an encoder."""
-    unit = options.units.get(field, 1.0)
-    return COLUMNS[field].units.get(unit, 1.0) if isinstance(unit, str) else float(unit)
 
 
 def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turned, warnings: list[str]) -> Array:
