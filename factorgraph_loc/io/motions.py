@@ -18,7 +18,8 @@ SPEED, TURN, FASTER = 1.0, 2.0, 3.0
 NEAR, ZERO = 0.05, 1e-6  # m: from the origin after a reset of odometry; and tolerance of zeros
 HELD = 1.0  # s for which the previous motion is continued across a reset
 COUNTERS = (2**8, 2**16, 2**32)  # ranges of encoders that wrap to 0
-TURNS, WAYS = {"left_angle", "left_rate"}, {"left", "left_speed"}  # columns of a mapped table
+TURNS = ("left_angle", "left_rate")  # columns of a table that tell how wheels turn, for which their radius is needed
+WHEELS = ("left", "left_speed", *TURNS)
 
 
 class WheelSizes(FileModel):
@@ -139,14 +140,10 @@ def with_wheels_of(rig: Rig | None, options: Mapping[str, Any]) -> Mapping[str, 
         return options
     known = drive.model_dump(exclude_none=True)
     if isinstance(wheels := told.get("wheels"), Mapping):
-        return {**options, "odometry": {**told, "wheels": {**wheels, **_needed(known, wheels.get("unit") != "m")}}}
-    if isinstance(columns := told.get("columns"), Mapping) and (TURNS | WAYS) & columns.keys():
-        return {**options, "odometry": {**told, **_needed(known, bool(TURNS & columns.keys()))}}
+        return {**options, "odometry": {**told, "wheels": {**wheels, **known}}}
+    if isinstance(columns := told.get("columns"), Mapping) and columns.keys() & set(WHEELS):
+        return {**options, "odometry": {**told, **known}}
     return options
-
-
-def _needed(known: Mapping[str, Any], turns: bool) -> dict[str, Any]:
-    return {name: value for name, value in known.items() if turns or name != "radius"}
 
 
 def with_wheels_in(rig: Rig, options: Mapping[str, Any]) -> Rig:

@@ -51,7 +51,7 @@ class Fields:
         store = bag.store(topic.name)
         for name, path in paths.items():
             check_path(store, topic, path, f"{self._where}: {name}")
-        self._getters = [(_list_getter(path) if LIST in path else _getter(path)) for path in paths.values()]
+        self._getters = [(_list_getter(path) if LIST in path else getter(path)) for path in paths.values()]
         self._are_lists = [LIST in path for path in paths.values()]
         self.has_list = any(self._are_lists)
 
@@ -130,12 +130,13 @@ def as_nanoseconds(value: Any, unit: int) -> int:
     return round(float(value) * unit)
 
 
-def _getter(path: str) -> Callable[[Any], Any]:
+def getter(path: str) -> Callable[[Any], Any]:
+    """A getter of the field at a path, or of the message itself without one."""
     return attrgetter(path) if path else lambda value: value
 
 
 def _list_getter(path: str) -> Callable[[Any], list[Any]]:
     """A getter of a field of the elements of a list."""
     outer, _, inner = path.partition(LIST)
-    get_list, get = attrgetter(outer), _getter(inner.lstrip("."))
+    get_list, get = attrgetter(outer), getter(inner.lstrip("."))
     return lambda message: [get(element) for element in get_list(message)]

@@ -13,7 +13,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import nearest
 from factorgraph_loc.io import motions
-from factorgraph_loc.io.bags.fields import TF, Fields, TopicSettings, as_number
+from factorgraph_loc.io.bags.fields import TF, Fields, TopicSettings, as_number, getter
 from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
 from factorgraph_loc.io.bags.frames import FrameReference, StaticFrames, poses_of_topic
 from factorgraph_loc.io.bags.listeners import Listeners
@@ -26,7 +26,10 @@ from factors.se2 import Array, Integers
 JOINTS = "sensor_msgs/msg/JointState"
 APART = 0.5  # of the usual time between messages of a wheel: more between left and right are no pair
 ODOMETRY = "nav_msgs/msg/Odometry"
-TWISTS = {"geometry_msgs/msg/Twist": "", "geometry_msgs/msg/TwistStamped": "twist"}
+TWISTS = {  # path of the twist by type
+    "geometry_msgs/msg/Twist": "",
+    "geometry_msgs/msg/TwistStamped": "twist",
+}
 IMU = "sensor_msgs/msg/Imu"
 Motion = IncrementStream | VelocityStream
 
@@ -159,17 +162,11 @@ class TwistMotion:
     """Odometry from velocities, each held until the next."""
 
     def __init__(self, bag: Bag, options: OdometryTopic) -> None:
-        kind = bag.topic(options.topic).type
-        self._of_odometry = kind == ODOMETRY
-        self._stamped = kind.endswith("TwistStamped")
+        self._twist = getter(TWISTS.get(bag.topic(options.topic).type, "twist.twist"))
         self._rows = TopicRows(f"{bag.path} {options.topic}", 2)
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        twist = item.message
-        if self._of_odometry:
-            twist = twist.twist.twist
-        elif self._stamped:
-            twist = twist.twist
+        twist = self._twist(item.message)
         self._rows.append(item, t_ns, (twist.linear.x, twist.angular.z))
 
     def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:

@@ -66,11 +66,6 @@ def antennas_of(names: Iterable[str], given: Mapping[str, str], frames: StaticFr
     )
 
 
-def rig_of(sensors: Iterable[str], camera: CameraSettings | None, rfid: RfidSettings | None) -> Rig:
-    """A rig with the known settings and the default noise."""
-    return DEFAULT_RIG.model_copy(update={"sensors": tuple(sensors), "camera": camera, "rfid": rfid})
-
-
 def _antenna(name: str, pose: Array) -> AntennaSettings:
     x, y, z = pose[:3, 3].tolist()
     ahead = pose[:3, 0]
@@ -196,14 +191,14 @@ def _images(listeners: Listeners, options: CameraTopic, stack: ExitStack) -> Ima
 def _rig(
     streams: dict[str, Stream], info: Info | None, options: Options, frames: StaticFrames, notes: list[str]
 ) -> Rig:
-    """The rig from the bag; a rig in the manifest replaces it."""
+    """The rig from the bag with the default noise; a rig in the manifest replaces it."""
     camera = camera_of(info, frames, notes) if info else None
     reads = streams.get("rfid")
     rfid = None
     if options.rfid and isinstance(reads, RfidStream) and reads.antenna:
         rfid = antennas_of(set(reads.antenna), options.rfid.frames, frames, notes)
     usable = [name for name in streams if name not in {"camera", "sightings"} or camera is not None]
-    return rig_of(usable, camera, rfid)
+    return DEFAULT_RIG.model_copy(update={"sensors": tuple(usable), "camera": camera, "rfid": rfid})
 
 
 def read_trajectory(path: Path, topic: str) -> PosePath:

@@ -19,6 +19,7 @@ from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.sensors.rfid import tables as native_rfid
 from factorgraph_loc.sensors.rfid.columns import RFID
+from factorgraph_loc.sensors.rfid.rounds import make_rfid_stream
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.tables import stream_of
 from factorgraph_loc.text import listed
@@ -156,24 +157,18 @@ class Reads(RowsOfTopic):
         self._number += [numbers[name] for name in of_reads]
         self._rounds += [(t_ns, reads, name) for name in antennas]
 
-    def rounds(self, warnings: list[str]) -> native_rfid.ReadsByRound:
+    def stream(self, t0_ns: int, warnings: list[str]) -> RfidStream:
         """All reads in their rounds. InputError names the invalid message."""
         table = self.rows_of()
         table = replace(table, names=table.names | {"epc": in_case(table.names["epc"], self._options.epc_case)})
         native_rfid.check_reads(table)
         if self._options.rounds == "gaps":
-            return native_rfid.read_rounds(table, None, self._options.round_gap, warnings)
-        rssi, phase, frequency = (table.numbers[name] for name in native_rfid.SIGNALS)
+            return native_rfid.read_rounds(table, None, self._options.round_gap, warnings).stream(t0_ns)
         ends = [max([t_ns, *table.t_ns[reads].tolist()]) for t_ns, reads, _ in self._rounds]
         number, end_ns = (np.array(column, dtype=np.int64) for column in (self._number, ends))
+        signals = (table.numbers["rssi"], table.numbers["phase"], table.numbers["frequency"])
         antennas = [antenna for *_, antenna in self._rounds]
-        return native_rfid.ReadsByRound(
-            table.t_ns, number, table.names["epc"], (rssi, phase, frequency), end_ns, antennas
-        )
-
-    def stream(self, t0_ns: int, warnings: list[str]) -> RfidStream:
-        """The reads as a stream; problems are an InputError or a warning."""
-        return self.rounds(warnings).stream(t0_ns)
+        return make_rfid_stream(table.t_ns, number, table.names["epc"], signals, end_ns, antennas, t0_ns)
 
     def _stamp(self, found: Mapping[Any, Any], t_ns: int, row: int) -> int:
         if "stamp" not in found:

@@ -11,6 +11,7 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.column_mapping import Mapped, TimedMapping
 from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
 from factorgraph_loc.io import motions
+from factorgraph_loc.io.motions import TURNS, WHEELS
 from factorgraph_loc.io.readers.pose_file import read_kitti, read_pose_file
 from factorgraph_loc.io.readers.table_folder import TableFolder
 from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
@@ -23,8 +24,6 @@ from factors.se2 import Array, Integers
 
 QUATERNION = ("qx", "qy", "qz", "qw")
 POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION), ("t", "x", "y", "z", *QUATERNION))
-TURNS = {"left_angle": "rad", "left_rate": "rad/s"}  # of wheels, which need their radius
-WHEELS = ("left", "left_speed", *TURNS)
 ODOMETRY = (
     ("t", "v", "w"),
     ("t", "dx", "dy", "dtheta"),

@@ -51,8 +51,9 @@ class TableFolder:
             choice.names |= dict.fromkeys(mapped.mapping.where)
             choice.others -= sum(row not in choice.read for row in rows)
             choice.read |= set(rows)
+        left_out = dict.fromkeys(mapped.left_out)
         before = self._left_out.get(path, mapped.left_out)
-        self._left_out[path] = tuple(name for name in before if name in mapped.left_out)
+        self._left_out[path] = tuple(name for name in before if name in left_out)
         return mapped
 
     def left_out(self) -> list[str]:
