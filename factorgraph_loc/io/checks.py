@@ -14,6 +14,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.registry import channels
 from factorgraph_loc.sensors.tables import columns_of
+from factorgraph_loc.text import listed
 from factors.se2 import Array
 
 MAX_ODOMETRY_GAP = 5.0  # s
@@ -88,7 +89,6 @@ def look_over(log: Log) -> list[str]:
     if isinstance(sightings, BearingRangeStream):
         unknown = [name for name in sightings.landmark if name not in log.world.landmarks]
         if unknown:
-            names = sorted(set(unknown))
-            shown = ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
-            warnings.append(f"bearing_range: {len(unknown)} rows name landmarks that the map lacks: {shown}")
+            names = listed(sorted(set(unknown)))
+            warnings.append(f"bearing_range: {len(unknown)} rows name landmarks that the map lacks: {names}")
     return warnings

@@ -94,7 +94,9 @@ def propose(bag: Bag) -> Proposal:
     _reference(out, topics, tree)
     out.take("imu", [topic for topic in topics if topic.type == IMU])
     _camera(out, topics)
-    _tables(out, topics)
+    out.take("bearing_range", [topic for topic in topics if topic.type in DETECTIONS])
+    out.take("sightings", [topic for topic in topics if topic.type == CORNERS])
+    out.take("start", [topic for topic in topics if (topic.name, topic.type) == INITIAL_POSE])
     custom = _custom(out, bag, topics)
     _rfid(out, custom)
     _ranges(out, custom)
@@ -217,16 +219,6 @@ def _camera(out: Proposal, topics: Sequence[Topic]) -> None:
         out.uses[settings["info"]] = "camera: lens"
     else:
         out.notes.append("no CameraInfo belongs to the images: the rig has to describe the camera")
-
-
-def _tables(out: Proposal, topics: Sequence[Topic]) -> None:
-    for topic in topics:
-        if topic.type in DETECTIONS and "bearing_range" not in out.options:
-            out.take("bearing_range", [topic])
-        elif topic.type == CORNERS and "sightings" not in out.options:
-            out.take("sightings", [topic])
-        elif topic.type == INITIAL_POSE[1] and topic.name == INITIAL_POSE[0]:
-            out.take("start", [topic])
 
 
 def _custom(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:

@@ -5,7 +5,7 @@ topic, or joints of one message.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -69,15 +69,14 @@ class JointRows:
             wheels = (values[names.index(self._wheels.left)], values[names.index(self._wheels.right)])
             self.rows.append(item, t_ns, (float(wheels[0]), float(wheels[1])))
 
-    def pairs(self, warnings: list[str]) -> tuple[Integers, Array, Array]:
-        """Timestamps (N,), left and right (N,). InputError if no message has both joints."""
+    def pairs(self, warnings: list[str]) -> tuple[Integers, Array]:
+        """Timestamps (N,), and the left and the right number (N, 2). InputError if no message has both joints."""
         if not len(self.rows):
             wrong = next((n for n in (self._wheels.left, self._wheels.right) if n not in self._seen), self._wheels.left)
             raise InputError(
                 f"{self.rows.source}: has no message with both wheels, {quoted(wrong)}{nearest(wrong, sorted(self._seen))}"
             )
-        t_ns, (left, right) = finite_columns(self.rows, ("left wheel", "right wheel"), warnings)
-        return t_ns, left, right
+        return finite_rows(self.rows, ("left wheel", "right wheel"), warnings)
 
 
 class OneWheel:
@@ -102,10 +101,10 @@ class TwoWheels:
     def __init__(self, left: TopicRows, right: TopicRows) -> None:
         self.rows, self._right = left, right
 
-    def pairs(self, warnings: list[str]) -> tuple[Integers, Array, Array]:
-        """Timestamps (N,), left and right (N,). InputError if the topics have no time in common."""
-        l_ns, (left,) = finite_columns(self.rows, ("wheel",), warnings)
-        r_ns, (right,) = finite_columns(self._right, ("wheel",), warnings)
+    def pairs(self, warnings: list[str]) -> tuple[Integers, Array]:
+        """Timestamps (N,), and the left and the right number (N, 2). InputError if the topics have no time in common."""
+        l_ns, left = finite_rows(self.rows, ("wheel",), warnings)
+        r_ns, right = finite_rows(self._right, ("wheel",), warnings)
         after = np.clip(np.searchsorted(r_ns, l_ns), 0, len(r_ns) - 1)
         before = np.maximum(after - 1, 0)
         near = np.where(np.abs(r_ns[before] - l_ns) <= np.abs(r_ns[after] - l_ns), before, after)
@@ -117,15 +116,19 @@ class TwoWheels:
         if lost := len(l_ns) - len(keep):
             warnings.append(f"{self.rows.source}: {lost} messages have none of the right wheel near in time")
         alone = np.append(np.diff(t_ns) > 0, True)  # the last one of equal stamps
-        return t_ns[alone], left[keep][alone], right[near[keep]][alone]
+        return t_ns[alone], np.hstack((left[keep], right[near[keep]]))[alone]
 
 
-def finite_columns(rows: TopicRows, names: Sequence[str], warnings: list[str]) -> tuple[Integers, list[Any]]:
-    """Timestamps and columns of rows in order of time, all finite; InputError names the invalid message."""
-    number, t_ns, values = rows.rows, rows.t_ns, rows.values
-    checks.require_finite(rows.source, number, names, values)
-    keep = checks.in_order(rows.source, number, t_ns, warnings)
-    return t_ns[keep], [values[keep, i] for i in range(len(names))]
+def finite_rows(rows: TopicRows, names: Sequence[str], warnings: list[str]) -> tuple[Integers, Array]:
+    """Timestamps (N,) and numbers (N, K) in order of time, all finite; InputError names the invalid message."""
+    checks.require_finite(rows.source, rows.rows, names, rows.values)
+    keep = checks.in_order(rows.source, rows.rows, rows.t_ns, warnings)
+    return rows.t_ns[keep], rows.values[keep]
+
+
+def velocities(t_ns: Integers, values: Array) -> VelocityStream:
+    """Speeds and turn rates (N, 2) at N timestamps as a stream."""
+    return VelocityStream(checks.seconds(t_ns, int(t_ns[0])), *np.ascontiguousarray(values.T))
 
 
 class OdometryTopic(PoseTopic):
@@ -170,8 +173,8 @@ class TwistMotion:
         self._rows.append(item, t_ns, (twist.linear.x, twist.angular.z))
 
     def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
-        t_ns, (v, w) = finite_columns(self._rows, ("v", "w"), warnings)
-        return t_ns, VelocityStream(checks.seconds(t_ns, int(t_ns[0])), v, w)
+        t_ns, values = finite_rows(self._rows, ("v", "w"), warnings)
+        return t_ns, velocities(t_ns, values)
 
 
 class WheelMotion:
@@ -194,11 +197,10 @@ class WheelMotion:
     def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
         source = self._rows.rows.source
         size, track = self._wheels.sizes(source, "odometry.wheels", turns=self._wheels.unit == "rad")
-        t_ns, left, right = self._rows.pairs(warnings)
-        ways = size * np.column_stack((left, right))
+        t_ns, numbers = self._rows.pairs(warnings)
+        ways = size * numbers
         if self._are_speeds:
-            v, w = np.ascontiguousarray(motions.velocities_of_wheels(ways, track).T)
-            return t_ns, VelocityStream(checks.seconds(t_ns, int(t_ns[0])), v, w)
+            return t_ns, velocities(t_ns, motions.velocities_of_wheels(ways, track))
         moves = motions.between_wheels(source, t_ns, ways, np.full(2, size), track, warnings)
         return t_ns, increments(t_ns, moves)
 
