@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -219,24 +220,27 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
     comments, content = _split_comments(numbered)
     if not content:
         raise InputError(f"{path}: contains no rows")
-    body = list(_cells_of(path, content, mapping.separator))
-    first_row, first = body[0]
+    parsed = _cells_of(path, content, mapping.separator)
+    body: Iterable[tuple[int, list[str]]]
     if mapping.header:
+        first_row, first = next(parsed)
         named = next(_cells_of(path, comments[-1:], mapping.separator), (0, []))[1]
         # a comment with as many names as there are columns is the header, unless the first row contains the names
         in_comment = _has(named, needed) or (len(named) == len(first) and not _has(first, needed))
         header = named if in_comment else first
-        body = body if in_comment else body[1:]
+        body = chain([(first_row, first)], parsed) if in_comment else parsed
     else:
+        body = list(parsed)
         # rows of other kinds may have other numbers of columns
         chosen = _places(_numbers(max(len(parts) for _, parts in body)), mapping.chosen())
         first_row, first = next((one for one in body if _is_chosen(one[1], chosen)), body[0])
         header = _numbers(len(first))
     _require_columns(path, mapping, needed, header, first_row)
     chosen = _places(header, mapping.chosen())
-    rows, table = [], []
+    rows, table, unwanted = [], [], 0
     for row, parts in body:
         if not _is_chosen(parts, chosen):
+            unwanted += 1
             continue
         if len(parts) != len(header):
             raise bad_field(path, "row", ",".join(parts), f"{len(header)} values: {','.join(header)}", row=row)
@@ -244,7 +248,7 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
         table.append(parts)
     places = _places(header, dict.fromkeys(mapping.columns.values()))
     columns = {header[i]: [parts[i] for parts in table] for i in places}
-    return _mapped(Cells(path, rows, columns), mapping, header, len(body) - len(rows))
+    return _mapped(Cells(path, rows, columns), mapping, header, unwanted)
 
 
 def _numbers(count: int) -> list[str]:
