@@ -19,7 +19,6 @@ from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.sensors.rfid import tables as native_rfid
 from factorgraph_loc.sensors.rfid.columns import RFID
-from factorgraph_loc.sensors.rfid.rounds import make_rfid_stream
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.tables import stream_of
 from factorgraph_loc.text import listed
@@ -168,7 +167,8 @@ class Reads(RowsOfTopic):
         number, end_ns = (np.array(column, dtype=np.int64) for column in (self._number, ends))
         signals = (table.numbers["rssi"], table.numbers["phase"], table.numbers["frequency"])
         antennas = [antenna for *_, antenna in self._rounds]
-        return make_rfid_stream(table.t_ns, number, table.names["epc"], signals, end_ns, antennas, t0_ns)
+        reads = native_rfid.ReadsByRound(table.t_ns, number, table.names["epc"], signals, end_ns, antennas)
+        return reads.stream(t0_ns)
 
     def _stamp(self, found: Mapping[Any, Any], t_ns: int, row: int) -> int:
         if "stamp" not in found:
