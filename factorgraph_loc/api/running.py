@@ -7,7 +7,7 @@ from typing import Any
 
 from factorgraph_loc.api.given import LogLike, RigLike, Settings, WorldLike, every, one
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.aligned import score
+from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.evaluation.plots import write_plots
 from factorgraph_loc.experiments import compare as comparing
 from factorgraph_loc.experiments import output

@@ -2,8 +2,6 @@
 
 __all__ = [
     "active",
-    "aligned",
-    "estimates_file",
     "features",
     "figures",
     "inference",

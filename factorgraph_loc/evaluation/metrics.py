@@ -1,40 +1,53 @@
 """Accuracy of a trajectory against the reference, and consistency of its covariances.
 
-There is no alignment, as the map's frame is known; for runs that estimated the map, aligned figures are added. Pairing of poses:
+There is no alignment, as the map's frame is known, unless it is asked for; for runs that estimated the map, aligned figures are
+added. Pairing of poses:
 :mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to
 Tracking and Navigation", 2001, section 5.4. Relative pose error: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
 systems", 2012, section IV.A, over time and over path length.
 """
 
-import bisect
-import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.evaluation import pairing
-from factorgraph_loc.evaluation.pairing import TOLERANCE, pairs, pauses, rms
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.pairing import (
+    DELTA,
+    TOLERANCE,
+    align_points,
+    between,
+    indices,
+    pairs,
+    pauses,
+    rms,
+    spread,
+    successive,
+)
+from factorgraph_loc.evaluation.trajectories.score import score_paths
 from factorgraph_loc.evaluation.warned import WARNINGS
-from factorgraph_loc.model.belief import Learnt
+from factorgraph_loc.model.belief import Learnt, LearntPoint
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult, Timings
-from factorgraph_loc.model.scoring import MAX_GAP
+from factorgraph_loc.model.scoring import MAX_GAP, Alignment
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory3 import path_of
 from factors import chi_squared, positive, se2
 from factors.se2 import Array, Integers
 
-PIECE_TOLERANCE = 0.1  # by which the length of one of all pairs may differ, as a share of it
 FEWEST_SCORED = 10  # least number of poses for meaningful figures
-RPE_DISTANCE, RPE_TIME = 1.0, 1.0  # m, s
 CONFIDENCE = 0.95
+OF_FREE_MAP = ("aligned.position_rmse", "aligned.heading_rmse", "landmarks.count", "landmarks.rmse", "landmarks.anees")
+ALIGNED = ("aligned_position_rmse", "aligned_rotation_rmse")
 FREE_MAP = "unknown"  # value of an estimator's setting ``landmarks`` with which it estimates the map
 
+_HOW = ("rmse", "median", "p95", "max")
 _ACCURACY = (
-    *(f"{what}_{how}" for what in ("position", "heading") for how in ("rmse", "median", "p95", "max")),
+    *(f"{what}_{how}" for what in ("position", "heading") for how in _HOW),
     "rpe_position_per_m",
     "rpe_heading_per_m",
     "rpe_pieces",
@@ -46,46 +59,6 @@ _ACCURACY = (
     "invalid_covariances",
     "scored",
 )
-
-
-def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
-    """Pieces, one after the other, as indices of first and last pose, for the ``steps`` (N - 1,) between N poses that are numbered
-    from ``first``: each ends at the first pose at which the steps since its beginning sum up to ``length`` or more."""
-    found: list[tuple[int, int]] = []
-    begin, covered = first, 0.0
-    for i, step in enumerate(steps.tolist(), start=first + 1):
-        covered += step
-        if covered >= length:
-            found.append((begin, i))
-            begin, covered = i, 0.0
-    return found
-
-
-def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
-    """The same for pieces that may overlap: from each pose to that later one whose distance is nearest to ``length``, the first of
-    several, if it differs from that by at most :data:`PIECE_TOLERANCE` of it."""
-    covered = np.concatenate(([0.0], np.cumsum(steps))).tolist()
-    found: list[tuple[int, int]] = []
-    for i, here in enumerate(covered[:-1]):
-        after = bisect.bisect_left(covered, here + length, i + 1)
-        near = [j for j in (after - 1, after) if i < j < len(covered)]
-        best = min(near, key=lambda j: abs(covered[j] - here - length))
-        best = bisect.bisect_left(covered, covered[best], i + 1)  # the first of those that stand still
-        if abs(covered[best] - here - length) <= PIECE_TOLERANCE * length:
-            found.append((first + i, first + best))
-    return found
-
-
-def between(count: int, breaks: Iterable[int]) -> list[tuple[int, int]]:
-    """The half-open ranges of ``count`` indices that are split before each of ``breaks``."""
-    bounds = [0, *sorted({b for b in breaks if 0 < b < count}), count]
-    return list(itertools.pairwise(bounds))
-
-
-def indices(pieces: list[tuple[int, int]]) -> tuple[Integers, Integers]:
-    """First and last poses (K,) of ``pieces``."""
-    begins, ends = np.array(pieces, dtype=np.int64).reshape(-1, 2).T
-    return begins, ends
 
 
 @dataclass(frozen=True)
@@ -145,34 +118,57 @@ def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_G
     )
 
 
-def score(result: RunResult, log: Log) -> dict[str, Any]:
+def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, Any]:
     """All figures of a run, by dotted key; metres, radians, None where undefined.
 
     ``scoring.max_gap`` [s]: only runs with equal values are comparable. ``causal.*`` and ``final.*`` (see
     :func:`accuracy`) are scored from the first localized causal estimate and, except for ``scored``, are None without a reference
     or with fewer than :data:`FEWEST_SCORED` scored poses. If the run was never localized, ``causal.*`` is None, and ``final.*``
     is scored from its beginning. ``time_to_localized`` [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
-    :func:`~factorgraph_loc.evaluation.pairing.free_map_figures`) are None unless the map was estimated. ``learnt.NAME.value``
+    :func:`free_map_figures`) are None unless the map was estimated. ``learnt.NAME.value``
     and ``learnt.NAME.sigma`` exist for each learnt constant. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
     ``timing.*`` always exist, as do ``warnings``, a list of texts.
+
+    With ``align`` also ``scoring.align``, and ``causal.*`` and ``final.*`` of :data:`ALIGNED` [m, rad] after that alignment, at the
+    same stamps (see :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`): None without a reference, and where the
+    poses do not determine the alignment, which ``warnings`` then says.
     """
     causal = result.causal()
     final = result.final
     if causal is not None:
-        final = since(final, float(causal.t[0]))
+        final = _since(final, float(causal.t[0]))
     gap = result.max_gap
     scores: dict[str, Any] = {"scoring.max_gap": gap, WARNINGS: list(result.warnings)}
-    for kind, trajectory in (("causal", causal), ("final", final)):
+    trajectories = (("causal", causal), ("final", final))
+    for kind, trajectory in trajectories:
         figures = dict.fromkeys(_ACCURACY) if trajectory is None else accuracy(trajectory, log.reference, gap)
         if (figures["scored"] or 0) < FEWEST_SCORED:
             figures = dict.fromkeys(_ACCURACY) | {"scored": figures["scored"]}
         scores |= {f"{kind}.{name}": value for name, value in figures.items()}
     scores["time_to_localized"] = None if causal is None else float(causal.t[0] - result.t[0])
     if result.config.get("settings", {}).get("landmarks") == FREE_MAP:
-        scores |= pairing.free_map_figures(final, result.learnt.landmarks, log, gap)
+        scores |= free_map_figures(final, result.learnt.landmarks, log, gap)
     else:
-        scores |= dict.fromkeys(pairing.FIGURES)
-    return scores | _constants(result.learnt) | _counts(result.diagnostics) | _timing(result.timings)
+        scores |= dict.fromkeys(OF_FREE_MAP)
+    scores |= _constants(result.learnt) | _counts(result.diagnostics) | _timing(result.timings)
+    if align != "none":
+        scores["scoring.align"] = align
+        for kind, trajectory in trajectories:
+            aligned: dict[str, float | None] = dict.fromkeys(ALIGNED)
+            try:
+                aligned |= _aligned(trajectory, log, align, gap)
+            except InputError as error:
+                scores[WARNINGS] = list(dict.fromkeys((*scores[WARNINGS], f"not aligned: {error}")))
+            scores |= {f"{kind}.{name}": value for name, value in aligned.items()}
+    return scores
+
+
+def _aligned(trajectory: Trajectory | None, log: Log, align: Alignment, max_gap: float) -> dict[str, float | None]:
+    if trajectory is None or log.reference is None or not len(trajectory):
+        return {}
+    paths = path_of(trajectory, log.name), path_of(log.reference, "the reference")
+    found = score_paths(*paths, align, "interpolate", max_gap=max_gap).figures
+    return {name: found[f"ape.{name.removeprefix('aligned_')}"] for name in ALIGNED}
 
 
 def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: float = MAX_GAP) -> dict[str, Any]:
@@ -191,13 +187,14 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
         return figures
     e = errors(trajectory, reference, max_gap)
     for name, values in (("position", e.position), ("heading", e.heading)):
-        figures |= {f"{name}_{how}": value for how, value in _spread(values).items()}
+        statistics = spread(values)
+        figures |= {f"{name}_{how}": statistics[how] for how in _HOW}
     if reference.has_heading:
         position, heading = relative_errors(e.poses, e.reference, pauses(e.t))
         figures["rpe_position_per_m"] = rms(position)
         figures["rpe_heading_per_m"] = rms(heading)
         figures["rpe_pieces"] = len(position)
-        position, heading = relative_errors(e.poses, e.reference, pauses(e.t), np.diff(e.t), RPE_TIME - TOLERANCE)
+        position, heading = relative_errors(e.poses, e.reference, pauses(e.t), np.diff(e.t), DELTA - TOLERANCE)
         figures["rpe_position_per_s"] = rms(position)
         figures["rpe_heading_per_s"] = rms(heading)
     nees = e.nees[np.isfinite(e.nees)]
@@ -214,12 +211,46 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
     return figures
 
 
+def free_map_figures(
+    trajectory: Trajectory, landmarks: Mapping[str, LearntPoint], log: Log, max_gap: float = MAX_GAP
+) -> dict[str, Any]:
+    """``OF_FREE_MAP`` of a run that estimated its map.
+
+    ``aligned.*``: root mean square error of the aligned ``trajectory`` in position [m] and heading [rad]. ``landmarks.*``: of the
+    learnt landmarks that are also in the log's map, after the same alignment: their ``count``, root mean square distance ``rmse``
+    [m] and mean NEES ``anees``, ideally 2. The covariances include the uncertainty of the start, which the alignment removes, so
+    less than 2 is usual. Without a reference the landmarks themselves are aligned. None where a figure is undefined.
+    """
+    figures: dict[str, Any] = dict.fromkeys(OF_FREE_MAP)
+    names = [name for name in landmarks if name in log.world.landmarks]
+    figures["landmarks.count"] = len(names)
+    positions = np.array([landmarks[name].position for name in names]).reshape(-1, 2)
+    truth = np.array([log.world.position(name) for name in names]).reshape(-1, 2)
+    if log.reference is None:
+        pose = align_points(positions, truth)
+    else:
+        pair = pairs(trajectory, log.reference, max_gap)
+        pose = align_points(pair.poses[:, :2], pair.truth[:, :2])
+        error = se2.compose(pose, pair.poses) - pair.truth
+        figures["aligned.position_rmse"] = rms(np.hypot(error[:, 0], error[:, 1]))
+        if log.reference.has_heading:
+            figures["aligned.heading_rmse"] = rms(se2.wrap(error[:, 2]))
+    if names and np.isfinite(pose).all():
+        # in the estimate's own frame, as the covariances
+        error = positions - se2.transform_to(pose, truth)
+        figures["landmarks.rmse"] = rms(np.hypot(error[:, 0], error[:, 1]))
+        covariances = np.array([landmarks[name].covariance for name in names])
+        if (good := _positive_definite(covariances)).any():
+            figures["landmarks.anees"] = float(np.mean(_squared(error[good], covariances[good])))
+    return figures
+
+
 def relative_errors(
     poses: Array,
     reference: Array,
     breaks: Sequence[int] | Integers = (),
     steps: Array | None = None,
-    length: float = RPE_DISTANCE,
+    length: float = DELTA,
 ) -> tuple[Array, Array]:
     """Relative pose errors over 1 m of the reference's path: position (K,) [m] and heading (K,) [rad, absolute].
 
@@ -249,7 +280,7 @@ def _unbroken(valid: NDArray[np.bool_], breaks: Sequence[int] | Integers) -> lis
     return found
 
 
-def since(trajectory: Trajectory, t: float) -> Trajectory:
+def _since(trajectory: Trajectory, t: float) -> Trajectory:
     """The poses of a trajectory from the time ``t`` on."""
     keep = trajectory.t >= t - TOLERANCE
     covariances = None if trajectory.covariances is None else trajectory.covariances[keep]
@@ -258,25 +289,13 @@ def since(trajectory: Trajectory, t: float) -> Trajectory:
 
 def _positive_definite(covariances: Array) -> NDArray[np.bool_]:
     finite: NDArray[np.bool_] = np.all(np.isfinite(covariances), axis=(1, 2))
-    smallest = np.linalg.eigvalsh(np.where(finite[:, None, None], covariances, np.eye(3)))[:, 0]
+    smallest = np.linalg.eigvalsh(np.where(finite[:, None, None], covariances, np.eye(covariances.shape[-1])))[:, 0]
     return np.asarray(finite & (smallest > 0.0))
 
 
 def _squared(difference: Array, covariances: Array) -> Array:
     whitened = positive.solve(covariances, difference[..., None])[..., 0]
     return np.asarray(np.sum(difference * whitened, axis=1))
-
-
-def _spread(values: Array) -> dict[str, float | None]:
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return dict.fromkeys(("rmse", "median", "p95", "max"))
-    return {
-        "rmse": rms(values),
-        "median": float(np.median(values)),
-        "p95": float(np.percentile(values, 95)),
-        "max": float(np.max(values)),
-    }
 
 
 def _constants(learnt: Learnt) -> dict[str, float]:

@@ -1,5 +1,5 @@
-"""Pairing of estimates and reference poses, at the reference's own stamps, at most ten per second; and scores of a run that
-estimated its map: its frame is arbitrary, so the estimate is aligned with the reference first.
+"""What all scores of trajectories share: pairing of estimates and reference poses, at the reference's own stamps, at most ten per
+second; alignment in the plane; the pieces over which relative errors are taken; and statistics of errors.
 
 The estimate is interpolated, the reference never is: it is defined at its stamps only, and a gap contains no stamp. Estimates are
 on a grid of 10 Hz, so a scored pose is interpolated between two that are less than 0.1 s away; the later of them may use a
@@ -14,25 +14,25 @@ with scale 1. In the plane the rotation is one angle, and reflections cannot occ
 """
 
 import bisect
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.model.belief import LearntPoint
-from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3
-from factors import positive, se2
+from factors import se2
 from factors.se2 import Array, Integers
 
 RATE = 10.0  # Hz, of poses that are scored
 TOLERANCE = 1e-3  # s, of stamps
 _PAUSE = 1.0  # s between neighbours of a reference that is never a gap
 _USUAL = 3.0  # times the median interval that is never a gap
-FIGURES = ("aligned.position_rmse", "aligned.heading_rmse", "landmarks.count", "landmarks.rmse", "landmarks.anees")
+PIECE_TOLERANCE = 0.1  # by which the length of one of all pairs may differ, as a share of it
+DELTA = 1.0  # m, and s, over which relative errors are taken
+HOW = ("rmse", "mean", "median", "p95", "max", "min", "std")
 
 
 @dataclass(frozen=True)
@@ -93,13 +93,6 @@ def _within(t: Array, stamps: Array) -> Array:
     return np.asarray(np.where(np.abs(clipped - t) <= TOLERANCE, clipped, np.nan))
 
 
-def align(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GAP) -> Array:
-    """The pose (3,) of the estimate's frame in the reference's, by least squares on the positions at the scored stamps; NaN if
-    there are none."""
-    pair = pairs(trajectory, reference, max_gap)
-    return align_points(pair.poses[:, :2], pair.truth[:, :2])
-
-
 def align_points(points: Array, targets: Array) -> Array:
     """The pose (3,) that moves ``points`` (N, 2) onto ``targets`` (N, 2) in least squares; pairs with a NaN are ignored.
 
@@ -115,49 +108,63 @@ def align_points(points: Array, targets: Array) -> Array:
     return np.array((*(target_centre - se2.transform_from(rotation, centre)), angle))
 
 
-def free_map_figures(
-    trajectory: Trajectory, landmarks: Mapping[str, LearntPoint], log: Log, max_gap: float = MAX_GAP
-) -> dict[str, Any]:
-    """``FIGURES`` of a run that estimated its map.
-
-    ``aligned.*``: root mean square error of the aligned ``trajectory`` in position [m] and heading [rad]. ``landmarks.*``: of the
-    learnt landmarks that are also in the log's map, after the same alignment: their ``count``, root mean square distance ``rmse``
-    [m] and mean NEES ``anees``, ideally 2. The covariances include the uncertainty of the start, which the alignment removes, so
-    less than 2 is usual. Without a reference the landmarks themselves are aligned. None where a figure is undefined.
-    """
-    figures: dict[str, Any] = dict.fromkeys(FIGURES)
-    names = [name for name in landmarks if name in log.world.landmarks]
-    figures["landmarks.count"] = len(names)
-    positions = np.array([landmarks[name].position for name in names]).reshape(-1, 2)
-    truth = np.array([log.world.position(name) for name in names]).reshape(-1, 2)
-    if log.reference is None:
-        pose = align_points(positions, truth)
-    else:
-        pair = pairs(trajectory, log.reference, max_gap)
-        pose = align_points(pair.poses[:, :2], pair.truth[:, :2])
-        error = se2.compose(pose, pair.poses) - pair.truth
-        figures["aligned.position_rmse"] = rms(np.hypot(error[:, 0], error[:, 1]))
-        if log.reference.has_heading:
-            figures["aligned.heading_rmse"] = rms(se2.wrap(error[:, 2]))
-    if names and np.isfinite(pose).all():
-        # in the estimate's own frame, as the covariances
-        error = positions - se2.transform_to(pose, truth)
-        figures["landmarks.rmse"] = rms(np.hypot(error[:, 0], error[:, 1]))
-        figures["landmarks.anees"] = _anees(error, np.array([landmarks[name].covariance for name in names]))
-    return figures
-
-
 def rms(values: Array) -> float | None:
     """Root mean square of the finite values, None without any."""
     values = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
-def _anees(errors: Array, covariances: Array) -> float | None:
-    """Mean NEES of errors (N, 2) with covariances (N, 2, 2), of those that are positive definite."""
-    good = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
-    good[good] = np.linalg.eigvalsh(covariances[good])[:, 0] > 0.0
-    if not good.any():
-        return None
-    whitened = positive.solve(covariances[good], errors[good, :, None])[..., 0]
-    return float(np.mean(np.sum(errors[good] * whitened, axis=1)))
+def spread(values: Array) -> dict[str, float | None]:
+    """Statistics of the finite values by the names of :data:`HOW`, None without any."""
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return dict.fromkeys(HOW)
+    return {
+        "rmse": rms(values),
+        "mean": float(np.mean(values)),
+        "median": float(np.median(values)),
+        "p95": float(np.percentile(values, 95)),
+        "max": float(np.max(values)),
+        "min": float(np.min(values)),
+        "std": float(np.std(values)),
+    }
+
+
+def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
+    """Pieces, one after the other, as indices of first and last pose, for the ``steps`` (N - 1,) between N poses that are numbered
+    from ``first``: each ends at the first pose at which the steps since its beginning sum up to ``length`` or more."""
+    found: list[tuple[int, int]] = []
+    begin, covered = first, 0.0
+    for i, step in enumerate(steps.tolist(), start=first + 1):
+        covered += step
+        if covered >= length:
+            found.append((begin, i))
+            begin, covered = i, 0.0
+    return found
+
+
+def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
+    """The same for pieces that may overlap: from each pose to that later one whose distance is nearest to ``length``, the first of
+    several, if it differs from that by at most :data:`PIECE_TOLERANCE` of it."""
+    covered = np.concatenate(([0.0], np.cumsum(steps))).tolist()
+    found: list[tuple[int, int]] = []
+    for i, here in enumerate(covered[:-1]):
+        after = bisect.bisect_left(covered, here + length, i + 1)
+        near = [j for j in (after - 1, after) if i < j < len(covered)]
+        best = min(near, key=lambda j: abs(covered[j] - here - length))
+        best = bisect.bisect_left(covered, covered[best], i + 1)  # the first of those that stand still
+        if abs(covered[best] - here - length) <= PIECE_TOLERANCE * length:
+            found.append((first + i, first + best))
+    return found
+
+
+def between(count: int, breaks: Iterable[int]) -> list[tuple[int, int]]:
+    """The half-open ranges of ``count`` indices that are split before each of ``breaks``."""
+    bounds = [0, *sorted({b for b in breaks if 0 < b < count}), count]
+    return list(itertools.pairwise(bounds))
+
+
+def indices(pieces: list[tuple[int, int]]) -> tuple[Integers, Integers]:
+    """First and last poses (K,) of ``pieces``."""
+    begins, ends = np.array(pieces, dtype=np.int64).reshape(-1, 2).T
+    return begins, ends

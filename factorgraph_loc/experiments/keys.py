@@ -29,7 +29,6 @@ PACKAGE = __name__.partition(".")[0]
 COUNTED = (
     "builtin.py",
     "errors.py",
-    "evaluation/aligned.py",
     "evaluation/metrics.py",
     "evaluation/pairing.py",
     "evaluation/trajectories/association.py",

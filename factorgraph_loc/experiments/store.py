@@ -192,11 +192,10 @@ class Store:
         import numpy as np  # noqa: PLC0415
         import polars as pl  # noqa: PLC0415
 
-        from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates  # noqa: PLC0415
         from factorgraph_loc.evaluation.figures import Track  # noqa: PLC0415
-        from factorgraph_loc.io.results import trajectory_of  # noqa: PLC0415
+        from factorgraph_loc.io.results import ESTIMATES, parse_estimates, trajectory_of  # noqa: PLC0415
 
-        table = parse_estimates(self.read(key, NAME), NAME)
+        table = parse_estimates(self.read(key, ESTIMATES), ESTIMATES)
         causal, final = (table.filter(pl.col("kind") == kind) for kind in ("causal", "final"))
         t0_ns = int(table["t_ns"].to_numpy().min(initial=np.iinfo(np.int64).max))
         localized = causal.filter(pl.col("status") == "localized")["t_ns"]

@@ -10,11 +10,10 @@ import polars as pl
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates
 from factorgraph_loc.files.bounded import DATA, foreign, read_bytes
 from factorgraph_loc.files.columns import LATEST
 from factorgraph_loc.files.models import FileModel, parse_model, read_json, read_toml
-from factorgraph_loc.io.results import FILES, trajectory_of
+from factorgraph_loc.io.results import ESTIMATES, FILES, parse_estimates, trajectory_of
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
@@ -132,7 +131,7 @@ def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
 def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
     if folder.log != log.name:
         raise InputError(f"{folder.path}: is a run of the log {folder.log}, expected one of {log.name}")
-    path = folder.path / NAME
+    path = folder.path / ESTIMATES
     table = parse_estimates(read_bytes(path, DATA), path)
     table = table.filter(pl.all_horizontal(pl.col(key).is_finite() for key in ("x", "y", "heading")))
     table = table.with_columns(t=(pl.col("t_ns") - log.t0_ns) / 1e9)

@@ -8,7 +8,8 @@ import pytest
 from evo.core.geometry import umeyama_alignment
 from scipy.stats import chi2
 
-from factorgraph_loc.evaluation.pairing import align, align_points, free_map_figures
+from factorgraph_loc.evaluation.metrics import free_map_figures
+from factorgraph_loc.evaluation.pairing import align_points, pairs
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -24,6 +25,11 @@ SIGMA = np.array(((0.04, 0.015), (0.015, 0.01)))
 def arc(n=50):
     t = np.arange(n) * 0.1
     return Trajectory(t, np.stack((np.cos(t), 2.0 * np.sin(t), se2.wrap(t)), axis=1))
+
+
+def align(estimate, truth):
+    pair = pairs(estimate, truth)
+    return align_points(pair.poses[:, :2], pair.truth[:, :2])
 
 
 def free_map(n, rng, sigma=SIGMA):

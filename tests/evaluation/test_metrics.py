@@ -8,8 +8,7 @@ from evo.core import metrics as evo
 from evo.core.trajectory import PosePath3D
 from scipy.stats import binom, chi2
 
-from factorgraph_loc.evaluation.metrics import accuracy, errors, relative_errors, score
-from factorgraph_loc.evaluation.pairing import FIGURES
+from factorgraph_loc.evaluation.metrics import OF_FREE_MAP, accuracy, errors, relative_errors, score
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
@@ -213,7 +212,7 @@ def test_aligned_figures_only_where_the_map_was_free(landmarks):
         assert scores["aligned.position_rmse"] == pytest.approx(0.0, abs=1e-9)
         assert scores["landmarks.count"] == 0
     else:
-        assert all(scores[name] is None for name in FIGURES)
+        assert all(scores[name] is None for name in OF_FREE_MAP)
 
 
 def test_innovations_without_degrees_of_freedom_say_nothing():

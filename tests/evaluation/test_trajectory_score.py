@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tum_files import read_tum
 
 from factorgraph_loc import InputError, Trajectory, Trajectory3, score
-from factorgraph_loc.evaluation import metrics
+from factorgraph_loc.evaluation import metrics, pairing
 from factorgraph_loc.model.scoring import ALIGNMENTS
 
 OPTIONS = {
@@ -200,4 +200,4 @@ def test_pieces_of_all_pairs_are_those_of_a_search():
             far = np.abs(covered[i + 1 :] - covered[i] - 1.0)
             if far.min() <= 0.1:
                 expected.append((i, i + 1 + int(np.argmin(far))))
-        assert metrics.all_pairs(steps, 1.0) == expected
+        assert pairing.all_pairs(steps, 1.0) == expected

@@ -9,10 +9,10 @@ import polars as pl
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.estimates_file import NUMBERS
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.exports.runs import find_runs, is_results, read_runs
+from factorgraph_loc.io.results import NUMBERS
 
 
 def test_a_run_is_read_as_it_was(log, results):

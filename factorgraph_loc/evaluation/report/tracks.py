@@ -8,8 +8,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from factorgraph_loc.evaluation.estimates_file import NAME, parse_estimates
 from factorgraph_loc.evaluation.inference import independent_count
+from factorgraph_loc.io.results import ESTIMATES, parse_estimates
 from factors.se2 import Array
 
 KINDS = ("causal", "final")
@@ -39,7 +39,7 @@ def read_series(estimates: bytes, t0_ns: int | None) -> dict[str, Series]:
 
     Times are relative to ``t0_ns``, by default to the first tick.
     """
-    table = parse_estimates(estimates, NAME, ("kind", "t_ns", "status", *_NUMBERS))
+    table = parse_estimates(estimates, ESTIMATES, ("kind", "t_ns", "status", *_NUMBERS))
     start_ns = table["t_ns"].min() if t0_ns is None else t0_ns
     found = {}
     for kind in KINDS:

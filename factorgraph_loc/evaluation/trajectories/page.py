@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
 from factorgraph_loc.drawing.pages import Part, Rows, number, sectioned
 from factorgraph_loc.evaluation.figures import write_picture
-from factorgraph_loc.evaluation.pairing import pauses
-from factorgraph_loc.evaluation.trajectories.score import HOW, TrajectoryScore
+from factorgraph_loc.evaluation.pairing import HOW, pauses
+from factorgraph_loc.evaluation.trajectories.score import TrajectoryScore
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import require_free, writing
 from factors.se2 import Array

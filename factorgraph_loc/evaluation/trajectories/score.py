@@ -13,8 +13,8 @@ import numpy as np
 import scipy
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation import metrics
-from factorgraph_loc.evaluation.pairing import TOLERANCE, pauses, rms
+from factorgraph_loc.evaluation import pairing
+from factorgraph_loc.evaluation.pairing import DELTA, TOLERANCE, pauses, spread
 from factorgraph_loc.evaluation.trajectories.association import Similarity, alignment, associate
 from factorgraph_loc.model.planar import MOST, RISE
 from factorgraph_loc.model.pose_path import PosePath, require_poses
@@ -30,8 +30,6 @@ from factorgraph_loc.model.scoring import (
 from factorgraph_loc.text import listed, quoted
 from factors.se2 import Array, Integers
 
-DELTA = 1.0  # m, and s, over which relative errors are taken
-HOW = ("rmse", "mean", "median", "p95", "max", "min", "std")
 _MANY = 0.5  # share of poses that are paired, below which there is a warning
 
 
@@ -48,7 +46,8 @@ class PoseErrors:
         """Statistics as ``NAME.position_rmse``, ...; None where there are no errors."""
         told: dict[str, float | None] = {}
         for what, values in (("position", self.position), ("rotation", self.rotation)):
-            told |= {f"{name}.{what}_{how}": value for how, value in _statistics(values).items()}
+            statistics = spread(np.empty(0) if values is None else values)
+            told |= {f"{name}.{what}_{how}": value for how, value in statistics.items()}
         return told
 
 
@@ -178,9 +177,9 @@ def _relative(
     found: PosePath, truth: PosePath, steps: Array, length: float, gaps: Integers, *, all_pairs: bool
 ) -> PoseErrors:
     """The translation and rotation of ``Q^-1 P`` for the motions Q of the reference and P of the estimate over each piece."""
-    cut = metrics.all_pairs if all_pairs else metrics.successive
-    ranges = metrics.between(len(found), gaps.tolist())
-    begins, ends = metrics.indices([one for a, b in ranges for one in cut(steps[a : b - 1], length, a)])
+    cut = pairing.all_pairs if all_pairs else pairing.successive
+    ranges = pairing.between(len(found), gaps.tolist())
+    begins, ends = pairing.indices([one for a, b in ranges for one in cut(steps[a : b - 1], length, a)])
     (turn, way), (true_turn, true_way) = (_motions(path, begins, ends) for path in (found, truth))
     back = true_turn.transpose(0, 2, 1)
     error = np.linalg.norm(np.einsum("kij,kj->ki", back, way - true_way), axis=1)
@@ -229,17 +228,3 @@ def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, 
         f"{flat.name} is planar, and {other.name} is up to {apart:.1f} m above or below it: heights count, but not with "
         "align se2 or associate interpolate"
     ]
-
-
-def _statistics(values: Array | None) -> dict[str, float | None]:
-    if values is None or not len(values):
-        return dict.fromkeys(HOW)
-    return {
-        "rmse": rms(values),
-        "mean": float(np.mean(values)),
-        "median": float(np.median(values)),
-        "p95": float(np.percentile(values, 95)),
-        "max": float(np.max(values)),
-        "min": float(np.min(values)),
-        "std": float(np.std(values)),
-    }
