@@ -5,6 +5,7 @@ This module must import light modules only: a new process loads it before it is 
 
 import ctypes
 import gc
+import importlib
 import multiprocessing
 import os
 import pickle
@@ -53,13 +54,29 @@ class Child(SpawnProcess):
 
 
 @dataclass(eq=False)
-class Started:
-    """A worker process, the parent's end of its connection, and the index of its current job or None."""
+class Worker:
+    """A worker process, the parent's end of its connection, whether it has loaded its modules, and its current job or None."""
 
     process: Child
     connection: Connection
     ready: bool = False
-    at: int | None = None
+    job: Any = None
+
+    def send(self, content: object) -> None:
+        """Send the function first, then a job at a time."""
+        with suppress(OSError):  # it has died; the next `hear` reports that
+            self.connection.send(content)
+
+    def hear(self) -> Any:
+        """Receive ``READY``, a value, or the exception of the job; a ProcessDiedError if the process has ended."""
+        try:
+            heard, told = self.connection.recv()
+        except (EOFError, OSError):
+            return ProcessDiedError("the process died (killed, out of memory, or a crash in native code)")
+        self.ready = True
+        if told:
+            heard.__cause__ = RemoteError(told)
+        return heard
 
     def end(self) -> None:
         """Kill the process."""
@@ -98,25 +115,25 @@ def run_each(
     jobs and values must be picklable, and of modules that can be imported.
     """
     waiting = deque(range(len(jobs)))
-    team: list[Started] = []
+    team: list[Worker] = []
     try:
-        while waiting or any(worker.at is not None for worker in team):
-            while len(team) < workers and sum(worker.at is None for worker in team) < len(waiting):
-                worker = Started(*start(_serve))
+        while waiting or any(worker.job is not None for worker in team):
+            while len(team) < workers and sum(worker.job is None for worker in team) < len(waiting):
+                worker = Worker(*start(serve))
                 team.append(worker)
-                _send(worker, function)
+                worker.send(function)
             for connection in wait([worker.connection for worker in team], None if beat is None else BEAT):
                 worker = next(worker for worker in team if worker.connection is connection)
-                heard = _hear(worker)
-                if isinstance(heard, ProcessDiedError) and worker.at is None and waiting:  # died before its first job
-                    worker.at = waiting.popleft()
-                at, worker.at = worker.at, None
+                heard = worker.hear()
+                if isinstance(heard, ProcessDiedError) and worker.job is None and waiting:  # died before its first job
+                    worker.job = waiting.popleft()
+                at, worker.job = worker.job, None
                 if isinstance(heard, ProcessDiedError) or (at is not None and not lasting):
                     team.remove(worker)
                     worker.end()
                 elif waiting:
-                    worker.at = waiting.popleft()
-                    _send(worker, jobs[worker.at])
+                    worker.job = waiting.popleft()
+                    worker.send(jobs[worker.job])
                 if at is not None:
                     yield at, heard
             if beat is not None:
@@ -126,22 +143,6 @@ def run_each(
             worker.end()
 
 
-def _send(worker: Started, content: object) -> None:
-    with suppress(OSError):  # it has died; the next `_hear` reports that
-        worker.connection.send(content)
-
-
-def _hear(worker: Started) -> Any:
-    """Receive ``READY``, a value, or the exception of the job."""
-    try:
-        heard, told = worker.connection.recv()
-    except (EOFError, OSError):
-        return ProcessDiedError("the process died (killed, out of memory, or a crash in native code)")
-    if told:
-        heard.__cause__ = RemoteError(told)
-    return heard
-
-
 class RemoteError(Exception):
     """The traceback of an exception from another process, attached as its cause."""
 
@@ -149,8 +150,10 @@ class RemoteError(Exception):
         return f'\n"""\n{self.args[0]}"""'
 
 
-def _serve(connection: Connection) -> None:
-    """Main loop of a worker: receive a function, then answer each job with its value or exception."""
+def serve(connection: Connection, *modules: str) -> None:
+    """Main loop of a worker: import ``modules``, receive a function, then answer each job with its value or exception."""
+    for name in modules:
+        importlib.import_module(name)
     function = connection.recv()
     connection.send((READY, ""))
     while True:

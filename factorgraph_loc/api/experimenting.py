@@ -8,7 +8,7 @@ from typing import Any
 from factorgraph_loc.api.given import Settings
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.active import ActiveResults, seek
-from factorgraph_loc.experiments.cluster import on_cluster
+from factorgraph_loc.experiments.cluster import Cluster
 from factorgraph_loc.experiments.experiment import Done, Prepared, prepare, run_experiment
 from factorgraph_loc.experiments.plan import MOST_RUNS
 from factorgraph_loc.experiments.reporting import report_experiment
@@ -64,7 +64,7 @@ def execute(
     """Execute the runs of an experiment that is prepared. For the arguments see :func:`experiment`."""
     if scheduler is not None and jobs is not None:
         raise InputError("--jobs applies to this machine, but --scheduler names a cluster: expected one of them")
-    executor = None if scheduler is None else on_cluster(scheduler, plan, again=retry_failed)
+    executor = None if scheduler is None else Cluster(scheduler, plan.experiment.limits)
     return run_experiment(plan, jobs=jobs, again=retry_failed, executor=executor, progress=progress)
 
 

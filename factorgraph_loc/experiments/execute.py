@@ -1,16 +1,23 @@
-"""Execution of one planned run, or its lookup in the store, in any process."""
+"""Execution of planned runs: each is claimed in the store, computed by an executor, and stored here under its claim.
+
+An executor computes in local processes (:mod:`~factorgraph_loc.experiments.pool`) or on a cluster
+(:mod:`~factorgraph_loc.experiments.cluster`). Only this process stores, so that nothing is stored twice, whatever other processes
+use the same store."""
 
 from __future__ import annotations
 
 import errno
 import json
 import tempfile
+import time
 import traceback
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.experiments.plan import PlannedRun
@@ -21,16 +28,18 @@ if TYPE_CHECKING:
     from factorgraph_loc.experiments.log_source import LogSource
     from factorgraph_loc.model.log import Log
 
+Files = dict[str, bytes]
 Kind = Literal["error", "timeout", "memory", "killed", "vanished"]
+AGAIN = 0.5  # s after which a run that another process has claimed is tried again
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of a run: its results are stored (``ok``), its failure is, or another process works on it (``busy``)."""
+    """The outcome of a run: its results are stored (``ok``), or its failure is."""
 
     key: str
-    status: Literal["ok", "failed", "busy"]
+    status: Literal["ok", "failed"]
     reason: str | None = None
 
 
@@ -38,62 +47,124 @@ class VanishedError(InputError):
     """A log disappeared, or differs from the planned one."""
 
 
-def run_planned(run: PlannedRun, folder: Path, *, again: bool = False) -> Outcome:
-    """Make a run and store its results, or its failure, in the store below ``folder``, unless they exist.
+class Take(Protocol):
+    """A function that returns the next claimed run, or None if there is none now."""
 
-    ``again``: retry a stored failure. Raises StoreError only, if the store cannot be written.
+    def __call__(self, loaded: LogSource | None = None, others: Sequence[LogSource] = ()) -> PlannedRun | None:
+        """The run is of the log ``loaded`` if possible, else of one that is not among ``others``."""
+
+
+class Executor(AbstractContextManager[Any], Protocol):
+    """Computes runs with :func:`compute`, in other processes. The end of the context ends all computations."""
+
+    def submit(self, take: Take, left: int) -> None:
+        """Begin as many runs as there is room for; ``left``: the number of runs that have no outcome yet."""
+
+    def finished(self) -> Iterable[tuple[str, Files]]:
+        """The keys of runs that have ended, with their files; returns within about half a second."""
+
+
+class _Queue:
+    """The runs that are to be made, by log, and the ``later`` ones, which another process has claimed."""
+
+    def __init__(self, runs: Sequence[PlannedRun]) -> None:
+        self._runs: dict[LogSource, list[PlannedRun]] = {}
+        self.later: list[tuple[float, PlannedRun]] = []
+        for run in runs:
+            self._add(run)
+
+    def __len__(self) -> int:
+        return sum(map(len, self._runs.values())) + len(self.later)
+
+    def next(self, loaded: LogSource | None, others: Sequence[LogSource]) -> PlannedRun | None:
+        """The next run; see :class:`Take`."""
+        while self.later and self.later[0][0] <= time.monotonic():
+            self._add(self.later.pop(0)[1])
+        if not self._runs:
+            return None
+        most = max(self._runs, key=lambda source: len(self._runs[source]))
+        free = next((source for source in self._runs if source not in others), most)
+        chosen = loaded if loaded in self._runs else free
+        assert chosen is not None
+        run = self._runs[chosen].pop(0)
+        if not self._runs[chosen]:
+            del self._runs[chosen]
+        return run
+
+    def _add(self, run: PlannedRun) -> None:
+        self._runs.setdefault(run.source, []).append(run)
+
+
+def execute(runs: Sequence[PlannedRun], folder: Path, executor: Executor, *, again: bool = False) -> Iterator[Outcome]:
+    """Make ``runs``, store their results or failures in the store below ``folder`` unless they exist, and yield their outcomes.
+
+    ``again``: repeat stored failures. A run that another process has claimed is waited for. When the generator is closed, the
+    executor ends at once, and unfinished runs are not stored. Raises StoreError if the store cannot be written.
     """
-    store = Store(folder)
-    with store.claim(run.key) as mine:
-        if not mine:
-            return Outcome(run.key, "busy")
-        state = store.state(run.key, thorough=True)  # the caller considers it missing or damaged
-        if state == "ok" or (state == "failed" and not again):
-            return stored_outcome(run.key, store)
-        store.put(run.key, compute(run))
-        return stored_outcome(run.key, store)
+    store, queue = Store(folder), _Queue(runs)
+    claims: dict[str, ExitStack] = {}
+    found: list[Outcome] = []
+
+    def take(loaded: LogSource | None = None, others: Sequence[LogSource] = ()) -> PlannedRun | None:
+        while (run := queue.next(loaded, others)) is not None:
+            with ExitStack() as claim:
+                if not claim.enter_context(store.claim(run.key)):
+                    queue.later.append((time.monotonic() + AGAIN, run))
+                    continue
+                state = store.state(run.key, thorough=True)  # the caller considers it missing or damaged
+                if state not in ("ok", "failed") or (state == "failed" and again):
+                    claims[run.key] = claim.pop_all()
+                    return run
+            found.append(stored_outcome(run.key, store))
+        return None
+
+    try:
+        with executor:
+            while left := len(queue) + len(claims):
+                executor.submit(take, left)
+                yield from found
+                found.clear()
+                for key, files in executor.finished():
+                    with claims.pop(key):
+                        store.put(key, files)
+                    yield stored_outcome(key, store)
+    finally:
+        for claim in claims.values():
+            claim.close()
+        store.sweep()
 
 
-def store_failure(run: PlannedRun, folder: Path, kind: Kind, reason: str) -> Outcome:
-    """Store the failure of a run whose process could not do so itself."""
-    store = Store(folder)
-    with store.claim(run.key) as mine:
-        if not mine:
-            return Outcome(run.key, "busy")
-        if store.state(run.key, thorough=True) != "ok":
-            store.put(run.key, {FAILURE: failure_file(kind, reason)})
-        return stored_outcome(run.key, store)
-
-
-def compute(run: PlannedRun) -> dict[str, bytes]:
+def compute(run: PlannedRun) -> Files:
     """The files of a run, or of its failure, for :meth:`~factorgraph_loc.experiments.store.Store.put`.
 
     Raises StoreError only, if there is no space for them.
     """
+    import cv2  # noqa: PLC0415
+
     from factorgraph_loc.experiments.output import run_files  # noqa: PLC0415
     from factorgraph_loc.experiments.run import run as run_log  # noqa: PLC0415
 
+    cv2.setNumThreads(1)
     _forget_peak_memory()
     started = perf_counter()
     try:
         log = _load(run.source, run.log_digest)
-        files = run_files(run_log(log, run.config), log, started)
+        return run_files(run_log(log, run.config), log, started)
     except MemoryError:
-        files = {FAILURE: failure_file("memory", "there was no memory left")}
+        return failure("memory", "there was no memory left")
     except FglocError as error:
-        kind: Kind = "vanished" if isinstance(error, VanishedError) else "error"
-        files = {FAILURE: failure_file(kind, str(error))}
+        return failure("vanished" if isinstance(error, VanishedError) else "error", str(error))
     except Exception as error:
         if isinstance(error, OSError) and error.errno in _DISK:
             raise StoreError(f"{tempfile.gettempdir()}: cannot be written: {error.strerror}") from error
-        reason = f"{type(error).__name__}: {told(error)}"
-        files = {FAILURE: failure_file("error", reason, "".join(traceback.format_exception(error)))}
-    return files
+        details = "".join(traceback.format_exception(error))
+        return failure("error", f"{type(error).__name__}: {told(error)}", details)
 
 
-def failure_file(kind: Kind, reason: str, details: str = "") -> bytes:
-    content: dict[str, Any] = {"kind": kind, "reason": reason}
-    return (json.dumps(content | ({"traceback": details} if details else {}), indent=2) + "\n").encode()
+def failure(kind: Kind, reason: str, details: str = "") -> Files:
+    """The files of a failed run; ``details``: a traceback."""
+    content = {"kind": kind, "reason": reason} | ({"traceback": details} if details else {})
+    return {FAILURE: (json.dumps(content, indent=2) + "\n").encode()}
 
 
 @lru_cache(maxsize=4)
@@ -112,8 +183,7 @@ def _load(source: LogSource, digest: str) -> Log:
 
 def stored_outcome(key: str, store: Store) -> Outcome:
     """The outcome of a run whose results, or whose failure, are stored."""
-    state = store.state(key)
-    if state == "failed":
+    if store.state(key) == "failed":
         return Outcome(key, "failed", str(store.row(key)["reason"]))
     return Outcome(key, "ok")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.warned import lines
-from factorgraph_loc.experiments.execute import Outcome
+from factorgraph_loc.experiments.execute import Executor, execute
 from factorgraph_loc.experiments.experiment_file import Experiment, read_experiment
 from factorgraph_loc.experiments.plan import MOST_RUNS, PlannedRun, TooManyRunsError, plan
-from factorgraph_loc.experiments.pool import execute
+from factorgraph_loc.experiments.pool import Processes
 from factorgraph_loc.experiments.store import State, Store
 from factorgraph_loc.files.bounded import kind
 from factorgraph_loc.text import plain
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     import polars as pl
 
 PACE = 20.0  # assumed ratio of log time to computing time, for an unknown estimator
-Executor = Callable[[Sequence[PlannedRun]], Iterator[Outcome]]
 
 
 @dataclass(frozen=True)
@@ -109,9 +108,9 @@ def run_experiment(
 ) -> Done:
     """Make the runs that are not stored, with ``again`` also the failed ones, and write the table of all results.
 
-    ``jobs``: processes, by default one per core; ``executor``: makes the runs instead, and yields their outcomes. ``progress`` is
-    called with the numbers of runs made, to be made, and failed. The table is written also after an error or interrupt. Raises
-    StoreError if the store cannot be written.
+    ``jobs``: processes, by default one per core; ``executor``: computes the runs instead. ``progress`` is called
+    with the numbers of runs made, to be made, and failed. The table is written also after an error or interrupt. Raises StoreError
+    if the store cannot be written.
     """
     todo = prepared.todo(again=again)
     states = dict(prepared.states)
@@ -119,15 +118,11 @@ def run_experiment(
     failed = sum(states[run.key] == "failed" and run.key not in waiting for run in prepared.runs)
     made = 0
     progress(made, len(todo), failed)
-    limits = prepared.experiment.limits
-    outcomes = (
-        executor(todo)
-        if executor
-        else execute(todo, prepared.folder, jobs=jobs or os.cpu_count() or 1, limits=limits, again=again)
-    )
+    if executor is None:
+        executor = Processes(max(1, min(jobs or os.cpu_count() or 1, len(todo))), prepared.experiment.limits)
     try:
-        for outcome in outcomes if todo else ():
-            states[outcome.key] = outcome.status if outcome.status != "busy" else "missing"
+        for outcome in execute(todo, prepared.folder, executor, again=again) if todo else ():
+            states[outcome.key] = outcome.status
             made, failed = made + 1, failed + (outcome.status == "failed")
             progress(made, len(todo), failed)
     finally:

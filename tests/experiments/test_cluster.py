@@ -12,6 +12,8 @@ from typer.testing import CliRunner
 from factorgraph_loc.cli.app import app
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments import cluster
+from factorgraph_loc.experiments.cluster import Cluster
+from factorgraph_loc.experiments.execute import execute
 from factorgraph_loc.experiments.experiment_file import Limits, read_experiment
 from factorgraph_loc.experiments.plan import plan
 from factorgraph_loc.experiments.store import Store
@@ -65,7 +67,7 @@ def stored(monkeypatch):
 def test_a_worker_that_is_killed_loses_no_run_and_none_is_stored_twice(workers, planned, stored):
     runs, folder = planned(6)
     outcomes = []
-    for outcome in cluster.execute(runs, folder, scheduler=workers.scheduler_address, limits=Limits()):
+    for outcome in execute(runs, folder, Cluster(workers.scheduler_address, Limits())):
         outcomes.append(outcome)
         if len(outcomes) == 3:  # both are at work, with more runs than they compute
             os.kill(workers.workers[0].pid, signal.SIGKILL)
@@ -82,7 +84,7 @@ def test_a_run_that_another_process_has_is_waited_for(workers, planned, stored):
     runs, folder = planned(1)
     claim = Store(folder).claim(runs[0].key)
     assert claim.__enter__()
-    outcomes = cluster.execute(runs, folder, scheduler=workers.scheduler_address, limits=Limits())
+    outcomes = execute(runs, folder, Cluster(workers.scheduler_address, Limits()))
     assert next(outcomes).key == runs[1].key
     assert not stored[runs[0].key]
     claim.__exit__(None, None, None)
@@ -92,13 +94,13 @@ def test_a_run_that_another_process_has_is_waited_for(workers, planned, stored):
 def test_a_run_that_takes_too_long_is_a_failure_and_its_worker_begins_anew(workers, planned):
     runs, folder = planned(1)
     before = {worker.pid for worker in workers.workers.values()}
-    outcomes = list(cluster.execute(runs[:1], folder, scheduler=workers.scheduler_address, limits=Limits(time=1e-3)))
+    outcomes = list(execute(runs[:1], folder, Cluster(workers.scheduler_address, Limits(time=1e-3))))
     assert [(o.status, o.reason) for o in outcomes] == [("failed", "it took more than 0.001 s")]
     assert Store(folder).row(runs[0].key)["kind"] == "timeout"
     assert {worker.pid for worker in workers.workers.values()} != before
-    kept = list(cluster.execute(runs, folder, scheduler=workers.scheduler_address, limits=Limits()))
+    kept = list(execute(runs, folder, Cluster(workers.scheduler_address, Limits())))
     assert sorted(o.status for o in kept) == ["failed", "ok"]
-    tried = list(cluster.execute(runs[:1], folder, scheduler=workers.scheduler_address, limits=Limits(), again=True))
+    tried = list(execute(runs[:1], folder, Cluster(workers.scheduler_address, Limits()), again=True))
     assert [o.status for o in tried] == ["ok"]
 
 
@@ -107,10 +109,10 @@ def test_a_run_that_ends_its_workers_is_a_failure_and_the_others_go_on(workers, 
     monkeypatch.setattr(workers.scheduler, "allowed_failures", 0)
     with monkeypatch.context() as patch:
         patch.setattr(cluster, "make", lambda *_: os._exit(1))
-        (outcome,) = cluster.execute(runs[:1], folder, scheduler=workers.scheduler_address, limits=Limits())
+        (outcome,) = execute(runs[:1], folder, Cluster(workers.scheduler_address, Limits()))
     assert outcome.status == "failed"
     assert Store(folder).row(runs[0].key)["kind"] == "killed"
-    others = list(cluster.execute(runs[1:], folder, scheduler=workers.scheduler_address, limits=Limits()))
+    others = list(execute(runs[1:], folder, Cluster(workers.scheduler_address, Limits())))
     assert [other.status for other in others] == ["ok"]
 
 
@@ -129,7 +131,7 @@ def test_workers_with_other_code_are_refused(workers, planned, stored, monkeypat
     runs, folder = planned(1)
     monkeypatch.setattr(cluster, "version_here", lambda: "of another day")
     with pytest.raises(InputError, match="another version of the code"):
-        list(cluster.execute(runs, folder, scheduler=workers.scheduler_address, limits=Limits()))
+        list(execute(runs, folder, Cluster(workers.scheduler_address, Limits())))
     assert not stored
     assert not list((Store(folder).folder / "claims").iterdir())
 
@@ -138,7 +140,7 @@ def test_no_scheduler_and_no_package_are_told_in_a_line(planned, monkeypatch):
     runs, folder = planned(1)
     monkeypatch.setattr(cluster, "CONNECT", 0.5)
     with pytest.raises(InputError, match="no scheduler answers there"):
-        list(cluster.execute(runs, folder, scheduler="tcp://127.0.0.1:9", limits=Limits()))
+        list(execute(runs, folder, Cluster("tcp://127.0.0.1:9", Limits())))
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'factorgraph-loc\[cluster\]'"):
-        list(cluster.execute(runs, folder, scheduler="tcp://127.0.0.1:9", limits=Limits()))
+        list(execute(runs, folder, Cluster("tcp://127.0.0.1:9", Limits())))

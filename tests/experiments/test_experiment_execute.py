@@ -6,6 +6,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from computed_here import Here, run_planned
 
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments import execute
@@ -47,7 +48,7 @@ def planned(log, tmp_path, out):
 
 def test_a_run_gives_what_fgloc_run_gives_but_for_times(planned, out, tmp_path):
     (one,) = planned(estimators=["ekf"])
-    assert execute.run_planned(one, out).status == "ok"
+    assert run_planned(one, out).status == "ok"
     store = Store(out)
     (log,) = load(str(tmp_path / "log"))
     result = run(log, RunConfig("ekf"))
@@ -65,8 +66,8 @@ def test_the_same_run_again_is_the_same_to_the_byte_but_for_times(planned, out, 
     (one,) = planned(estimators=["particle_filter"])
     other = tmp_path / "other"
     Store(other).create()
-    execute.run_planned(one, out)
-    execute.run_planned(one, other)
+    run_planned(one, out)
+    run_planned(one, other)
     a, b = Store(out).path(one.key), Store(other).path(one.key)
     names = sorted(file.name for file in a.iterdir())
     assert names == sorted(file.name for file in b.iterdir())
@@ -76,11 +77,12 @@ def test_the_same_run_again_is_the_same_to_the_byte_but_for_times(planned, out, 
 
 
 def test_a_claimed_run_is_left_to_its_owner(planned, out):
-    (one,) = planned()
+    one, other = planned(estimators=["fake", "ekf"])
     with Store(out).claim(one.key):
-        assert execute.run_planned(one, out).status == "busy"
-        assert execute.store_failure(one, out, "timeout", "late").status == "busy"
-    assert Store(out).state(one.key) == "missing"
+        outcomes = execute.execute([one, other], out, Here())
+        assert next(outcomes).key == other.key
+        assert Store(out).state(one.key) == "missing"
+    assert [outcome.key for outcome in outcomes] == [one.key]
 
 
 @pytest.mark.parametrize(
@@ -101,26 +103,26 @@ def test_a_failure_is_stored_with_its_reason_and_tried_again_if_told(
     (one,) = planned()
     with monkeypatch.context() as patch:
         patch.setattr(fake, "process", fail)
-        outcome = execute.run_planned(one, out)
+        outcome = run_planned(one, out)
     assert outcome.status == "failed"
     assert outcome.reason.endswith(reason)
     row = Store(out).row(one.key)
     assert (row["status"], row["kind"], row["reason"]) == ("failed", kind, outcome.reason)
-    assert execute.run_planned(one, out).status == "failed"
-    assert execute.run_planned(one, out, again=True).status == "ok"
+    assert run_planned(one, out).status == "failed"
+    assert run_planned(one, out, again=True).status == "ok"
     assert not (Store(out).path(one.key) / FAILURE).exists()
 
 
 @pytest.mark.parametrize("how", ["removed", "changed"])
 def test_a_log_that_vanishes_or_changes_mid_way_is_a_failure(planned, out, tmp_path, how):
     one, other = planned(estimators=["dead_reckoning", "ekf"])
-    execute.run_planned(one, out)
+    run_planned(one, out)
     execute._load.cache_clear()
     if how == "removed":
         shutil.rmtree(tmp_path / "log")
     else:
         (tmp_path / "log" / "odometry.csv").write_text("t_ns,v,w\n")
-    outcome = execute.run_planned(other, out)
+    outcome = run_planned(other, out)
     assert outcome.status == "failed"
     assert "log" in outcome.reason
     assert Store(out).row(other.key)["kind"] == "vanished"
@@ -140,15 +142,10 @@ def experiment(log, tmp_path, out):
     return make
 
 
-def here(out, again=False):
-    """What makes runs in this process."""
-    return lambda runs: (execute.run_planned(one, out, again=again) for one in runs)
-
-
 def test_the_table_has_a_row_a_run_and_names_stay_what_they_are(experiment, out, tmp_path):
     told = []
     text = "estimators = ['ekf', {name = 'smoother', label = 'short'}]\nsensors = ['odometry']\n[sweep]\nshort.lag = [1, 2]"
-    done = run_experiment(experiment(text), executor=here(out), progress=lambda *numbers: told.append(numbers))
+    done = run_experiment(experiment(text), executor=Here(), progress=lambda *numbers: told.append(numbers))
     rows = load_results(out)
     assert rows.equals(done.rows)
     assert rows["log"].to_list() == [NASTY] * 3
@@ -162,42 +159,44 @@ def test_the_table_has_a_row_a_run_and_names_stay_what_they_are(experiment, out,
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.toml", "log", "out"]
 
 
-def test_failures_are_rows_and_are_tried_again_if_told(experiment, out, fake, monkeypatch):
+def test_failures_are_rows_and_are_tried_again_if_told(experiment, fake, monkeypatch):
     def fail(*_):
         raise FglocError("cannot go on")
 
     with monkeypatch.context() as patch:
         patch.setattr(fake, "process", fail)
-        done = run_experiment(experiment(), executor=here(out))
+        done = run_experiment(experiment(), executor=Here())
     assert done.rows["status"].to_list() == ["failed", "ok"]
     assert done.rows["reason"].to_list() == ["cannot go on", None]
     assert done.failures == [f"{NASTY}, fake, seed 0: cannot go on"]
     assert experiment().todo() == []
     (again,) = experiment().todo(again=True)
     assert again.label == "fake"
-    done = run_experiment(experiment(), again=True, executor=here(out, again=True))
+    done = run_experiment(experiment(), again=True, executor=Here())
     assert done.rows["status"].to_list() == ["ok", "ok"]
 
 
 def test_a_damaged_result_is_found_and_done_again(experiment, out):
-    first = run_experiment(experiment(), executor=here(out)).rows
+    first = run_experiment(experiment(), executor=Here()).rows
     key = first["key"][1]
     (Store(out).path(key) / "estimates.parquet").write_bytes(b"")
     prepared = experiment()
     assert prepared.counts() == {"ok": 1, "damaged": 1}
     assert [one.key for one in prepared.todo()] == [key]
-    second = run_experiment(prepared, executor=here(out)).rows
+    second = run_experiment(prepared, executor=Here()).rows
     times = [name for name in first.columns if name.startswith("timing.")]
     assert second.drop(times).equals(first.drop(times))
 
 
 def test_the_table_is_written_when_an_experiment_is_stopped(experiment, out):
-    def stopped(runs):
-        yield execute.run_planned(runs[0], out)
-        raise KeyboardInterrupt
+    class Stopped(Here):
+        def submit(self, take, left):
+            if left == 1:
+                raise KeyboardInterrupt
+            super().submit(take, left)
 
     with pytest.raises(KeyboardInterrupt):
-        run_experiment(experiment(), executor=stopped)
+        run_experiment(experiment(), executor=Stopped())
     assert load_results(out)["label"].to_list() == ["fake"]
     assert [one.label for one in experiment().todo()] == ["ekf"]
 
@@ -206,9 +205,9 @@ def test_an_experiment_ends_with_one_line_when_the_disk_is_full_and_goes_on_when
     disk = small_disk(120)
     text = "estimators = ['particle_filter']\nseeds = '0:20'"
     with pytest.raises(StoreError, match="No space left on device"):
-        run_experiment(experiment(text, folder=disk), executor=here(disk))
+        run_experiment(experiment(text, folder=disk), executor=Here())
     counts = experiment(text, folder=disk, verify=True).counts()
     assert 0 < counts["ok"] < 20
     assert set(counts) == {"ok", "missing"}
     subprocess.run(["mount", "-o", "remount,size=10M", disk], check=True)
-    assert len(run_experiment(experiment(text, folder=disk), executor=here(disk)).rows) == 20
+    assert len(run_experiment(experiment(text, folder=disk), executor=Here()).rows) == 20

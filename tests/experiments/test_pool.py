@@ -9,9 +9,10 @@ import time
 import pytest
 
 from factorgraph_loc.experiments import pool
+from factorgraph_loc.experiments.execute import execute
 from factorgraph_loc.experiments.experiment_file import Experiment, Limits
 from factorgraph_loc.experiments.plan import plan
-from factorgraph_loc.experiments.pool import execute
+from factorgraph_loc.experiments.pool import Processes
 from factorgraph_loc.experiments.store import Store
 
 SHORT = {"simulate": "office", "settings": {"drive": {"duration": 4}}}
@@ -35,12 +36,12 @@ def planned(tmp_path):
 def test_a_run_that_takes_too_long_or_too_much_memory_fails_and_the_others_go_on(planned, tmp_path):
     runs = planned([LONG], [HUGE]) + planned([SHORT], ["dead_reckoning"])
     store = Store(tmp_path / "out")
-    outcomes = list(execute(runs, tmp_path / "out", jobs=1, limits=Limits(memory=450.0)))
+    outcomes = list(execute(runs, tmp_path / "out", Processes(1, Limits(memory=450.0))))
     assert [o.status for o in outcomes] == ["failed", "ok"]
     assert outcomes[0].reason == "its process held more than 450 MB"
     assert store.row(runs[0].key)["kind"] == "memory"
     runs = planned([LONG], [ENDLESS])
-    (outcome,) = execute(runs, tmp_path / "out", jobs=1, limits=Limits(time=1.0))
+    (outcome,) = execute(runs, tmp_path / "out", Processes(1, Limits(time=1.0)))
     assert outcome.reason == "it took more than 1 s"
     assert store.row(runs[0].key)["kind"] == "timeout"
     assert [list((store.folder / name).iterdir()) for name in ("tmp", "claims")] == [[], []]
@@ -64,7 +65,7 @@ def test_a_run_whose_worker_is_killed_is_tried_once_more(planned, tmp_path, monk
     (run,) = planned([LONG], [{"name": "particle_filter", "settings": {"particles": 500}}])
     store = Store(tmp_path / "out")
     kill_worker((store.folder / "claims" / run.key).exists)
-    (outcome,) = execute([run], tmp_path / "out", jobs=1, limits=Limits())
+    (outcome,) = execute([run], tmp_path / "out", Processes(1, Limits()))
     if attempts == 2:
         assert outcome.status == "ok"
     else:
@@ -74,7 +75,7 @@ def test_a_run_whose_worker_is_killed_is_tried_once_more(planned, tmp_path, monk
 
 def test_workers_end_when_the_caller_stops_listening(planned, tmp_path):
     runs = planned([SHORT], ["dead_reckoning"]) + planned([LONG], [ENDLESS])
-    outcomes = execute(runs, tmp_path / "out", jobs=1, limits=Limits())
+    outcomes = execute(runs, tmp_path / "out", Processes(1, Limits()))
     assert next(outcomes).status == "ok"
     outcomes.close()
     assert multiprocessing.active_children() == []

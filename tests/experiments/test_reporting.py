@@ -3,9 +3,9 @@
 import os
 
 import pytest
+from computed_here import run_planned
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.execute import run_planned
 from factorgraph_loc.experiments.experiment import prepare
 from factorgraph_loc.experiments.keys import code_version
 from factorgraph_loc.experiments.reporting import report_experiment

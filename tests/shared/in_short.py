@@ -4,16 +4,14 @@ Comparisons and experiments in processes of their own, and pictures in full, hav
 ``tests/experiments``, ``tests/evaluation/test_plots.py``, ``tests/drawing``), and here those that are marked ``in_full``.
 """
 
-import pickle
-
 import pytest
+from computed_here import Here, sent
 from matplotlib.figure import Figure
 from PIL import Image
 
 from factorgraph_loc.drawing import figures
 from factorgraph_loc.drawing.pages import Picture
 from factorgraph_loc.evaluation.report import plots
-from factorgraph_loc.experiments.execute import run_planned
 
 
 @pytest.fixture(autouse=True)
@@ -31,22 +29,14 @@ def runs_here(monkeypatch):
     def run_each(function, jobs, *_, **__):
         for i, job in enumerate(jobs):
             try:
-                value = _sent(_sent(function)(_sent(job)))
+                value = sent(sent(function)(sent(job)))
             except Exception as error:
                 value = error
             yield i, value
 
-    def execute(runs, folder, *, again=False, **_):
-        for run in runs:
-            yield _sent(run_planned(_sent(run), folder, again=again))
-
     for user in ("active", "compare"):
         monkeypatch.setattr(f"factorgraph_loc.experiments.{user}.run_each", run_each)
-    monkeypatch.setattr("factorgraph_loc.experiments.experiment.execute", execute)
-
-
-def _sent(what):
-    return pickle.loads(pickle.dumps(what))
+    monkeypatch.setattr("factorgraph_loc.experiments.experiment.Processes", Here)
 
 
 @pytest.fixture
