@@ -6,7 +6,6 @@ Finished parts are stored meanwhile, so that an interrupted experiment can be re
 import hashlib
 import json
 import os
-import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.active import (
     DIFFERENCES,
     Decision,
@@ -29,7 +28,8 @@ from factorgraph_loc.evaluation.active import (
 )
 from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.tables import markdown
-from factorgraph_loc.files.models import file_name, nearest, write_text, write_toml
+from factorgraph_loc.experiments import output
+from factorgraph_loc.files.models import file_name, nearest, write_toml
 from factorgraph_loc.files.tables import read_parquet, write_parquet
 from factorgraph_loc.files.temporary import require_free, writing
 from factorgraph_loc.planning.closed_loop import ActiveRun, run_active
@@ -37,11 +37,11 @@ from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.plugins import ACTIVE_ESTIMATORS, POLICIES
 from factorgraph_loc.processes import run_each
 from factorgraph_loc.simulation.settings import SimulationSettings
-from factorgraph_loc.text import plain_lines, quoted, told
+from factorgraph_loc.text import quoted
 from factorgraph_loc.version import __version__
 
-CHUNK = 10  # runs per process, as starting a process takes longer than a run
-FILES = ("results.parquet", "results.csv", "differences.csv", "table.md", "config.toml")
+CHUNK = 10  # seeds that run with all policies before the next ones do
+FILES = (*output.TABLES, "config.toml")
 PARTS, PLOTS = "parts", "plots"
 ROW: dict[str, Any] = {
     **dict.fromkeys(("world", "policy", "estimator"), pl.String),
@@ -58,17 +58,15 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class ActiveJob:
-    """Runs of one policy and estimator in one kind of world, for :func:`run_jobs`. The run of ``pictured``, if
-    any, is plotted.
-    """
+    """A run, for :func:`run_jobs`; plotted if ``pictured``."""
 
     simulation: SimulationSettings
     policy: str
     estimator: str
-    seeds: tuple[int, ...]
+    seed: int
     settings: ActiveSettings
     folder: Path
-    pictured: int | None = None
+    pictured: bool = False
 
     @property
     def name(self) -> str:
@@ -77,11 +75,11 @@ class ActiveJob:
 
     @property
     def part(self) -> Path:
-        """The file with the rows of this job, specific to settings and version."""
-        told: list[Any] = [__version__, self.policy, self.estimator, list(self.seeds), self.pictured]
+        """The file with the row of this run, specific to settings and version."""
+        told: list[Any] = [__version__, self.policy, self.estimator, self.seed, self.pictured]
         told += [model.model_dump(mode="json") for model in (self.simulation, self.settings)]
         key = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]
-        return self.folder / PARTS / f"{self.name}-{self.seeds[0]}-{key}.parquet"
+        return self.folder / PARTS / f"{self.name}-{self.seed}-{key}.parquet"
 
 
 @dataclass(frozen=True)
@@ -155,12 +153,12 @@ def jobs_of(
     pictured: int | None = None,
 ) -> list[ActiveJob]:
     """The jobs of all these runs, ordered such that all policies of some seeds come before the next seeds."""
-    chunks = [tuple(seeds[i : i + CHUNK]) for i in range(0, len(seeds), CHUNK)]
     return [
-        ActiveJob(simulation, policy, estimator, chunk, settings, folder, pictured if pictured in chunk else None)
-        for chunk in chunks
+        ActiveJob(simulation, policy, estimator, seed, settings, folder, seed == pictured)
+        for chunk in (seeds[i : i + CHUNK] for i in range(0, len(seeds), CHUNK))
         for estimator in estimators
         for policy in policies
+        for seed in chunk
     ]
 
 
@@ -168,23 +166,15 @@ def run_jobs(
     jobs: Sequence[ActiveJob], workers: int, progress: Callable[[int, int], None] | None = None
 ) -> ActiveResults:
     """The rows of all jobs in order. Parts from a previous call are read, new ones are stored."""
-    found: dict[int, list[Row]] = {i: _kept(job) for i, job in enumerate(jobs) if job.part.exists()}
+    found = {i: read_parquet(job.part).to_dicts()[0] for i, job in enumerate(jobs) if job.part.exists()}
     left = [i for i in range(len(jobs)) if i not in found]
-    total = sum(len(job.seeds) for job in jobs)
-
-    def tell() -> None:
-        if progress is not None:
-            progress(sum(map(len, found.values())), total)
-
-    tell()
-    for at, outcome in run_each(run_job, [jobs[i] for i in left], workers):
+    report = progress or (lambda _done, _total: None)
+    report(len(found), len(jobs))
+    for at, outcome in run_each(run_job, [jobs[i] for i in left], workers, lasting=True):
         job = jobs[left[at]]
-        if isinstance(outcome, Exception):
-            found[left[at]] = [_failed(job, seed, "failed", _message(outcome)) for seed in job.seeds]
-        else:
-            found[left[at]] = outcome
-        tell()
-    rows = [row for i in range(len(jobs)) for row in found[i]]
+        found[left[at]] = _failed(job, outcome) if isinstance(outcome, Exception) else outcome
+        report(len(found), len(jobs))
+    rows = [found[i] for i in range(len(jobs))]
     failures = [
         f"{row['world']}, {row['policy']}, {row['estimator']}, seed {row['seed']}: {row['reason']}"
         for row in rows
@@ -193,13 +183,15 @@ def run_jobs(
     return ActiveResults(rows, failures)
 
 
-def run_job(job: ActiveJob) -> list[Row]:
-    """The rows of a job, stored as its part if all succeeded; can be sent to other processes."""
-    rows = [_run(job, seed) for seed in job.seeds]
-    if all(row["status"] == "ok" for row in rows):
-        job.part.parent.mkdir(parents=True, exist_ok=True)
-        write_parquet(pl.DataFrame(rows, schema=ROW), job.part)
-    return rows
+def run_job(job: ActiveJob) -> Row:
+    """The row of a run, stored as its part; can be sent to other processes."""
+    run = run_active(job.simulation, job.policy, job.estimator, job.seed, job.settings)
+    if job.pictured:
+        write_picture(run_picture(track_of(run)), job.folder / PLOTS / f"{job.name}-seed{job.seed}.png")
+    row = row_of(run)
+    job.part.parent.mkdir(parents=True, exist_ok=True)
+    write_parquet(pl.DataFrame([row], schema=ROW), job.part)
+    return row
 
 
 def row_of(run: ActiveRun) -> Row:
@@ -233,14 +225,10 @@ def track_of(run: ActiveRun) -> SeekingTrack:
 
 
 def write_tables(rows: Sequence[Row], out: Path) -> None:
-    """Write ``results.parquet``, ``results.csv``, ``differences.csv`` and ``table.md`` into a folder."""
-    table = pl.DataFrame(rows, schema=ROW)
-    write_text(out / "results.csv", plain_lines(table.write_csv()))
-    compared = pl.DataFrame(differences(rows), schema=DIFFERENCES)
-    write_text(out / "differences.csv", plain_lines(compared.write_csv()))
+    """Write :data:`~factorgraph_loc.experiments.output.TABLES` into a folder."""
     text = markdown(*summary_cells(rows)) + "\n" + markdown(*difference_cells(rows))
-    write_text(out / "table.md", plain_lines(text))
-    write_parquet(table, out / "results.parquet")
+    compared = pl.DataFrame(differences(rows), schema=DIFFERENCES)
+    output.write_tables(pl.DataFrame(rows, schema=ROW), compared, text, out)
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:
@@ -267,30 +255,8 @@ def _check_names(what: str, names: Sequence[str], known: Sequence[str]) -> None:
             raise InputError(f"{what} {name} is given twice")
 
 
-def _run(job: ActiveJob, seed: int) -> Row:
-    try:
-        run = run_active(job.simulation, job.policy, job.estimator, seed, job.settings)
-    except InputError as error:
-        return _failed(job, seed, "refused", _message(error))
-    except Exception as error:
-        if not isinstance(error, FglocError):
-            text = "".join(traceback.format_exception(error))
-            job.part.parent.mkdir(parents=True, exist_ok=True)
-            write_text(job.part.parent / f"{job.name}-{seed}.error.txt", text)
-        return _failed(job, seed, "failed", _message(error))
-    if seed == job.pictured:
-        write_picture(run_picture(track_of(run)), job.folder / PLOTS / f"{job.name}-seed{seed}.png")
-    return row_of(run)
-
-
-def _failed(job: ActiveJob, seed: int, status: str, reason: str) -> Row:
-    known = (job.simulation.name, job.policy, job.estimator, seed, status, reason)
+def _failed(job: ActiveJob, error: Exception) -> Row:
+    status = "refused" if isinstance(error, InputError) else "failed"
+    reason = output.reason_of(error, job.part.with_name(f"{job.name}-{job.seed}.error.txt"))
+    known = (job.simulation.name, job.policy, job.estimator, job.seed, status, reason)
     return {**dict.fromkeys(ROW), **dict(zip(ROW, known, strict=False))}
-
-
-def _message(error: Exception) -> str:
-    return str(error) if isinstance(error, FglocError) else f"{type(error).__name__}: {told(error)}"
-
-
-def _kept(job: ActiveJob) -> list[Row]:
-    return read_parquet(job.part).to_dicts()

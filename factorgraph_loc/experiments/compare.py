@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -12,29 +11,29 @@ from typing import Any
 
 import polars as pl
 
-from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import plot_log, remove_plots
 from factorgraph_loc.evaluation.report import DEFAULT, RunFiles, Scene, write_report
 from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
 from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, further_tables, markdown, unscored, verdict
 from factorgraph_loc.evaluation.warned import WARNINGS, lines, row_of
-from factorgraph_loc.experiments.output import remove_run, write_run
+from factorgraph_loc.experiments.output import TABLES, reason_of, remove_run, write_run, write_tables
 from factorgraph_loc.experiments.preparation import check_prior, columns_of, fill_cache, use_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import file_name, nearest, write_text
-from factorgraph_loc.files.tables import write_parquet
 from factorgraph_loc.files.temporary import require_free, sweep, writing
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import Alignment, check_max_gap, check_tick_gap
 from factorgraph_loc.processes import run_each
-from factorgraph_loc.text import plain_lines, quoted
+from factorgraph_loc.text import quoted
 
 _ERROR = "error.txt"
 _BEGUN = "unfinished.txt"  # exists until a comparison is finished, with a digest of its arguments
-_TABLES = ("results.parquet", "results.csv", "differences.csv", "table.md", "report.html")
+_PAGE = "report.html"
+_WRITTEN = (*TABLES, _PAGE)
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ def compare(
     (see :func:`~factorgraph_loc.evaluation.statistics.differences`), ``table.md``, ``report.html`` (see
     :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png`` and ``runs/LOG/ESTIMATOR/seedK/`` with the files of
     each run, or ``error.txt`` with the traceback. ``align``: also score after this alignment, see
-    :func:`~factorgraph_loc.evaluation.aligned.score`; ``rpe``: also show relative errors. Both are further tables in ``table.md``,
+    :func:`~factorgraph_loc.evaluation.metrics.score`; ``rpe``: also show relative errors. Both are further tables in ``table.md``,
     and further scores in the report. ``progress`` is called with the number of runs done and of all.
 
     Raises InputError, before anything runs, for no logs, no configurations, two logs of one name, two configurations of one
@@ -187,7 +186,7 @@ def check_free(out: Path, *, overwrite: bool, asked: str | None = None) -> None:
         begun = (out / _BEGUN).read_text(encoding="ascii", errors="replace").split()[0]
     except (OSError, IndexError):
         begun = None
-    names = (*_TABLES, *FILES, *(str(run.relative_to(out)) for run in _runs(out)))
+    names = (*_WRITTEN, *FILES, *(str(run.relative_to(out)) for run in _runs(out)))
     same = begun is not None and asked in (None, begun)
     require_free(out, names, overwrite=overwrite or same, folders=_folders(out))
 
@@ -206,7 +205,7 @@ def _prepare(out: Path, overwrite: bool, asked: str) -> None:
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         write_text(out / _BEGUN, f"{asked} of an unfinished comparison; the same command starts it again\n")
-    for name in _TABLES:
+    for name in _WRITTEN:
         (out / name).unlink(missing_ok=True)
     remove_plots(out / "plots")
     for folder in _runs(out):
@@ -224,24 +223,16 @@ def _row(job: _Job, outcome: _Outcome | Exception) -> dict[str, Any]:
     row: dict[str, Any] = {"log": job.log.name, "estimator": job.config.estimator, "seed": job.config.seed}
     if isinstance(outcome, _Outcome):
         return row | {"status": "ok", "reason": None} | row_of(outcome.scores)
-    message = " ".join(str(outcome).split())
-    if not isinstance(outcome, FglocError):
-        message = f"{type(outcome).__name__}: {message}"
-        job.folder.mkdir(parents=True, exist_ok=True)
-        write_text(job.folder / _ERROR, "".join(traceback.format_exception(outcome)))
-    return row | {"status": "failed", "reason": message} | row_of({WARNINGS: list(job.log.warnings)})
+    failure = {"status": "failed", "reason": reason_of(outcome, job.folder / _ERROR)}
+    return row | failure | row_of({WARNINGS: list(job.log.warnings)})
 
 
 def _write_tables(rows: Sequence[Mapping[str, Any]], out: Path, *, rpe: bool) -> None:
-    table = pl.DataFrame(rows, infer_schema_length=None)
-    write_parquet(table, out / "results.parquet")
-    write_text(out / "results.csv", plain_lines(table.write_csv()))
-    compared = pl.DataFrame(differences(rows), schema=DIFFERENCES)
-    write_text(out / "differences.csv", plain_lines(compared.write_csv()))
     text = markdown(*comparison_cells(rows))
     for title, columns in further_tables(rows, rpe=rpe).items():
         text += f"\n{title}\n\n{markdown(*comparison_cells(rows, columns))}"
-    write_text(out / "table.md", plain_lines(text))
+    compared = pl.DataFrame(differences(rows), schema=DIFFERENCES)
+    write_tables(pl.DataFrame(rows, infer_schema_length=None), compared, text, out)
 
 
 def _write_page(rows: Sequence[Mapping[str, Any]], work: Sequence[_Job], out: Path, *, rpe: bool) -> None:
@@ -258,6 +249,4 @@ def _write_page(rows: Sequence[Mapping[str, Any]], work: Sequence[_Job], out: Pa
     asked = {"logs": list(scenes), "estimators": names}
     further = [key for columns in further_tables(rows, rpe=rpe).values() for key, *_ in columns.values()]
     metrics = (*DEFAULT, *further)
-    write_report(
-        table, files, out / _TABLES[-1], metrics=metrics, baseline=baseline, title="Comparison", experiment=asked
-    )
+    write_report(table, files, out / _PAGE, metrics=metrics, baseline=baseline, title="Comparison", experiment=asked)

@@ -1,4 +1,5 @@
-"""The files of one run: trajectories, estimates, learnt values, events, scores, and the configuration; those that a store keeps.
+"""The files of one run: trajectories, estimates, learnt values, events, scores, and the configuration; those that a store
+keeps; and the tables of several runs.
 
 Times aside, all files of a run are reproducible to the byte.
 """
@@ -7,6 +8,7 @@ import json
 import math
 import shutil
 import tempfile
+import traceback
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +18,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.aligned import score
-from factorgraph_loc.evaluation.metrics import errors
+from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
 from factorgraph_loc.files.models import write_text, write_toml
 from factorgraph_loc.files.tables import write_parquet
@@ -31,17 +32,18 @@ from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import Alignment
 from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory, write_tum
 from factorgraph_loc.model.world import World
-from factorgraph_loc.text import quoted
+from factorgraph_loc.text import plain_lines, quoted
 from factors.se2 import Array
 
 MAP = "map.world.toml"
+TABLES = ("results.parquet", "results.csv", "differences.csv", "table.md")
 
 
 def write_run(
     result: RunResult, log: Log, out: Path, *, align: Alignment = "none", overwrite: bool = False
 ) -> dict[str, Any]:
     """Score a run, write its files into the folder ``out``, and return the scores; for ``align`` see
-    :func:`~factorgraph_loc.evaluation.aligned.score`.
+    :func:`~factorgraph_loc.evaluation.metrics.score`.
 
     ``estimates.parquet`` has one row per tick and kind: ``kind`` (causal, final), ``t_ns`` (absolute), ``x``, ``y`` [m],
     ``heading`` [rad], covariances in the world frame; ``error_position`` [m], ``error_heading`` [rad, absolute] and ``nees`` at
@@ -253,3 +255,21 @@ def run_files(result: RunResult, log: Log, started: float) -> dict[str, bytes]:
 def timings_file(timings: Mapping[str, Any]) -> bytes:
     """The content of ``timings.json``; non-finite values are null."""
     return _json(timings).encode()
+
+
+def write_tables(table: pl.DataFrame, differences: pl.DataFrame, text: str, out: Path) -> None:
+    """Write :data:`TABLES` into a folder: a row per run, the differences between methods, and ``text``."""
+    write_text(out / "results.csv", plain_lines(table.write_csv()))
+    write_text(out / "differences.csv", plain_lines(differences.write_csv()))
+    write_text(out / "table.md", plain_lines(text))
+    write_parquet(table, out / "results.parquet")
+
+
+def reason_of(error: Exception, details: Path) -> str:
+    """Why a run failed, on one line. The traceback of an unexpected error is written to the file ``details``."""
+    reason = " ".join(str(error).split())
+    if isinstance(error, FglocError):
+        return reason
+    details.parent.mkdir(parents=True, exist_ok=True)
+    write_text(details, "".join(traceback.format_exception(error)))
+    return f"{type(error).__name__}: {reason}"
