@@ -6,15 +6,14 @@ Fast-Hessian: Bay, Tuytelaars, Van Gool, "SURF: Speeded Up Robust Features", ECC
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.vision.features import Keypoints
-from factorgraph_loc.vision.images import Image, as_image, as_mask, is_blank
+from factorgraph_loc.vision.images import Image, as_image, is_blank
 from factors.se2 import Array
 
 SIGMAS: Array = 1.2 * np.exp2(0.25 * np.arange(18.0))  # px, to 23
@@ -36,67 +35,42 @@ Plane = NDArray[np.float32]
 Truths = NDArray[np.bool_]
 
 
-class Detector(Protocol):
-    """A detector; every :class:`~factorgraph_loc.vision.features.Extractor` is one too."""
-
-    @property
-    def name(self) -> str: ...
-
-    def detect(self, image: object, mask: object = None) -> Keypoints:
-        """The points of ``image`` where ``mask`` (H, W) is not 0."""
-
-
-@dataclass(frozen=True)
-class LaplaceDetector:
-    """Local maxima of ``strength`` in the image, at scales of maximal Laplacian; at most ``count``, the strongest first."""
-
-    name: str
-    strength: Callable[[Plane, float], Plane]
-    count: int
-
-    def detect(self, image: object, mask: object = None) -> Keypoints:
-        """Points of an image where ``mask`` (H, W) is not 0; sizes are twice the scale of the Laplacian."""
-        found = _plane_and_mask(image, mask)
-        if found is None:
-            return Keypoints.empty()
-        plane, where = found
-        strengths = np.stack([self.strength(plane, sigma) for sigma in SIGMAS])
-        laplacians = np.stack([np.abs(_laplacian(plane, sigma)) for sigma in SIGMAS])
-        inner = slice(1, len(SIGMAS) - 1)
-        in_scale = (laplacians[inner] > laplacians[:-2]) & (laplacians[inner] >= laplacians[2:])
-        peaks = np.zeros(strengths.shape, dtype=bool)
-        peaks[inner] = in_scale & np.stack([_peaks(s) for s in strengths[inner]])
-        return _strongest(strengths, laplacians, peaks, SIGMAS, where, self.count)
+def maximal_laplacian(strength: Callable[[Plane, float], Plane], image: object, count: int) -> Keypoints:
+    """Local maxima of ``strength`` in the image, at scales of maximal Laplacian; at most ``count``, the strongest first. Sizes are
+    twice the scale of the Laplacian."""
+    plane = _luminance(image)
+    if plane is None:
+        return Keypoints.empty()
+    strengths = np.stack([strength(plane, sigma) for sigma in SIGMAS])
+    laplacians = np.stack([np.abs(_laplacian(plane, sigma)) for sigma in SIGMAS])
+    inner = slice(1, len(SIGMAS) - 1)
+    in_scale = (laplacians[inner] > laplacians[:-2]) & (laplacians[inner] >= laplacians[2:])
+    peaks = np.zeros(strengths.shape, dtype=bool)
+    peaks[inner] = in_scale & np.stack([_peaks(s) for s in strengths[inner]])
+    return _strongest(strengths, laplacians, peaks, SIGMAS, count)
 
 
-@dataclass(frozen=True)
-class FastHessianDetector:
-    """Local maxima over image and scale of the determinant of the Hessian, with derivatives from box filters.
+def fast_hessian(image: object, count: int) -> Keypoints:
+    """Local maxima over image and scale of the determinant of the Hessian, with derivatives from box filters; at most ``count``.
+    Sizes are twice the scale of the filter.
 
     Each octave is computed at full resolution: the paper skips every second pixel of the second octave, and so on.
     """
-
-    name: str
-    count: int
-
-    def detect(self, image: object, mask: object = None) -> Keypoints:
-        """Points of an image where ``mask`` (H, W) is not 0; sizes are twice the scale of the filter."""
-        found = _plane_and_mask(image, mask)
-        if found is None:
-            return Keypoints.empty()
-        plane, where = found
-        integral = np.asarray(cv2.integral(plane, sdepth=cv2.CV_64F), dtype=float)
-        sides = sorted({side for octave in OCTAVES for side in octave})
-        maps = {side: box_hessian(integral, side) for side in sides}
-        points = []
-        for octave in OCTAVES:
-            stack = np.stack([maps[side] for side in octave])
-            peaks = np.zeros(stack.shape, dtype=bool)
-            for level in (1, 2):
-                beside = np.maximum(_highest(stack[level - 1]), _highest(stack[level + 1]))
-                peaks[level] = _peaks(stack[level]) & (stack[level] > beside)
-            points.append(_strongest(stack, stack, peaks, BOX_SIGMA * np.array(octave), where, self.count))
-        return _merged(points, self.count)
+    plane = _luminance(image)
+    if plane is None:
+        return Keypoints.empty()
+    integral = np.asarray(cv2.integral(plane, sdepth=cv2.CV_64F), dtype=float)
+    sides = sorted({side for octave in OCTAVES for side in octave})
+    maps = {side: box_hessian(integral, side) for side in sides}
+    points = []
+    for octave in OCTAVES:
+        stack = np.stack([maps[side] for side in octave])
+        peaks = np.zeros(stack.shape, dtype=bool)
+        for level in (1, 2):
+            beside = np.maximum(_highest(stack[level - 1]), _highest(stack[level + 1]))
+            peaks[level] = _peaks(stack[level]) & (stack[level] > beside)
+        points.append(_strongest(stack, stack, peaks, BOX_SIGMA * np.array(octave), count))
+    return _merged(points, count)
 
 
 def harris(plane: Plane, sigma: float) -> Plane:
@@ -140,14 +114,13 @@ def box_hessian(integral: Array, side: int) -> Plane:
     return out
 
 
-def _plane_and_mask(image: object, mask: object) -> tuple[Plane, NDArray[np.uint8] | None] | None:
-    """Luminance 0 to 1 and the mask; None if the image has no features."""
+def _luminance(image: object) -> Plane | None:
+    """Luminance 0 to 1; None if the image has no features."""
     pixels: Image = as_image(image)
-    where = as_mask(mask, pixels)
     if is_blank(pixels):
         return None
     grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
-    return np.asarray(grey, dtype=np.float32) / np.float32(255.0), where
+    return np.asarray(grey, dtype=np.float32) / np.float32(255.0)
 
 
 def _blur(plane: Plane, sigma: float) -> Plane:
@@ -187,12 +160,8 @@ def _peaks(plane: Plane) -> Truths:
     return out
 
 
-def _strongest(
-    strengths: Plane, across: Plane, peaks: Truths, sigmas: Array, where: NDArray[np.uint8] | None, count: int
-) -> Keypoints:
+def _strongest(strengths: Plane, across: Plane, peaks: Truths, sigmas: Array, count: int) -> Keypoints:
     """The ``count`` strongest of ``peaks`` in stacks (L, H, W), refined in position in ``strengths`` and in scale in ``across``."""
-    if where is not None:
-        peaks = peaks & (where != 0)
     level, y, x = np.nonzero(peaks)
     response = strengths[level, y, x]
     order = np.argsort(-response, kind="stable")
@@ -230,8 +199,8 @@ def _merged(parts: list[Keypoints], count: int) -> Keypoints:
     return everything[np.array(kept[:count], dtype=np.int64)]
 
 
-DETECTORS: dict[str, Callable[[int], Detector]] = {
-    "harris_laplace": lambda count: LaplaceDetector("harris_laplace", harris, count),
-    "hessian_laplace": lambda count: LaplaceDetector("hessian_laplace", hessian, count),
-    "fast_hessian": lambda count: FastHessianDetector("fast_hessian", count),
+DETECTORS: dict[str, Callable[[object, int], Keypoints]] = {
+    "harris_laplace": partial(maximal_laplacian, harris),
+    "hessian_laplace": partial(maximal_laplacian, hessian),
+    "fast_hessian": fast_hessian,
 }

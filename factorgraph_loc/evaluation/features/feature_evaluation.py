@@ -125,8 +125,7 @@ def feature(name: str, count: int) -> Feature:
         return Feature(name, extractor(name, count).detectAndCompute)
     if count < 1:
         raise InputError(f"feature {name}: count is {count}, expected at least 1")
-    detector = DETECTORS[name](count)
-    return Feature(name, lambda image: (detector.detect(image), None))
+    return Feature(name, lambda image: (DETECTORS[name](image, count), None))
 
 
 def evaluate(
