@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend, save
-from factorgraph_loc.evaluation.metrics import CONFIDENCE, errors
-from factorgraph_loc.evaluation.pairing import pauses
+from factorgraph_loc.evaluation.metrics import errors
+from factorgraph_loc.evaluation.pairing import CONFIDENCE, pauses
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.reliability import Reliability

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtr
 
-from factorgraph_loc.evaluation.metrics import CONFIDENCE
+from factorgraph_loc.evaluation.pairing import CONFIDENCE
 from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS, bounds, draw_pooled, pair_seeds
 from factors import chi_squared
 from factors.se2 import Array

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.pairing import (
+    CONFIDENCE,
     DELTA,
     TOLERANCE,
     align_points,
@@ -40,7 +41,6 @@ from factors import chi_squared, positive, se2
 from factors.se2 import Array, Integers
 
 FEWEST_SCORED = 10  # least number of poses for meaningful figures
-CONFIDENCE = 0.95
 OF_FREE_MAP = ("aligned.position_rmse", "aligned.heading_rmse", "landmarks.count", "landmarks.rmse", "landmarks.anees")
 ALIGNED = ("aligned_position_rmse", "aligned_rotation_rmse")
 FREE_MAP = "unknown"  # value of an estimator's setting ``landmarks`` with which it estimates the map

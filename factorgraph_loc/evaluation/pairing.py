@@ -32,6 +32,7 @@ _PAUSE = 1.0  # s between neighbours of a reference that is never a gap
 _USUAL = 3.0  # times the median interval that is never a gap
 PIECE_TOLERANCE = 0.1  # by which the length of one of all pairs may differ, as a share of it
 DELTA = 1.0  # m, and s, over which relative errors are taken
+CONFIDENCE = 0.95  # of intervals
 HOW = ("rmse", "mean", "median", "p95", "max", "min", "std")
 
 

@@ -20,12 +20,12 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from factorgraph_loc.evaluation.pairing import CONFIDENCE
 from factors.se2 import Array
 
 COMPARED = tuple(f"{kind}.{what}_rmse" for kind in ("causal", "final") for what in ("position", "heading"))
 ENOUGH_LOGS = 6  # needed for a bootstrap over logs
 DRAWS = 4000
-CONFIDENCE = 0.95
 _SEED = 0  # of the bootstrap, for reproducible intervals
 
 # columns of a difference, with their types, as there may be no rows

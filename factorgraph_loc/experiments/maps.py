@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 SUFFIX = ".world.toml"
 POINTS = "points"
-TURN_SIGMA, SHIFT_SIGMA = 0.01, 0.02  # rad, m: of a reference without covariances, for points
 HEIGHTS = (-10.0, 20.0)  # m
 OF_REFERENCE = "that of the reference"
 BY_RUN = "fgloc run -e smoother --set smoother.landmarks=unknown makes a map of points without one"
@@ -243,7 +242,7 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     with stages("features") as report:
         seen, doubts = with_features(log, camera.frontend, lambda share: report(share, 1.0))
     with stages("points") as report:
-        posed = posed_frames(seen, TURN_SIGMA, SHIFT_SIGMA)
+        posed = posed_frames(seen)
         made = map_points(camera.model(), posed, settings, progress=lambda share: report(share, 1.0))
     points, fused = made.points, 0
     if options.extend and log.world.points is not None:

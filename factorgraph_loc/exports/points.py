@@ -22,7 +22,6 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.association import Associator
 from factors.camera.model import undistorted
 
-TURN_SIGMA, SHIFT_SIGMA = 0.01, 0.02  # rad, m: of a reference without covariances, as for a map
 HEADER = """ply
 format ascii 1.0
 comment points of a map in metres; sigma: standard deviation in the worst direction; views: stored views of a point
@@ -59,7 +58,7 @@ def write_bundle(log: Log, path: Path) -> None:
             f"{log.name}: its map has no points with descriptors to write, expected one with them (--world)"
         )
     camera = log.rig.of(CameraSettings).model()
-    posed = posed_frames(with_features(log, frontend_of(log.rig, log.world))[0], TURN_SIGMA, SHIFT_SIGMA)
+    posed = posed_frames(with_features(log, frontend_of(log.rig, log.world))[0])
     associator, cameras = Associator(points, camera), posed.cameras
     turns = Rotation.from_matrix(cameras.rotations).as_quat(canonical=True)
     weight = f"{camera.sigma**-2:.12g}"

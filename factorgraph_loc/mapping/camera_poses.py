@@ -32,7 +32,7 @@ class PosedFrames:
         return PosedFrames([self.frames[i] for i in index.tolist()], self.cameras[index], self.covariances[index])
 
 
-def posed_frames(log: Log, turn_sigma: float, shift_sigma: float) -> PosedFrames:
+def posed_frames(log: Log, turn_sigma: float = 0.01, shift_sigma: float = 0.02) -> PosedFrames:
     """The frames of a log with features, at the poses of its reference.
 
     ``turn_sigma`` [rad], ``shift_sigma`` [m]: standard deviations about and along each axis for a reference without

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from factorgraph_loc.evaluation.metrics import CONFIDENCE
+from factorgraph_loc.evaluation.pairing import CONFIDENCE
 from factorgraph_loc.evaluation.statistics import pooled_rms
 from factors.se2 import Array
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from factorgraph_loc.evaluation.metrics import CONFIDENCE
+from factorgraph_loc.evaluation.pairing import CONFIDENCE
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
