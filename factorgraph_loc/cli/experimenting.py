@@ -285,7 +285,7 @@ def active(
 ) -> None:
     """Drive simulated robots from an unknown start until they are localized, and compare policies on the same seeds."""
     from factorgraph_loc.api import experimenting
-    from factorgraph_loc.evaluation.active import difference_cells, differences, summaries, summary_cells
+    from factorgraph_loc.experiments.active_results import difference_cells, differences, summaries, summary_cells
 
     show.first_use()
     with show.progress("runs", counted=True) as report:

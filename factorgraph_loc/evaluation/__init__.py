@@ -1,7 +1,6 @@
 """Evaluation of results: metrics, statistics, tables and plots."""
 
 __all__ = [
-    "active",
     "features",
     "figures",
     "inference",

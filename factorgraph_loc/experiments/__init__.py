@@ -2,6 +2,7 @@
 
 __all__ = [
     "active",
+    "active_results",
     "cluster",
     "compare",
     "experiment",

@@ -16,19 +16,17 @@ import numpy as np
 import polars as pl
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.active import (
+from factorgraph_loc.evaluation.figures import write_picture
+from factorgraph_loc.evaluation.tables import markdown
+from factorgraph_loc.experiments import output
+from factorgraph_loc.experiments.active_results import (
     DIFFERENCES,
-    Decision,
-    SeekingTrack,
     comparison,
     difference_cells,
     differences,
     run_picture,
     summary_cells,
 )
-from factorgraph_loc.evaluation.figures import write_picture
-from factorgraph_loc.evaluation.tables import markdown
-from factorgraph_loc.experiments import output
 from factorgraph_loc.files.models import file_name, nearest, write_toml
 from factorgraph_loc.files.tables import read_parquet, write_parquet
 from factorgraph_loc.files.temporary import require_free, writing
@@ -106,9 +104,9 @@ def seek(
     """Run every policy with every estimator on every seed, in ``jobs`` parallel processes (None: one per core).
 
     Written into ``out``: ``results.parquet`` and ``results.csv`` (a row per run), ``differences.csv`` (see
-    :func:`~factorgraph_loc.evaluation.active.differences`), ``table.md``, ``config.toml``, ``plots/comparison.png`` and for each
-    policy and estimator a plot of the run of the first seed. A failed run is a row with its reason; the others continue. The same
-    call resumes an interrupted experiment. ``progress`` is called with the number of runs done and of all.
+    :func:`~factorgraph_loc.experiments.active_results.differences`), ``table.md``, ``config.toml``, ``plots/comparison.png``
+    and for each policy and estimator a plot of the run of the first seed. A failed run is a row with its reason; the others
+    continue. The same call resumes an interrupted experiment. ``progress`` is called with the number of runs done and of all.
 
     Raises InputError, before anything runs, for an unknown or repeated policy or estimator, or an ``out`` that contains results
     without ``overwrite``; and if all runs are refused for their input.
@@ -187,7 +185,7 @@ def run_job(job: ActiveJob) -> Row:
     """The row of a run, stored as its part; can be sent to other processes."""
     run = run_active(job.simulation, job.policy, job.estimator, job.seed, job.settings)
     if job.pictured:
-        write_picture(run_picture(track_of(run)), job.folder / PLOTS / f"{job.name}-seed{job.seed}.png")
+        write_picture(run_picture(run), job.folder / PLOTS / f"{job.name}-seed{job.seed}.png")
     row = row_of(run)
     job.part.parent.mkdir(parents=True, exist_ok=True)
     write_parquet(pl.DataFrame([row], schema=ROW), job.part)
@@ -214,14 +212,6 @@ def row_of(run: ActiveRun) -> Row:
         "planning_ms": float(np.median(times)) if len(times) else None,
         "planning_ms_max": float(np.max(times)) if len(times) else None,
     }
-
-
-def track_of(run: ActiveRun) -> SeekingTrack:
-    """The data of a run for plotting."""
-    decisions = [Decision(s.metres, s.truth, s.particles, s.candidates, s.chosen) for s in run.steps]
-    ended = "localized" if run.localized else "not localized"
-    title = f"{run.preset}, seed {run.seed}: {run.policy} with {run.estimator}, {ended} after {run.metres:.1f} m"
-    return SeekingTrack(title, run.world, run.truth.poses, run.metres, decisions)
 
 
 def write_tables(rows: Sequence[Row], out: Path) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from factorgraph_loc.drawing.figures import COLOURS, dress, empty, grid, legend, styles
 from factorgraph_loc.evaluation.statistics import Interval, mcnemar, median_difference, median_ratio, quantile
 from factorgraph_loc.fitting.shares import wilson
-from factorgraph_loc.model.world import World
+from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
 from factors.se2 import Array
 
 if TYPE_CHECKING:
@@ -181,34 +180,6 @@ def _median(rows: Sequence[Row], key: str) -> float:
     return float(np.median(known)) if known else math.nan
 
 
-@dataclass(frozen=True)
-class Decision:
-    """The state at a choice after ``metres`` [m]: the true ``pose`` (3,), the belief as equally weighted ``particles`` (M, 3),
-    and from that pose the ``candidates`` (S, 3), and the ``chosen`` one (S, 3) if any."""
-
-    metres: float
-    pose: Array
-    particles: Array
-    candidates: Sequence[Array]
-    chosen: Array | None
-
-    @property
-    def spread(self) -> float:
-        """Root of the sum of the belief's variances in x and y [m]."""
-        return float(np.sqrt(np.sum(np.var(self.particles[:, :2], axis=0))))
-
-
-@dataclass(frozen=True)
-class SeekingTrack:
-    """One run: its ``world``, the true poses ``truth`` (N, 3), and the decisions. It ended after ``metres`` [m]."""
-
-    title: str
-    world: World
-    truth: Array
-    metres: float
-    decisions: Sequence[Decision]
-
-
 def comparison(rows: Sequence[Row]) -> Figure:
     """For each world and estimator: a box plot per policy, and the fraction of runs localized over distance."""
     found = cases(rows)
@@ -223,25 +194,27 @@ def comparison(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def run_picture(track: SeekingTrack) -> Figure:
+def run_picture(run: ActiveRun) -> Figure:
     """Belief, candidates and choice at some decisions of a run; and the spread of the belief over distance."""
-    chosen = np.unique(np.linspace(0, len(track.decisions) - 1, SHOWN).round().astype(int)) if track.decisions else ()
+    chosen = np.unique(np.linspace(0, len(run.steps) - 1, SHOWN).round().astype(int)) if run.steps else ()
     rows = max(math.ceil(len(chosen) / COLUMNS), 1)
-    width, depth = np.ptp(_outline(track).reshape(-1, 2), axis=0)
+    width, depth = np.ptp(_outline(run).reshape(-1, 2), axis=0)
     height = float(np.clip(rows * (16.0 / COLUMNS * depth / max(width, 1e-9) + 0.9), 4.0, 14.0)) + 3.5
-    figure = empty(height, track.title)
+    ended = "localized" if run.localized else "not localized"
+    title = f"{run.preset}, seed {run.seed}: {run.policy} with {run.estimator}, {ended} after {run.metres:.1f} m"
+    figure = empty(height, title)
     names: list[Any] = [[f"{COLUMNS * row + column}" for column in range(COLUMNS)] for row in range(rows)]
     axes = figure.subplot_mosaic([*names, ["belief"] * COLUMNS], height_ratios=(*[(height - 3.5) / rows] * rows, 2.5))
     dress(axes.values())
     for panel in range(rows * COLUMNS):
         axis = axes[str(panel)]
         if panel < len(chosen):
-            _decision(axis, track, int(chosen[panel]))
+            _step(axis, run, int(chosen[panel]))
         else:
             axis.set_axis_off()
-    driven, spread = ([getattr(one, key) for one in track.decisions] for key in ("metres", "spread"))
+    driven, spread = [step.metres for step in run.steps], [_spread(step) for step in run.steps]
     axes["belief"].semilogy(driven, np.maximum(spread, 1e-3), "o-", color=COLOURS[0], markersize=4)
-    axes["belief"].axvline(track.metres, color="0.5", linestyle="--", label="end of the run")
+    axes["belief"].axvline(run.metres, color="0.5", linestyle="--", label="end of the run")
     axes["belief"].set(xlabel="metres driven", ylabel="spread of the belief [m]")
     legend(figure, axes.values())
     return figure
@@ -286,32 +259,38 @@ def _farthest(rows: Sequence[Row], case: tuple[str, str]) -> float:
     return max((row["metres"] or 0.0 for row in rows if (row["world"], row["estimator"]) == case), default=0.0) or 1.0
 
 
-def _decision(axis: Axes, track: SeekingTrack, index: int) -> None:
-    one = track.decisions[index]
-    for i, (x1, y1, x2, y2) in enumerate(track.world.walls):
+def _step(axis: Axes, run: ActiveRun, index: int) -> None:
+    one = run.steps[index]
+    for i, (x1, y1, x2, y2) in enumerate(run.world.walls):
         axis.plot((x1, x2), (y1, y2), color="0.35", linewidth=1.0, label=None if i else "walls", zorder=1)
-    tags = np.array([(tag.x, tag.y) for tag in track.world.tags.values()]).reshape(-1, 2)
+    tags = np.array([(tag.x, tag.y) for tag in run.world.tags.values()]).reshape(-1, 2)
     axis.plot(*tags.T, "s", color=COLOURS[-1], markersize=4, markerfacecolor="none", label="tags", zorder=2)
     axis.plot(*one.particles[:, :2].T, ".", color=COLOURS[4], markersize=2, label="belief", zorder=3)
     for i, path in enumerate(one.candidates):
         axis.plot(*path[:, :2].T, color="0.7", linewidth=0.6, label=None if i else "candidates", zorder=2)
     if one.chosen is not None:
         axis.plot(*one.chosen[:, :2].T, color=COLOURS[1], linewidth=2.2, label="chosen", zorder=6)
-    x, y, heading = one.pose.tolist()
+    x, y, heading = one.truth.tolist()
     along = (x, x + ARROW * math.cos(heading)), (y, y + ARROW * math.sin(heading))
     axis.plot(*along, color=COLOURS[0], linewidth=2.0, zorder=5)
     axis.plot(x, y, "o", color=COLOURS[0], markersize=6, label="robot (true)", zorder=5)
-    driven = np.concatenate((np.zeros(1), np.cumsum(np.hypot(*np.diff(track.truth[:, :2], axis=0).T))))
-    last = index == len(track.decisions) - 1
-    so_far = track.truth if last else track.truth[driven <= one.metres + 1e-6]
+    truth = run.truth.poses
+    driven = np.concatenate((np.zeros(1), np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))))
+    last = index == len(run.steps) - 1
+    so_far = truth if last else truth[driven <= one.metres + 1e-6]
     axis.plot(*so_far[:, :2].T, color=COLOURS[0], linewidth=1.2, label="way (true)", zorder=4)
-    low, high = _outline(track).min(axis=0), _outline(track).max(axis=0)
+    low, high = _outline(run).min(axis=0), _outline(run).max(axis=0)
     axis.set(xlim=(low[0] - 0.5, high[0] + 0.5), ylim=(low[1] - 0.5, high[1] + 0.5))
     axis.set_aspect("equal", adjustable="box")
-    axis.set_title(f"after {one.metres:.1f} m" + (f", way to the end at {track.metres:.1f} m" if last else ""))
+    axis.set_title(f"after {one.metres:.1f} m" + (f", way to the end at {run.metres:.1f} m" if last else ""))
 
 
-def _outline(track: SeekingTrack) -> Array:
+def _spread(step: PlanningStep) -> float:
+    """Root of the sum of the belief's variances in x and y [m]."""
+    return float(np.sqrt(np.sum(np.var(step.particles[:, :2], axis=0))))
+
+
+def _outline(run: ActiveRun) -> Array:
     """The ends (K, 2) of all walls, or the trajectory if there are none."""
-    walls = np.array(track.world.walls).reshape(-1, 2)
-    return walls if len(walls) else track.truth[:, :2]
+    walls = np.array(run.world.walls).reshape(-1, 2)
+    return walls if len(walls) else run.truth.poses[:, :2]

@@ -1,26 +1,19 @@
 """One run of an estimator on a log: process measurements in the order of arrival, and store and time the estimates."""
 
-import bisect
 import importlib.metadata
 import math
 import platform
-import resource
-import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import groupby, takewhile
-from operator import attrgetter
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from factorgraph_loc.errors import FglocError, InputError
-from factorgraph_loc.experiments.causal_estimates import CausalEstimates
+from factorgraph_loc.experiments.causal_run import CausalRun, only_new_searched, span_of
 from factorgraph_loc.experiments.doubts import findable, in_bent_map, never_localized, partly_scored, with_pauses
-from factorgraph_loc.experiments.garbage import only_new_searched
 from factorgraph_loc.experiments.preparation import (
     KNOWN,
     at_origin,
@@ -34,20 +27,16 @@ from factorgraph_loc.experiments.preparation import (
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, finds_heading
-from factorgraph_loc.fusion.guarded import Guard, sound, sound_trajectory
+from factorgraph_loc.fusion.guarded import Guard, sound_trajectory
 from factorgraph_loc.fusion.map_frame import MapFrame
 from factorgraph_loc.io.checks import require_bounds, require_one_span
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.measurement import Measurement, Rows, Tick
-from factorgraph_loc.model.result import RunResult, Timings
+from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Ticks, check_max_gap, check_tick_gap
-from factorgraph_loc.sensors.interfaces import PreparedLog
 from factorgraph_loc.sensors.registry import functions, moving
-from factorgraph_loc.text import listed
 from factorgraph_loc.version import __version__
-from factors.se2 import Array
 
 _REHEARSAL = 2.0  # s from the first observation
 _REHEARSED: set[tuple[str, tuple[str, ...]]] = set()  # estimators with their sensors, in this process
@@ -129,7 +118,7 @@ def run(
     frame = MapFrame.of(setup, use.modalities, getattr(settings, "landmarks", "known"))
     _rehearse(config, setup, settings, prepared.log, prior)
     ticks = Ticks(_begin(log, sensors, prior), config.tick_gap)
-    loop = _CausalRun(
+    loop = CausalRun(
         guard,
         estimator,
         prepared.log,
@@ -212,139 +201,18 @@ def _rehearse(
     with suppress(FglocError), guard, guard.quiet():
         estimator = registry.create(config.estimator, replace(setup, rng=np.random.default_rng(config.seed)), settings)
         ticks = Ticks(begin, config.tick_gap)
-        _CausalRun(guard, estimator, log, setup.sensors, prior, ticks, MapFrame(), end=first + _REHEARSAL).run()
+        CausalRun(guard, estimator, log, setup.sensors, prior, ticks, MapFrame(), end=first + _REHEARSAL).run()
         with guard.telling("the final trajectory"):
             estimator.trajectory()
 
 
-@dataclass
-class _CausalRun:
-    """The causal part of a run, up to ``end``, in a map with this ``frame``."""
-
-    guard: Guard
-    estimator: Estimator
-    log: Log
-    sensors: tuple[str, ...]
-    prior: PosePrior | None
-    ticks: Ticks
-    frame: MapFrame
-    progress: Callable[[float], None] = lambda _: None
-    watch: Callable[[float, Estimator], None] | None = None
-    end: float = math.inf
-    told: CausalEstimates = field(default_factory=CausalEstimates)
-
-    def __post_init__(self) -> None:
-        first, self._last = _span(self.log, self.sensors)
-        self._start = first if self.prior is None else self.prior.t
-        self._initialized = self.prior is None
-        self._reported = self._seconds = 0.0
-        self._update_t: list[float] = []
-        self._update_s: list[float] = []
-
-    def run(self) -> None:
-        """Process all measurements and ticks."""
-        started = perf_counter()
-        for (t, is_motion), group in groupby(self._measurements(), attrgetter("t", "is_motion")):
-            if is_motion:
-                for m in group:
-                    self._move(m)
-                continue
-            self._reach(t)
-            if t < self._start:
-                self.estimator.diagnostics.ignore("before the start", sum(1 for _ in group))
-            else:
-                if not self._initialized:
-                    self._initialize()
-                self._update(t, group)
-        if not self._initialized:
-            self._initialize()
-        for tick in self.ticks.rest():
-            self._tick(tick)
-        self._seconds = perf_counter() - started
-        self.progress(1.0)
-
-    def timings(self, final_seconds: float, prepared: PreparedLog) -> Timings:
-        """The times of the loop, of the preparation, and of the final trajectory."""
-        return Timings(
-            update_t=np.array(self._update_t),
-            update_ms=np.array(self._update_s) * 1e3,
-            causal_seconds=self._seconds,
-            real_time_factor=self.ticks.seconds / self._seconds,
-            final_seconds=final_seconds,
-            peak_memory_mb=_peak_memory_mb(),
-            images=prepared.images,
-            frontend_seconds=prepared.seconds,
-        )
-
-    def _measurements(self) -> Iterator[Measurement]:
-        joined = getattr(self.estimator, "takes_rows", False)
-        steps = self.log.steps(self.sensors) if joined else self.log.measurements(self.sensors)
-        return takewhile(lambda m: m.t <= self.end, steps)
-
-    def _reach(self, t: float) -> None:
-        """What comes before a measurement at ``t``: the start, and ticks."""
-        if not self._initialized and t > self._start:
-            self._initialize()
-        for tick in self.ticks.before(t):
-            self._tick(tick)
-
-    def _move(self, m: Measurement) -> None:
-        """Take a row of motion; or some, cut where a tick is due."""
-        if not isinstance(m, Rows):
-            self._reach(m.t)
-            self.guard.process(self.estimator, m)
-            return
-        times, first = m.times.tolist(), 0
-        while first < len(times):
-            self._reach(times[first])
-            last = max(first + 1, bisect.bisect_right(times, self.ticks.due))
-            self.ticks.before(times[last - 1])  # none, but it has come that far
-            self.guard.process(self.estimator, m.part(first, last))
-            first = last
-
-    def _initialize(self) -> None:
-        assert self.prior is not None
-        self._initialized = True
-        with self.guard.telling("the start", self.prior.t):
-            self.estimator.initialize(self.frame.prior(self.prior))
-
-    def _update(self, t: float, measurements: Iterator[Measurement]) -> None:
-        started = perf_counter()
-        for m in measurements:
-            self.guard.process(self.estimator, m)
-        with self.guard.telling("the estimate", t):
-            sound(self.estimator.estimate())
-        self._update_s.append(perf_counter() - started)
-        self._update_t.append(t)
-
-    def _tick(self, t: float) -> None:
-        with self.guard.telling("the estimate", t):
-            e = self.frame.estimate(sound(self.estimator.estimate(t)))
-        self.guard.process(self.estimator, Tick(t))
-        self.told.add(t, e)
-        if self.watch is not None:
-            self.watch(t, self.estimator)
-        share = (t - self._start) / max(self._last - self._start, 1e-9)
-        if share >= self._reported:
-            self.progress(share)
-            self._reported = share + 0.01
-
-
 def _begin(log: Log, sensors: tuple[str, ...], prior: PosePrior | None) -> float:
     """The time of the first tick. Raises InputError if there are no measurements from then on."""
-    first, last = _span(log, sensors)
+    first, last = span_of(log, sensors)
     begin = first if prior is None else prior.t
     if not begin <= last:
         raise InputError(f"{log.name}: the prior's time {begin:.3f} s lies after the last measurement at {last:.3f} s")
     return begin
-
-
-def _span(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
-    streams = {s: log.streams[s].t for s in sensors if s in log.streams}
-    stamps: list[Array] = [t + log.rig.time_offset(s) for s, t in streams.items() if len(t)]
-    if not stamps:
-        raise InputError(f"{log.name}: has no measurements of {listed(sensors)}")
-    return min(float(t.min()) for t in stamps), max(float(t.max()) for t in stamps)
 
 
 def _once(*warnings: str) -> tuple[str, ...]:
@@ -359,13 +227,3 @@ def _versions() -> dict[str, str]:
         "numpy": importlib.metadata.version("numpy"),
         "python": platform.python_version(),
     }
-
-
-def _peak_memory_mb() -> float:
-    # getrusage includes the parent's memory at the fork; the kernel's own figure does not
-    try:
-        status = Path("/proc/self/status").read_text(encoding="ascii")
-        return float(status.split("VmHWM:")[1].split()[0]) * 1024 / 1e6
-    except (OSError, IndexError):
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6

@@ -6,15 +6,15 @@ import math
 import numpy as np
 import pytest
 
-from factorgraph_loc.evaluation.active import (
-    Decision,
-    SeekingTrack,
+from factorgraph_loc.experiments.active_results import (
     comparison,
     differences,
     run_picture,
     summaries,
 )
+from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
+from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
 from factorgraph_loc.sensors.rfid.map import Tag
 
 
@@ -94,18 +94,22 @@ def walls(width, depth):
     return tuple((*a, *b) for a, b in itertools.pairwise(corners))
 
 
-def track(count):
+def seeking(count):
     """A run of so many decisions, whose belief is half as wide after each."""
     rng = np.random.default_rng(0)
-    decisions = []
+    steps = []
     for i in range(count):
         pose = np.array((1.0 + i, 1.5, 0.0))
         ways = tuple(pose + np.array(((0.0, 0.0, 0.0), (1.0, side, 0.0))) for side in (-0.5, 0.0, 0.5))
         particles = pose + 2.0**-i * rng.standard_normal((200, 3))
-        decisions.append(Decision(float(i), pose, particles, ways, ways[1] if i else None))
+        chosen = ways[1] if i else None
+        steps.append(PlanningStep(0.0, float(i), pose, pose, np.eye(3), particles, ways, np.ones(3), chosen, 1.0))
     truth = np.column_stack((np.linspace(1.0, 1.0 + count, 50), np.full(50, 1.5), np.zeros(50)))
     world = World(tags={"T": Tag(x=2.0, y=0.0)}, walls=walls(12.0, 3.0))
-    return SeekingTrack("a run", world, truth, float(count), decisions)
+    ends = (True, float(count), 1.0, 0.1, 0.05, False)
+    return ActiveRun(
+        0, "hall", world, "information", "active_mcl", *ends, Trajectory(np.arange(50.0), truth), tuple(steps)
+    )
 
 
 def labels(figure):
@@ -113,7 +117,7 @@ def labels(figure):
 
 
 def test_the_picture_of_a_run_shows_what_was_proposed_chosen_and_believed():
-    figure = run_picture(track(9))
+    figure = run_picture(seeking(9))
     maps = [axis for axis in figure.axes if axis.get_title().startswith("after")]
     assert [axis.get_title() for axis in maps[:-1]] == [f"after {i}.0 m" for i in (0, 2, 3, 5, 6)]
     assert maps[-1].get_title() == "after 8.0 m, way to the end at 9.0 m"

@@ -2,7 +2,7 @@
 
 import gc
 
-from factorgraph_loc.experiments.garbage import NEW, only_new_searched
+from factorgraph_loc.experiments.causal_run import NEW, only_new_searched
 
 
 def test_what_was_there_is_not_searched_for_the_time_being():

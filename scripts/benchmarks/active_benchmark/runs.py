@@ -9,9 +9,9 @@ from typing import Any
 
 from benchmarking.report import Options, Report
 
-from factorgraph_loc.evaluation.active import comparison, difference_cells, summary_cells
 from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.experiments.active import jobs_of, run_jobs, write_tables
+from factorgraph_loc.experiments.active_results import comparison, difference_cells, summary_cells
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation import preset
 

@@ -1,0 +1,205 @@
+"""The causal part of a run: measurements and ticks in the order of arrival, the estimates at the ticks, and their times."""
+
+import bisect
+import gc
+import math
+import resource
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import groupby, takewhile
+from operator import attrgetter
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.fusion.base import Estimator
+from factorgraph_loc.fusion.guarded import Guard, sound
+from factorgraph_loc.fusion.map_frame import MapFrame
+from factorgraph_loc.model.belief import PoseEstimate, PosePrior, Status
+from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import Measurement, Rows, Tick
+from factorgraph_loc.model.result import Timings
+from factorgraph_loc.model.scoring import Ticks
+from factorgraph_loc.sensors.interfaces import PreparedLog
+from factorgraph_loc.text import listed
+from factors.se2 import Array
+
+NEW = 1000  # objects after which they are searched; tens of thousands at once would take as long as many updates
+
+
+@dataclass
+class CausalEstimates:
+    """The estimates at the ticks, as columns: a few objects less for each tick."""
+
+    t: list[float] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    covariances: list[Array] = field(default_factory=list)
+    status: list[Status] = field(default_factory=list)
+
+    def add(self, t: float, e: PoseEstimate) -> None:
+        """Take an estimate with the tick's time, as an unlocalized one has none; copied, as an estimator may reuse its arrays."""
+        self.t.append(t)
+        self.poses.append(np.array(e.pose, dtype=float))
+        self.covariances.append(np.array(e.covariance, dtype=float))
+        self.status.append(e.status)
+
+
+@dataclass
+class CausalRun:
+    """The causal part of a run, up to ``end``, in a map with this ``frame``."""
+
+    guard: Guard
+    estimator: Estimator
+    log: Log
+    sensors: tuple[str, ...]
+    prior: PosePrior | None
+    ticks: Ticks
+    frame: MapFrame
+    progress: Callable[[float], None] = lambda _: None
+    watch: Callable[[float, Estimator], None] | None = None
+    end: float = math.inf
+    told: CausalEstimates = field(default_factory=CausalEstimates)
+
+    def __post_init__(self) -> None:
+        first, self._last = span_of(self.log, self.sensors)
+        self._start = first if self.prior is None else self.prior.t
+        self._initialized = self.prior is None
+        self._reported = self._seconds = 0.0
+        self._update_t: list[float] = []
+        self._update_s: list[float] = []
+
+    def run(self) -> None:
+        """Process all measurements and ticks."""
+        started = perf_counter()
+        for (t, is_motion), group in groupby(self._measurements(), attrgetter("t", "is_motion")):
+            if is_motion:
+                for m in group:
+                    self._move(m)
+                continue
+            self._reach(t)
+            if t < self._start:
+                self.estimator.diagnostics.ignore("before the start", sum(1 for _ in group))
+            else:
+                if not self._initialized:
+                    self._initialize()
+                self._update(t, group)
+        if not self._initialized:
+            self._initialize()
+        for tick in self.ticks.rest():
+            self._tick(tick)
+        self._seconds = perf_counter() - started
+        self.progress(1.0)
+
+    def timings(self, final_seconds: float, prepared: PreparedLog) -> Timings:
+        """The times of the loop, of the preparation, and of the final trajectory."""
+        return Timings(
+            update_t=np.array(self._update_t),
+            update_ms=np.array(self._update_s) * 1e3,
+            causal_seconds=self._seconds,
+            real_time_factor=self.ticks.seconds / self._seconds,
+            final_seconds=final_seconds,
+            peak_memory_mb=_peak_memory_mb(),
+            images=prepared.images,
+            frontend_seconds=prepared.seconds,
+        )
+
+    def _measurements(self) -> Iterator[Measurement]:
+        joined = getattr(self.estimator, "takes_rows", False)
+        steps = self.log.steps(self.sensors) if joined else self.log.measurements(self.sensors)
+        return takewhile(lambda m: m.t <= self.end, steps)
+
+    def _reach(self, t: float) -> None:
+        """What comes before a measurement at ``t``: the start, and ticks."""
+        if not self._initialized and t > self._start:
+            self._initialize()
+        for tick in self.ticks.before(t):
+            self._tick(tick)
+
+    def _move(self, m: Measurement) -> None:
+        """Take a row of motion; or some, cut where a tick is due."""
+        if not isinstance(m, Rows):
+            self._reach(m.t)
+            self.guard.process(self.estimator, m)
+            return
+        times, first = m.times.tolist(), 0
+        while first < len(times):
+            self._reach(times[first])
+            last = max(first + 1, bisect.bisect_right(times, self.ticks.due))
+            self.ticks.before(times[last - 1])  # none, but it has come that far
+            self.guard.process(self.estimator, m.part(first, last))
+            first = last
+
+    def _initialize(self) -> None:
+        assert self.prior is not None
+        self._initialized = True
+        with self.guard.telling("the start", self.prior.t):
+            self.estimator.initialize(self.frame.prior(self.prior))
+
+    def _update(self, t: float, measurements: Iterator[Measurement]) -> None:
+        started = perf_counter()
+        for m in measurements:
+            self.guard.process(self.estimator, m)
+        with self.guard.telling("the estimate", t):
+            sound(self.estimator.estimate())
+        self._update_s.append(perf_counter() - started)
+        self._update_t.append(t)
+
+    def _tick(self, t: float) -> None:
+        with self.guard.telling("the estimate", t):
+            e = self.frame.estimate(sound(self.estimator.estimate(t)))
+        self.guard.process(self.estimator, Tick(t))
+        self.told.add(t, e)
+        if self.watch is not None:
+            self.watch(t, self.estimator)
+        share = (t - self._start) / max(self._last - self._start, 1e-9)
+        if share >= self._reported:
+            self.progress(share)
+            self._reported = share + 0.01
+
+
+def span_of(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
+    """First and last stamp [s] of the measurements of ``sensors``. Raises InputError if there are none."""
+    streams = {s: log.streams[s].t for s in sensors if s in log.streams}
+    stamps: list[Array] = [t + log.rig.time_offset(s) for s, t in streams.items() if len(t)]
+    if not stamps:
+        raise InputError(f"{log.name}: has no measurements of {listed(sensors)}")
+    return min(float(t.min()) for t in stamps), max(float(t.max()) for t in stamps)
+
+
+@contextmanager
+def only_new_searched() -> Iterator[None]:
+    """A context in which objects that were there before, and those that have outlived two searches, are not searched for garbage:
+    those of the loaded modules and of a long run are so many that each time takes a tenth of a second. Nothing changes where a
+    program has told Python so for itself (``gc.freeze``)."""
+    if gc.get_freeze_count():
+        yield
+        return
+    threshold = gc.get_threshold()
+    gc.freeze()
+    gc.callbacks.append(_keep)
+    gc.set_threshold(NEW, *threshold[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*threshold)
+        gc.callbacks.remove(_keep)
+        gc.unfreeze()
+
+
+def _keep(phase: str, info: dict[str, int]) -> None:
+    if phase == "stop" and info["generation"] == 1:
+        gc.freeze()
+
+
+def _peak_memory_mb() -> float:
+    # getrusage includes the parent's memory at the fork; the kernel's own figure does not
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        return float(status.split("VmHWM:")[1].split()[0]) * 1024 / 1e6
+    except (OSError, IndexError):
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
