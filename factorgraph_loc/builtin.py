@@ -25,5 +25,4 @@ READERS.own |= {
     "mrclam": "factorgraph_loc.io.readers.mrclam",
     "plaza": "factorgraph_loc.io.readers.plaza",
     "rosbag": "factorgraph_loc.io.bags.rosbag",
-    "trajectory": "factorgraph_loc.io.readers.trajectory",
 }

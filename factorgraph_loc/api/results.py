@@ -6,12 +6,11 @@ from typing import TypeVar
 
 from factorgraph_loc.api.given import LogLike, RigLike, WorldLike, one
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.particles import particles_of
 from factorgraph_loc.exports import rerun_scene
-from factorgraph_loc.exports.points import write_bundle, write_ply
+from factorgraph_loc.exports.points import write_ply
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 from factorgraph_loc.exports.ros import write_mcap
-from factorgraph_loc.exports.runs import Particles, StoredRun, find_runs, is_results, read_runs
+from factorgraph_loc.exports.runs import StoredRun, find_runs, is_results, read_runs
 from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write_g2o, write_trajectory
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.model.log import Log
@@ -28,18 +27,17 @@ def view(
     rig: RigLike | None = None,
     world: WorldLike | None = None,
     rrd: str | Path | None = None,
-    particles: bool = False,
     bind: str = LOOPBACK,
 ) -> None:
     """Show a log and its runs over time, in Rerun.
 
     ``results``: folders of runs or comparisons, and their log if :func:`~factorgraph_loc.api.logs.datasets` does not list it; or
-    a log alone. ``rrd``: file to write for the viewer instead of opening it. ``particles``: repeat runs of particle filters to
-    show their particles. ``bind``: IP address that the viewer listens on, without credentials; only this machine reaches the
-    default one. InputError if ``rerun-sdk`` is not installed, the viewer does not start, or the file cannot be written.
+    a log alone. ``rrd``: file to write for the viewer instead of opening it. ``bind``: IP address that the viewer
+    listens on, without credentials; only this machine reaches the default one. InputError if ``rerun-sdk`` is not installed, the
+    viewer does not start, or the file cannot be written.
     """
     log, runs = stored(_listed(results), lambda name: one(name, rig, world))
-    show(log, runs, None if rrd is None else Path(rrd), clouds_of(log, runs) if particles else {}, bind)
+    show(log, runs, None if rrd is None else Path(rrd), bind)
 
 
 def export(
@@ -90,20 +88,12 @@ def stored(results: Sequence[L], read: Callable[[L | str], Log]) -> tuple[Log, l
     return log, read_runs(of_log, log)
 
 
-def clouds_of(
-    log: Log, runs: Sequence[StoredRun], progress: Callable[[float], None] | None = None
-) -> dict[str, Particles]:
-    """The particles of the runs that use particles, by the names of the runs."""
-    clouds = {run.name: particles_of(run, log, progress) for run in runs}
-    return {name: cloud for name, cloud in clouds.items() if cloud is not None}
-
-
-def show(log: Log, runs: list[StoredRun], rrd: Path | None, clouds: dict[str, Particles], bind: str) -> None:
+def show(log: Log, runs: list[StoredRun], rrd: Path | None, bind: str) -> None:
     """Open the viewer, or write a file for it."""
     if rrd is None:
-        rerun_scene.show(log, runs, clouds, bind)
+        rerun_scene.show(log, runs, bind)
     else:
-        rerun_scene.write_rrd(log, runs, rrd, clouds)
+        rerun_scene.write_rrd(log, runs, rrd)
 
 
 def require_format(out: Path) -> None:
@@ -120,8 +110,6 @@ def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
         if log.world.points is None:
             raise InputError(f"{log.name}: its map has no points to write, expected one with points (--world)")
         write_ply(log.world.points, out)
-    elif out.suffix == ".g2o" and not runs and log.world.points is not None:
-        write_bundle(log, out)
     elif out.suffix == ".g2o":
         run = _only(runs, out)
         sensors = run.folder.config.sensors or log.rig.sensors

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,11 +11,8 @@ from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import Json, LogOptions, takes_options
 
 if TYPE_CHECKING:
-    from factorgraph_loc.exports.runs import Particles, StoredRun
+    from factorgraph_loc.exports.runs import StoredRun
     from factorgraph_loc.model.log import Log
-
-
-SAME = 1e-6  # m between the positions of a run and of its repetition
 
 What = Annotated[
     list[str],
@@ -33,9 +29,6 @@ def view(
     rrd: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a file for the viewer instead of opening it.")
     ] = None,
-    particles: Annotated[
-        bool, typer.Option("--particles", help="Repeat runs of particle filters to show their particles.")
-    ] = False,
     bind: Annotated[
         str,
         typer.Option(
@@ -52,29 +45,11 @@ def view(
     from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 
     log, runs = results.stored(what, source.load_one)
-    results.show(log, runs, rrd, _particles(log, runs) if particles else {}, bind)
+    results.show(log, runs, rrd, bind)
     if json:
         show.document(shown(log, runs) | {"file": None if rrd is None else str(rrd)})
     elif rrd is not None:
         show.line(f"wrote {rrd}: open it with rerun --bind {LOOPBACK} {rrd}")
-
-
-def _particles(log: Log, runs: list[StoredRun]) -> dict[str, Particles]:
-    """The particles of the runs that use particles, by name."""
-    from factorgraph_loc.api.results import clouds_of
-
-    found: dict[str, Particles] = {}
-    for run in runs:
-        with show.progress(run.name, counted=False) as report:
-            found |= clouds_of(log, [run], partial(report, total=1.0))
-        if run.name in found and (difference := found[run.name].difference) > SAME:
-            show.note(
-                f"warning: {run.folder.path}: repeated, it differs by up to {difference:.2g} m, so its particles "
-                "differ too: did the rig, the map or the version change?"
-            )
-    if not found:
-        show.note("warning: no run has particles; only particle_filter and switching use them")
-    return found
 
 
 def shown(log: Log, runs: list[StoredRun]) -> dict[str, Any]:

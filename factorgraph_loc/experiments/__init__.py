@@ -10,7 +10,6 @@ __all__ = [
     "learning",
     "maps",
     "output",
-    "particles",
     "plan",
     "reporting",
     "result_table",

@@ -131,10 +131,7 @@ def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
         s for s in (log.rig.sensors if asked is None else asked) if s in there and not lacking_section(log.rig, s)
     )
     if not log.streams:
-        as_odometry = "--reader trajectory --reader-option use=odometry"
-        raise InputError(
-            f"{log.name}: is a trajectory without measurements, expected a log; as odometry: {as_odometry}"
-        )
+        raise InputError(f"{log.name}: has a reference but no measurements, expected odometry at least")
     if not sensors:
         raise InputError(
             f"{log.name}: has none of the rig's sensors {listed(log.rig.sensors)}{nearest('', list(there))}"

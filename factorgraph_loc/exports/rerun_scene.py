@@ -12,7 +12,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +20,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.rerun_camera import TIMELINE, WORLD, camera_path, record_camera, times
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK, open_viewer
-from factorgraph_loc.exports.runs import Particles, StoredRun
+from factorgraph_loc.exports.runs import StoredRun
 from factorgraph_loc.exports.scene import DARK, LIT, REFERENCE, Colour, colours
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.temporary import writing
@@ -40,10 +39,8 @@ LINE, POINT = 0.02, 0.06  # m: radii
 ARROW = 0.6  # m
 
 
-def write_rrd(
-    log: Log, runs: Sequence[StoredRun], path: Path, particles: Mapping[str, Particles] = MappingProxyType({})
-) -> None:
-    """Write a file that ``rerun FILE`` opens. ``particles``: by name of the run.
+def write_rrd(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
+    """Write a file that ``rerun FILE`` opens.
 
     Raises InputError if ``rerun-sdk`` is not installed, an image cannot be read, or the file cannot be written.
     """
@@ -52,19 +49,14 @@ def write_rrd(
 
     stream = rr.binary_stream(recording)  # in memory, because Rerun's own writer hangs when the disk is full
     recording.send_blueprint(_blueprint(log, runs), make_active=False)
-    _record(recording, log, runs, particles)
+    _record(recording, log, runs)
     content = stream.read()
     recording.disconnect()
     with writing(path), replacing(path) as temporary:
         temporary.write_bytes(content or b"")
 
 
-def show(
-    log: Log,
-    runs: Sequence[StoredRun],
-    particles: Mapping[str, Particles] = MappingProxyType({}),
-    bind: str = LOOPBACK,
-) -> None:
+def show(log: Log, runs: Sequence[StoredRun], bind: str = LOOPBACK) -> None:
     """Open the viewer, or use one that is open. ``bind``: IP address that a new viewer listens on; only this machine reaches the
     default one.
 
@@ -75,7 +67,7 @@ def show(
     recording = _recording()
     with open_viewer(bind) as url:
         recording.connect_grpc(url, default_blueprint=_blueprint(log, runs))
-        _record(recording, log, runs, particles)
+        _record(recording, log, runs)
         recording.flush()
 
 
@@ -101,9 +93,7 @@ def _quiet() -> Iterator[None]:
         del os.environ["RUST_LOG"]
 
 
-def _record(
-    recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun], particles: Mapping[str, Particles]
-) -> None:
+def _record(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) -> None:
     import rerun as rr  # noqa: PLC0415
 
     recording.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -113,8 +103,6 @@ def _record(
         _robot(recording, f"{WORLD}/reference/robot", log.reference, REFERENCE)
     for run, colour in zip(runs, colours(), strict=False):
         _run(recording, run, colour)
-        if run.name in particles:
-            _particles(recording, f"{WORLD}/{run.name}/particles", particles[run.name], colour)
     record_camera(recording, log, runs)
 
 
@@ -180,16 +168,6 @@ def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
     if run.events:
         when, texts = zip(*run.events, strict=True)
         recording.send_columns(f"{EVENTS}/{run.name}", times(np.array(when)), rr.TextLog.columns(text=texts))
-
-
-def _particles(recording: rr.RecordingStream, at: str, particles: Particles, colour: Colour) -> None:
-    import rerun as rr  # noqa: PLC0415
-
-    if any(map(len, particles.poses)):
-        positions = _on_floor(np.concatenate(particles.poses)[:, :2])
-        columns = rr.Points3D.columns(positions=positions).partition([len(poses) for poses in particles.poses])
-        recording.send_columns(at, times(particles.t), columns)
-        recording.log(at, rr.Points3D.from_fields(radii=LINE, colors=colour), static=True)
 
 
 def _path(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:

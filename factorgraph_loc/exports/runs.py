@@ -25,17 +25,6 @@ OUTSIDE = 60.0  # s that an estimate may lie outside of its log
 SERIES = ("error_position", "error_heading", "nees")
 
 
-@dataclass(frozen=True)
-class Particles:
-    """``t`` (N,) [s of the log] and ``poses``: N arrays (K, 3) of equally weighted particles, empty where there are none.
-    ``difference`` [m]: the largest difference between the causal positions of the stored run and of the repeated run.
-    """
-
-    t: Array
-    poses: tuple[Array, ...]
-    difference: float
-
-
 class _Landmark(FileModel, extra="ignore"):
     x: float | None
     y: float | None

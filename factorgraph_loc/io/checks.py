@@ -67,7 +67,7 @@ def require_one_span(log: Log) -> None:
 
 
 def look_over(log: Log) -> list[str]:
-    """Warnings about a whole log; InputError if it has no odometry, which only a bare trajectory lacks."""
+    """Warnings about a whole log; InputError if it has measurements but no odometry."""
     odometry = log.streams.get("odometry")
     if odometry is None and log.reference is not None and not log.streams:
         return []

@@ -5,12 +5,9 @@ import json
 
 import numpy as np
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.io.native.world_file import read_world, write_world
-from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.io.native.world_file import read_world
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
 
 WALL = 3.0  # m, where the picture hangs
 
@@ -70,35 +67,6 @@ def test_a_map_is_thinned_extended_and_exported(fgloc, gallery_on_disk, tmp_path
     rows = np.array([line.split() for line in body.splitlines()], dtype=float)
     np.testing.assert_allclose(rows[:, :3], read_world(both).points.positions, atol=1e-6)
     assert (rows[:, 4] >= 1).all()
-
-
-def test_a_map_goes_to_g2o(fgloc, gallery_on_disk, tmp_path):
-    log, world, out = gallery_on_disk(), tmp_path / "a.world.toml", tmp_path / "a.g2o"
-    assert fgloc("map", log, "-o", world).exit_code == 0
-    result = fgloc("export", log, "--world", world, "-o", out)
-    assert result.exit_code == 0, result.output
-    rows = [line.split() for line in out.read_text().splitlines()]
-    values = {row[1]: np.array(row[2:], dtype=float) for row in rows if row[0].startswith("VERTEX")}
-    focal = float(next(row[2] for row in rows if row[0] == "PARAMS_CAMERAPARAMETERS"))
-    edges = [row for row in rows if row[0] == "EDGE_PROJECT_XYZ2UV"]
-    apart = []
-    for _, point, image, _, *pixel in edges:
-        pose = values[image]
-        seen = Rotation.from_quat(pose[3:]).inv().apply(values[point] - pose[:3])
-        apart.append(np.array(pixel[:2], dtype=float) - focal * seen[:2] / seen[2])
-    assert sum(row[0] == "VERTEX_XYZ" for row in rows) == len(read_world(world).points)
-    assert len(edges) > 300
-    assert np.median(np.linalg.norm(apart, axis=1)) < 2.0
-    assert rows[-1] == ["FIX", "0"]
-
-
-def test_points_without_descriptors_do_not_go_to_g2o(fgloc, gallery_on_disk, tmp_path):
-    write_world(World(points=PointMap.of(["door"], np.ones((1, 3)))), tmp_path / "a.world.toml")
-    out = tmp_path / "a.g2o"
-    result = fgloc("export", gallery_on_disk(), "--world", tmp_path / "a.world.toml", "-o", out)
-    assert result.exit_code == 2
-    assert "its map has no points with descriptors to write" in result.stderr
-    assert not out.exists()
 
 
 UNKNOWN = ("-e", "smoother", "--set", "smoother.landmarks=unknown")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.exports import rerun_scene
-from factorgraph_loc.exports.runs import Particles, find_runs, read_runs
+from factorgraph_loc.exports.runs import find_runs, read_runs
 from factorgraph_loc.maps.points import PointMap
 from factors.camera import model as reprojection
 
@@ -119,12 +119,3 @@ def test_pictures_with_what_is_seen_and_what_should_be(log, results, recording):
     order = np.argsort(pixels[:, 0])
     found = np.array(expected[1.5])
     assert np.allclose(found[np.argsort(found[:, 0])], pixels[order] + 0.5, atol=1e-4)
-
-
-def test_particles_come_and_go(log, results, tmp_path):
-    clouds = {
-        "ekf": Particles(np.array((0.0, 0.5)), (np.array([(1.0, 2.0, 0.3), (3.0, 4.0, 0.1)]), np.empty((0, 3))), 0.0)
-    }
-    rerun_scene.write_rrd(log, read_runs(find_runs(results), log), tmp_path / "arc.rrd", clouds)
-    rows = Recording(tmp_path / "arc.rrd")("/world/ekf/particles", "positions")
-    assert [(t, v) for t, v in rows if t is not None] == [(0.0, [[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]]), (0.5, [])]

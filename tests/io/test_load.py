@@ -189,3 +189,13 @@ def test_the_data_sets_of_an_installed_package_lie_in_it(tmp_path, monkeypatch):
     monkeypatch.setattr(shipped.resources, "files", lambda _: tmp_path)
     for files, name in ((manifests(), "hall.toml"), (rigs(), "hall.rig.toml"), (readers(), "hall.reader.toml")):
         assert files == {"hall": tmp_path / "datasets" / name}
+
+
+def test_files_that_are_no_logs(tmp_path, refused):
+    poses = tmp_path / "a.tum"
+    poses.write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    refused(poses, "a.tum: is a file of poses, expected a log", "fgloc score")
+    (tmp_path / "a.csv").write_text("t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n")
+    refused(tmp_path / "a.csv", "is a table: describe its columns in a manifest")
+    (tmp_path / "a.txt").write_text("hello\n")
+    refused(tmp_path / "a.txt", "is not a manifest (.toml); name the reader of this format")

@@ -19,6 +19,5 @@ __all__ = [
     "read_log",
     "read_manifest",
     "reader",
-    "trajectory",
     "verify",
 ]

@@ -58,8 +58,8 @@ def load(
 ) -> list[Log]:
     """The logs that ``log`` refers to.
 
-    ``log``: a manifest, a folder in the native format or its ``run.toml``, a name in ``manifests()``, a file of poses in TUM, KITTI
-    or EuRoC format, or any path with ``reader``.
+    ``log``: a manifest, a folder in the native format or its ``run.toml``, a name in ``manifests()``, or any path with
+    ``reader``.
     ``options``: of the reader, overriding those of a manifest; a list, or text with commas, gives one log per value. ``rig`` and
     ``world``, values or files, replace those of the log. ``data_root``: a folder that a manifest may lead to besides its own, by
     default the environment's FGLOC_DATA. InputError describes what is invalid in one line.
@@ -145,7 +145,10 @@ def _from_file(log: str, path: Path, data_root: str | Path | None, given: Collec
     if path.suffix == ".toml":
         return _from_manifest(path, data_root, given)
     if is_pose_file(path):
-        return _Source("trajectory", path)
+        raise InputError(
+            f"{log}: is a file of poses, expected a log: name it as odometry or reference in a manifest with the reader mapped, "
+            f"or compare it with a log: `fgloc score {log} LOG`"
+        )
     if path.suffix.lower() in TABLES:
         raise InputError(f"{log}: is a table: describe its columns in a manifest with the reader mapped")
     raise InputError(f"{log}: is not a manifest (.toml); name the reader of this format")
