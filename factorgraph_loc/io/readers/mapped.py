@@ -170,7 +170,8 @@ def _in_map(table: TableRows, folder: TableFolder, naming: NamesFile) -> TableRo
     if not len(kept):
         raise InputError(f"{table.path}: no row has a {column} that {path.name} names, such as {listed(known)}")
     if skipped := len(names) - len(kept):
-        folder.warnings.append(f"{table.path}: {skipped} rows have a {column} that {path.name} does not name: skipped")
+        among = f"a {column} that is not among the names taken from {path.name}"
+        folder.warnings.append(f"{table.path}: {skipped} rows have {among}: skipped")
     found = table.rows_at(kept)
     return replace(found, names={column: [known[name] for name in found.names[column]]})
 
