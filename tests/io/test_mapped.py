@@ -257,7 +257,10 @@ def test_names_of_the_map_and_the_map_are_tables_of_the_folder(hall, one):
     seen = log.streams["bearing_range"]
     assert list(seen.landmark) == ["A", "B"]
     np.testing.assert_array_equal(seen.range, (2.5, 1.5))
-    assert any("seen.csv: 2 rows have a landmark that is not among the names taken from codes.csv" in told for told in log.warnings)
+    assert any(
+        "seen.csv: 2 rows have a landmark that is not among the names taken from codes.csv" in told
+        for told in log.warnings
+    )
     assert (log.world.name, list(log.world.landmarks)) == ("yard", ["A", "B"])
     for name, expected in {"A": (1.0, 2.0, 0.002), "B": (-0.5, 0.0, 0.004)}.items():
         landmark = log.world.landmarks[name]

@@ -32,7 +32,10 @@ def test_what_is_read(mrclam, read):
     assert log.world.landmarks["6"].sigma == 0.0002
     np.testing.assert_array_equal(log.reference.t, (-0.056, 0.044))
     left_out, no_rig = log.warnings
-    assert "Robot1_Measurement.dat: 2 rows have a landmark that is not among the names taken from Barcodes.dat: skipped" in left_out
+    assert (
+        "Robot1_Measurement.dat: 2 rows have a landmark that is not among the names taken from Barcodes.dat: skipped"
+        in left_out
+    )
     assert "no rig is given" in no_rig
 
 
