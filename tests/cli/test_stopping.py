@@ -1,5 +1,6 @@
 """Commands that a signal ends: with one line, an exit code, and nothing left behind; after `kill -9` the same command goes on."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -72,7 +73,8 @@ def test_a_conversion_is_whole_or_not_there(how, processes, short_log, tmp_path,
     fgloc("convert", short_log, tmp_path / "expected")
     running = processes.start(*COMMAND, "convert", short_log, tmp_path / "copy")
     processes.wait_until(lambda: temporary(tmp_path) or running.poll() is not None)
-    os.killpg(running.pid, how)
+    with contextlib.suppress(ProcessLookupError):  # it has just ended
+        os.killpg(running.pid, how)
     running.wait()
     if running.returncode == 130:
         assert temporary(tmp_path) == []
