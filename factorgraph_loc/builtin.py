@@ -15,8 +15,8 @@ ESTIMATORS.own |= {
     "particle_filter": "factorgraph_loc.fusion.particle_filter:ParticleFilter",
     "switching": "factorgraph_loc.fusion.switching:Switching",
     "monoslam": "factorgraph_loc.slam.monoslam:Monoslam",
-    "smoother": "factorgraph_loc.fusion.smoother:Smoother",
-    "batch": "factorgraph_loc.fusion.batch:Batch",
+    "smoother": "factorgraph_loc.fusion.graph.smoother:Smoother",
+    "batch": "factorgraph_loc.fusion.graph.batch:Batch",
 }
 MAPPERS.own["points"] = "factorgraph_loc.slam.point_mapper:bind"
 READERS.own |= {

@@ -2,22 +2,17 @@
 
 __all__ = [
     "base",
-    "batch",
     "cloud",
     "cloud_view",
     "dead_reckoning",
     "ekf",
-    "graph_parts",
+    "graph",
     "guarded",
     "kld",
     "map_frame",
     "mapping",
-    "marginals",
     "particle_filter",
-    "problem",
     "registry",
-    "smoother",
     "switching",
     "timeline",
-    "variables",
 ]

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe
-from factorgraph_loc.fusion.variables import Node, Values
+from factorgraph_loc.fusion.graph.graph_parts import Addition, Guess, Keyframe
+from factorgraph_loc.fusion.graph.variables import Node, Values
 from factorgraph_loc.maps.points import PointMap
 from factors.motion import Increment
 from factors.se2 import Array

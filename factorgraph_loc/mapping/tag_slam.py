@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.fusion.marginals import IndeterminateError
-from factorgraph_loc.fusion.problem import Problem
-from factorgraph_loc.fusion.variables import Values, constants_key, landmark_key, pose_key
+from factorgraph_loc.fusion.graph.marginals import IndeterminateError
+from factorgraph_loc.fusion.graph.problem import Problem
+from factorgraph_loc.fusion.graph.variables import Values, constants_key, landmark_key, pose_key
 from factorgraph_loc.mapping.tag_looks import TagLooks
 from factorgraph_loc.mapping.tag_refinement import reach
 from factorgraph_loc.mapping.tag_search import TagPosterior, search

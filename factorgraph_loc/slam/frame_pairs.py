@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph_parts import Keyframe
-from factorgraph_loc.fusion.variables import Node
+from factorgraph_loc.fusion.graph.graph_parts import Keyframe
+from factorgraph_loc.fusion.graph.variables import Node
 from factorgraph_loc.vision.frame_motion import frame_motion
 from factors.camera.model import CameraModel
 from factors.camera.visual_odometry import SHARED, VisualOdometryFactor

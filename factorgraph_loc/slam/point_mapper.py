@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 
-from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe
+from factorgraph_loc.fusion.graph.graph_parts import Addition, GraphSettings, Guess, Keyframe
+from factorgraph_loc.fusion.graph.variables import Node, Values, gather
 from factorgraph_loc.fusion.mapping import GraphView
-from factorgraph_loc.fusion.variables import Node, Values, gather
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.base import Sensor

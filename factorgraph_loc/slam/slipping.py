@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph_parts import Guess, Keyframe
+from factorgraph_loc.fusion.graph.graph_parts import Guess, Keyframe
 from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, lifted
 from factorgraph_loc.vision.consensus import agreeing
 from factors import positive

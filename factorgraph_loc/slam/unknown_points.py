@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe, jumps
+from factorgraph_loc.fusion.graph.graph_parts import Addition, Guess, Keyframe, jumps
+from factorgraph_loc.fusion.graph.variables import Node, point_key, tilt_key
 from factorgraph_loc.fusion.mapping import GraphView
-from factorgraph_loc.fusion.variables import Node, point_key, tilt_key
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING, Estimated

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.fusion.chained import Chained
-from factorgraph_loc.fusion.problem import Problem
-from factorgraph_loc.fusion.variables import constants_key, landmark_key, pose_key
+from factorgraph_loc.fusion.graph.chained import Chained
+from factorgraph_loc.fusion.graph.problem import Problem
+from factorgraph_loc.fusion.graph.variables import constants_key, landmark_key, pose_key
 from factors import se2
 from factors.graph import PriorFactor, VectorPriorFactor
 from factors.landmarks.factor import BearingRangeFactor

@@ -8,7 +8,7 @@ from landmark_world import simulate, with_sightings
 
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.solvers import FullHistory, Window
+from factorgraph_loc.fusion.graph.solver import FullHistory, Window
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream

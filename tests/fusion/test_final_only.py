@@ -6,7 +6,7 @@ from landmark_world import simulate
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.incremental import Incremental
+from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.registry import for_final_only, settings_of
 
 

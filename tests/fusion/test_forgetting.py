@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorgraph_loc.experiments.preparation import resolve_prior
-from factorgraph_loc.fusion.kept import Kept
+from factorgraph_loc.fusion.graph.kept import Kept
 from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.setup import Setup

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.fusion.linear_factors import unaware
-from factorgraph_loc.fusion.variables import (
+from factorgraph_loc.fusion.graph.linear_factors import unaware
+from factorgraph_loc.fusion.graph.variables import (
     constants_key,
     frame_motions,
     is_place,

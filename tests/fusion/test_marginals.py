@@ -7,11 +7,11 @@ from landmark_world import simulate
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion import incremental
-from factorgraph_loc.fusion.marginals import IndeterminateError, covariances
-from factorgraph_loc.fusion.problem import Problem
-from factorgraph_loc.fusion.solvers import Window
-from factorgraph_loc.fusion.variables import constants_key, pose_key
+from factorgraph_loc.fusion.graph import isam
+from factorgraph_loc.fusion.graph.marginals import IndeterminateError, covariances
+from factorgraph_loc.fusion.graph.problem import Problem
+from factorgraph_loc.fusion.graph.solver import Window
+from factorgraph_loc.fusion.graph.variables import constants_key, pose_key
 
 STEP = np.array(((1.0, 0.0, 0.03), (0.0, 1.0, 0.3), (0.0, 0.0, 1.0)))
 WHITENER = np.diag((300.0, 3000.0, 200.0))
@@ -112,7 +112,7 @@ def test_a_smoother_that_cannot_be_solved_says_so_in_one_line(lag, monkeypatch):
     def failing(_, key, **__):
         raise RuntimeError(GTSAM_SAYS.format(key))
 
-    monkeypatch.setattr(incremental.Incremental, "_marginal", failing)
+    monkeypatch.setattr(isam.Incremental, "_marginal", failing)
     with pytest.raises(RunFailedError) as raised:
         run(simulate(seconds=3.0), RunConfig("smoother", {} if lag is None else {"lag": lag}))
     text = str(raised.value)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.solvers import MARGIN, FullHistory, Window, read_all
-from factorgraph_loc.fusion.summary import MarginalSummary
-from factorgraph_loc.fusion.variables import Node, index_of, is_pose, landmark_key, pose_key, read, to_gtsam
+from factorgraph_loc.fusion.graph.solver import MARGIN, FullHistory, Window, read_all
+from factorgraph_loc.fusion.graph.summary import MarginalSummary
+from factorgraph_loc.fusion.graph.variables import Node, index_of, is_pose, landmark_key, pose_key, read, to_gtsam
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factors import se2
 

@@ -5,7 +5,7 @@ import pytest
 from landmark_world import simulate
 
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.incremental import Incremental
+from factorgraph_loc.fusion.graph.isam import Incremental
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,9 @@
 import camera_world
 import numpy as np
 
-from factorgraph_loc.fusion.graph_parts import Keyframe
-from factorgraph_loc.fusion.problem import Problem
-from factorgraph_loc.fusion.variables import point_key, pose_key, tilt_key
+from factorgraph_loc.fusion.graph.graph_parts import Keyframe
+from factorgraph_loc.fusion.graph.problem import Problem
+from factorgraph_loc.fusion.graph.variables import point_key, pose_key, tilt_key
 from factorgraph_loc.slam.local_bundle import bundled
 from factorgraph_loc.slam.new_points import sightings_of
 from factors import positive, se2

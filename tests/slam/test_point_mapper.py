@@ -5,7 +5,7 @@ from dataclasses import replace
 import camera_world
 import numpy as np
 
-from factorgraph_loc.fusion.smoother import Smoother, SmootherSettings
+from factorgraph_loc.fusion.graph.smoother import Smoother, SmootherSettings
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.setup import Setup

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 import factorgraph_loc as fgloc
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.solvers import FullHistory
-from factorgraph_loc.fusion.variables import pose_key
+from factorgraph_loc.fusion.graph.solver import FullHistory
+from factorgraph_loc.fusion.graph.variables import pose_key
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World

@@ -18,9 +18,9 @@ from typing import Protocol
 import numpy as np
 
 from factorgraph_loc.fusion.base import EVERY
-from factorgraph_loc.fusion.builder import Backend, Builder
-from factorgraph_loc.fusion.graph import Graph
-from factorgraph_loc.fusion.graph_parts import GraphSettings, Keyframe
+from factorgraph_loc.fusion.graph.graph import Graph
+from factorgraph_loc.fusion.graph.graph_parts import GraphSettings, Keyframe
+from factorgraph_loc.fusion.graph.keyframes import Backend, Builder
 from factorgraph_loc.fusion.mapping import Mapper
 from factorgraph_loc.fusion.search import DURATION, Refuted, Search, Tracked
 from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, gaussian_belief

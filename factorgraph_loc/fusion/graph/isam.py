@@ -13,15 +13,15 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.graduation import best_optimum, settled
-from factorgraph_loc.fusion.graph import Graph
-from factorgraph_loc.fusion.graph_parts import Addition, Guess, Keyframe, SmootherSettings, jumps
-from factorgraph_loc.fusion.kept import Kept
-from factorgraph_loc.fusion.marginals import IndeterminateError, covariances
-from factorgraph_loc.fusion.solvers import MARGIN, WITH_POINTS, FullHistory, Solver, Window, read_all
-from factorgraph_loc.fusion.stalled import Stalled
-from factorgraph_loc.fusion.summary import MarginalSummary, is_missing
-from factorgraph_loc.fusion.variables import (
+from factorgraph_loc.fusion.graph.graduation import best_optimum, settled
+from factorgraph_loc.fusion.graph.graph import Graph
+from factorgraph_loc.fusion.graph.graph_parts import Addition, Guess, Keyframe, SmootherSettings, jumps
+from factorgraph_loc.fusion.graph.kept import Kept
+from factorgraph_loc.fusion.graph.marginals import IndeterminateError, covariances
+from factorgraph_loc.fusion.graph.solver import MARGIN, WITH_POINTS, FullHistory, Solver, Window, read_all
+from factorgraph_loc.fusion.graph.stalled import Stalled
+from factorgraph_loc.fusion.graph.summary import MarginalSummary, is_missing
+from factorgraph_loc.fusion.graph.variables import (
     Node,
     Values,
     gtsam_errors,

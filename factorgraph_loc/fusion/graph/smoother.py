@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from factorgraph_loc.fusion.batch import at_the_end
-from factorgraph_loc.fusion.graph import Graph
-from factorgraph_loc.fusion.graph_estimator import GraphEstimator, SolvingBackend
-from factorgraph_loc.fusion.graph_parts import SmootherSettings
-from factorgraph_loc.fusion.incremental import Incremental
+from factorgraph_loc.fusion.graph.batch import at_the_end
+from factorgraph_loc.fusion.graph.estimator import GraphEstimator, SolvingBackend
+from factorgraph_loc.fusion.graph.graph import Graph
+from factorgraph_loc.fusion.graph.graph_parts import SmootherSettings
+from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.model.belief import PoseEstimate
 from factorgraph_loc.model.setup import Setup
 

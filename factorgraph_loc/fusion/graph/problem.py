@@ -11,10 +11,10 @@ from functools import cached_property
 
 import gtsam
 
-from factorgraph_loc.fusion.chained import Chained
-from factorgraph_loc.fusion.least_squares import MAX_ITERATIONS, damped_step, optimum
-from factorgraph_loc.fusion.marginals import Covariances, covariances
-from factorgraph_loc.fusion.variables import Values, gather, retract
+from factorgraph_loc.fusion.graph.chained import Chained
+from factorgraph_loc.fusion.graph.least_squares import MAX_ITERATIONS, damped_step, optimum
+from factorgraph_loc.fusion.graph.marginals import Covariances, covariances
+from factorgraph_loc.fusion.graph.variables import Values, gather, retract
 from factors.graph import Factor, jacobian_factors
 
 

@@ -7,7 +7,7 @@ from typing import Never
 
 import gtsam
 
-from factorgraph_loc.fusion.summary import MarginalSummary
+from factorgraph_loc.fusion.graph.summary import MarginalSummary
 from factors.se2 import Array
 
 FIRST_WAIT = 1.0  # s until the next try, twice as long each time

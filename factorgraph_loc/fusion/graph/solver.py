@@ -12,9 +12,9 @@ from typing import Any, Protocol, cast
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.linear_factors import LinearFactors
-from factorgraph_loc.fusion.summary import MarginalSummary, oldest_pose
-from factorgraph_loc.fusion.variables import (
+from factorgraph_loc.fusion.graph.linear_factors import LinearFactors
+from factorgraph_loc.fusion.graph.summary import MarginalSummary, oldest_pose
+from factorgraph_loc.fusion.graph.variables import (
     Node,
     Values,
     gtsam_errors,

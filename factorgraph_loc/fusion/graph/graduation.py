@@ -6,9 +6,9 @@ loss). Those of links between poses, of which most may be false, begin so wide t
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph import Graph
-from factorgraph_loc.fusion.problem import Problem, Solution
-from factorgraph_loc.fusion.variables import Values
+from factorgraph_loc.fusion.graph.graph import Graph
+from factorgraph_loc.fusion.graph.problem import Problem, Solution
+from factorgraph_loc.fusion.graph.variables import Values
 from factors.se2 import Array
 
 ITERATIONS_PER_WIDTH = 5

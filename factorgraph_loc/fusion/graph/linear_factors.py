@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.variables import Node, Values, frame_motions, is_place, is_pose, read, to_gtsam
+from factorgraph_loc.fusion.graph.variables import Node, Values, frame_motions, is_place, is_pose, read, to_gtsam
 from factors.graph import Factor, gaussian_factor, jacobian_factors, silenced
 from factors.se2 import Array
 

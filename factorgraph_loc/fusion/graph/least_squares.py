@@ -7,7 +7,7 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.variables import gtsam_errors
+from factorgraph_loc.fusion.graph.variables import gtsam_errors
 
 MAX_ITERATIONS = 100
 CONVERGED_GAIN = 1e-6  # of the cost

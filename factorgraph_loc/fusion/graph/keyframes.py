@@ -19,12 +19,12 @@ from typing import Protocol
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.graph import Graph
-from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe, TickAt
+from factorgraph_loc.fusion.graph.graph import Graph
+from factorgraph_loc.fusion.graph.graph_parts import Addition, GraphSettings, Guess, Keyframe, TickAt
+from factorgraph_loc.fusion.graph.variables import Node
 from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.fusion.search import Search, laplace_evidence
-from factorgraph_loc.fusion.variables import Node
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation, Sensor
 from factors import se2_kernels

@@ -12,13 +12,11 @@ import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.fusion.changes import Change, is_known
-from factorgraph_loc.fusion.graph_parts import Keyframe, TickAt
-from factorgraph_loc.fusion.kept import Kept
-from factorgraph_loc.fusion.layout import MOTION
-from factorgraph_loc.fusion.mapping import Mapper
-from factorgraph_loc.fusion.marginals import IndeterminateError, blamed, damped
-from factorgraph_loc.fusion.problem import Problem
-from factorgraph_loc.fusion.variables import (
+from factorgraph_loc.fusion.graph.graph_parts import Keyframe, TickAt
+from factorgraph_loc.fusion.graph.kept import Kept
+from factorgraph_loc.fusion.graph.marginals import IndeterminateError, blamed, damped
+from factorgraph_loc.fusion.graph.problem import Problem
+from factorgraph_loc.fusion.graph.variables import (
     Node,
     Values,
     constants_key,
@@ -31,6 +29,8 @@ from factorgraph_loc.fusion.variables import (
     landmark_key,
     pose_key,
 )
+from factorgraph_loc.fusion.layout import MOTION
+from factorgraph_loc.fusion.mapping import Mapper
 from factorgraph_loc.model.belief import Learnt, PosePrior, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Motion

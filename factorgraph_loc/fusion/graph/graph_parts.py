@@ -7,7 +7,7 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import Field, PlainSerializer, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.fusion.variables import Node, Values, pose_key
+from factorgraph_loc.fusion.graph.variables import Node, Values, pose_key
 from factorgraph_loc.model.setup import MapUse
 from factors import positive, se2
 from factors.graph import Factor

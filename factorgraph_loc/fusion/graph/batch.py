@@ -12,12 +12,12 @@ from typing import Annotated
 
 from pydantic import Field
 
-from factorgraph_loc.fusion.graduation import best_optimum, settled
-from factorgraph_loc.fusion.graph import Graph
-from factorgraph_loc.fusion.graph_estimator import GraphEstimator, SolvingBackend
-from factorgraph_loc.fusion.graph_parts import Addition, GraphSettings, Guess, Keyframe, SmootherSettings
-from factorgraph_loc.fusion.incremental import Incremental
-from factorgraph_loc.fusion.variables import Values, pose_key
+from factorgraph_loc.fusion.graph.estimator import GraphEstimator, SolvingBackend
+from factorgraph_loc.fusion.graph.graduation import best_optimum, settled
+from factorgraph_loc.fusion.graph.graph import Graph
+from factorgraph_loc.fusion.graph.graph_parts import Addition, GraphSettings, Guess, Keyframe, SmootherSettings
+from factorgraph_loc.fusion.graph.isam import Incremental
+from factorgraph_loc.fusion.graph.variables import Values, pose_key
 from factorgraph_loc.model.belief import PoseEstimate
 from factorgraph_loc.model.setup import Setup
 from factors.se2 import Array

@@ -10,8 +10,8 @@ from typing import cast
 
 import numpy as np
 
-from factorgraph_loc.fusion.marginals import Covariances
-from factorgraph_loc.fusion.variables import Values, index_of, is_pose
+from factorgraph_loc.fusion.graph.marginals import Covariances
+from factorgraph_loc.fusion.graph.variables import Values, index_of, is_pose
 from factors import chain, se2
 from factors.graph import Factor, Stack, Stackable
 from factors.se2 import Array
