@@ -8,8 +8,9 @@ import numpy as np
 
 from factorgraph_loc.fusion.search import Search
 from factorgraph_loc.model.belief import Belief, PosePrior
-from factorgraph_loc.model.measurement import Measurement, Motion, Tick
+from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
+from factorgraph_loc.sensors.motion import Motion
 from factors import se2
 from factors.se2 import Array
 

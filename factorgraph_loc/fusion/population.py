@@ -24,9 +24,9 @@ import numpy as np
 from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.cloud import Cloud, effective_size, largest_share, systematic, weighable
 from factorgraph_loc.model.belief import Mode, PosePrior
-from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.sensors.base import Observation
 from factorgraph_loc.sensors.known_position import KnownPosition
+from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
 from factors.motion import ChainState
 from factors.se2 import Array

@@ -19,9 +19,10 @@ import numpy as np
 from factorgraph_loc.fusion.changes import Change
 from factorgraph_loc.fusion.population import Population
 from factorgraph_loc.model.belief import Mode, PosePrior
-from factorgraph_loc.model.measurement import Motion, Tick
+from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.sensors.base import Observation, Sensor, View
 from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
+from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
 from factors.motion import ChainState
 from factors.se2 import Array

@@ -21,7 +21,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.binding import bound_motion
+from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
 from factors.motion import ChainState, Increment, propagate
 from factors.se2 import Array
@@ -72,7 +72,7 @@ class Switching:
         by_scans = TAG_SENSORS[0] in setup.sensors
         self.supports_unknown_start = by_scans or self._vision.supports_unknown_start
         self.supports_unknown_heading = by_scans or self._vision.supports_unknown_heading
-        self._motion = bound_motion(setup, Diagnostics())
+        self._motion = Motion(setup.rig, setup.sensors, Diagnostics())
         self._active: Filter = self._tags if by_scans else self._vision
         self._newest_scan = -np.inf
         self._ticks: list[float] = []

@@ -20,7 +20,7 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import Sensor
-from factorgraph_loc.sensors.binding import bound_motion
+from factorgraph_loc.sensors.motion import Motion
 from factors import se2, se2_kernels
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
@@ -65,7 +65,7 @@ class Filter(ABC):
         self._max_delay = settings.max_delay
         self._smooth = settings.smooth
         calibrates = getattr(settings, "self_calibration", False)
-        self._motion = bound_motion(setup, self.diagnostics, self_calibration=calibrates)
+        self._motion = Motion(setup.rig, setup.sensors, self.diagnostics, self_calibration=calibrates)
         self._sensors: dict[str, Sensor] = {}  # by the modality of their measurements
         self._rng: np.random.Generator | None = None  # of a filter whose predictions draw
         self._state: Any = None

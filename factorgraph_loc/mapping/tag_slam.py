@@ -23,7 +23,7 @@ from factorgraph_loc.mapping.tag_search import TagPosterior, search
 from factorgraph_loc.model.belief import LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import TICK_GAP
-from factorgraph_loc.sensors.odometry.motion import whole_motion
+from factorgraph_loc.sensors.motion import whole_motion
 from factorgraph_loc.sensors.registry import moving
 from factors import se2
 from factors.graph import Factor, PriorFactor, VectorPriorFactor

@@ -1,26 +1,18 @@
-"""The interface of measurements, frozen values with timestamps in seconds from the start of the log, in SI units; the rows of one
-sensor of a log; and the interface of motion sensors (odometry) used for prediction."""
+"""The interface of measurements, frozen values with timestamps in seconds from the start of the log, in SI units; and the
+rows of one sensor of a log."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from itertools import compress, pairwise
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factors.se2 import Array
-
-if TYPE_CHECKING:
-    import gtsam
-
-    from factorgraph_loc.model.settings import Estimated
-    from factors.graph import Factor
-    from factors.motion import ChainState, Increment
-
 
 GOING_BACK = 5.0  # s that an estimator goes back in time, at most, for one that is late
 SEEN = 2  # rank of exteroceptive streams; motion has lower ranks
@@ -159,70 +151,3 @@ def joined(first: Stream, second: Stream) -> Stream:
         k: np.concatenate((a, b)) if isinstance(a, np.ndarray) else [*a, *b] for k, (a, b) in columns.items()
     }
     return replace(first, **both)
-
-
-class Motion(Protocol):
-    """A motion sensor: collects rows and gives the relative motion between any two recent times.
-
-    ``constants``: the P calibration constants that are estimated. ``horizon`` [s]: how long rows are kept.
-    """
-
-    constants: Estimated
-    horizon: float
-
-    def add(self, m: Any) -> None:
-        """Add a row, or :class:`~factorgraph_loc.model.measurement.Rows`. Unused rows are counted as ignored, those older than the
-        kept rows as late."""
-
-    def keep(self, horizon: float) -> None:
-        """Keep the rows of the last ``horizon`` seconds."""
-
-    def state(self, t: float) -> ChainState:
-        """The state of the integrated odometry at ``t``. Raises RunFailedError if the rows of then are no longer kept."""
-
-    def relative(self, start: ChainState, end: ChainState) -> Increment:
-        """The relative motion between two states, with its covariance."""
-
-    def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
-        """The state at ``t``, and the relative motion from ``start`` to it."""
-
-    def moved(
-        self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array
-    ) -> tuple[Array, Array, Array]:
-        """A pose (3,) with body-frame ``covariance`` (3, 3) at ``start``, moved to ``t``, for ``constants`` (P,): the pose, and its
-        covariance in the body frame and in the world frame."""
-
-    def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
-        """The relative motions between states (N, 8), for ``constants`` (P,): poses (N, 3) and covariances (N, 3, 3)."""
-
-    def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
-        """Corrected ``delta`` (3,) of an increment for ``constants`` (P,), and its Jacobian (3, P) in the tangent space."""
-
-    def predicted(
-        self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array, first: int
-    ) -> tuple[ChainState, Array, Array, Array, Array]:
-        """Predict a Gaussian from ``start`` to ``t``: the state there, the pose (3,), the first rows (3, S) of the transition (the
-        other rows are those of the identity), the covariance (3, 3) that the motion adds to the first three components, and the
-        covariance (S, S) of the error state, in which the columns of ``constants`` (P,) begin at ``first``."""
-
-    def recalibrated(self, increment: Increment, constants: Array) -> Increment:
-        """An increment corrected for ``constants`` (P,)."""
-
-    def poses_at(self, start: ChainState, t: Array, constants: Array) -> Array:
-        """Poses (R, 3) at times (R,) relative to the pose at ``start``, for ``constants`` (P,)."""
-
-    def twist(self, t: float) -> Array:
-        """The robot's velocity (3,) just before ``t``, in the robot frame."""
-
-    def factor(self, increment: Increment, *, scale_known: bool) -> Factor:
-        """An increment as a factor on two poses, and on the constants if there are any. ``scale_known``: whether anything else than
-        the motion tells the scale of what is estimated."""
-
-    def slip(self, increment: Increment) -> tuple[Array, float]:
-        """The covariance (3, 3) that an increment has more if wheels slip, and minus the logarithm of how probable that is."""
-
-    def exact_factor(self, increment: Increment) -> Factor:
-        """An increment without constants as a factor on two poses."""
-
-    def native(self, keys: tuple[int, int], increment: Increment) -> gtsam.NonlinearFactor:
-        """An increment without constants as a GTSAM factor on two poses."""

@@ -11,7 +11,7 @@ import numpy as np
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.interfaces import Forecast
-from factorgraph_loc.sensors.odometry.motion import odometry_model
+from factorgraph_loc.sensors.motion import odometry_model
 from factorgraph_loc.sensors.registry import functions
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array

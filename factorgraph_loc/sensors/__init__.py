@@ -10,6 +10,7 @@ __all__ = [
     "landmarks",
     "loops",
     "measurements",
+    "motion",
     "odometry",
     "pushed",
     "registry",

@@ -15,10 +15,10 @@ import numpy as np
 
 from factorgraph_loc.model.belief import Mode, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.sensors.known_position import KnownPosition
+from factorgraph_loc.sensors.motion import Motion
 from factors import se2_kernels
 from factors.graph import Factor
 from factors.marginal import Marginalized

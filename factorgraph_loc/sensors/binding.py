@@ -1,18 +1,10 @@
 """Binding of the sensors of a run."""
 
-from typing import cast
-
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.sensors.base import Binding, Sensor
+from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.registry import functions
-
-
-def bound_motion(setup: Setup, diagnostics: Diagnostics, *, self_calibration: bool = False) -> Motion:
-    """The motion sensor of a run."""
-    _, predict = next(functions("predict"))
-    return cast(Motion, predict(setup.rig, setup.sensors, diagnostics, self_calibration=self_calibration))
 
 
 def bound_sensors(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.model.belief import Mode, PosePrior
-from factorgraph_loc.model.measurement import Motion
+from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
 from factors.motion import ChainState
 from factors.se2 import Array

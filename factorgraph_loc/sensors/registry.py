@@ -60,7 +60,6 @@ class SensorType:
     :class:`~factorgraph_loc.sensors.interfaces.Marks`, for plots and viewers.
 
     For estimators: ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor`, or None if a run does not use it;
-    ``predict``: ``(rig, sensors, diagnostics, self_calibration) ->`` :class:`~factorgraph_loc.model.measurement.Motion`;
     ``frame_error``: ``(setup, modalities, landmarks)``, what is not known of the frame of the map, see
     :class:`~factorgraph_loc.fusion.map_frame.MapFrame`, or None.
 
@@ -87,7 +86,6 @@ class SensorType:
     layers: Mapping[str, Layer] = field(default_factory=dict)
     simulation: Mapping[str, Section] = field(default_factory=dict)
     bind: Place = ""
-    predict: Place = ""
     frame_error: Place = ""
     summarize: Place = ""
     draw: Place = ""

@@ -33,7 +33,7 @@ def unless_slipped(
 ) -> Guess:
     """The ``guess`` of the pose of a new keyframe; if wheels slipped on the step to it, both are less certain from now on.
 
-    ``slip``: see :class:`~factorgraph_loc.model.measurement.Motion`. ``seen``: points (K, 3), their pixels (K, 2), their
+    ``slip``: see :class:`~factorgraph_loc.sensors.motion.Motion`. ``seen``: points (K, 3), their pixels (K, 2), their
     covariances (K, 3, 3), and those (K, 2, 2) of the pixels [px^2].
     """
     step = keyframe.from_previous

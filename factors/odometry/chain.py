@@ -133,7 +133,7 @@ class OdometryChain:
         indices: Integers,
         first: int,
     ) -> tuple[ChainState, Array, Array, Array, Array]:
-        """A Gaussian at ``start``, predicted to ``t``; see :meth:`factorgraph_loc.model.measurement.Motion.predicted`."""
+        """A Gaussian at ``start``, predicted to ``t``; see :meth:`factorgraph_loc.sensors.motion.Motion.predicted`."""
         size = len(covariance)
         at, transition, noise, after = np.empty(3), np.empty((3, size)), np.empty((3, 3)), np.empty((size, size))
         # into arrays that are there: each that compiled code returns takes longer than its arithmetic

@@ -10,8 +10,8 @@ from factorgraph_loc.fusion.population import CHUNK, PARTICLE, Population
 from factorgraph_loc.fusion.search import laplace_evidence
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
-from factorgraph_loc.sensors.odometry.motion import OdometryMotion
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factorgraph_loc.sensors.rfid.bound import TagObservation
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
@@ -42,7 +42,7 @@ class World:
         points = np.column_stack((points, np.full(len(points), 1.2)))
         self.likelihood = RfidLikelihood(rfid.model(), TagArray(points, np.full(len(points), np.nan)))
         self.told = self.likelihood  # what the seeker believes
-        self.motion = OdometryMotion(RIG, ("odometry", "rfid"), Diagnostics())
+        self.motion = Motion(RIG, ("odometry", "rfid"), Diagnostics())
         self.motion.add(VelocityOdometry(0.0, SPEED, turn))
         self.truth = START
         self.t = 0.0

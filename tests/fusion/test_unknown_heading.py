@@ -19,8 +19,8 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
+from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
-from factorgraph_loc.sensors.odometry.motion import OdometryMotion
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate as simulated
 from factors import se2
@@ -220,7 +220,7 @@ def test_who_cannot_find_it_says_so(config, who, log):
 
 def test_the_start_as_a_constraint():
     """Loss, gradient and density of present poses are those of where they began, and draws have the moments that it states."""
-    motion = OdometryMotion(Rig(), ("odometry",), Diagnostics())
+    motion = Motion(Rig(), ("odometry",), Diagnostics())
     for t, x, y, turn in ((0.0, 0.0, 0.0, 0.0), (1.0, 0.5, 0.1, 0.7), (2.0, 0.4, -0.1, 0.3)):
         motion.add(IncrementOdometry(t, x, y, turn))
     position, covariance = np.array((1.0, -2.0)), np.array(((0.04, 0.01), (0.01, 0.09)))

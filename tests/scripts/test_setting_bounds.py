@@ -13,7 +13,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.calibrator import CALIBRATOR
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
-from factorgraph_loc.sensors.odometry.motion import odometry_model
+from factorgraph_loc.sensors.motion import odometry_model
 from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,
     OdometryNoise,

@@ -29,8 +29,9 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.plugins import MAPPERS
-from factorgraph_loc.sensors.binding import bound_motion, bound_sensors
+from factorgraph_loc.sensors.binding import bound_sensors
 from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
+from factorgraph_loc.sensors.motion import Motion
 from factors import se2
 from factors.motion import Increment
 from factors.se2 import Array
@@ -77,7 +78,7 @@ class GraphEstimator(ABC):
         self.diagnostics = Diagnostics()
         self._max_delay = settings.max_delay
         calibration: Calibration = "all" if settings.self_calibration else "none"
-        self._motion = bound_motion(setup, self.diagnostics, self_calibration=settings.self_calibration)
+        self._motion = Motion(setup.rig, setup.sensors, self.diagnostics, self_calibration=settings.self_calibration)
         sensors = bound_sensors(
             setup,
             self._motion,

@@ -33,10 +33,10 @@ from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.mapping import Mapper
 from factorgraph_loc.model.belief import Learnt, PosePrior, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import NewVariable, Sensor, Term
+from factorgraph_loc.sensors.motion import Motion
 from factors import se2, se2_kernels
 from factors.between import between
 from factors.graph import Factor, PriorFactor, VectorPriorFactor

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.model.belief import Mode, PosePrior
-from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.sensors.camera.sensor import KnownPoints, Pixels
 from factorgraph_loc.sensors.known_position import KnownPosition
+from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.vision.relocalization import FoundOnFloor
 from factors import positive, se2
 from factors.motion import ChainState, propagate

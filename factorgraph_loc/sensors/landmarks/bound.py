@@ -11,7 +11,7 @@ import numpy as np
 
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import GOING_BACK, Motion
+from factorgraph_loc.model.measurement import GOING_BACK
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
 from factorgraph_loc.sensors.known_position import KnownPosition
@@ -20,6 +20,7 @@ from factorgraph_loc.sensors.landmarks.located import NewLandmarks
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks, together
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.motion import Motion
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor
 from factors.landmarks.model import PARAMETERS, TIME_OFFSET

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.model.belief import Mode, PosePrior, Status
-from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.landmarks.window import Sighting, SightingWindow
+from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
 from factors.landmarks.factor import BearingRangeFactor
 from factors.landmarks.model import BearingRangeModel

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factorgraph_loc.model.measurement import Motion
 from factorgraph_loc.sensors.known_position import KnownPosition
+from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
 from factors.landmarks.model import BearingRangeModel, jacobians, located, residuals, sigmas
 from factors.motion import ChainState

@@ -3,7 +3,7 @@
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
-__all__ = ["SENSOR", "calibration", "measurement", "motion", "settings", "simulation", "tables"]
+__all__ = ["SENSOR", "calibration", "measurement", "settings", "simulation", "tables"]
 
 SENSOR = SensorType(
     "odometry",
@@ -44,7 +44,6 @@ SENSOR = SensorType(
         "odometry": Section("factorgraph_loc.sensors.odometry.settings:OdometrySettings", always=True),
         "imu": Section("factorgraph_loc.sensors.odometry.settings:ImuSettings"),
     },
-    predict="factorgraph_loc.sensors.odometry.motion:OdometryMotion",
     summarize="factorgraph_loc.sensors.odometry.summary:summarize",
     simulate="factorgraph_loc.sensors.odometry.simulation:simulate",
     calibrator="factorgraph_loc.sensors.odometry.calibration.calibrator:CALIBRATOR",

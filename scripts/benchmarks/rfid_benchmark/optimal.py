@@ -13,8 +13,8 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
-from factorgraph_loc.sensors.odometry.motion import OdometryMotion
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factorgraph_loc.sensors.odometry.simulation import ALONG, HEADING, LATERAL, RATE
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags
@@ -66,7 +66,7 @@ def optimal_filter(log: Log) -> Trajectory:
     assert prior is not None
     diagnostics = Diagnostics()
     tags = KnownTags(Setup(log.rig, log.world, SENSORS, np.random.default_rng(0)), diagnostics)
-    motion = OdometryMotion(log.rig, SENSORS, diagnostics, self_calibration=True)
+    motion = Motion(log.rig, SENSORS, diagnostics, self_calibration=True)
     likelihood = tags.likelihood
     if likelihood is None:
         raise InputError(f"{log.name}: its rig has no RFID antennas")

@@ -14,8 +14,8 @@ from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.turn_check import TurnCheck
+from factorgraph_loc.sensors.motion import whole_motion
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
-from factorgraph_loc.sensors.odometry.motion import whole_motion
 from factors import se2
 from factors.camera.model import FOCAL, PARAMETERS, TIME_OFFSET
 

@@ -8,8 +8,8 @@ from factorgraph_loc import BearingRange, Rig, World
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding
-from factorgraph_loc.sensors.binding import bound_motion
 from factorgraph_loc.sensors.landmarks.bound import bind
+from factorgraph_loc.sensors.motion import Motion
 
 
 def test_a_track_that_others_confirm_is_no_longer_in_doubt():
@@ -18,7 +18,7 @@ def test_a_track_that_others_confirm_is_no_longer_in_doubt():
     rig = Rig(bearing_range={"range_sigma": 0.05})
     setup = Setup(rig, world, ("odometry", "bearing_range"), np.random.default_rng(0))
     diagnostics = Diagnostics()
-    sensor = bind(Binding(setup, bound_motion(setup, diagnostics), diagnostics))
+    sensor = bind(Binding(setup, Motion(setup.rig, setup.sensors, diagnostics), diagnostics))
     view = SimpleNamespace(
         t=0.0,
         offset=None,

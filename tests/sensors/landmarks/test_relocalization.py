@@ -13,7 +13,7 @@ from factorgraph_loc.sensors.landmarks.finder import Relocalizer, TrackMonitor, 
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks
 from factorgraph_loc.sensors.landmarks.window import Sighting
-from factorgraph_loc.sensors.odometry.motion import OdometryMotion
+from factorgraph_loc.sensors.motion import Motion
 from factors import se2
 from factors.motion import ChainState
 
@@ -29,7 +29,7 @@ class Seeker:
     def __init__(self, log, start=0.0):
         setup = Setup(log.rig, log.world, log.rig.sensors, np.random.default_rng(0))
         self.log, diagnostics = log, Diagnostics()
-        self.motion = OdometryMotion(log.rig, log.rig.sensors, diagnostics)
+        self.motion = Motion(log.rig, log.rig.sensors, diagnostics)
         self.landmarks = KnownLandmarks(setup, diagnostics)
         self.relocalizer = Relocalizer(self.motion, log.world.positions())
         self.measurements = (m for m in log.measurements(log.rig.sensors) if m.t >= start - 3.0)

@@ -6,8 +6,8 @@ import pytest
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
-from factorgraph_loc.sensors.odometry.motion import OdometryMotion
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, ImuSettings, OdometryNoise, OdometrySettings
 from factors.motion import propagate
 
@@ -15,7 +15,7 @@ RIG = Rig(imu=ImuSettings(bias=0.1))
 
 
 def test_a_gyro_replaces_the_rotation_of_velocities():
-    motion = OdometryMotion(RIG, ("odometry", "imu"), Diagnostics())
+    motion = Motion(RIG, ("odometry", "imu"), Diagnostics())
     motion.add(VelocityOdometry(0.0, 1.0, 5.0))
     motion.add(YawRate(0.0, 0.4))
     assert motion.state(1.0).heading == pytest.approx(0.3)
@@ -25,7 +25,7 @@ def test_a_gyro_replaces_the_rotation_of_velocities():
 def test_a_gyro_replaces_the_rotation_of_increments(rig, turned):
     """Of a rig without settings of a gyro too: then its bias is 0."""
     diagnostics = Diagnostics()
-    motion = OdometryMotion(rig, ("odometry", "imu"), diagnostics)
+    motion = Motion(rig, ("odometry", "imu"), diagnostics)
     for i in range(4):
         motion.add(YawRate(0.1 * i, 0.3))
         motion.add(IncrementOdometry(0.1 * i, 0.05, 0.0, 0.5))
@@ -36,7 +36,7 @@ def test_a_gyro_replaces_the_rotation_of_increments(rig, turned):
 
 def test_a_sensor_that_is_not_used_is_ignored_and_counted():
     diagnostics = Diagnostics()
-    motion = OdometryMotion(RIG, ("imu",), diagnostics)
+    motion = Motion(RIG, ("imu",), diagnostics)
     motion.add(VelocityOdometry(0.0, 1.0, 5.0))
     assert motion.state(1.0).x == 0.0
     assert diagnostics.ignored == {"odometry": 1}
@@ -47,7 +47,7 @@ def test_a_covariance_can_be_inverted_however_far_the_robot_seems_to_go(sigma):
     """The heading's error moves the robot across, along it only the odometry's own noise does."""
     growth, across = GrowthSettings(per_distance=1e-6), GrowthSettings(per_distance=sigma, per_rotation=5.0)
     noise = OdometryNoise(along=growth, lateral=growth, heading=across)
-    motion = OdometryMotion(Rig(odometry=OdometrySettings(noise=noise)), ("odometry",), Diagnostics())
+    motion = Motion(Rig(odometry=OdometrySettings(noise=noise)), ("odometry",), Diagnostics())
     covariance, before = 1e-8 * np.eye(3), motion.state(0.0)
     for i in range(40):
         motion.add(IncrementOdometry(0.1 * i, 1000.0, 0.0, 90.0))
@@ -60,7 +60,7 @@ def test_a_covariance_can_be_inverted_however_far_the_robot_seems_to_go(sigma):
 
 
 def test_motion_of_before_what_is_kept_is_refused():
-    motion = OdometryMotion(RIG, ("odometry",), Diagnostics())
+    motion = Motion(RIG, ("odometry",), Diagnostics())
     for i in range(300):
         motion.add(VelocityOdometry(0.1 * i, 1.0, 0.0))
     moved = motion.relative(motion.state(29.0 - motion.horizon), motion.state(29.0))

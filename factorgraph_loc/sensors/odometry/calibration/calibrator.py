@@ -15,11 +15,11 @@ from factorgraph_loc.fitting.robust import Constant, Fit, folds, gains
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import BLOCKS, ConstantsCalibrator, ConstantsFound, Settled, Told, Unit
+from factorgraph_loc.sensors.motion import odometry_model
 from factorgraph_loc.sensors.odometry.calibration import constants as odometry
 from factorgraph_loc.sensors.odometry.calibration.constants import Windows, cut, odometry_of
 from factorgraph_loc.sensors.odometry.calibration.noise import BLACKOUT, LENGTHS, NoiseFit, fit_noise
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
-from factorgraph_loc.sensors.odometry.motion import odometry_model
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array

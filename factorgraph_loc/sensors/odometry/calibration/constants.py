@@ -11,8 +11,8 @@ import numpy as np
 
 from factorgraph_loc.fitting.robust import Constant, Fit, blocks, fit, loss, spread
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.motion import odometry_model
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
-from factorgraph_loc.sensors.odometry.motion import odometry_model
 from factorgraph_loc.sensors.odometry.settings import OdometrySettings
 from factors import se2
 from factors.motion import ChainState

@@ -1,4 +1,4 @@
-"""The odometry of a run, of a whole log, and the motion model of a rig."""
+"""The motion of the robot by wheel odometry and gyro: of a run, of a whole log, and the noise model of a rig."""
 
 from __future__ import annotations
 
@@ -73,11 +73,11 @@ def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool
     )
 
 
-class OdometryMotion:
-    """The motion sensor (:class:`~factorgraph_loc.model.measurement.Motion`) made of wheel odometry.
+class Motion:
+    """Collects rows of wheel odometry and gyro, and gives the relative motion between any two recent times.
 
-    A gyro replaces the rotation of the wheels if ``sensors`` include ``imu``. ``self_calibration``: the uncertain constants of
-    the odometry are estimated; otherwise their error is part of the noise.
+    A gyro replaces the rotation of the wheels if ``sensors`` include ``imu``. ``constants``: the P calibration constants that are
+    estimated, none without ``self_calibration``; their errors are part of the noise then. ``horizon`` [s]: how long rows are kept.
     """
 
     def __init__(
@@ -102,7 +102,8 @@ class OdometryMotion:
         return OdometryChain(model, use_gyro=self._use_gyro, horizon=self.horizon)
 
     def add(self, m: Measurement) -> None:
-        """Add a row or several. Rows of an unused sensor are counted as ignored, those older than the kept rows as late."""
+        """Add a row, or :class:`~factorgraph_loc.model.measurement.Rows`. Rows of an unused sensor are counted as ignored, those
+        older than the kept rows as late."""
         kept: int
         match m:
             case Rows(kind=kind) if kind is VelocityOdometry and self._use_wheels:
@@ -120,6 +121,7 @@ class OdometryMotion:
             self._diagnostics.drop_late("odometry", m.count - kept)
 
     def state(self, t: float) -> ChainState:
+        """The state of the integrated odometry at ``t``. RunFailedError if the rows of then are no longer kept."""
         if t < self._chain.begin:
             raise RunFailedError(
                 f"odometry: the motion at {t:.3f} s was asked for, but only that from {self._chain.begin:.3f} s on is kept"
@@ -127,17 +129,22 @@ class OdometryMotion:
         return self._chain.state(t)
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:
+        """The relative motion between two states, with its covariance."""
         return self._chain.relative(start, end)
 
     def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
+        """The state at ``t``, and the relative motion from ``start`` to it."""
         return self._chain.travelled(start, t)
 
     def moved(
         self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array
     ) -> tuple[Array, Array, Array]:
+        """A pose (3,) with body-frame ``covariance`` (3, 3) at ``start``, moved to ``t``, for ``constants`` (P,): the pose, and its
+        covariance in the body frame and in the world frame."""
         return self._chain.moved(start, t, pose, covariance, constants, self._indices)
 
     def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
+        """The relative motions between states (N, 8), for ``constants`` (P,): poses (N, 3) and covariances (N, 3, 3)."""
         return self._chain.relatives(starts, ends, constants, self._indices)
 
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
@@ -148,6 +155,9 @@ class OdometryMotion:
     def predicted(
         self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array, first: int
     ) -> tuple[ChainState, Array, Array, Array, Array]:
+        """Predict a Gaussian from ``start`` to ``t``: the state there, the pose (3,), the first rows (3, S) of the transition (the
+        other rows are those of the identity), the covariance (3, 3) that the motion adds to the first three components, and the
+        covariance (S, S) of the error state, in which the columns of ``constants`` (P,) begin at ``first``."""
         return self._chain.predicted(start, t, pose, covariance, constants, self._indices, first)
 
     def recalibrated(self, increment: Increment, constants: Array) -> Increment:
@@ -164,18 +174,20 @@ class OdometryMotion:
         deltas = se2.between(np.array((start.x, start.y, start.heading)), states[:, 1:4])
         if not self.constants.names:
             return deltas
-        changes, moved, later = self._full(constants), se2.log(deltas), t - start.t
+        changes, moved, later = self.constants.full(constants, len(PARAMETERS)), se2.log(deltas), t - start.t
         ways, moving = np.sign(later) * np.hypot(moved[:, 0], moved[:, 1]), later - (states[:, 7] - start.still)
         moved[:, :2] *= 1.0 + changes[0]
         moved[:, 2] += changes[1] * moved[:, 2] - changes[2] * moving + changes[3] * ways
         return np.asarray(se2.exp(moved))
 
     def factor(self, increment: Increment, *, scale_known: bool) -> OdometryFactor:
-        """An increment as a factor on two poses, and on the constants if there are any."""
+        """An increment as a factor on two poses, and on the constants if there are any. ``scale_known``: whether anything else than
+        the motion determines the scale of what is estimated."""
         kind = OdometryFactor if scale_known else ScaleFreeOdometryFactor
         return kind(increment, self.constants.indices)
 
     def slip(self, increment: Increment) -> tuple[Array, float]:
+        """The additional covariance (3, 3) of an increment if wheels slip, and minus the log-probability of that."""
         return slip(self._chain.model, increment, use_gyro=self._use_gyro)
 
     def exact_factor(self, increment: Increment) -> OdometryFactor:
@@ -186,18 +198,15 @@ class OdometryMotion:
         """An increment without constants as a GTSAM factor on two poses."""
         return between_factor(*keys, increment)
 
-    def _full(self, constants: Array) -> Array:
-        return self.constants.full(constants, len(PARAMETERS))
-
     def twist(self, t: float) -> Array:
         """The robot's velocity (3,) just before ``t``, in the robot frame."""
         moved = self.relative(self.state(t - TWIST_TIME), self.state(t))
         return np.asarray(se2.log(moved.delta) / TWIST_TIME)
 
 
-def whole_motion(log: Log, sensors: Sequence[str]) -> OdometryMotion:
+def whole_motion(log: Log, sensors: Sequence[str]) -> Motion:
     """The motion between any two times of a log, from the odometry and gyro among ``sensors``."""
-    motion = OdometryMotion(log.rig, tuple(sensors), Diagnostics())
+    motion = Motion(log.rig, tuple(sensors), Diagnostics())
     motion.keep(math.inf)
     for m in log.measurements(sensors):
         if isinstance(m, VelocityOdometry | IncrementOdometry | YawRate):
