@@ -304,7 +304,7 @@ def check(logs: Sequence[Log]) -> None:
 def check_together(logs: Sequence[Log]) -> None:
     """Raise InputError if these logs are not of one kind, or nothing can be learnt from one of them."""
     for log in logs:
-        if not any(_has(log, name) for name in moving(log.streams, "floor")):
+        if not any(_has(log, name) for name in moving(log.streams)):
             raise InputError(f"{log.name}: has no odometry, expected one in every log to calibrate from")
         if not any(_has(log, sensor) for sensor in senses()) and not has_heading(log):
             lacking = " and ".join(f"no {sensor}" for sensor in senses())

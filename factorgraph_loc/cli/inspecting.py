@@ -109,7 +109,7 @@ def _draw(logs: list[Log], path: Path) -> None:
     if len(logs) != 1:
         raise InputError(f"-o: there are {len(logs)} logs, expected one to draw")
     (log,) = logs
-    odometry = run(log, RunConfig("dead_reckoning")).final if moving(tuple(log.streams), "floor") else None
+    odometry = run(log, RunConfig("dead_reckoning")).final if moving(tuple(log.streams)) else None
     path.parent.mkdir(parents=True, exist_ok=True)
     write_picture(overview(log, odometry), path)
 

@@ -6,11 +6,11 @@ import numpy as np
 
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
 from factorgraph_loc.evaluation.pairing import pairs
-from factorgraph_loc.fusion.map_frame import MapFrame
 from factorgraph_loc.model.belief import Status
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.registry import functions
+from factorgraph_loc.sensors.camera.map_frame import MapFrame
+from factorgraph_loc.sensors.registry import detecting
 
 MOSTLY = 0.9  # fraction of the time with estimates
 
@@ -59,19 +59,14 @@ def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: floa
     )
 
 
-def findable(log: Log, sensors: Sequence[str]) -> list[tuple[str, str]]:
-    """The objects of the map that ``sensors`` can observe, each with the warning that none was."""
-    return [found for _, function in functions("findable") if (found := function(log, sensors))]
-
-
 def never_localized(log: Log, sensors: Sequence[str], status: Sequence[Status], final: Trajectory) -> tuple[str, ...]:
     """Warnings for an unknown start that was never resolved, in terms of what ``sensors`` observe in the map; ``status``: of
     each causal estimate."""
     found = set(status)
     if "localized" in found or (len(final) and status[-1] == "unlocalized"):  # or it has no causal estimates
         return ()
-    kinds = findable(log, sensors)
-    names = " and ".join(name for name, _ in kinds)
+    kinds = detecting(log.world, sensors)
+    names = " and ".join(kind.detects for kind in kinds)
     if not kinds:
         why = "the map has nothing that its sensors could find"
     elif "ambiguous" in found:
@@ -79,5 +74,5 @@ def never_localized(log: Log, sensors: Sequence[str], status: Sequence[Status], 
     elif len(kinds) > 1:  # an estimator may use only some of them
         why = f"its {names} did not determine the pose"
     else:
-        why = kinds[0][1]
+        why = kinds[0].undetected
     return (f"{log.name}: never localized: {why}",)

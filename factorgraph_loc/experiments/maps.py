@@ -31,8 +31,9 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import MAP_ESTIMATORS
 from factorgraph_loc.sensors.camera.frontend import with_features
 from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.interfaces import lacking_section
 from factorgraph_loc.sensors.landmarks import mapping as landmarks_mapping
-from factorgraph_loc.sensors.registry import functions
+from factorgraph_loc.sensors.registry import sensors
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.text import quoted
@@ -158,7 +159,12 @@ def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points
 
 def _mappable(log: Log) -> dict[str, str]:
     """The layers of a world that can be mapped from a log, and the sensors that observe them."""
-    return {layer: name for name, function in functions("mappable") if (layer := function(log)) is not None}
+    found = {sensor.detects: sensor for sensor in sensors().values() if sensor.detects}
+    return {
+        layer: sensor.name
+        for layer, sensor in found.items()
+        if (first := sensor.channels[0].name) in log.streams and not lacking_section(log.rig, first)
+    }
 
 
 def _of_landmarks(log: Log, options: MapOptions, stages: Stages) -> MadeMap:

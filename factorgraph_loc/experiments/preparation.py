@@ -2,10 +2,8 @@
 an estimator runs."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -14,8 +12,9 @@ from factorgraph_loc.files.models import FARTHEST, FileModel, nearest
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, PosePrior
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.interfaces import PreparedLog, Use, lacking_section
-from factorgraph_loc.sensors.registry import channels, functions, moving, sensor_of
+from factorgraph_loc.sensors.camera.prepare import prepare
+from factorgraph_loc.sensors.interfaces import Use, lacking_section
+from factorgraph_loc.sensors.registry import channels, functions, moving, parent_of
 from factorgraph_loc.text import listed, quoted
 
 # of a start taken from the reference
@@ -67,9 +66,7 @@ def check_prior(prior: str | None) -> None:
 def first_odometry(log: Log) -> float:
     """Stamp of the first odometry [s], clock offset applied; of the first measurement if there is no odometry."""
     starts = [
-        float(t.min()) + log.rig.time_offset(name)
-        for name in moving(log.streams, "floor")
-        if len(t := log.streams[name].t)
+        float(t.min()) + log.rig.time_offset(name) for name in moving(log.streams) if len(t := log.streams[name].t)
     ]
     return min(starts, default=log.span()[0])
 
@@ -110,19 +107,18 @@ def _parse(prior: str) -> list[float]:
 def columns_of(streams: Iterable[str]) -> tuple[str, ...]:
     """The channels that are columns of ``streams``."""
     there = set(streams)
-    return tuple(channel.name for channel in channels().values() if channel.column_of in there)
+    return tuple(name for name in channels() if parent_of(name) in there)
 
 
 def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
     """The sensors to use: those of the rig that the log has, or ``asked``, which must be available."""
     there = (*log.streams, *_told_columns(log))
     for sensor in asked or ():
-        channel = channels().get(sensor)
-        rows = channels()[channel.column_of] if channel is not None and channel.column_of else None
-        if rows is not None and rows.name not in (asked or ()):
-            raise InputError(f"{log.name}: {sensor} comes with {rows.rows}, expected {rows.name} among the sensors too")
-        if rows is not None and sensor not in there:
-            raise InputError(f"{log.name}: has no sensor {quoted(sensor)}: none of its {rows.rows} has a value of it")
+        parent = parent_of(sensor)
+        if parent and parent not in (asked or ()):
+            raise InputError(f"{log.name}: {sensor} is a column of {parent}, expected {parent} among the sensors too")
+        if parent and sensor not in there:
+            raise InputError(f"{log.name}: has no sensor {quoted(sensor)}: no row of {parent} has a value of it")
         if sensor not in there:
             raise InputError(f"{log.name}: has no sensor {quoted(sensor)}{nearest(sensor, list(there))}")
         if section := lacking_section(log.rig, sensor):
@@ -147,37 +143,23 @@ def unused(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
     for section in dict.fromkeys(lacking.values()):
         names = ", ".join(name for name, of in lacking.items() if of == section)
         doubts.append(f"{log.name}: {names} left out, as the rig {log.rig.name} has no [{section}]")
-    if not moving(sensors, "floor"):
+    if not moving(sensors):
         doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
     return tuple(doubts)
 
 
-def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel) -> Use:
-    """The description of a run for the sensors' packages."""
+def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel, given: Collection[str] = ()) -> Use:
+    """The description of a run for the sensors' packages; ``given``: the settings that the user has set."""
     kind = registry.estimator_type(estimator)
     modalities = getattr(kind, "modalities", frozenset[str]())
-    return Use(log, tuple(sensors), estimator, settings, modalities, getattr(kind, "estimates_points", False))
+    return Use(log, tuple(sensors), estimator, settings, modalities, getattr(kind, "estimates_points", False), given)
 
 
-def with_own_map(use: Use, given: Mapping[str, Any]) -> tuple[Use, tuple[str, ...]]:
-    """The run, and a warning if the map has nothing that its sensors could find: what one of them sees beside measured motion is
-    estimated then, unless the settings that are ``given`` say what is done."""
-    seeing = {sensor_of(name).name for name in use.sensors if not channels()[name].motion}
-    if "landmarks" in given or not any(seeing == {name} and lacks(use) for name, lacks in functions("unmapped")):
-        return use, ()
-    settings = registry.settings_of(use.estimator, {**given, "landmarks": "unknown"})
-    told = f"the map has nothing that the {listed(sorted(seeing))} could find: it is estimated ({use.estimator}.landmarks=unknown)"
-    return replace(use, settings=settings), (f"{use.log.name}: {told}",)
-
-
-def prepare(use: Use, progress: Callable[[float], None] = lambda _: None) -> PreparedLog:
-    """The log of a run after the preparation by its sensors, and warnings."""
-    made = PreparedLog(use.log)
-    for _, function in functions("prepare"):
-        one: PreparedLog = function(replace(use, log=made.log), progress)
-        images, seconds = made.images + one.images, made.seconds + one.seconds
-        made = PreparedLog(one.log, (*made.warnings, *one.warnings), images, seconds)
-    return made
+def checked_use(use: Use) -> Use:
+    """The run with the settings that its sensors require of it; InputError if log and settings do not fit."""
+    for _, check in functions("check"):
+        use = check(use)
+    return use
 
 
 def fill_cache(uses: Iterable[Use]) -> None:
@@ -186,10 +168,10 @@ def fill_cache(uses: Iterable[Use]) -> None:
     Errors of the log are left to the runs.
     """
     with suppress(FglocError):
-        any(prepare(use).images for use in uses)
+        any(prepare(use, lambda _: None).images for use in uses)
 
 
 def _told_columns(log: Log) -> tuple[str, ...]:
     """The columns that have a value in any row of the log."""
     names = columns_of(log.streams)
-    return tuple(n for n in names if np.any(np.isfinite(getattr(log.streams[channels()[n].column_of], n, np.nan))))
+    return tuple(n for n in names if np.any(np.isfinite(getattr(log.streams[parent_of(n)], n, np.nan))))

@@ -13,29 +13,31 @@ import numpy as np
 
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.experiments.causal_run import CausalRun, only_new_searched, span_of
-from factorgraph_loc.experiments.doubts import findable, in_bent_map, never_localized, partly_scored, with_pauses
+from factorgraph_loc.experiments.doubts import in_bent_map, never_localized, partly_scored, with_pauses
 from factorgraph_loc.experiments.preparation import (
     KNOWN,
     at_origin,
-    prepare,
+    checked_use,
     resolve_prior,
     unused,
     use_of,
     used_sensors,
-    with_own_map,
 )
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import ConcludingEstimator, Estimator, finds_heading
 from factorgraph_loc.fusion.guarded import Guard, sound_trajectory
-from factorgraph_loc.fusion.map_frame import MapFrame
 from factorgraph_loc.io.checks import require_bounds, require_one_span
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import TURN
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Ticks, check_max_gap, check_tick_gap
-from factorgraph_loc.sensors.registry import functions, moving
+from factorgraph_loc.sensors.camera.map_frame import MapFrame
+from factorgraph_loc.sensors.camera.prepare import prepare
+from factorgraph_loc.sensors.interfaces import Ending
+from factorgraph_loc.sensors.registry import detecting, functions, moving
 from factorgraph_loc.version import __version__
 
 _REHEARSAL = 2.0  # s from the first observation
@@ -88,17 +90,15 @@ def run(
     require_one_span(log)
     sensors = used_sensors(log, config.sensors)
     settings = registry.settings_of(config.estimator, config.settings)
-    use, own_map = with_own_map(use_of(log, sensors, config.estimator, settings), config.settings)
+    use = checked_use(use_of(log, sensors, config.estimator, settings, config.settings))
     settings = use.settings
-    for _, check in functions("check"):
-        check(use)
     prior, prior_source = resolve_prior(log, config.prior)
     setup = model_setup.Setup(log.rig, log.world, sensors, np.random.default_rng(config.seed))
     guard = Guard(f"{config.estimator} on {log.name}")
     with guard:
         estimator = registry.create(config.estimator, setup, settings)
     unstated: tuple[str, ...] = ()
-    if prior is None and config.prior is None and not findable(log, tuple(log.streams)):
+    if prior is None and config.prior is None and not detecting(log.world, log.streams):
         prior, prior_source = at_origin(log), "origin"
         unstated = (f"{log.name}: has neither a start nor a reference: begins at (0, 0, 0); --prior says where else",)
     if prior is None and not getattr(estimator, "supports_unknown_start", False):
@@ -106,7 +106,7 @@ def run(
             f"{config.estimator} cannot start from an unknown pose on {log.name} with these settings, "
             f"expected a prior {KNOWN}"
         )
-    if prior is not None and not prior.has_heading and not (finds_heading(estimator) and findable(log, sensors)):
+    if prior is not None and not prior.has_heading and not (finds_heading(estimator) and detecting(log.world, sensors)):
         raise InputError(
             f"{config.estimator} cannot find an unknown heading on {log.name} with these settings and sensors, "
             f"expected a prior X,Y,HEADING"
@@ -138,8 +138,9 @@ def run(
         diagnostics, learnt = estimator.diagnostics, estimator.learnt()
         if isinstance(estimator, ConcludingEstimator):
             diagnostics = estimator.final_diagnostics()
-    told = [(name, of(use, diagnostics, learnt, final)) for name, of in functions("reliability")]
-    reliability = {name: one for name, one in told if one is not None}
+    ending = Ending(estimator.diagnostics, diagnostics, learnt, final)
+    reviews = {name: review(use, ending) for name, review in functions("review")}
+    reliability = {name: one.reliability for name, one in reviews.items() if one.reliability is not None}
     versions = _versions()
     effective = {
         "log": log.name,
@@ -168,10 +169,10 @@ def run(
         warnings=_once(
             *log.warnings,
             *unstated,
-            *own_map,
+            *use.warnings,
             *unused(log, sensors),
             *prepared.warnings,
-            *(line for _, doubts in functions("doubts") for line in doubts(use, estimator.diagnostics, learnt)),
+            *(line for one in reviews.values() for line in one.warnings),
             *(line for one in reliability.values() for line in one.doubts),
             *never_localized(log, sensors, loop.told.status, final),
             *partly_scored(log, final, config.max_gap),
@@ -193,7 +194,7 @@ def _rehearse(
         return
     _REHEARSED.add(kind)
     begin = _begin(log, setup.sensors, prior)
-    moves = moving(log.streams, "floor", "turn")
+    moves = moving(log.streams, TURN)
     observes = [s for s in log.streams if s in setup.sensors and s not in moves]
     seen = [log.streams[s].t + log.rig.time_offset(s) for s in observes]
     first = min((float(t[t >= begin].min(initial=math.inf)) for t in seen), default=begin)

@@ -21,6 +21,7 @@ from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import TURN
 from factorgraph_loc.model.pose_path import upright
 from factorgraph_loc.model.trajectory import Trajectory, write_tum
 from factorgraph_loc.model.trajectory3 import Trajectory3
@@ -101,7 +102,7 @@ def pose_graph(
     InputError for fewer than two poses, or a log without odometry.
     """
     used = [name for name in log.streams if name in sensors]
-    if not moving(used, "floor"):
+    if not moving(used):
         raise InputError(
             f"{log.name}: has no odometry among {listed(sensors)}, expected it for the edges of a pose graph"
         )
@@ -117,7 +118,7 @@ def pose_graph(
     sightings = tuple(LandmarkEdge(index[at], name, point, covariance) for at, name, point, covariance in seen)
     found = {s.landmark for s in seen}
     landmarks = {name: place for name, place in landmarks.items() if name in found}
-    motion = whole_motion(log, moving(used, "floor", "turn"))
+    motion = whole_motion(log, moving(used, TURN))
     motions = tuple(motion.relative(a, b) for a, b in pairwise([motion.state(at) for at in t.tolist()]))
     return PoseGraph(t, trajectory.at(t), motions, landmarks, bool(log.world.landmarks), sightings)
 

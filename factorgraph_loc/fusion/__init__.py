@@ -9,7 +9,6 @@ __all__ = [
     "graph",
     "guarded",
     "kld",
-    "map_frame",
     "mapping",
     "particle_filter",
     "registry",

@@ -1,6 +1,6 @@
 """The estimators by name, what is known of each, and how one is made for a run."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -10,7 +10,7 @@ from factorgraph_loc.files.settings import Setting, first_sentence, settings_in
 from factorgraph_loc.fusion.base import EVERY, Estimator
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.plugins import ESTIMATORS, load
-from factorgraph_loc.sensors.registry import Channel, channels
+from factorgraph_loc.sensors.registry import Channel, channels, parent_of
 from factorgraph_loc.text import listed, quoted
 
 FINAL_ONLY = "final_only"  # the setting of an estimator that need solve nothing on the way
@@ -69,13 +69,8 @@ def describe(name: str) -> Description:
 
 def _takes(kind: type[Any], channel: Channel) -> bool:
     modalities = getattr(kind, "modalities", EVERY)
-    return bool(channel.motion) or any(modality in modalities for modality in _modalities(channel))
-
-
-def _modalities(channel: Channel) -> Iterator[str]:
-    for place in (channels()[channel.column_of] if channel.column_of else channel).measurements:
-        modality = load(place).modality
-        yield modality if isinstance(modality, str) else channel.name
+    measured = map(load, channels()[parent_of(channel.name) or channel.name].measurements)
+    return any(one.is_motion or one.modality in modalities for one in measured)
 
 
 def check_names(names: Sequence[str]) -> None:

@@ -17,7 +17,6 @@ from factorgraph_loc.files.values import seconds_of
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.base import Estimator, ForgettingEstimator, finds_heading
 from factorgraph_loc.fusion.guarded import Guard, sound, sound_belief, sound_trajectory
-from factorgraph_loc.fusion.map_frame import MapFrame
 from factorgraph_loc.live.start import prior_of, require_options, usable_sensors
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior
@@ -28,6 +27,7 @@ from factorgraph_loc.model.scoring import Ticks
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import load
+from factorgraph_loc.sensors.camera.map_frame import MapFrame
 from factorgraph_loc.sensors.camera.prepare import frontend_of, uses_images
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.pushed import checked

@@ -22,6 +22,7 @@ from factorgraph_loc.mapping.tag_refinement import reach
 from factorgraph_loc.mapping.tag_search import TagPosterior, search
 from factorgraph_loc.model.belief import LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import TURN
 from factorgraph_loc.model.scoring import TICK_GAP
 from factorgraph_loc.sensors.motion import whole_motion
 from factorgraph_loc.sensors.registry import moving
@@ -84,8 +85,8 @@ class _Problem:
     def __init__(self, log: Log, looks: TagLooks, prior: PosePrior, known: NDArray[np.bool_]) -> None:
         self._looks, self._prior, self._known = looks, prior, known
         self._constants = log.rig.estimated("odometry")
-        wheels = moving(log.streams, "floor")
-        motion = whole_motion(log, (*wheels, *moving(log.rig.sensors, "turn")))
+        wheels = moving(log.streams)
+        motion = whole_motion(log, (*wheels, *(name for name in moving(log.rig.sensors, TURN) if not moving((name,)))))
         last = max(float(looks.t[-1]), prior.t)
         self.t = _keyframes(prior.t, last, np.concatenate((looks.t, *(log.streams[name].t for name in wheels))))
         states = [motion.state(float(t)) for t in self.t]

@@ -15,7 +15,7 @@ from factorgraph_loc.errors import InputError
 from factors.se2 import Array
 
 GOING_BACK = 5.0  # s that an estimator goes back in time, at most, for one that is late
-SEEN = 2  # rank of exteroceptive streams; motion has lower ranks
+FLOOR, TURN, SEEN = 0, 1, 2  # ranks of streams: motion on the floor, rotation alone, and what is exteroceptive
 
 
 class Measurement(Protocol):
@@ -92,7 +92,7 @@ class Stream:
     """The rows of one channel as columns; ``t`` (N,) in seconds from the start of the log, by the sensor's clock.
 
     Rows are in order of arrival; a late row has an older timestamp than the one before. ``rank`` orders rows with equal
-    timestamps: 0 for wheel odometry, 1 for other motion. ``kind``: class of the measurements, constructed from a timestamp and
+    timestamps. ``kind``: class of the measurements, constructed from a timestamp and
     the columns. ``joins``: whether consecutive rows, of numbers, can be one measurement
     (:class:`~factorgraph_loc.model.measurement.Rows`).
     """

@@ -1,7 +1,7 @@
 """What functions of sensors take and return: the use of a sensor in a run, its summary for ``fgloc info``, what is drawn of it,
 simulated drives, and the expected information along a planned path."""
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -9,12 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.model.belief import Learnt
+from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Measurement, Stream
+from factorgraph_loc.model.reliability import Reliability
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.registry import channels, functions
+from factorgraph_loc.plugins import load
+from factorgraph_loc.sensors.registry import channels, functions, sensor_of
 from factors.se2 import Array
 
 STEP = 0.05  # s between compared times and between shifts
@@ -30,8 +34,9 @@ Places = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Use:
-    """A run of a log. ``sensors``: names of usable channels; ``estimator``: its name, with ``settings``; ``modalities``: of
-    measurements that it uses; ``estimates_points``: whether it may estimate points that are not in the map."""
+    """A run of a log. ``sensors``: names of usable channels; ``estimator``: its name, with ``settings``, of which ``given`` are by
+    the user; ``modalities``: of measurements that it uses; ``estimates_points``: whether it may estimate points that are not in the
+    map; ``warnings``: one line each."""
 
     log: Log
     sensors: tuple[str, ...]
@@ -39,6 +44,8 @@ class Use:
     settings: FileModel
     modalities: Container[str]
     estimates_points: bool
+    given: Collection[str] = ()
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -52,12 +59,32 @@ class PreparedLog:
     seconds: float = 0.0
 
 
+@dataclass(frozen=True)
+class Ending:
+    """The end of a run: ``diagnostics`` of the estimator and ``final_diagnostics`` of the ``final`` trajectory; what was
+    ``learnt``."""
+
+    diagnostics: Diagnostics
+    final_diagnostics: Diagnostics
+    learnt: Learnt
+    final: Trajectory
+
+
+@dataclass(frozen=True)
+class Review:
+    """What a sensor says of a run that has ended: ``warnings``, one line each, and the ``reliability`` of its model."""
+
+    warnings: tuple[str, ...] = ()
+    reliability: Reliability | None = None
+
+
 def lacking_section(rig: Rig, sensor: str) -> str:
-    """The section that a sensor requires, if the rig lacks it, else ""."""
-    channel = channels().get(sensor)
-    if channel is None or not channel.needs_section or getattr(rig, channel.section, None) is not None:
+    """The section that a sensor requires, because its settings have no defaults, if the rig lacks it, else ""."""
+    known = channels().get(sensor)
+    if known is None or not known.section or getattr(rig, known.section, None) is not None:
         return ""
-    return channel.section
+    fields = load(sensor_of(sensor).settings[known.section].kind).model_fields.values()
+    return known.section if any(one.is_required() for one in fields) else ""
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ listed in :mod:`factorgraph_loc.builtin`; other packages register the place of t
 group ``factorgraph_loc.sensors``.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import nearest
@@ -23,26 +23,20 @@ from factorgraph_loc.text import quoted
 class Channel:
     """A name in ``--sensors`` and of a log's streams.
 
-    ``streams``, ``measurements``: the classes of its streams and measurements. Both are empty for a channel that selects columns
-    of another one (``column_of``), as ``rssi`` and ``phase`` do for ``rfid``. ``rows``: a plural for its rows. ``section``: the
-    rig's section with the ``time_offset``; ``needs_section``: whether the channel is useless without it. ``motion``: whether it
-    measures motion on the floor, or rotation alone.
+    ``streams``, ``measurements``: the classes of its streams and measurements. Both are empty for an optional column of the
+    sensor's first channel, as ``rssi`` and ``phase`` are of ``rfid``. ``section``: the rig's section with the ``time_offset``.
 
     ``tables``: the descriptions (:class:`~factorgraph_loc.files.columns.Table`) of its tables in a log; ``described``: of further
     tables, for measurements that differ from those. If stream fields are not columns: ``assemble``: ``(rows by table, reading) ->
     stream`` and ``disassemble``: ``(stream, writing) -> columns by table``, see :mod:`factorgraph_loc.sensors.tables`. For pushed
     measurements whose fields are not columns: ``check``: ``(measurement, where) -> validated fields``. ``sequence``: a class made
-    of (rig, world) whose ``require(measurement, where)`` raises InputError if a measurement does not fit the previous ones.
+    of (rig, world) whose ``require(measurement)`` raises InputError if a measurement does not fit the previous ones.
     """
 
     name: str
     streams: tuple[Place, ...] = ()
     measurements: tuple[Place, ...] = ()
     section: str = ""
-    needs_section: bool = False
-    column_of: str = ""
-    rows: str = "rows"
-    motion: Literal["", "floor", "turn"] = ""
     tables: tuple[Place, ...] = ()
     described: tuple[Place, ...] = ()
     assemble: Place = ""
@@ -56,20 +50,15 @@ class SensorType:
     """A sensor: its ``channels``, its ``settings`` (sections of the rig), its ``layers`` of the world, and the places of its
     functions, "" for none. :func:`functions` returns those of all sensors.
 
+    ``detects``: the layer of the world whose elements it detects, "" for none; ``undetected``: the warning that none was detected.
+
     ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.interfaces.Summary`, for ``fgloc info``; ``draw``: ``(log) ->``
-    :class:`~factorgraph_loc.sensors.interfaces.Marks`, for plots and viewers.
+    :class:`~factorgraph_loc.sensors.interfaces.Marks`, for plots and viewers. ``bind``: ``(binding) ->``
+    :class:`~factorgraph_loc.sensors.base.Sensor`, or None if a run does not use it.
 
-    For estimators: ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor`, or None if a run does not use it;
-    ``frame_error``: ``(setup, modalities, landmarks)``, what is not known of the frame of the map, see
-    :class:`~factorgraph_loc.fusion.map_frame.MapFrame`, or None.
-
-    For runs (:class:`~factorgraph_loc.sensors.interfaces.Use`): ``check``: ``(use)``, raises InputError if log and settings do not
-    fit; ``unmapped``: ``(use)``, whether the map has nothing that the sensor could find, which the estimator can do without;
-    ``prepare``: ``(use, progress) ->`` :class:`~factorgraph_loc.sensors.interfaces.PreparedLog`; ``doubts``: ``(use, diagnostics,
-    learnt)``, warnings at the end; ``reliability``: ``(use, diagnostics, learnt, final) ->``
-    :class:`~factorgraph_loc.model.reliability.Reliability` along the final trajectory, or None; ``findable``: ``(log, sensors)``,
-    a plural for the map elements that the channels can detect and a message that none was detected, or None; ``mappable``:
-    ``(log)``, the world layer that ``fgloc map`` can make, or None.
+    For runs (:class:`~factorgraph_loc.sensors.interfaces.Use`): ``check``: ``(use) -> use``, with the settings that the log
+    requires, or InputError if log and settings do not fit; ``review``: ``(use, ending) ->``
+    :class:`~factorgraph_loc.sensors.interfaces.Review`, from an :class:`~factorgraph_loc.sensors.interfaces.Ending`.
 
     For simulated logs, whose settings have the sections ``simulation``: ``simulate``: ``(ride) ->``
     :class:`~factorgraph_loc.sensors.interfaces.Simulated`, from a :class:`~factorgraph_loc.sensors.interfaces.Ride`; ``looks``:
@@ -85,17 +74,13 @@ class SensorType:
     settings: Mapping[str, Section] = field(default_factory=dict)
     layers: Mapping[str, Layer] = field(default_factory=dict)
     simulation: Mapping[str, Section] = field(default_factory=dict)
+    detects: str = ""
+    undetected: str = ""
     bind: Place = ""
-    frame_error: Place = ""
     summarize: Place = ""
     draw: Place = ""
     check: Place = ""
-    prepare: Place = ""
-    doubts: Place = ""
-    unmapped: Place = ""
-    reliability: Place = ""
-    findable: Place = ""
-    mappable: Place = ""
+    review: Place = ""
     simulate: Place = ""
     looks: Place = ""
     on_robot: Place = ""
@@ -143,10 +128,28 @@ def sensor_of(channel: str) -> SensorType:
     raise InputError(f"no sensor is called {quoted(channel)}{nearest(channel, list(channels()))}")
 
 
-def moving(names: Iterable[str], *motions: str) -> tuple[str, ...]:
-    """The channels among ``names`` that measure motion on the ``floor``, or rotation alone (``turn``)."""
-    known = channels()
-    return tuple(name for name in names if name in known and known[name].motion in motions)
+def moving(names: Iterable[str], rank: int = 0) -> tuple[str, ...]:
+    """The channels among ``names`` that measure motion on the floor; with ``rank``
+    :data:`~factorgraph_loc.model.measurement.TURN` also those that measure rotation alone."""
+    streams = {name: channels()[name].streams for name in names if name in channels()}
+    return tuple(name for name, places in streams.items() if places and load(places[0]).rank <= rank)
+
+
+def parent_of(channel: str) -> str:
+    """The channel of which ``channel`` is an optional column, or ""."""
+    known = channels().get(channel)
+    return "" if known is None or known.streams else sensor_of(channel).channels[0].name
+
+
+def detecting(world: Any, names: Collection[str]) -> list[SensorType]:
+    """The sensors with a channel among ``names`` that can detect elements of a ``world``."""
+    return [
+        sensor
+        for sensor in sensors().values()
+        if sensor.detects
+        and any(channel.name in names for channel in sensor.channels)
+        and getattr(world, sensor.detects, None)
+    ]
 
 
 def channel(name: str) -> Channel:

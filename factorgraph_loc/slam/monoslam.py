@@ -107,7 +107,7 @@ class Monoslam(Filter):
         self._constants = self._motion.constants
         camera = setup.rig.find(CameraSettings) if any(name in setup.sensors for name in CAMERAS) else None
         self._scale = self._constants.names.index(SCALE) if SCALE in self._constants.names else None
-        turns = camera.model() if camera is not None and moving(setup.sensors, "floor") else None
+        turns = camera.model() if camera is not None and moving(setup.sensors) else None
         self._check = TurnCheck(turns, self._motion, self.diagnostics, NOTHING)
         self._mounting = np.zeros((6, 6)) if camera is None else of_mounting(camera)
         self._step: Step | None = None

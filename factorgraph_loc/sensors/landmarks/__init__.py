@@ -23,11 +23,11 @@ SENSOR = SensorType(
             read="factorgraph_loc.sensors.landmarks.map:read_layer",
         ),
     },
+    detects="landmarks",
+    undetected="no landmark of the map was seen",
     bind="factorgraph_loc.sensors.landmarks.bound:bind",
     summarize="factorgraph_loc.sensors.landmarks.summary:summarize",
     check="factorgraph_loc.sensors.landmarks.describe:check",
-    findable="factorgraph_loc.sensors.landmarks.describe:findable",
-    mappable="factorgraph_loc.sensors.landmarks.mapping:mappable",
     draw="factorgraph_loc.sensors.landmarks.describe:draw",
     simulation={
         "sightings": Section("factorgraph_loc.sensors.landmarks.settings:SightingSettings", always=True),

@@ -1,7 +1,5 @@
 """What a run can do with landmarks, and plots of them."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from factorgraph_loc.errors import InputError
@@ -10,26 +8,19 @@ from factorgraph_loc.sensors.interfaces import Marks, Use
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 
 
-def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:
-    """The kind of map elements that ``sensors`` could detect, and the message if none were detected."""
-    if log.world.landmarks and "bearing_range" in sensors:
-        return "landmarks", "no landmark of the map was seen"
-    return None
-
-
-def check(use: Use) -> None:
+def check(use: Use) -> Use:
     """InputError if landmarks are to be estimated (setting ``landmarks`` of the estimator) but no sighting determines the
     position of one or shows a landmark of the map."""
     log, wanted = use.log, getattr(use.settings, "landmarks", "known")
     stream = log.streams.get("bearing_range")
     if wanted == "known" or "bearing_range" not in use.sensors:
-        return
+        return use
     if not isinstance(stream, BearingRangeStream) or not len(stream.t):
-        return
+        return use
     if np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)):
-        return
+        return use
     if wanted == "extended" and any(landmark in log.world.landmarks for landmark in stream.landmark):
-        return
+        return use
     lacks = "bearing" if np.any(np.isfinite(stream.range)) else "range"
     name = use.estimator
     raise InputError(

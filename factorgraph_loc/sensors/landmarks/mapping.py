@@ -8,11 +8,6 @@ from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 
 
-def mappable(log: Log) -> str | None:
-    """The map layer that can be made from a log's sightings, or None."""
-    return "landmarks" if "bearing_range" in log.streams else None
-
-
 def check(log: Log) -> None:
     """InputError if the log's sightings cannot locate any landmark."""
     stream = log.streams.get("bearing_range")

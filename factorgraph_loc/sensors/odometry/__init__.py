@@ -29,7 +29,6 @@ SENSOR = SensorType(
             assemble="factorgraph_loc.sensors.odometry.tables:assemble",
             sequence="factorgraph_loc.sensors.odometry.measurement:Increments",
             section="odometry",
-            motion="floor",
         ),
         Channel(
             "imu",
@@ -37,7 +36,6 @@ SENSOR = SensorType(
             measurements=("factorgraph_loc.sensors.odometry.measurement:YawRate",),
             tables=("factorgraph_loc.sensors.odometry.tables:IMU",),
             section="imu",
-            motion="turn",
         ),
     ),
     settings={

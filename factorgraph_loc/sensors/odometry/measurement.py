@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.model.measurement import Measurement, Stream, named
+from factorgraph_loc.model.measurement import FLOOR, TURN, Measurement, Stream, named
 from factors.se2 import Array
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class YawRate:
 class VelocityStream(Stream):
     """``v`` (N,) [m/s] and ``w`` (N,) [rad/s], each held until the next row."""
 
-    rank: ClassVar[int] = 0
+    rank: ClassVar[int] = FLOOR
     kind: ClassVar[type[Any]] = VelocityOdometry
     joins: ClassVar[bool] = True
     v: Array
@@ -71,7 +71,7 @@ class VelocityStream(Stream):
 class IncrementStream(Stream):
     """``dx``, ``dy``, ``dtheta`` (N,): motion since the previous row, in the robot frame at that row."""
 
-    rank: ClassVar[int] = 0
+    rank: ClassVar[int] = FLOOR
     kind: ClassVar[type[Any]] = IncrementOdometry
     dx: Array
     dy: Array
@@ -87,7 +87,7 @@ class IncrementStream(Stream):
 class YawRateStream(Stream):
     """``w`` (N,) [rad/s] of a gyro."""
 
-    rank: ClassVar[int] = 1
+    rank: ClassVar[int] = TURN
     kind: ClassVar[type[Any]] = YawRate
     w: Array
 

@@ -36,10 +36,9 @@ SENSOR = SensorType(
             disassemble="factorgraph_loc.sensors.rfid.tables:disassemble",
             check="factorgraph_loc.sensors.rfid.pushed:check",
             section="rfid",
-            rows="reads of tags",
         ),
-        Channel("rssi", column_of="rfid"),
-        Channel("phase", column_of="rfid"),
+        Channel("rssi"),
+        Channel("phase"),
     ),
     settings={
         "rfid": Section("factorgraph_loc.sensors.rfid.settings:RfidSettings"),
@@ -54,12 +53,11 @@ SENSOR = SensorType(
             suffix=".tags.csv",
         )
     },
+    detects="tags",
+    undetected="no tag of the map was read",
     bind="factorgraph_loc.sensors.rfid.bound:bind",
     summarize="factorgraph_loc.sensors.rfid.summary:summarize",
-    doubts="factorgraph_loc.sensors.rfid.describe:doubts",
-    reliability="factorgraph_loc.sensors.rfid.reliability:reliability",
-    findable="factorgraph_loc.sensors.rfid.describe:findable",
-    mappable="factorgraph_loc.sensors.rfid.describe:mappable",
+    review="factorgraph_loc.sensors.rfid.describe:review",
     draw="factorgraph_loc.sensors.rfid.draw:draw",
     simulation={
         "rssi": Section("factorgraph_loc.sensors.rfid.simulation_settings:SimulatedRssiSettings"),

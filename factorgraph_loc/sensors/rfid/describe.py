@@ -1,12 +1,12 @@
 """Descriptions of what a run can do with RFID tags."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.interfaces import Use
+from factorgraph_loc.sensors.interfaces import Ending, Review, Use
+from factorgraph_loc.sensors.rfid.reliability import reliability
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.text import quoted
@@ -17,14 +17,10 @@ CLEARLY = 3.0  # standard deviations
 DIFFERENT = 0.1  # of a range or of a probability: less is nothing to warn of
 
 
-def findable(log: Log, sensors: Sequence[str]) -> tuple[str, str] | None:
-    """The kind of map elements that ``sensors`` could detect, and the message if none were detected."""
-    return ("tags", "no tag of the map was read") if log.world.tags and "rfid" in sensors else None
-
-
-def mappable(log: Log) -> str | None:
-    """The map layer that can be made from a log's reads, or None."""
-    return "tags" if "rfid" in log.streams else None
+def review(use: Use, ending: Ending) -> Review:
+    """The warnings of a run, and the reliability of the detection models along its final trajectory."""
+    reliable = reliability(use, ending.final_diagnostics, ending.learnt, ending.final)
+    return Review(tuple(doubts(use, ending.diagnostics, ending.learnt)), reliable)
 
 
 def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:

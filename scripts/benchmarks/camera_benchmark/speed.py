@@ -17,10 +17,11 @@ from benchmarking.report import Report
 from camera_benchmark.drives import COUNT, FEATURE, RATE, Drive, log_of, map_of, with_map
 from camera_benchmark.options import CameraOptions
 from camera_benchmark.report import NOTHING
-from factorgraph_loc.experiments.preparation import prepare, use_of
+from factorgraph_loc.experiments.preparation import use_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.sensors.camera import frontend
+from factorgraph_loc.sensors.camera.prepare import prepare
 from factorgraph_loc.simulation import film, preset, simulate, with_images
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.feature_cache import VARIABLE
@@ -154,7 +155,7 @@ def chained(job: Chain) -> Links:
             spent(Associator, "relocalized") as relocalized,
         ):
             chosen = registry.settings_of(config.estimator, config.settings)
-            prepared = prepare(use_of(log, config.sensors or (), config.estimator, chosen))
+            prepared = prepare(use_of(log, config.sensors or (), config.estimator, chosen), lambda _: None)
             started = perf_counter()
             run(prepared.log, config)
             smooth = perf_counter() - started

@@ -7,13 +7,16 @@ which is known in the world.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Container
 from dataclasses import dataclass, replace
+from functools import partial
 
+from factorgraph_loc.maps.common_error import CommonError
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.registry import functions
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factors.se2 import Array
 
 
@@ -26,8 +29,12 @@ class MapFrame:
     @classmethod
     def of(cls, setup: Setup, modalities: Container[str], landmarks: MapUse) -> MapFrame:
         """That of a run; ``modalities``: of measurements that the estimator takes, ``landmarks``: how it uses the map."""
-        errors = (find(setup, modalities, landmarks) for _, find in functions("frame_error"))
-        return cls(next((error for error in errors if error is not None), None))
+        points, camera = setup.world.points, setup.rig.find(CameraSettings)
+        used = "camera" in setup.sensors and "camera" in modalities and landmarks != "unknown"
+        if points is None or camera is None or not used or (common := CommonError.of(points)) is None:
+            return cls()
+        ahead = camera.model().rotation[:, 2]
+        return cls(partial(common.at, looking=math.atan2(ahead[1], ahead[0])))
 
     def prior(self, prior: PosePrior) -> PosePrior:
         """A start in the world, as one in the map."""
