@@ -43,24 +43,27 @@ def test_the_settings_of_simulations_and_active_runs_are_those_of_the_models():
     ("line", "expected"),
     [
         ("fgloc simu", ["simulate"]),
-        ("fgloc compare plaza2 mrclam6-robot", ["mrclam6-robot1", "mrclam6-robot3", "mrclam6-robot5"]),
-        (
-            "fgloc compare plaza2 -e ekf,smoother,s",
-            ["ekf,smoother,switching"],
-        ),
-        (
-            "fgloc run plaza2 -e smoother --set smoother.re",
-            ["smoother.relinearize_threshold=", "smoother.relinearize_skip="],
-        ),
-        ("fgloc run plaza2 -e ekf --sensors odometry,rfid,r", ["odometry,rfid,rssi"]),
-        ("fgloc info data --reader m", ["mapped", "mrclam"]),
-        ("fgloc simulate office --set world.ta", ["world.tags=", "world.tag_height="]),
-        ("fgloc active symmetric --policy random,p", ["random,paper_literal", "random,patrol"]),
+        ("fgloc compare plaza2 -e ekf,smoother,s", ["ekf,smoother,switching"]),
         ("fgloc run no-such-log", []),  # the shell goes on with files
     ],
 )
-def test_words_are_completed(line, expected):
+def test_a_shell_completes_words(line, expected):
     assert completed(line) == expected
+
+
+@pytest.mark.parametrize(
+    ("complete", "word", "expected"),
+    [
+        ("logs", "mrclam6-robot", ["mrclam6-robot1", "mrclam6-robot3", "mrclam6-robot5"]),
+        ("setting", "smoother.re", ["smoother.relinearize_threshold=", "smoother.relinearize_skip="]),
+        ("sensors", "odometry,rfid,r", ["odometry,rfid,rssi"]),
+        ("reader", "m", ["mapped", "mrclam"]),
+        ("simulation_setting", "world.ta", ["world.tags=", "world.tag_height="]),
+        ("policies", "random,p", ["random,paper_literal", "random,patrol"]),
+    ],
+)
+def test_words_of_options_are_completed(complete, word, expected):
+    assert getattr(completion, complete)(word) == expected
 
 
 def test_completion_loads_no_numerical_libraries():

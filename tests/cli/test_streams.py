@@ -36,13 +36,12 @@ def named_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("arguments", ["datasets --json", "--help"])
 @pytest.mark.parametrize(
-    ("to", "why", "unbuffered"),
+    ("arguments", "to", "why", "unbuffered"),
     [
-        (">/dev/full", "No space left on device", ""),
-        (">/dev/full", "No space left on device", "1"),
-        (">&-", "Bad file descriptor", ""),  # the interpreter opens no stream that might have a buffer
+        ("datasets --json", ">/dev/full", "No space left on device", ""),
+        ("--help", ">/dev/full", "No space left on device", "1"),
+        ("--help", ">&-", "Bad file descriptor", ""),  # the interpreter opens no stream that might have a buffer
     ],
 )
 def test_output_that_cannot_be_written_is_one_line(arguments: str, to: str, why: str, unbuffered: str) -> None:

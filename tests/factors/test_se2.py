@@ -46,7 +46,7 @@ def test_arrays_give_what_single_poses_give(pairs):
     a, b = np.array([p for p, _ in pairs]), np.array([q for _, q in pairs])
     for function in (se2.compose, se2.between):
         np.testing.assert_allclose(function(a, b), [function(p, q) for p, q in pairs], atol=1e-9)
-    for function in (se2.inverse, se2.exp, se2.log):
+    for function in (se2.inverse, se2.exp, se2.log, se2.right_jacobian):
         np.testing.assert_allclose(function(a), [function(p) for p, _ in pairs], atol=1e-9)
 
 

@@ -19,7 +19,7 @@ EXACT = PriorSettings(range_scale=0.0, read_rate=0.0)
 
 @cache
 def office() -> Log:
-    return simulate(preset("office", {"drive": {"duration": 90.0}}), 5)
+    return simulate(preset("office", {"drive": {"duration": 60.0}}), 5)
 
 
 def told(log: Log, prior: PriorSettings | None = None, **changes: float) -> Log:
