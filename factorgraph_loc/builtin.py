@@ -15,8 +15,8 @@ ESTIMATORS.own |= {
     "particle_filter": "factorgraph_loc.fusion.particle_filter:ParticleFilter",
     "switching": "factorgraph_loc.fusion.switching:Switching",
     "monoslam": "factorgraph_loc.slam.monoslam:Monoslam",
-    "smoother": "factorgraph_loc.fusion.graph.smoother:Smoother",
-    "batch": "factorgraph_loc.fusion.graph.batch:Batch",
+    "smoother": "factorgraph_loc.fusion.graph.estimator:Smoother",
+    "batch": "factorgraph_loc.fusion.graph.estimator:Batch",
 }
 MAPPERS.own["points"] = "factorgraph_loc.slam.point_mapper:bind"
 READERS.own |= {

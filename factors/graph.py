@@ -9,6 +9,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import lru_cache
+from itertools import chain
 from typing import Any, Protocol, runtime_checkable
 
 import gtsam
@@ -76,35 +77,36 @@ def pose_array(pose: gtsam.Pose2) -> Array:
     return np.array((pose.x(), pose.y(), pose.theta()))
 
 
-def silenced(factor: Factor, rows: int, on_failure: Callable[[str], None]) -> Factor:
-    """``factor`` with ``rows`` residuals; a residual or Jacobian that is not finite or has a wrong shape is replaced by zeros and
-    reported to ``on_failure``. One of :class:`Alike` ones is taken as it is."""
-    return factor if hasattr(factor, "alike") else _Silenced(factor, rows, on_failure)
-
-
 def jacobian_factor(factor: Factor, keys: Sequence[int], values: Sequence[Array]) -> gtsam.GaussianFactor:
     """``factor`` linearised at ``values``."""
     return gaussian_factor(keys, *factor.linearize(values))
 
 
 def jacobian_factors(
-    factors: Sequence[tuple[Factor, Sequence[int]]], values: Mapping[int, Array]
+    factors: Sequence[tuple[Factor, Sequence[int]] | tuple[Factor, Sequence[int], int]],
+    values: Mapping[int, Array],
+    on_failure: Callable[[str], None] | None = None,
 ) -> list[gtsam.GaussianFactor]:
-    """Factors, each with the keys of its variables, linearised at ``values``; those that are alike together."""
-    out: list[Any] = [None] * len(factors)
+    """Factors, each with the keys of its variables, linearised at ``values``; those that are alike together.
+
+    ``on_failure``: called with the reason where a residual or Jacobian is not finite or has a wrong shape, which then is zero.
+    Each factor comes with the number of its residuals then. Factors that are alike are not checked.
+    """
+    out: list[Any] = []
     alike: defaultdict[Hashable, list[int]] = defaultdict(list)
-    for i, (factor, keys) in enumerate(factors):
+    for i, (factor, keys, *rows) in enumerate(factors):
         if hasattr(factor, "alike"):
             alike[factor.alike].append(i)
-        else:
-            out[i] = jacobian_factor(factor, keys, [values[key] for key in keys])
+            out.append(None)
+            continue
+        at = list(map(values.__getitem__, keys))
+        linear = factor.linearize(at) if on_failure is None else _checked(factor, at, rows[0], on_failure)
+        out.append(gaussian_factor(keys, *linear))
     for numbers in alike.values():
         some = [factors[i] for i in numbers]
         first: Any = some[0][0]
-        residuals, blocks = first.linearize_all(
-            [f for f, _ in some], [[values[key] for key in keys] for _, keys in some]
-        )
-        for i, (_, keys), residual, *parts in zip(numbers, some, residuals, *blocks, strict=True):
+        residuals, blocks = first.linearize_all([f[0] for f in some], [[values[key] for key in f[1]] for f in some])
+        for i, (_, keys, *_), residual, *parts in zip(numbers, some, residuals, *blocks, strict=True):
             out[i] = gaussian_factor(keys, residual, parts)
     return out
 
@@ -114,9 +116,8 @@ def gaussian_factor(keys: Sequence[int], residual: Array, blocks: Sequence[Array
     unit = _unit(len(residual))
     if len(blocks) > MOST_TERMS:
         return gtsam.GaussianConditional(list(zip(keys, blocks, strict=True)), 1, -residual, unit)
-    arguments: list[Any] = [part for pair in zip(keys, blocks, strict=True) for part in pair]
-    arguments += [-residual, unit]
-    return gtsam.JacobianFactor(*arguments)
+    terms: Any = chain.from_iterable(zip(keys, blocks, strict=True))
+    return gtsam.JacobianFactor(*terms, -residual, unit)
 
 
 @lru_cache(maxsize=256)
@@ -158,27 +159,27 @@ class VectorPriorFactor:
         return 0.5 * float(np.sum((self._whitener @ (values[0] - self._mean)) ** 2))
 
 
-class _Silenced:
-    def __init__(self, factor: Factor, rows: int, on_failure: Callable[[str], None]) -> None:
-        self._factor, self._rows, self._on_failure = factor, rows, on_failure
-        self.cost = factor.cost
-
-    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        try:
-            residual, blocks = self._factor.linearize(values)
-            _check(residual, blocks, self._rows, values)
-        except (ValueError, FloatingPointError, np.linalg.LinAlgError) as failure:
-            self._on_failure(str(failure))
-            return np.zeros(self._rows), [np.zeros((self._rows, len(value))) for value in values]
-        return residual, blocks
-
-
-def _check(residual: Array, blocks: Sequence[Array], rows: int, values: Sequence[Array]) -> None:
-    if residual.shape != (rows,) or [b.shape for b in blocks] != [(rows, len(value)) for value in values]:
-        raise ValueError(f"shapes {residual.shape}, {[b.shape for b in blocks]}, expected {rows} rows")
-    # a product with zeros is not a number if any value is not finite
-    if not math.isfinite(sum([np.vdot(part, _zeros(part.size)) for part in (residual, *blocks)])):
-        raise ValueError("a residual or Jacobian is not finite")
+def _checked(
+    factor: Factor, values: Sequence[Array], rows: int, on_failure: Callable[[str], None]
+) -> tuple[Array, list[Array]]:
+    """A factor with ``rows`` residuals, linearised; zero where that fails."""
+    try:
+        residual, blocks = factor.linearize(values)
+        # a product with zeros is not a number if any value is not finite
+        total = np.vdot(residual, _zeros(residual.size))
+        fits = residual.shape == (rows,) and len(blocks) == len(values)
+        for block, value in zip(blocks, values, strict=False):
+            fits = fits and block.shape == (rows, len(value))
+            total += np.vdot(block, _zeros(block.size))
+        if not fits:
+            shapes = [part.shape for part in (residual, *blocks)]
+            raise ValueError(f"shapes {shapes}, expected {rows} rows for {len(values)} variables")
+        if not math.isfinite(total):
+            raise ValueError("a residual or Jacobian is not finite")
+    except (ValueError, FloatingPointError, np.linalg.LinAlgError) as failure:
+        on_failure(str(failure))
+        return np.zeros(rows), [np.zeros((rows, len(value))) for value in values]
+    return residual, blocks
 
 
 @lru_cache(maxsize=256)

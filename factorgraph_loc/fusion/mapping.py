@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from factorgraph_loc.fusion.graph.graph_parts import Addition, Guess, Keyframe
-from factorgraph_loc.fusion.graph.variables import Node, Values
+from factorgraph_loc.fusion.graph.variables import Addition, Guess, Keyframe, Node, Values
 from factorgraph_loc.maps.points import PointMap
 from factors.motion import Increment
 from factors.se2 import Array
@@ -15,12 +14,12 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class GraphView:
-    """What a mapper sees of its graph: the ``keyframes``; estimates of all variables but poses, to which it adds
+    """What a mapper sees of its graph: the ``keyframes`` by number; estimates of all variables but poses, to which it adds
     (``values``, ``spreads``); the ``current`` estimate of a variable by key; which keyframes are open; the motion ``between``
     two of them; what wheels that ``slip`` do to an increment, and the robot's velocity (``twist``, (3,)) at a time, as the motion
     tells them; keys of the sensor's constants (``shared``), and the values (P,) of these."""
 
-    keyframes: Sequence[Keyframe]
+    keyframes: Mapping[int, Keyframe]
     values: Values
     spreads: Values
     current: Callable[[int], Array]

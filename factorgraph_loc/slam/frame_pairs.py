@@ -5,13 +5,12 @@ points waiting to be triangulated.
 """
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.graph_parts import Keyframe
-from factorgraph_loc.fusion.graph.variables import Node
+from factorgraph_loc.fusion.graph.variables import Keyframe, Node
 from factorgraph_loc.vision.frame_motion import frame_motion
 from factors.camera.model import CameraModel
 from factors.camera.visual_odometry import SHARED, VisualOdometryFactor
@@ -37,14 +36,14 @@ class FramePairs:
         self._model = model
         self._last: _Frame | None = None
 
-    def previous(self, keyframe: Keyframe, keyframes: Sequence[Keyframe]) -> Keyframe | None:
+    def previous(self, keyframe: Keyframe, keyframes: Mapping[int, Keyframe]) -> Keyframe | None:
         """The keyframe of the last image, if it is still one of ``keyframes`` and not much older than ``keyframe``."""
         if self._last is None:
             return None
         before = self._last.keyframe
         if not 0.0 < keyframe.t - before.t <= MAX_TIME:
             return None
-        return before if before.index < len(keyframes) and keyframes[before.index] is before else None
+        return before if keyframes.get(before.index) is before else None
 
     def take(
         self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, predicted: Increment | None

@@ -6,7 +6,7 @@ at the stamp.
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.graph_parts import Guess, Keyframe
+from factorgraph_loc.fusion.graph.variables import Guess, Keyframe
 from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.model.settings import Estimated
 from factors import se2

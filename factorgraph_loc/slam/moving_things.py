@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.graph_parts import Keyframe
+from factorgraph_loc.fusion.graph.variables import Keyframe
 from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.sensors.camera.sensor import lifted
 from factorgraph_loc.vision.consensus import GATE, Truths

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 
-from factorgraph_loc.fusion.graph.graph_parts import Addition, GraphSettings, Guess, Keyframe
-from factorgraph_loc.fusion.graph.variables import Node, Values, gather
+from factorgraph_loc.fusion.graph.settings import GraphSettings
+from factorgraph_loc.fusion.graph.variables import Addition, Guess, Keyframe, Node, Values, gather
 from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics

@@ -5,12 +5,12 @@ Research 32(7), 2013) has many optima, and a graph of points falls into wrong on
 comes in.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.graph_parts import Guess, Keyframe
+from factorgraph_loc.fusion.graph.variables import Guess, Keyframe
 from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, lifted
 from factorgraph_loc.vision.consensus import agreeing
 from factors import positive
@@ -46,7 +46,7 @@ def unless_slipped(
     return guess[0], guess[1] + added
 
 
-def moved_since(keyframes: Sequence[Keyframe], newest: Keyframe, t: float, most: int) -> Array | None:
+def moved_since(keyframes: Mapping[int, Keyframe], newest: Keyframe, t: float, most: int) -> Array | None:
     """The covariance (3, 3) of the motion, slips included, to the ``newest`` of the ``keyframes`` from the last one at or before
     ``t`` [s], or from ``most`` steps ago; None where the step to the newest is not known."""
     steps: list[Increment] = []

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.graph.graph_parts import Addition, Guess, Keyframe, jumps
-from factorgraph_loc.fusion.graph.variables import Node, point_key, tilt_key
+from factorgraph_loc.fusion.graph.variables import Addition, Guess, Keyframe, Node, jumps, point_key, tilt_key
 from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics

@@ -2,11 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from factorgraph_loc.experiments.preparation import resolve_prior
-from factorgraph_loc.fusion.graph.kept import Kept
 from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.setup import Setup
@@ -74,24 +71,3 @@ def test_a_full_history_forgets_nothing(log):
     whole, _ = driven(log, "smoother", ("odometry", "bearing_range"), {}, None)
     short, _ = driven(log, "smoother", ("odometry", "bearing_range"), {}, 1.0)
     assert len(short.trajectory()) == len(whole.trajectory())
-
-
-@given(st.lists(st.integers(), max_size=12), st.integers(0, 15), st.integers(-14, 14), st.integers(-14, 14))
-def test_a_kept_list_keeps_its_numbers(items, before, start, stop):
-    kept, count = Kept(items), min(before, len(items))
-    kept.forget(before)
-    assert (len(kept), kept.first, list(kept)) == (len(items), count, items[count:])
-    plain = slice(*slice(start, stop).indices(len(items))[:2])
-    assert kept[start:stop] == items[max(count, plain.start) : max(count, plain.stop)]
-    for number in range(-len(items), len(items)):
-        if number % len(items) >= count:
-            assert kept[number] == items[number]
-        else:
-            with pytest.raises(IndexError):
-                kept[number]
-    kept.append(7)
-    kept += [8]
-    kept[-1] = 9
-    assert kept[len(items) :] == [7, 9]
-    del kept[len(items) :]
-    assert list(kept) == items[count:]

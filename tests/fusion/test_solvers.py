@@ -9,14 +9,19 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.graph.solver import MARGIN, FullHistory, Window, read_all
-from factorgraph_loc.fusion.graph.summary import MarginalSummary
+from factorgraph_loc.fusion.graph.solver import MARGIN, FullHistory, MarginalSummary, Window
 from factorgraph_loc.fusion.graph.variables import Node, index_of, is_pose, landmark_key, pose_key, read, to_gtsam
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factors import se2
+from factors.graph import pose_array
 
 START = "0,0,0"  # its standard deviations are 0.05 m, 0.05 m, 0.05 rad
 SIGMA = 0.05
+
+
+def values_of(values, keys):
+    """GTSAM's values of variables, as arrays by key."""
+    return {key: pose_array(values.atPose2(key)) if is_pose(key) else values.atVector(key) for key in keys}
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +125,7 @@ def test_poses_leave_a_window_several_at_a_time(log):
 
     def watch(_, estimator):
         graph, poses = estimator._graph, [k for k in estimator._backend._solver._ours.at if is_pose(k)]
-        assert graph.newest.t - graph.times[index_of(min(poses))] <= 6.0 + MARGIN + 0.5  # and two keyframes
+        assert graph.newest.t - graph.keyframes[index_of(min(poses))].t <= 6.0 + MARGIN + 0.5  # and two keyframes
         oldest.append(index_of(min(poses)))
 
     run(log, RunConfig("smoother", {"lag": 6.0}, prior=START), watch=watch)
@@ -137,7 +142,7 @@ def test_what_is_absent_is_marginalised_out_of_a_summary():
     step = gtsam.BetweenFactorPose2(pose_key(0), pose_key(1), gtsam.Pose2(1.0, 0.0, 0.0), noise)
     graph.add(gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(0.0, 0.0, 0.0), noise))
     graph.add(gtsam.LinearContainerFactor(step.linearize(at), at))
-    (left,) = MarginalSummary.of(graph, at, read_all(at, at.keys())).on({pose_key(1)})
+    (left,) = MarginalSummary.of(graph, at, values_of(at, at.keys())).on({pose_key(1)})
     marginal = gtsam.Marginals(graph, at).marginalCovariance(pose_key(1))
     assert list(left.keys()) == [pose_key(1)]
     assert np.allclose(np.linalg.inv(left.linearize(at).information()), marginal, rtol=1e-6)
@@ -151,12 +156,12 @@ def test_our_factors_are_linearised_where_isam2_linearises(skip, lag, log):
     def watch(_, estimator):
         solver = estimator._backend._solver
         assert isinstance(solver, FullHistory if lag is None else Window)
-        isam = solver._isam if lag is None else solver._smoother.getISAM2()
+        isam = solver._isam if lag is None else solver._solver.getISAM2()
         assert set(isam.getLinearizationPoint().keys()) == set(solver._ours.at)
         factors = isam.getFactorsUnsafe()
         for slot in solver._ours.slots:
             assert isinstance(factors.at(slot), gtsam.LinearContainerFactor)
-        at = read_all(isam.getLinearizationPoint(), solver._ours.at)
+        at = values_of(isam.getLinearizationPoint(), solver._ours.at)
         for key, value in solver._ours.at.items():
             assert np.allclose(at[key], value, atol=1e-12) or key in solver._ours._held
             if not np.array_equal(value, first.setdefault(key, value)):
@@ -195,7 +200,7 @@ def test_a_window_that_begins_with_marginal_factors_linearises_what_they_are_on_
     residual, blocks = _Seen().linearize(list(values.values()))
     seen = gtsam.JacobianFactor(pose, blocks[0], landmark, blocks[1], -residual, unit)
     turned = gtsam.PriorFactorPose2(pose, gtsam.Pose2(0.0, 0.0, 0.3), start).linearize(to_gtsam(values))
-    window = Window(gtsam.ISAM2Params(), 0.02, 10.0, [].append)
+    window = Window(gtsam.ISAM2Params(), 0.02, [].append, 10.0)
     factors = [gtsam.LinearContainerFactor(factor, to_gtsam(values)) for factor in (turned, seen)]
     node = Node((pose, landmark), _Seen(), 2)
     window.begin(factors, [node], values, {pose: 0.0, landmark: 0.0})
@@ -233,7 +238,7 @@ def test_what_a_window_sees_of_old_landmarks_is_linearised_where_they_are_by_now
     seen = gtsam.JacobianFactor(first, blocks[0], landmark, blocks[1], -residual, gtsam.noiseModel.Unit.Create(2))
     parameters = gtsam.ISAM2Params()
     parameters.relinearizeSkip = 1
-    window = Window(parameters, 0.02, 10.0, [].append)
+    window = Window(parameters, 0.02, [].append, 10.0)
     factors = [
         gtsam.LinearContainerFactor(factor, to_gtsam(values)) for factor in (aside.linearize(to_gtsam(values)), seen)
     ]
@@ -247,7 +252,7 @@ def test_what_a_window_sees_of_old_landmarks_is_linearised_where_they_are_by_now
         window.update([], {}, float(t))
     summary = window.summary(failed=False)
     assert np.allclose(summary.at[landmark], (2.0, 0.8), atol=0.03)
-    again = Window(parameters, 0.02, 10.0, [].append)
+    again = Window(parameters, 0.02, [].append, 10.0)
     again.begin(summary.on(summary.at), nodes, summary.at, dict.fromkeys(summary.at, 5.0))
     for one in (window, again):
         assert np.allclose(one.value(second), (0.5, 0.8, 0.0), atol=1e-3)

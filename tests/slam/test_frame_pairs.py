@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.graph.graph_parts import Keyframe
+from factorgraph_loc.fusion.graph.variables import Keyframe
 from factorgraph_loc.model.world import World
 from factorgraph_loc.slam.frame_pairs import FramePairs
 from factors import se2
@@ -57,9 +57,9 @@ def test_an_image_whose_keyframe_was_taken_back_is_forgotten():
     pairs, first, other = FramePairs(MODEL), keyframe(0, 0.0), keyframe(0, 0.0)
     pairs.take(first, *seen(np.zeros(3)), None)
     later = keyframe(1, 0.5)
-    assert pairs.previous(later, [first, later]) is first
-    assert pairs.previous(later, [other, later]) is None
-    assert pairs.previous(keyframe(1, 5.0), [first]) is None
+    assert pairs.previous(later, {0: first, 1: later}) is first
+    assert pairs.previous(later, {0: other, 1: later}) is None
+    assert pairs.previous(keyframe(1, 5.0), {0: first}) is None
 
 
 @pytest.mark.parametrize("name", ["smoother", "batch"])

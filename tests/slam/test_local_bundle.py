@@ -3,9 +3,8 @@
 import camera_world
 import numpy as np
 
-from factorgraph_loc.fusion.graph.graph_parts import Keyframe
 from factorgraph_loc.fusion.graph.problem import Problem
-from factorgraph_loc.fusion.graph.variables import point_key, pose_key, tilt_key
+from factorgraph_loc.fusion.graph.variables import Keyframe, point_key, pose_key, tilt_key
 from factorgraph_loc.slam.local_bundle import bundled
 from factorgraph_loc.slam.new_points import sightings_of
 from factors import positive, se2

@@ -5,7 +5,7 @@ from dataclasses import replace
 import camera_world
 import numpy as np
 
-from factorgraph_loc.fusion.graph.smoother import Smoother, SmootherSettings
+from factorgraph_loc.fusion.graph.estimator import Smoother, SmootherSettings
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.setup import Setup
@@ -32,7 +32,7 @@ def keyframe_times(common):
     for i in range(3):
         tracks = np.where(np.arange(50) < round(50 * common), look.tracks, look.tracks + 100 * i)
         smoother.process(replace(look, t=0.1 + 0.2 * i, tracks=tracks))
-    return [round(k.t, 3) for k in smoother._graph.keyframes]
+    return [round(k.t, 3) for k in smoother._graph.keyframes.values()]
 
 
 def test_an_image_with_little_in_common_with_the_last_keyframe_becomes_one():

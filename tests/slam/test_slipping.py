@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.fusion.graph.graph_parts import Keyframe
+from factorgraph_loc.fusion.graph.variables import Keyframe
 from factorgraph_loc.slam.slipping import moved_since, unless_slipped
 from factors import se2
 from factors.camera.model import CameraModel, predict
@@ -71,7 +71,7 @@ def test_sideways_wheels_are_held():
 def test_how_far_the_motion_is_known_of_some_seconds():
     rng = np.random.default_rng(3)
     steps = [Increment(rng.normal(size=3), np.diag(rng.uniform(0.01, 0.1, 3)) ** 2, 1.0) for _ in range(9)]
-    keyframes = [Keyframe(i, float(i), ChainState(float(i), *np.zeros(7)), step) for i, step in enumerate(steps)]
+    keyframes = {i: Keyframe(i, float(i), ChainState(float(i), *np.zeros(7)), step) for i, step in enumerate(steps)}
     expected = np.zeros((3, 3))
     for step in steps[6:]:
         expected = propagate(expected, step)

@@ -1,134 +1,131 @@
-"""The offline optimum: the whole log in one robust least-squares problem, solved when all is known.
+"""The offline optimum: the whole run as one robust least-squares problem, solved once all measurements are there.
 
-While measurements come it only keeps a guess, as an EKF would; its result is the final trajectory, and its causal estimates
-are never ``localized``. A start far from the optimum is met by graduated non-convexity (:mod:`.graduation`).
-
-Where points that the map lacks are estimated, such a guess drifts too far to tell which sightings belong together. There the
-smoother's solver goes ahead: its graph is the problem, its estimates are the start.
+The losses may have many optima. One is found from the start, a second by graduated non-convexity: the losses begin wide and narrow
+to their own scale (Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020, here for the Geman-McClure loss). Those of links between
+poses, of which most may be false, begin so wide that they are convex. The better optimum counts.
 """
 
-from dataclasses import replace
-from typing import Annotated
+from __future__ import annotations
 
-from pydantic import Field
+import numpy as np
 
-from factorgraph_loc.fusion.graph.estimator import GraphEstimator, SolvingBackend
-from factorgraph_loc.fusion.graph.graduation import best_optimum, settled
 from factorgraph_loc.fusion.graph.graph import Graph
-from factorgraph_loc.fusion.graph.graph_parts import Addition, GraphSettings, Guess, Keyframe, SmootherSettings
-from factorgraph_loc.fusion.graph.isam import Incremental
-from factorgraph_loc.fusion.graph.variables import Values, pose_key
-from factorgraph_loc.model.belief import PoseEstimate
-from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.fusion.graph.marginals import IndeterminateError
+from factorgraph_loc.fusion.graph.problem import Problem, Solution
+from factorgraph_loc.fusion.graph.variables import Addition, Guess, Keyframe, Values, gather, is_of_keyframe, is_pose
+from factors import se2
+from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.se2 import Array
 
-WIDEST = 8.0  # by default
+ITERATIONS_PER_WIDTH = 5
+NARROWED = 0.5  # width of a loss after a step, relative to the width before
 
 
-class BatchSettings(GraphSettings):
-    """Settings of the batch estimator."""
-
-    widest_loss: Annotated[float, Field(ge=1.0, le=1000.0)] = WIDEST
-    """how many times wider than its own scale the robust loss begins; 1 for a plain robust start"""
-
-
-class Batch(GraphEstimator):
-    """Robust optimum over the whole log, computed once at its end. See the module."""
-
-    causal = False
-
-    def __init__(self, setup: Setup, settings: BatchSettings) -> None:
-        self._settings = settings
-        super().__init__(setup, settings)
-
-    def _new_backend(self, graph: Graph) -> SolvingBackend:
-        ahead = SmootherSettings(**self._settings.model_dump(exclude={"widest_loss"}))
-        return at_the_end(graph, ahead, self._settings.widest_loss)
-
-    def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The guess so far: not an estimate to be scored, as the problem is only solved at the end."""
-        guess = super().estimate(t)
-        return guess if self._graph.prior is None else replace(guess, status="unlocalized")
+def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> Problem:
+    """All measurements of a graph as one problem; its robust losses are ``width`` times as wide as usual, those of links
+    ``link_width`` times."""
+    assert graph.prior is not None
+    keyframes = list(graph.keyframes.values())
+    body = se2.world_to_body(graph.prior.pose, graph.prior.covariance)
+    factors: list[tuple[Factor, tuple[int, ...]]] = [(PriorFactor(graph.prior.pose, body), (keyframes[0].key,))]
+    means, spreads = graph.constant_priors()
+    factors += [(VectorPriorFactor(means[key], np.sqrt(np.diag(spreads[key]))), (key,)) for key in means]
+    factors += [graph.odometry_factor(k) for k in keyframes[1:]]
+    for node in (node for keyframe in keyframes for node in keyframe.nodes):
+        factor, sensor = node.factor, graph.sensors.get(node.sensor)
+        assert factor is not None
+        final = factor if sensor is None else sensor.at_end(factor, link_width if sensor.links else width)
+        if final is not None:
+            factors.append((final, node.keys))
+    return Problem(factors)
 
 
-def at_the_end(graph: Graph, settings: SmootherSettings, widest: float = WIDEST) -> SolvingBackend:
-    """A backend that solves the problem at the end, with robust losses that begin ``widest`` times as wide; ``settings``: of the
-    smoother that goes ahead where points are estimated."""
-    if any(mapper.estimates for mapper in graph.mappers):
-        return Ahead(graph, settings, widest)
-    return Guessing(graph, widest)
+def convex_width(graph: Graph, values: Values) -> float:
+    """How many times as wide the losses of links must be for all of them to be convex at ``values``, at least 1."""
+    linked = {name: sensor for name, sensor in graph.sensors.items() if sensor.links}
+    nodes = (node for k in graph.keyframes.values() for node in k.nodes if linked and node.sensor in linked)
+    return max(
+        (linked[n.sensor].convex_width(n.factor, gather(values, n.keys)) for n in nodes if n.factor is not None),
+        default=1.0,
+    )
 
 
-def graduated(graph: Graph, start: Values, widest: float) -> tuple[Array, Array]:
-    """Poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes at the best optimum found from ``start``, with
-    robust losses that begin ``widest`` times as wide."""
+def best_optimum(graph: Graph, start: Values, widest: float) -> tuple[Problem, Solution]:
+    """The problem of a graph and the best optimum found from ``start``: directly, or with losses that begin ``widest`` times as
+    wide."""
+    problem = whole_problem(graph)
+    best = problem.solve(start)
+    width = max(widest, convex_width(graph, start))
+    if width <= 1.0:
+        return problem, best
+    values = start
+    while width > 1.0:
+        values = whole_problem(graph, min(width, widest), width).solve(values, ITERATIONS_PER_WIDTH).values
+        width *= NARROWED
+    # either way may end in the worse optimum
+    return problem, min(best, problem.solve(values), key=lambda s: s.cost)
+
+
+def solve_whole(graph: Graph, start: Values, widest: float) -> tuple[Array, Array]:
+    """Solve a graph with all its measurements, without sightings that cannot be of their points.
+
+    Returned are poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes; the constants are written into the graph.
+    ``widest``: how many times as wide the robust losses begin. RunFailedError where the measurements do not determine a variable.
+    """
+    graph.drop_astray(graph.keyframes.values(), start)
     problem, best = best_optimum(graph, start, widest)
-    if graph.drop_astray(graph.keyframes, best.values):
-        problem = graph.problem()
+    if graph.drop_astray(graph.keyframes.values(), best.values):
+        problem = whole_problem(graph)
         best = problem.solve(best.values)
-    return settled(graph, problem, best)
+    values = best.values
+    try:
+        found = problem.covariances(values, [k for k in values if is_pose(k) or not is_of_keyframe(k)])
+    except IndeterminateError as error:
+        raise graph.unsolved(error) from error
+    graph.report_damping(found.damping)
+    for key in graph.values:
+        graph.values[key] = values[key]
+        if not is_of_keyframe(key):
+            graph.spreads[key] = found.by_key[key]
+    keys = [k.key for k in graph.keyframes.values()]
+    return np.array([values[key] for key in keys]), np.array([found.by_key[key] for key in keys])
 
 
-class Ahead(Incremental):
-    """A backend that is solved on the way, and once more at the end."""
-
-    def __init__(self, graph: Graph, settings: SmootherSettings, widest: float) -> None:
-        super().__init__(graph, settings)
-        self._widest = widest
-
-    def final(self, graph: Graph) -> tuple[Array, Array]:
-        """The optimum over the whole log."""
-        return graduated(graph, self.solved(graph), self._widest)
-
-
-class Guessing:
-    """A backend that keeps a guess and solves the problem at the end."""
+class AtTheEnd:
+    """A backend that keeps a guess, as an EKF would, and solves the problem at the end."""
 
     def __init__(self, graph: Graph, widest: float) -> None:
         self._graph, self._widest = graph, widest
-        self._guesses: Values = {}
-        self._spreads: Values = {}  # of keyframes
+        self._guesses: Values = {}  # of all variables but poses
 
     def begin(self, newest: Keyframe) -> None:
         """The graph begins, or keyframes were taken back and ``newest`` was added."""
         graph = self._graph
         graph.forget_landmarks(())
-        kept = {k.key for k in graph.keyframes}
-        self._guesses = {key: value for key, value in self._guesses.items() if key in kept or key in graph.values}
-        self.refine(newest, (graph.pose, graph.covariance))
+        self._guesses = {key: value for key, value in self._guesses.items() if key in graph.values}
+        newest.causal = graph.pose, graph.covariance
 
-    def extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
-        """Take a new keyframe and what came with it."""
-        self._guesses |= addition.values
-        self._graph.pose, self._graph.covariance = addition.values[keyframe.key], spread
-        self._spreads[keyframe.key] = spread
+    def extend(self, keyframe: Keyframe, addition: Addition, guess: Guess) -> None:
+        """Take a new keyframe with the ``guess`` of its pose, and what came with it."""
+        self.attach(keyframe, addition, guess)
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
         """Take what was added to a keyframe that is in the graph."""
         self._guesses |= addition.values
         if guess is not None:
-            self._graph.pose, self._graph.covariance = guess
-            self.refine(keyframe, guess)
-
-    def refine(self, newest: Keyframe, guess: Guess) -> None:
-        """Take pose and covariance of the newest keyframe."""
-        self._guesses[newest.key], self._spreads[newest.key] = guess
-
-    def guess_of(self, keyframe: int) -> Guess:
-        """The causal estimate of a keyframe."""
-        key = pose_key(keyframe)
-        return self._guesses[key], self._spreads[key]
+            keyframe.causal = self._graph.pose, self._graph.covariance = guess
 
     def current(self, key: int) -> Array:
-        """The newest estimate of a variable."""
+        """The newest estimate of a variable that is no pose."""
         return self._guesses[key]
 
     def is_open(self, keyframe: int) -> bool:
         """Whether factors may still be added to a keyframe."""
-        return 0 <= keyframe < len(self._graph.keyframes)
+        return keyframe in self._graph.keyframes
 
     is_kept = is_open
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
-        """The optimum over the whole log."""
-        return graduated(graph, graph.constant_priors()[0] | self._guesses, self._widest)
+        """The optimum over the whole run."""
+        poses = {k.key: k.causal[0] for k in graph.keyframes.values() if k.causal is not None}
+        return solve_whole(graph, graph.constant_priors()[0] | self._guesses | poses, self._widest)

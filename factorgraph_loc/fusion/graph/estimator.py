@@ -1,26 +1,32 @@
-"""An estimator that is a graph: it takes measurements, finds its place, and tells what it believes.
+"""The graph estimators: the smoother, one factor graph over the run, and the batch solution.
+
+By default causal estimates come from a window, from which poses older than 10 s are marginalised out, and the whole problem is
+solved at the end. With ``lag = "all"`` the whole history stays in iSAM2; with a number of seconds each pose keeps the estimate
+that it left the window with. Where landmarks or points are estimated, which loops may close at any time, the default is the whole
+history. With ``final_only``, as in the batch, the graph is built with a guess and solved at the end only; but where points are
+estimated, such a guess drifts too far to tell which sightings belong together, and iSAM2 solves the graph on the way.
 
 Before the start the last measurements are kept until they tell one place; then they are taken in from their first on. So they are
 where the start is known but for its heading; the graph then begins at that start. On the way, when what is seen refutes the track
-and tells another place, the graph goes back to where that began, and goes on there after a step of unknown length. What is taken in
-once more is so in slices, counted in work and not in seconds; until the graph has caught up it does not claim to be localized.
+and tells another place, the graph goes back to where that began, and goes on there after a step of unknown length. Replay runs in
+slices of fixed work, so that results do not depend on the machine; until the graph has caught up it does not claim to be localized.
 """
 
 from __future__ import annotations
 
-import bisect
 import math
-from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from factorgraph_loc.fusion.base import EVERY
+from factorgraph_loc.fusion.graph.batch import AtTheEnd
 from factorgraph_loc.fusion.graph.graph import Graph
-from factorgraph_loc.fusion.graph.graph_parts import GraphSettings, Keyframe
-from factorgraph_loc.fusion.graph.keyframes import Backend, Builder
+from factorgraph_loc.fusion.graph.isam import Incremental
+from factorgraph_loc.fusion.graph.keyframes import Builder
+from factorgraph_loc.fusion.graph.settings import BatchSettings, SmootherSettings
+from factorgraph_loc.fusion.graph.variables import Keyframe
 from factorgraph_loc.fusion.mapping import Mapper
 from factorgraph_loc.fusion.search import DURATION, Refuted, Search, Tracked
 from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, gaussian_belief
@@ -36,25 +42,15 @@ from factors import se2
 from factors.motion import Increment
 from factors.se2 import Array
 
+__all__ = ["Batch", "BatchSettings", "Smoother", "SmootherSettings"]
+
 # m, m, rad: of a place that the search told. What told it comes in as factors, so it is to count for next to nothing, but to keep
 # what the first scan alone tells from leading elsewhere.
 FOUND = np.diag((1.0, 1.0, 0.5)) ** 2
 
 
 REPLAYED, TICK = 300, 2  # work of which so much is done at once, and that of a tick; see `Sensor.work`
-
-
-class SolvingBackend(Backend, Protocol):
-    """A backend of an estimator."""
-
-    def begin(self, newest: Keyframe) -> None:
-        """Solve the graph anew: it begins, or keyframes were taken back and ``newest`` was added."""
-
-    def final(self, graph: Graph) -> tuple[Array, Array]:
-        """The best estimate of all keyframes: poses (M, 3) and body-frame covariances (M, 3, 3).
-
-        ``graph`` is a copy, which may be changed; all else may only be read.
-        """
+WIDEST = 8.0  # how many times wider than its own scale a robust loss begins where the problem is solved from a guess
 
 
 @dataclass(frozen=True)
@@ -66,15 +62,16 @@ class _Conclusion:
     covariances: Array
 
 
-class GraphEstimator(ABC):
-    """A graph with the backend that solves it; see the module."""
+class Smoother:
+    """Incremental factor graph (iSAM2): a window and the whole problem at the end, a fixed lag, or the full history. See above."""
 
     deterministic = True
     modalities = EVERY
     takes_rows = True
     estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
 
-    def __init__(self, setup: Setup, settings: GraphSettings) -> None:
+    def __init__(self, setup: Setup, settings: SmootherSettings, widest: float = WIDEST) -> None:
+        self._settings = settings
         self.diagnostics = Diagnostics()
         self._max_delay = settings.max_delay
         calibration: Calibration = "all" if settings.self_calibration else "none"
@@ -97,16 +94,16 @@ class GraphEstimator(ABC):
         self._search.remember()
         # where landmarks are estimated too, they cannot tell the place
         self.supports_unknown_start = settings.landmarks == "known"
-        self._backend = self._new_backend(self._graph)
+        self._backend: AtTheEnd | Incremental
+        if settings.final_only and not any(mapper.estimates for mapper in mappers):
+            self._backend = AtTheEnd(self._graph, widest)
+        else:
+            self._backend = Incremental(self._graph, settings, widest if settings.final_only else 1.0)
         self._builder = Builder(self._graph, self._backend, self._search, settings)
         # the last measurements, in the order in which they were taken, with what the diagnostics say of them
         self._recent: deque[tuple[Measurement, Written]] = deque()
         self._behind: deque[Measurement] = deque()  # what was seen and is still to be taken in, after a track has begun
         self._conclusion: _Conclusion | None = None  # the end, until something is taken
-
-    @abstractmethod
-    def _new_backend(self, graph: Graph) -> SolvingBackend:
-        """What solves the graph."""
 
     def initialize(self, prior: PosePrior) -> None:
         """Start from a Gaussian; without a heading, once what is seen tells it."""
@@ -144,7 +141,8 @@ class GraphEstimator(ABC):
         """The newest keyframe, moved along the odometry since, to the newest time or to ``t`` if that is later; before the start
         the likeliest place, if there is any.
 
-        ``ambiguous`` before one place is clear, and while what is seen is not what is expected.
+        ``ambiguous`` before one place is clear, and while what is seen is not what is expected. With ``final_only`` it is a guess
+        that is not to be scored, and ``unlocalized``.
         """
         graph = self._graph
         at = graph.t if t is None else max(t, graph.t)
@@ -156,6 +154,8 @@ class GraphEstimator(ABC):
         pose, _, covariance = graph.moved(at)
         doubted = self._behind or self._search.doubts or self._search.is_unsure(covariance)
         status: Status = "ambiguous" if doubted else "localized"
+        if self._settings.final_only:
+            status = "unlocalized"
         return PoseEstimate(at, pose, covariance, status)
 
     def belief(self, t: float | None = None) -> Belief:
@@ -185,11 +185,16 @@ class GraphEstimator(ABC):
         """The diagnostics, and what the final trajectory adds to them."""
         return self.diagnostics if self._graph.prior is None else self._concluded().graph.diagnostics
 
+    def forget(self, before: float) -> None:
+        """Forget the trajectory before then, as far as it has left a window whose ``lag`` is set; else all is kept."""
+        if isinstance(self._backend, Incremental):
+            self._backend.forget(min(before, self._taken_until - self._settings.max_delay))
+
     def _concluded(self) -> _Conclusion:
         """The graph as it is at its end, which is solved beside it: nothing that comes later shall depend on who asked."""
         if self._conclusion is None:
             graph = self._graph.copy()
-            graph.keyframes[-1].nodes += self._builder.waiting()
+            graph.newest.nodes += self._builder.waiting()
             self._conclusion = _Conclusion(graph, *self._backend.final(graph))
         return self._conclusion
 
@@ -199,7 +204,8 @@ class GraphEstimator(ABC):
 
     def _take(self, m: Measurement) -> None:
         mark = self.diagnostics.mark()
-        self._graph.anchor()
+        if not self._graph.is_anchored:
+            self._graph.anchor()
         if isinstance(m, Tick):
             self._builder.pass_time(m.t)
         elif not self._builder.take(m):
@@ -263,16 +269,16 @@ class GraphEstimator(ABC):
     def _go_on(self, refuted: Refuted, best: PosePrior) -> None:
         """Take back what was added since the track was wrong, and add it once more at the ``best`` place."""
         graph, since = self._graph, refuted.since
-        index = max(1, bisect.bisect_left(graph.times, since, graph.times.first))
-        while not self._backend.is_open(index - 1):
-            index += 1
-        replay = self._take_back(max(since, graph.keyframes[index - 1].t))
+        first = graph.newest.index + 1  # the number of the first keyframe that is taken back
+        while first > 1 and graph.keyframes[first - 1].t >= since and self._backend.is_open(first - 2):
+            first -= 1
+        replay = self._take_back(max(since, graph.keyframes[first - 1].t))
         t = replay[0].t
-        del graph.keyframes[index:], graph.times[index:]
-        graph.ticks = [tick for tick in graph.ticks if tick.keyframe < index and tick.t < t]
-        pose = self._placed(t, best)
-        jump = Increment(se2.between(self._backend.guess_of(index - 1)[0], pose), FOUND, t - graph.newest.t)
-        keyframe = Keyframe(index, t, self._motion.state(t), jump, is_elsewhere=True)
+        graph.cut(first, t)
+        pose, last = self._placed(t, best), graph.newest.causal
+        assert last is not None
+        jump = Increment(se2.between(last[0], pose), FOUND, t - graph.newest.t)
+        keyframe = Keyframe(first, t, self._motion.state(t), jump, is_elsewhere=True)
         graph.append(keyframe)
         earlier = [change for change in graph.changes if change[0] < t]
         graph.changes = (*earlier, (min(refuted.change[0], t), max(refuted.change[1], t)))
@@ -307,3 +313,13 @@ class GraphEstimator(ABC):
             m = self._behind.popleft()
             work -= TICK if isinstance(m, Tick) else self._graph.sensors[m.modality].work
             self._take(m)
+
+
+class Batch(Smoother):
+    """Robust optimum over the whole log, computed once at its end. See the module."""
+
+    causal = False
+
+    def __init__(self, setup: Setup, settings: BatchSettings) -> None:
+        common = settings.model_dump(exclude={"widest_loss"})
+        super().__init__(setup, SmootherSettings(**common, final_only=True), settings.widest_loss)

@@ -1,8 +1,7 @@
-"""A graph as data: its keyframes and other variables, the factors on them, the whole as one problem, and the trajectory between."""
+"""A graph as data: its keyframes and other variables, the factors on them, and the trajectory between."""
 
 from __future__ import annotations
 
-import bisect
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -12,22 +11,19 @@ import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.fusion.changes import Change, is_known
-from factorgraph_loc.fusion.graph.graph_parts import Keyframe, TickAt
-from factorgraph_loc.fusion.graph.kept import Kept
-from factorgraph_loc.fusion.graph.marginals import IndeterminateError, blamed, damped
-from factorgraph_loc.fusion.graph.problem import Problem
+from factorgraph_loc.fusion.graph.marginals import blamed, damped
 from factorgraph_loc.fusion.graph.variables import (
+    Keyframe,
     Node,
+    TickAt,
     Values,
     constants_key,
-    gather,
     index_of,
     is_landmark,
     is_of_keyframe,
     is_point,
     is_pose,
     landmark_key,
-    pose_key,
 )
 from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.mapping import Mapper
@@ -39,7 +35,7 @@ from factorgraph_loc.sensors.base import NewVariable, Sensor, Term
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2, se2_kernels
 from factors.between import between
-from factors.graph import Factor, PriorFactor, VectorPriorFactor
+from factors.graph import Factor
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
@@ -48,11 +44,13 @@ NOTHING_KNOWN = np.zeros(0)  # of constants, where none are estimated
 
 
 class Graph:
-    """Keyframes, and the other variables by key: ``values`` with covariances ``spreads``. ``pose`` (3,) with body-frame
-    ``covariance`` (3, 3): of the newest keyframe.
+    """Keyframes by number, and the other variables by key: ``values`` with covariances ``spreads``.
 
-    ``keys``: of blocks by name; ``departed``: estimates and covariances of points that have left the graph; ``t``: the newest time.
+    ``newest``: the last keyframe, whose current estimate is ``pose`` (3,) with body-frame ``covariance`` (3, 3). ``keys``: of
+    blocks by name. ``departed``: estimates and covariances of points that have left the graph. ``t``: the newest time.
     """
+
+    newest: Keyframe
 
     def __init__(
         self, motion: Motion, sensors: Mapping[str, Sensor], mappers: Sequence[Mapper], diagnostics: Diagnostics
@@ -63,11 +61,10 @@ class Graph:
         self.keys = {n: constants_key(i) for i, (n, c) in enumerate(self._constants.items()) if c.names}
         self.values, self.spreads = self.constant_priors()
         self.departed: tuple[Values, Values] = {}, {}
-        self.keyframes: Kept[Keyframe] = Kept()
-        self.times: Kept[float] = Kept()
+        self.keyframes: dict[int, Keyframe] = {}  # consecutive numbers
         self.ticks: list[TickAt] = []
         self.changes: tuple[Change, ...] = ()  # when the robot was carried elsewhere
-        self._anchored = False  # whether the odometry of the first keyframe counts: rows of before it may still come
+        self.is_anchored = False  # whether the odometry of the first keyframe counts: earlier rows may still come
         self._damping = 0.0  # the largest that covariances were computed with
         self.t = -math.inf
         self.prior: PosePrior | None = None
@@ -78,45 +75,51 @@ class Graph:
         self.prior, self.t = prior, prior.t
         self.pose = np.array(prior.pose, dtype=float)
         self.covariance = se2.world_to_body(prior.pose, prior.covariance)
-        first = Keyframe(0, prior.t, self.motion.state(prior.t), None)
-        self.keyframes, self.times, self._anchored = Kept([first]), Kept([prior.t]), False
-        return first
+        self.keyframes, self.is_anchored = {}, False
+        self.append(Keyframe(0, prior.t, self.motion.state(prior.t), None))
+        return self.newest
 
     def copy(self) -> Graph:
         """One of its own with the same content, to be solved beside this one."""
         graph = object.__new__(Graph)
         vars(graph).update(vars(self))
-        graph.diagnostics, graph.keyframes = self.diagnostics.copy(), self.keyframes.copy()
-        for place, keyframe in enumerate(self.keyframes, start=self.keyframes.first):
-            graph.keyframes[place] = replace(keyframe, nodes=list(keyframe.nodes))
+        graph.diagnostics = self.diagnostics.copy()
+        graph.keyframes = {i: replace(k, nodes=list(k.nodes)) for i, k in self.keyframes.items()}
+        graph.newest = graph.keyframes[self.newest.index]
         graph.values, graph.spreads = dict(self.values), dict(self.spreads)
         return graph
 
     def anchor(self) -> None:
-        """At the first measurement after a start: the odometry there is what has come by now."""
-        if not self._anchored:
-            first = self.keyframes[-1]
-            first.odometry, self._anchored = self.motion.state(first.t), True
-
-    @property
-    def newest(self) -> Keyframe:
-        """The newest keyframe."""
-        return self.keyframes.last
+        """Take the odometry at the first keyframe from the rows that came by now, at the first measurement after a start."""
+        self.newest.odometry, self.is_anchored = self.motion.state(self.newest.t), True
 
     def append(self, keyframe: Keyframe) -> None:
         """Add a keyframe after all others."""
-        self.keyframes.append(keyframe)
-        self.times.append(keyframe.t)
+        self.keyframes[keyframe.index] = self.newest = keyframe
+
+    def cut(self, first: int, t: float) -> None:
+        """Remove the keyframes with numbers from ``first`` on, and the ticks after them or at or after ``t``."""
+        for index in range(first, self.newest.index + 1):
+            del self.keyframes[index]
+        self.newest = self.keyframes[first - 1]
+        self.ticks = [tick for tick in self.ticks if tick.keyframe < first and tick.t < t]
+
+    def forget(self, first: int) -> None:
+        """Forget the keyframes with numbers below ``first``, and the ticks after them."""
+        for index in range(next(iter(self.keyframes)), first):
+            del self.keyframes[index]
+        self.ticks = [tick for tick in self.ticks if tick.keyframe >= first]
 
     def before(self, t: float) -> Keyframe:
-        """The last keyframe at or before ``t``."""
-        if self.newest.t <= t:
-            return self.newest
-        return self.keyframes[bisect.bisect_right(self.times, t, self.times.first) - 1]
+        """The last keyframe at or before ``t``; KeyError where there is none."""
+        keyframe = self.newest
+        while keyframe.t > t:
+            keyframe = self.keyframes[keyframe.index - 1]
+        return keyframe
 
     def since(self, keyframe: Keyframe, t: float) -> Increment:
         """The motion from a keyframe to ``t``, as the constants have it."""
-        start = keyframe.odometry if self._anchored else self.motion.state(keyframe.t)
+        start = keyframe.odometry if self.is_anchored else self.motion.state(keyframe.t)
         return self.recalibrated(self.motion.relative(start, self.motion.state(t)))
 
     def part_of_step(self, keyframe: Keyframe, t: float) -> Increment:
@@ -134,7 +137,7 @@ class Graph:
         newest = self.newest
         if t <= newest.t:
             return self.pose, self.covariance, se2_kernels.body_to_world(self.pose, self.covariance)
-        start = newest.odometry if self._anchored else self.motion.state(newest.t)
+        start = newest.odometry if self.is_anchored else self.motion.state(newest.t)
         return self.motion.moved(start, t, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
 
     def recalibrated(self, increment: Increment) -> Increment:
@@ -162,13 +165,13 @@ class Graph:
 
     def node(self, keyframe: Keyframe, term: Term, sensor: str) -> Node:
         """A term of an observation as a factor on a keyframe."""
-        keys = (keyframe.key, *(self.keys[name] for name in term.blocks))
+        keys = (keyframe.key, *map(self.keys.__getitem__, term.blocks))
         return Node(keys, term.factor, term.rows, sensor=sensor)
 
     def odometry_factor(self, keyframe: Keyframe) -> tuple[Factor, tuple[int, ...]]:
         """The factor from the keyframe before, and its keys. The constants of the odometry do not tell how a robot is carried."""
         assert keyframe.from_previous is not None
-        keys: tuple[int, ...] = (pose_key(keyframe.index - 1), keyframe.key)
+        keys: tuple[int, ...] = (keyframe.key - 1, keyframe.key)
         if MOTION in self.keys and not keyframe.is_elsewhere:
             keys = (*keys, self.keys[MOTION])
         if keyframe.factor is None:
@@ -176,8 +179,8 @@ class Graph:
             if keyframe.is_elsewhere:
                 keyframe.factor = self.motion.exact_factor(increment)
             else:
-                scale_known = all(mapper.knows_scale for mapper in self.mappers)
-                keyframe.factor = self.motion.factor(increment, scale_known=scale_known)
+                scale_free = self.mappers and not all(mapper.knows_scale for mapper in self.mappers)
+                keyframe.factor = self.motion.factor(increment, scale_known=not scale_free)
         return keyframe.factor, keys
 
     def learnt(self, poses: Iterable[Array] = (), covariances: Iterable[Array] = ()) -> Learnt:
@@ -193,45 +196,15 @@ class Graph:
             sigmas = np.sqrt(np.diag(self.spreads[key]))
             for label, value, sigma in zip(self._constants[name].names, self.values[key], sigmas, strict=True):
                 values[prefix + label] = (float(value), float(sigma))
-        at, spreads = ({k.key: v for k, v in zip(self.keyframes, part)} for part in (poses, covariances))  # noqa: B905
+        numbered = self.keyframes.values()
+        at, spreads = ({k.key: v for k, v in zip(numbered, part)} for part in (poses, covariances))  # noqa: B905
         for mapper in self.mappers:
             found = mapper.learnt(self.departed[0] | self.values | at, self.departed[1] | self.spreads | spreads)
             if found is not None:
                 return Learnt(values, landmarks, found)
         return Learnt(values, landmarks)
 
-    def convex_width(self, values: Values) -> float:
-        """How many times as wide the losses of links must be for all of them to be convex at ``values``, at least 1."""
-        linked = {name: sensor for name, sensor in self.sensors.items() if sensor.links}
-        nodes = (node for k in self.keyframes for node in k.nodes if linked and node.sensor in linked)
-        return max(
-            (linked[n.sensor].convex_width(n.factor, gather(values, n.keys)) for n in nodes if n.factor is not None),
-            default=1.0,
-        )
-
-    def problem(self, width: float = 1.0, link_width: float = 1.0) -> Problem:
-        """All that is known as one problem; the robust losses ``width`` times as wide as they are, and those of links
-        ``link_width`` times."""
-        assert self.prior is not None
-        body = se2.world_to_body(self.prior.pose, self.prior.covariance)
-        factors: list[tuple[Factor, tuple[int, ...]]] = [(PriorFactor(self.prior.pose, body), (pose_key(0),))]
-        means, spreads = self.constant_priors()
-        factors += [(VectorPriorFactor(means[key], np.sqrt(np.diag(spreads[key]))), (key,)) for key in means]
-        factors += [self.odometry_factor(k) for k in self.keyframes[1:]]
-        for keyframe in self.keyframes:
-            for node in keyframe.nodes:
-                assert node.factor is not None
-                factor = node.factor
-                if node.sensor in self.sensors:
-                    sensor = self.sensors[node.sensor]
-                    final = sensor.at_end(factor, link_width if sensor.links else width)
-                    if final is None:
-                        continue
-                    factor = final
-                factors.append((factor, node.keys))
-        return Problem(factors)
-
-    def drop_astray(self, keyframes: Sequence[Keyframe], values: Values) -> bool:
+    def drop_astray(self, keyframes: Collection[Keyframe], values: Values) -> bool:
         """Take sightings out of the graph that cannot be of their points, as these are estimated, and points of which too few are
         left. Returns whether there were any."""
         dropped = False
@@ -240,7 +213,7 @@ class Graph:
             if not astray:
                 continue
             dropped = True
-            left = Counter(mapper.point(n) for k in self.keyframes for n in k.nodes if id(n) not in astray)
+            left = Counter(mapper.point(n) for k in self.keyframes.values() for n in k.nodes if id(n) not in astray)
             for keyframe in keyframes:
                 kept = [
                     n
@@ -254,10 +227,11 @@ class Graph:
 
     def forget_points(self) -> None:
         """Give up the points that the keyframes that are left do not tell."""
-        seen = Counter(key for k in self.keyframes for node in k.nodes for key in node.keys if is_point(key))
+        keyframes = self.keyframes.values()
+        seen = Counter(key for k in keyframes for node in k.nodes for key in node.keys if is_point(key))
         for mapper in self.mappers:
             kept = {key for key, count in seen.items() if count >= mapper.fewest}
-            for k in self.keyframes:
+            for k in keyframes:
                 k.nodes = [node for node in k.nodes if all(key in kept or not is_point(key) for key in node.keys)]
             for key in [key for key in self.values if is_point(key) and key not in kept]:
                 del self.values[key], self.spreads[key]
@@ -268,34 +242,22 @@ class Graph:
     def forget_landmarks(self, known: Collection[int]) -> None:
         """Give up the landmarks that neither the keyframes that are left tell, nor a summary of what has left the graph, whose
         variables are ``known``."""
-        told = {key for k in self.keyframes for node in k.nodes for key in node.keys}
+        told = {key for k in self.keyframes.values() for node in k.nodes for key in node.keys}
         for name, key in list(self.keys.items()):
             if is_landmark(key) and key not in told and key not in known:
                 del self.keys[name], self.values[key], self.spreads[key]
 
-    def settle(self, problem: Problem, values: Values) -> Array:
-        """Take over a solution of the whole problem: the constants, and the body-frame covariances (M, 3, 3) that are returned."""
-        try:
-            found = problem.covariances(values, [k for k in values if is_pose(k) or not is_of_keyframe(k)])
-        except IndeterminateError as error:
-            raise self.unsolved(error) from error
-        self.report_damping(found.damping)
-        for key in self.values:
-            self.values[key] = values[key]
-            if not is_of_keyframe(key):
-                self.spreads[key] = found.by_key[key]
-        return np.array([found.by_key[k.key] for k in self.keyframes])
-
     def report_damping(self, damping: float) -> None:
+        """Note as an event that covariances needed a larger damping than before."""
         if damping > self._damping:
             self._damping = damping
             self.diagnostics.events.append((self.t, damped(damping)))
 
-    def unsolved(self, error: RuntimeError) -> RunFailedError:
-        """What a user is told where the graph cannot be solved: when, and which variable is to blame."""
+    def unsolved(self, error: Exception) -> RunFailedError:
+        """The error of a graph that cannot be solved, with the time and the variable that is to blame."""
         return RunFailedError(f"the graph cannot be solved at {self.t:.3f} s: {self.reason(error)}")
 
-    def reason(self, error: RuntimeError) -> str:
+    def reason(self, error: Exception) -> str:
         """An error of the solver, or of GTSAM's, in one line."""
         key = blamed(error)
         if key is None:
@@ -306,7 +268,7 @@ class Graph:
     def _named(self, key: int) -> str:
         """A variable in words."""
         if is_of_keyframe(key):
-            return f"the {'pose' if is_pose(key) else 'tilt'} at {self.times[index_of(key)]:.3f} s"
+            return f"the {'pose' if is_pose(key) else 'tilt'} at {self.keyframes[index_of(key)].t:.3f} s"
         if is_point(key):
             return f"point {index_of(key)}"
         name = {number: name for name, number in self.keys.items()}[key]
@@ -318,8 +280,8 @@ class Graph:
         newest = {tick.t: tick for tick in self.ticks}
         stamps = np.array(sorted(newest))
         ticks = [newest[t] for t in stamps[is_known(stamps, self.changes)].tolist()]
-        keyframes, first = list(self.keyframes), self.keyframes.first
-        before = np.array([tick.keyframe - first for tick in ticks], dtype=np.int64)
+        keyframes = list(self.keyframes.values())
+        before = np.array([tick.keyframe - keyframes[0].index for tick in ticks], dtype=np.int64)
         ends = np.array([tick.odometry for tick in ticks]).reshape(-1, STATE)
         starts = np.array([k.odometry for k in keyframes]).reshape(-1, STATE)[before]
         deltas, noises = self.motion.relatives(starts, ends, self.value(MOTION, NOTHING_KNOWN))

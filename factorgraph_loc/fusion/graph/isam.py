@@ -1,41 +1,39 @@
 """A graph kept solved by iSAM2 (Kaess et al., IJRR 31(2), 2012), with its full history or with a window.
 
-GTSAM's solvers are lost after any exception in an update, so everything that is in the graph is also kept beside them, and a solver
-is rebuilt from that.
+A solver of GTSAM is unusable after an exception in an update. All that it holds is kept beside it, too: after a failure a new
+solver is built from that, once. If that fails as well, the run ends with an error.
 """
 
 from __future__ import annotations
 
-import bisect
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.graph.graduation import best_optimum, settled
+from factorgraph_loc.fusion.graph.batch import solve_whole, whole_problem
 from factorgraph_loc.fusion.graph.graph import Graph
-from factorgraph_loc.fusion.graph.graph_parts import Addition, Guess, Keyframe, SmootherSettings, jumps
-from factorgraph_loc.fusion.graph.kept import Kept
 from factorgraph_loc.fusion.graph.marginals import IndeterminateError, covariances
-from factorgraph_loc.fusion.graph.solver import MARGIN, WITH_POINTS, FullHistory, Solver, Window, read_all
-from factorgraph_loc.fusion.graph.stalled import Stalled
-from factorgraph_loc.fusion.graph.summary import MarginalSummary, is_missing
+from factorgraph_loc.fusion.graph.settings import SmootherSettings
+from factorgraph_loc.fusion.graph.solver import MARGIN, WITH_POINTS, FullHistory, MarginalSummary, Window, is_missing
 from factorgraph_loc.fusion.graph.variables import (
+    GTSAM_ERRORS,
+    Addition,
+    Guess,
+    Keyframe,
     Node,
     Values,
-    gtsam_errors,
     index_of,
     is_constant,
     is_landmark,
     is_of_keyframe,
-    is_pose,
+    jumps,
     tilt_key,
 )
 from factors import positive, se2
 from factors.se2 import Array
 
-NOWHERE: Mapping[int, Array] = {}
 ITERATIONS_AFTER_FAILURE = 10
 LAG = 10.0  # s of the window that causal estimates come from, where none is set
 # m, rad: a window, whose oldest points are soon linearised for good, linearises anew what moves that far from where it saw points
@@ -44,10 +42,10 @@ ROUNDING = 1e-6  # s; differences of times are as exact as that
 
 
 class Incremental:
-    """The backend of the smoother; see the module."""
+    """The backend of the smoother; see the module. ``widest``: how many times as wide robust losses begin at the end."""
 
-    def __init__(self, graph: Graph, settings: SmootherSettings) -> None:
-        self._graph, self._settings = graph, settings
+    def __init__(self, graph: Graph, settings: SmootherSettings, widest: float = 1.0) -> None:
+        self._graph, self._settings, self._widest = graph, settings, widest
         self._waits = settings.landmarks != "known"  # what is seen between keyframes: an update takes long then
         self._maps = any(mapper.estimates for mapper in graph.mappers)
         self._margin = WITH_POINTS if self._maps else MARGIN
@@ -61,171 +59,140 @@ class Incremental:
         every = max((sensor.solve_every for sensor in graph.sensors.values()), default=0.0)
         defers = not self._waits and (self._lag is None or self._lag >= 2.0 * every)
         self._solve_every = every if defers else 0.0
-        self._failed: list[str] = []
+        # keys of constants whose covariance is needed during the run
+        self._followed = {
+            graph.keys[name]
+            for name, sensor in graph.sensors.items()
+            if sensor.follows_constants and name in graph.keys
+        }
+        self._failed: list[str] = []  # reasons of factors that could not be linearised
         # Cholesky loses long stretches of dead reckoning as indeterminate; with points it takes half the time
-        self._factorization = "CHOLESKY" if self._maps else "QR"
-        self._solver = self._new_solver()
-        self._stalled: Stalled | None = None  # the last one
-        self._last = gtsam.Values()  # all estimates after the last update, where landmarks are estimated
+        self._solver = self._new_solver("CHOLESKY" if self._maps else "QR")
         self._waiting = Addition()
         self._solved = -math.inf  # the time of the newest keyframe in the solver
-        # of each keyframe: its causal estimate, and the final one where it has left the window
-        self._filtered: Kept[Guess] = Kept()
-        self._left: Kept[Guess] = Kept()
+        self._oldest = 0  # the number of the oldest keyframe that has not left the window
 
     def forget(self, before: float) -> None:
         """Forget keyframes before then, as far as they have left the window; where the whole problem is solved at the end, all are
         kept."""
-        if self._is_whole:
-            return
         graph = self._graph
-        count = bisect.bisect_right(graph.times, before, graph.times.first) - 1
+        if self._is_whole or before < next(iter(graph.keyframes.values())).t:
+            return
         # points that wait are looked for in the newest ones
-        looked_back = 1 + max((mapper.horizon for mapper in graph.mappers), default=0)
-        count = min(count, len(self._left), len(graph.keyframes) - looked_back)
-        if count > graph.keyframes.first:
-            count = min(count, self._solver.oldest)  # it may have to be built anew
-        for kept in (graph.keyframes, graph.times, self._filtered, self._left):
-            kept.forget(count)
-        graph.ticks = [tick for tick in graph.ticks if tick.keyframe >= graph.keyframes.first]
+        looked_back = max((mapper.horizon for mapper in graph.mappers), default=0)
+        last = min(graph.before(before).index, self._oldest, graph.newest.index - looked_back)
+        graph.forget(min(last, self._solver.oldest))  # it may have to be built anew
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
-        """The whole graph, solved to the end. With a set lag: each pose as it left the window, the others as they are now; those
-        that wait for the solver as they were expected."""
-        waiting = self._waiting.values
-        if not self._settings.smooth:
-            estimates = list(self._filtered)
-        elif self._is_whole:
-            start = self.solved(graph)
-            graph.drop_astray(graph.keyframes, start)
-            return settled(graph, *best_optimum(graph, start, 1.0))
-        else:
-            stalled, open_ones = isinstance(self._solver, Stalled), graph.keyframes[len(self._left) :]
+        """The whole graph, solved to the end: poses (M, 3) and body-frame covariances (M, 3, 3) of the keyframes.
+
+        With a set lag each pose is as it left the window, the others as they are now; those that wait for the solver are as they
+        were expected."""
+        if self._settings.smooth and self._is_whole:
+            return solve_whole(graph, self._newest_values(graph), self._widest)
+        estimates = [keyframe.causal for keyframe in graph.keyframes.values()]
+        if self._settings.smooth:
+            waiting = self._waiting.values
             try:
-                known = [key for key in graph.values if not is_of_keyframe(key) and key not in waiting]
-                for key in () if stalled else known:
+                for key in [key for key in graph.values if not is_of_keyframe(key) and key not in waiting]:
                     graph.values[key], graph.spreads[key] = self._marginal(key, graph=graph)
-                now = [
-                    self._filtered[k.index] if stalled or k.key in waiting else self._marginal(k.key, graph=graph)
-                    for k in open_ones
+                estimates = [
+                    k.final or (k.causal if k.key in waiting else self._marginal(k.key, graph=graph))
+                    for k in graph.keyframes.values()
                 ]
-            except RuntimeError as error:
+            except GTSAM_ERRORS as error:
                 raise graph.unsolved(error) from error
-            estimates = [*self._left, *now]
         if self._waiting.nodes or len(graph.newest.nodes) > len(self._graph.newest.nodes):
             estimates[-1] = graph.pose, graph.covariance
-        return np.array([p for p, _ in estimates]), np.array([c for _, c in estimates])
+        found = [estimate for estimate in estimates if estimate is not None]
+        return np.array([p for p, _ in found]), np.array([c for _, c in found])
 
-    def solved(self, graph: Graph) -> Values:
+    def _newest_values(self, graph: Graph) -> Values:
         """The newest estimates of all variables of a copy of the graph."""
-        left = {k.key: guess[0] for k, guess in zip(graph.keyframes, self._left, strict=False)}
-        known = self._waiting.values | left
-        keys = [*(k.key for k in graph.keyframes), *graph.values]
+        known = self._waiting.values | {k.key: k.final[0] for k in graph.keyframes.values() if k.final is not None}
+        keys = [*(k.key for k in graph.keyframes.values()), *graph.values]
         return known | {key: self._solver.value(key) for key in keys if key not in known}
 
     def begin(self, newest: Keyframe) -> None:
         """Solve the graph anew: it begins, or keyframes were taken back and ``newest`` was added."""
-        del self._filtered[newest.index :]
-        guess = self._graph.pose, self._graph.covariance
-        self._filtered.append(guess)
+        newest.causal = self._graph.pose, self._graph.covariance
         summary = self._solver.summary(failed=False)
-        try:
-            with gtsam_errors():
-                summary = None if summary is None else summary.before(newest.index)
-                self._graph.forget_landmarks(frozenset() if summary is None else summary.keys)
-                self._start_again(newest, summary)
-        except RuntimeError as error:
-            if newest.index == 0:
-                raise self._graph.unsolved(error) from error
-            self._stall(newest, guess, summary, error)
+        summary = None if summary is None else summary.before(newest.index)
+        self._graph.forget_landmarks(frozenset() if summary is None else summary.keys)
+        self._start_again(newest, summary, "CHOLESKY" if self._maps else "QR")
 
-    def guess_of(self, keyframe: int) -> Guess:
-        """The causal estimate of a keyframe."""
-        return self._filtered[keyframe]
-
-    def extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
-        """Take a new keyframe and what came with it."""
-        guess = addition.values[keyframe.key], spread
-        self._filtered.append(guess)
+    def extend(self, keyframe: Keyframe, addition: Addition, guess: Guess) -> None:
+        """Take a new keyframe with the ``guess`` of its pose, and what came with it."""
+        keyframe.causal = guess
+        addition.nodes.insert(0, self._odometry_node(keyframe))
+        addition.values[keyframe.key] = guess[0]
         if keyframe.t < self._solved + self._solve_every:
-            self._wait([self._odometry_node(keyframe), *addition.nodes], addition.values, guess)
-            return
-        self._update([self._odometry_node(keyframe), *addition.nodes], addition.values)
+            self._wait(addition, guess)
+        else:
+            self._update(addition)
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
         """Take what was added to a keyframe that is in the graph."""
-        if guess is not None and (self._waits or keyframe.t < self._solved + self._solve_every):
-            if self._waits:  # what its error has in common with that of landmarks only the graph knows
-                guess = guess[0], self._graph.covariance
-            self._wait(addition.nodes, addition.values, guess)
+        if guess is None or not (self._waits or keyframe.t < self._solved + self._solve_every):
+            self._update(addition)
             return
-        self._update(addition.nodes, addition.values)
+        if self._waits:  # what its error has in common with that of landmarks only the graph knows
+            guess = guess[0], self._graph.covariance
+        self._wait(addition, guess)
 
-    def _wait(self, nodes: Sequence[Node], values: Values, guess: Guess) -> None:
+    def _wait(self, addition: Addition, guess: Guess) -> None:
         """Keep what is to enter the solver with its next update; until then the newest pose is ``guess``."""
-        self._waiting.nodes += nodes
-        self._waiting.values |= values
+        self._waiting.nodes += addition.nodes
+        self._waiting.values |= addition.values
         self._graph.pose, self._graph.covariance = guess
 
     def current(self, key: int) -> Array:
         """The newest estimate of a variable that is in the graph."""
         return self._solver.value(key)
 
-    def refine(self, newest: Keyframe, guess: Guess) -> None:
-        """Take pose and covariance of the newest keyframe from observations that are not yet in the graph."""
-        self._filtered[newest.index] = guess
-
     def is_open(self, keyframe: int) -> bool:
         """Whether factors may still be added to a keyframe."""
-        return max(0, len(self._left)) <= keyframe < len(self._graph.keyframes)
+        return keyframe >= self._oldest and keyframe in self._graph.keyframes
 
     def is_kept(self, keyframe: int) -> bool:
         """Whether a keyframe is part of the final problem."""
         return self._is_whole or self.is_open(keyframe)
 
-    def _update(self, nodes: Sequence[Node], values: Values) -> None:
-        newest = self._graph.keyframes[-1]
-        nodes, values, self._waiting = [*self._waiting.nodes, *nodes], self._waiting.values | values, Addition()
-        self._solved, guess = newest.t, self._filtered[newest.index]
-        if isinstance(self._solver, Stalled) and newest.t < self._solver.until:
-            self._graph.pose, self._graph.covariance = guess  # the next try takes in what keyframes and constants hold
-            return
-        self._leave(newest.t, values)
+    def _update(self, addition: Addition) -> None:
+        """Solve with an addition and what waits; after a failure once more, with a new solver."""
+        newest, nodes, values = self._graph.newest, addition.nodes, addition.values
+        if self._waiting.nodes or self._waiting.values:
+            nodes, values = self._waiting.nodes + nodes, self._waiting.values | values
+            self._waiting = Addition()
+        self._solved, guess = newest.t, newest.causal
+        if isinstance(self._solver, Window):
+            self._leave(self._solver, newest.t, values)
         try:
-            with gtsam_errors():
-                self._solver.update(nodes, values, newest.t)
-                self._check_jump(newest, guess)
-                touched = {key for node in nodes for key in node.keys if key in self._graph.values}
-                self._read(newest, {key for key in touched if not is_of_keyframe(key) or self.is_open(index_of(key))})
-        except RuntimeError as error:
+            self._solver.update(nodes, values, newest.t)
+            if self._maps and guess is not None and jumps(guess, self._solver.value(newest.key)):
+                raise RuntimeError("the estimate jumped")
+            self._read(newest, {key for node in nodes for key in node.keys})
+        except GTSAM_ERRORS as error:
             self._graph.diagnostics.events.append((newest.t, f"solver rebuilt: {self._graph.reason(error)}"))
-            self._rebuild(newest, guess)
+            newest.causal = guess
+            self._start_again(newest, self._solver.summary(failed=True), "QR", failed=True)
         while self._failed:
             self._graph.diagnostics.reject(f"factor: {self._failed.pop()}")
-
-    def _check_jump(self, newest: Keyframe, guess: Guess) -> None:
-        """RuntimeError if points that are estimated took the newest pose where it cannot be."""
-        if not self._maps:
-            return
-        estimates = self._solver.estimates()
-        if jumps(guess, self._solver.value(newest.key)):
-            raise RuntimeError("the estimate jumped")
-        self._last = estimates
 
     def _read(self, newest: Keyframe, touched: Iterable[int]) -> None:
         """Bring the newest pose with its covariance up to date, and those constants and landmarks that an update touched.
 
         Of constants and points the covariance is not needed before the end, and it takes time: only those of landmarks are read.
         """
-        keys = self._graph.keys
-        followed = {keys[name] for name, s in self._graph.sensors.items() if s.follows_constants and name in keys}
-        self._graph.pose, self._graph.covariance = self._marginal(newest.key)
-        self._filtered[newest.index] = (self._graph.pose, self._graph.covariance)
+        graph = self._graph
+        newest.causal = graph.pose, graph.covariance = self._marginal(newest.key)
         for key in touched:
-            if not is_landmark(key) and key not in followed:
-                self._graph.values[key] = self._value(key)
+            if key not in graph.values or (is_of_keyframe(key) and not self.is_open(index_of(key))):
+                continue
+            if is_landmark(key) or key in self._followed:
+                graph.values[key], graph.spreads[key] = self._marginal(key)
             else:
-                self._graph.values[key], self._graph.spreads[key] = self._marginal(key)
+                graph.values[key] = self._value(key)
 
     def _value(self, key: int) -> Array:
         value = self._solver.value(key)
@@ -233,12 +200,12 @@ class Incremental:
             raise IndeterminateError(key)
         return value
 
-    def _marginal(self, key: int, spread: Array | None = None, graph: Graph | None = None) -> tuple[Array, Array]:
+    def _marginal(self, key: int, spread: Array | None = None, graph: Graph | None = None) -> Guess:
         """Estimate and covariance of a variable; ``spread``: that covariance, if known; ``graph``: where to report, of a copy."""
         value = self._value(key)
         try:
             covariance = self._solver.covariance(key) if spread is None else spread
-        except RuntimeError:
+        except GTSAM_ERRORS:
             covariance = np.full((1, 1), np.nan)
         if positive.is_clear(covariance):
             return value, covariance
@@ -248,34 +215,38 @@ class Incremental:
             covariance = found.by_key[key]
         return value, positive.sound(covariance)
 
-    def _leave(self, now: float, new: Collection[int]) -> None:
+    def _leave(self, window: Window, now: float, new: Collection[int]) -> None:
         """Keep the estimates of the keyframes older than the lag, before updates marginalise them out, and of the constants that
         are in the solver by now, which are all but the ``new`` ones."""
-        if not isinstance(self._solver, Window) or self._lag is None:
-            return
-        lag, count = self._lag, len(self._left)
-        first = self._graph.keyframes[count].t
+        assert self._lag is not None
+        graph, oldest = self._graph, self._graph.keyframes[self._oldest]
         if not self._maps:  # those read before leave by now: both takes time
-            self._solver.lag = now - first + ROUNDING
-        if first >= now - lag - self._margin:
+            window.lag = now - oldest.t + ROUNDING
+        if oldest.t >= now - self._lag - self._margin:
             return
-        leaving = self._graph.keyframes[count : bisect.bisect_left(self._graph.times, now - lag, count)]
-        constants = [key for key in self._graph.values if key not in new and is_constant(key)]
-        points = [key for mapper in self._graph.mappers for key in mapper.leave(now - lag)]
+        leaving = []
+        while oldest.t < now - self._lag:
+            leaving.append(oldest)
+            oldest = graph.keyframes[oldest.index + 1]
+        self._oldest = oldest.index
+        constants = [key for key in graph.values if key not in new and is_constant(key)]
+        points = [key for mapper in graph.mappers for key in mapper.leave(now - self._lag)]
         # of a start of the whole problem the covariance is not asked
         asked = [] if self._is_whole else [*(k.key for k in leaving), *constants, *points]
-        spreads = self._solver.covariances(asked) if asked else {}
+        spreads = window.covariances(asked) if asked else {}
+        for k in leaving:
+            k.final = k.causal
         try:
             for k in leaving:
-                spread = self._filtered[k.index][1] if self._is_whole else spreads.get(k.key)
-                self._left.append(self._marginal(k.key, spread))
+                assert k.causal is not None
+                k.final = self._marginal(k.key, k.causal[1] if self._is_whole else spreads.get(k.key))
             for key in constants:
-                self._graph.values[key], self._graph.spreads[key] = self._marginal(key, spreads.get(key))
-        except RuntimeError:
-            self._left += [self._filtered[k.index] for k in leaving[len(self._left) - count :]]
-        oldest = self._solver.oldest  # what is still in the solver is needed where that is rebuilt
-        for key in [key for key in self._graph.values if is_of_keyframe(key) and index_of(key) < oldest]:
-            del self._graph.values[key]
+                graph.values[key], graph.spreads[key] = self._marginal(key, spreads.get(key))
+        except GTSAM_ERRORS:
+            pass  # the causal estimates stay
+        first = window.oldest  # what is still in the solver is needed where that is rebuilt
+        for key in [key for key in graph.values if is_of_keyframe(key) and index_of(key) < first]:
+            del graph.values[key]
         self._forget(points, spreads)
 
     def _forget(self, points: Iterable[int], spreads: Mapping[int, Array]) -> None:
@@ -283,92 +254,46 @@ class Incremental:
         for key in points:
             try:
                 found = self._marginal(key, spreads.get(key))
-            except RuntimeError:
+            except GTSAM_ERRORS:
                 found = self._graph.values[key], self._graph.spreads[key]
             self._graph.departed[0][key], self._graph.departed[1][key] = found
             del self._graph.values[key], self._graph.spreads[key]
 
-    def _rebuild(self, newest: Keyframe, guess: Guess) -> None:
-        """A new solver after the old one failed, from what that told before; then with QR, which keeps more digits, then without
-        what the newest keyframe tells. Where nothing helps there is none for a while."""
-        failure = RuntimeError()
-        summary = self._solver.summary(failed=True)
-        near = read_all(self._last, [*(k.key for k in self._graph.keyframes), *self._graph.values])
-        tries = ("CHOLESKY", "QR", "QR") if self._factorization == "CHOLESKY" else ("QR", "QR")
-        for i, factorization in enumerate(tries):
-            if i == len(tries) - 1:
-                self._drop_newest(newest)
-            self._filtered[newest.index] = guess
-            try:
-                with gtsam_errors():
-                    self._start_again(newest, summary, near, factorization)
-                    if summary is not None and any(node.has_pose for node in newest.nodes):
-                        self._check_jump(newest, guess)
-            except RuntimeError as error:
-                failure = error
-            else:
-                return
-        self._stall(newest, guess, summary, failure)
-
-    def _drop_newest(self, newest: Keyframe) -> None:
-        """Drop what the newest keyframe tells of poses; the prior of its tilt stays."""
-        if count := sum(node.has_pose for node in newest.nodes):
-            self._graph.diagnostics.reject("newest keyframe: the graph cannot be solved with it", count)
-            newest.nodes[:] = [node for node in newest.nodes if not node.has_pose]
-
-    def _stall(self, newest: Keyframe, guess: Guess, summary: MarginalSummary | None, error: RuntimeError) -> None:
-        """Go on as a filter where the graph cannot be solved."""
-        self._filtered[newest.index] = self._graph.pose, self._graph.covariance = guess
-        self._waiting = Addition()
-        self._solver = self._stalled = Stalled(newest.t, self._known, summary, self._stalled)
-        self._graph.diagnostics.events.append(
-            (newest.t, f"goes on without a solver until {self._solver.until:.1f} s: {self._graph.reason(error)}")
-        )
-
-    def _known(self, key: int) -> Array:
-        """What is known of a variable without the solver."""
-        if is_pose(key):
-            return self._filtered[index_of(key)][0]
-        return self._graph.values[key] if key in self._graph.values else self._graph.departed[0][key]
-
     def _start_again(
-        self,
-        newest: Keyframe,
-        summary: MarginalSummary | None,
-        near: Mapping[int, Array] = NOWHERE,
-        factorization: str | None = None,
+        self, newest: Keyframe, summary: MarginalSummary | None, factorization: str, *, failed: bool = False
     ) -> None:
-        """A new solver with what is in the graph, which begins ``near`` there where that is known.
+        """A new solver with what is in the graph; ``failed``: whether the one before did. RunFailedError where it fails.
 
         A window begins with the ``summary`` of what has left it, and with all measurements that this does not hold; else the graph
         begins with the priors.
         """
+        graph, first = self._graph, 0 if summary is None else summary.oldest
         self._solver, self._waiting, self._solved = self._new_solver(factorization), Addition(), newest.t
-        keyframes = self._graph.keyframes[0 if summary is None else summary.oldest :]
-        guesses = {k.key: self._filtered[k.index][0] for k in keyframes} | self._graph.values
+        keyframes = [k for k in graph.keyframes.values() if k.index >= first]
+        guesses = {k.key: k.causal[0] for k in keyframes if k.causal is not None} | graph.values
         known: Collection[int] = () if summary is None else summary.keys
-        guesses |= {key: value for key, value in self._graph.departed[0].items() if key in known}
-        guesses |= {key: value for key, value in near.items() if key in guesses}
-        self._graph.drop_astray(keyframes[1:], guesses)
-        if summary is not None:  # what is marginalised is linearised there, and fits to nothing else
-            guesses |= {key: value for key, value in summary.at.items() if key in guesses}
-        factors = self._priors() if summary is None else summary.on(guesses)
-        nodes = [n for k in keyframes for n in k.nodes if is_missing(n, guesses, known)]
-        if near and isinstance(self._solver, FullHistory):
-            guesses = self._graph.problem().solve(guesses, ITERATIONS_AFTER_FAILURE).values
-        nodes = [*(self._odometry_node(k) for k in keyframes[1:]), *nodes]
-        self._solver.begin(factors, nodes, guesses, self._stamps(keyframes, guesses))
-        self._read(newest, [key for key in self._graph.values if not is_of_keyframe(key)])
+        guesses |= {key: value for key, value in graph.departed[0].items() if key in known}
+        graph.drop_astray(keyframes[1:], guesses)
+        try:
+            if summary is not None:  # what is marginalised is linearised there, and fits to nothing else
+                guesses |= {key: value for key, value in summary.at.items() if key in guesses}
+            elif failed:
+                guesses = whole_problem(graph).solve(guesses, ITERATIONS_AFTER_FAILURE).values
+            factors = self._priors() if summary is None else summary.on(guesses)
+            nodes = [n for k in keyframes for n in k.nodes if is_missing(n, guesses, known)]
+            nodes = [*(self._odometry_node(k) for k in keyframes[1:]), *nodes]
+            self._solver.begin(factors, nodes, guesses, self._stamps(keyframes, guesses))
+            self._read(newest, [key for key in graph.values if not is_of_keyframe(key)])
+        except GTSAM_ERRORS as error:
+            raise graph.unsolved(error) from error
 
     def _priors(self) -> list[gtsam.NonlinearFactor]:
         """What is known before any measurement."""
-        assert self._graph.prior is not None
-        noise = gtsam.noiseModel.Gaussian.Covariance(
-            se2.world_to_body(self._graph.prior.pose, self._graph.prior.covariance)
-        )
-        start = gtsam.PriorFactorPose2(self._graph.keyframes[0].key, gtsam.Pose2(*self._graph.prior.pose), noise)
+        prior, spread_as = self._graph.prior, gtsam.noiseModel.Gaussian.Covariance
+        assert prior is not None
+        noise = spread_as(se2.world_to_body(prior.pose, prior.covariance))
+        start = gtsam.PriorFactorPose2(self._graph.keyframes[0].key, gtsam.Pose2(*prior.pose), noise)
         means, spreads = self._graph.constant_priors()
-        spread_as = gtsam.noiseModel.Gaussian.Covariance
         return [start, *(gtsam.PriorFactorVector(key, mean, spread_as(spreads[key])) for key, mean in means.items())]
 
     def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
@@ -385,15 +310,15 @@ class Incremental:
         assert keyframe.from_previous is not None
         return Node(keys, native=self._graph.motion.native((keys[0], keys[1]), keyframe.from_previous))
 
-    def _new_solver(self, factorization: str | None = None) -> Solver:
+    def _new_solver(self, factorization: str) -> FullHistory | Window:
         parameters = gtsam.ISAM2Params()
-        parameters.setFactorization(factorization or self._factorization)
+        parameters.setFactorization(factorization)
         # far from where a point was first taken to be its factors mean nothing
         parameters.relinearizeSkip = 1 if self._maps else self._settings.relinearize_skip
         threshold = self._settings.relinearize_threshold
         if self._lag is None:
-            return FullHistory(parameters, threshold)
+            return FullHistory(parameters, threshold, self._failed.append)
         parameters.findUnusedFactorSlots = True
         threshold = min(threshold, NEAR_POINTS) if self._maps else threshold
         # with points each pose leaves by itself: a window that is built anew soon linearises what it knew where it knew it
-        return Window(parameters, threshold, self._lag + self._margin if self._maps else math.inf, self._failed.append)
+        return Window(parameters, threshold, self._failed.append, self._lag + self._margin if self._maps else math.inf)

@@ -11,8 +11,7 @@ filter would.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import partial
 from typing import Protocol
 
@@ -20,8 +19,8 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.fusion.graph.graph import Graph
-from factorgraph_loc.fusion.graph.graph_parts import Addition, GraphSettings, Guess, Keyframe, TickAt
-from factorgraph_loc.fusion.graph.variables import Node
+from factorgraph_loc.fusion.graph.settings import GraphSettings
+from factorgraph_loc.fusion.graph.variables import Addition, Guess, Keyframe, Node, TickAt
 from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.fusion.search import Search, laplace_evidence
@@ -39,19 +38,12 @@ MAPPING_KEYFRAME_INTERVAL = 0.5  # s, where landmarks are estimated too
 class Backend(Protocol):
     """What keeps a graph solved, or its guess; it brings pose and covariance of the newest keyframe up to date."""
 
-    def extend(self, keyframe: Keyframe, addition: Addition, spread: Array) -> None:
-        """Take a new keyframe and what came with it. The guess of its pose is in ``addition``, its body-frame covariance is
-        ``spread`` (3, 3)."""
+    def extend(self, keyframe: Keyframe, addition: Addition, guess: Guess) -> None:
+        """Take a new keyframe with the ``guess`` of its pose, and what came with it."""
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
         """Take what was added to a keyframe that is in the graph. ``guess``: pose and covariance of the newest keyframe after the
         update, where it is that."""
-
-    def refine(self, newest: Keyframe, guess: Guess) -> None:
-        """Take pose and covariance of the newest keyframe from observations that are not yet in the graph."""
-
-    def guess_of(self, keyframe: int) -> Guess:
-        """The causal estimate of a keyframe."""
 
     def current(self, key: int) -> Array:
         """The newest estimate of a variable that is in the graph."""
@@ -63,29 +55,24 @@ class Backend(Protocol):
         """Whether a keyframe is part of the final problem."""
 
 
-@dataclass
 class _KeyframeView:
-    """What sensors see of the graph: the ``guess`` of one keyframe. ``is_kept``: that of the backend."""
+    """What sensors see of the graph: the estimate ``pose`` and ``covariance`` of one keyframe."""
 
-    graph: Graph
-    is_kept: Callable[[int], bool]
-    keyframe: Keyframe
-    guess: Guess
-    offset: Increment | None
-    newest: bool
-    localized: bool = True
+    localized = True
 
-    @property
-    def t(self) -> float:
-        return self.keyframe.t
-
-    @property
-    def pose(self) -> Array:
-        return self.guess[0]
-
-    @property
-    def covariance(self) -> Array:
-        return self.guess[1]
+    def __init__(
+        self,
+        graph: Graph,
+        backend: Backend,
+        keyframe: Keyframe,
+        guess: Guess,
+        offset: Increment | None,
+        *,
+        newest: bool,
+    ) -> None:
+        self.graph, self.keyframe, self.offset, self.newest = graph, keyframe, offset, newest
+        self.t, self.is_kept = keyframe.t, backend.is_kept
+        self.pose, self.covariance = guess
 
     def value(self, name: str) -> Array | None:
         return self.graph.values[self.graph.keys[name]] if name in self.graph.keys else None
@@ -94,7 +81,7 @@ class _KeyframeView:
         return self.graph.spreads[self.graph.keys[name]]
 
     def joint(self) -> tuple[Array, Mapping[str, slice]]:
-        return self.guess[1], {}
+        return self.covariance, {}
 
     def poses_at(self, times: Array) -> Array:
         constants = self.graph.value(MOTION, np.zeros(0))
@@ -102,7 +89,7 @@ class _KeyframeView:
 
     def earlier(self, t: float) -> EarlierPose | None:
         graph = self.graph
-        if not graph.times[graph.times.first] <= t < self.t:
+        if not next(iter(graph.keyframes.values())).t <= t < self.t:
             return None
         before = graph.before(t)
         if before is self.keyframe or not self.is_kept(before.index):
@@ -111,8 +98,11 @@ class _KeyframeView:
 
     def on_pose(self, observation: Observation) -> Observation:
         """An observation of the pose alone, with its blocks where they are estimated to be."""
-        values = {name: self.graph.value(name) for name in observation.blocks}
-        return observation.on_pose(values, {name: self.spread(name) for name in observation.blocks})
+        values, spreads = {}, {}
+        for name in observation.blocks:
+            key = self.graph.keys[name]
+            values[name], spreads[name] = self.graph.values[key], self.graph.spreads[key]
+        return observation.on_pose(values, spreads)
 
 
 class Builder:
@@ -135,13 +125,13 @@ class Builder:
     def take(self, m: Measurement) -> bool:
         """Take a measurement; False where it is too late."""
         graph, sensor = self._graph, self._graph.sensors[m.modality]
-        graph.t = max(graph.t, m.t)
-        due = any(mapper.is_due(m) for mapper in graph.mappers) and m.t > graph.newest.t
-        if m.t - graph.newest.t >= self._interval(sensor) or due:
+        graph.t, newest = max(graph.t, m.t), graph.newest
+        if m.t - newest.t >= self._interval(sensor) or (m.t > newest.t and self._is_due(m)):
             self._add_keyframe(m.t, None if sensor.gathers else m)
             if not sensor.gathers:
                 return True
-        before, newest = graph.before(m.t), graph.newest
+            newest = graph.newest
+        before = newest if m.t >= newest.t else graph.before(m.t)
         if before is not newest and not self._backend.is_open(before.index):
             return False
         offset = graph.since(before, m.t) if m.t > before.t else None
@@ -154,9 +144,13 @@ class Builder:
             self._backend.attach(before, addition, guess)
         return True
 
+    def _is_due(self, m: Measurement) -> bool:
+        """Whether a mapper needs a keyframe at a measurement."""
+        return any(mapper.is_due(m) for mapper in self._graph.mappers) if self._graph.mappers else False
+
     def gather(self) -> list[Node]:
         """What waits on the newest keyframe becomes factors of it."""
-        nodes = self.waiting()
+        nodes = self.waiting() if self._waiting else []
         self._graph.newest.nodes += nodes
         self._waiting = []
         return nodes
@@ -190,34 +184,32 @@ class Builder:
             self._gatherer = sensor
         odometry = graph.motion.state(m.t)
         guess = graph.pose, graph.covariance
-        view = _KeyframeView(graph, self._backend.is_kept, graph.newest, guess, offset, newest=True)
+        view = _KeyframeView(graph, self._backend, graph.newest, guess, offset, newest=True)
         for seen in sensor.observe(m, view):
             if isinstance(seen, NewVariable | Link):
                 continue
             here = view.on_pose(seen)
-            correction = here.correct(*view.guess, {}, {}, here.iterations or ITERATIONS_OF_GUESS)
+            correction = here.correct(view.pose, view.covariance, {}, {}, here.iterations or ITERATIONS_OF_GUESS)
             if seen.is_judged and not sensor.judge(here, correction, view):
                 continue
-            evidence = partial(laplace_evidence, here, *view.guess, correction)
+            evidence = partial(laplace_evidence, here, view.pose, view.covariance, correction)
             self._waiting.append(seen)
-            graph.pose = se2_kernels.moved(view.pose, correction.delta)
-            graph.covariance = correction.covariance
-            view.guess = graph.pose, graph.covariance
-            self._backend.refine(graph.newest, view.guess)
+            view.pose, view.covariance = se2_kernels.moved(view.pose, correction.delta), correction.covariance
+            graph.newest.causal = graph.pose, graph.covariance = view.pose, view.covariance
             self._search.keep(sensor, here, odometry, evidence)
 
     def _add_keyframe(self, t: float, m: Measurement | None) -> None:
-        graph = self._graph
-        newest, odometry = graph.newest, graph.motion.state(t)
-        keyframe = Keyframe(newest.index + 1, t, odometry, graph.motion.relative(newest.odometry, odometry))
-        guess: Guess | None = graph.moved(t)[:2]
+        graph, motion = self._graph, self._graph.motion
+        newest, odometry = graph.newest, motion.state(t)
+        keyframe = Keyframe(newest.index + 1, t, odometry, motion.relative(newest.odometry, odometry))
+        pose, covariance, _ = graph.moved(t)
         addition = Addition(self.gather())
         graph.append(keyframe)
+        guess: Guess | None = (pose, covariance)
         if m is not None:
             guess = self._see(keyframe, m, None, guess, addition, is_new=True)
         assert guess is not None
-        addition.values[keyframe.key] = guess[0]
-        self._backend.extend(keyframe, addition, guess[1])
+        self._backend.extend(keyframe, addition, guess)
 
     def _see(
         self,
@@ -236,8 +228,9 @@ class Builder:
         """
         graph, sensor = self._graph, self._graph.sensors[m.modality]
         odometry = graph.motion.state(m.t)
-        expected = self._backend.guess_of(keyframe.index) if guess is None else guess
-        view = _KeyframeView(graph, self._backend.is_kept, keyframe, expected, offset, newest=guess is not None)
+        expected = keyframe.causal if guess is None else guess
+        assert expected is not None
+        view = _KeyframeView(graph, self._backend, keyframe, expected, offset, newest=guess is not None)
         for seen in sensor.observe(m, view):
             if isinstance(seen, Link):
                 self._add_link(seen, sensor, keyframe, addition)
@@ -246,17 +239,20 @@ class Builder:
                 self._add_block(seen, sensor, view, addition)
                 continue
             here = view.on_pose(seen)
-            correction = here.correct(*view.guess, {}, {}, here.iterations or ITERATIONS_OF_GUESS)
+            correction = here.correct(view.pose, view.covariance, {}, {}, here.iterations or ITERATIONS_OF_GUESS)
             if seen.is_judged and not sensor.judge(here, correction, view):
                 continue
-            addition.hang(keyframe, *(graph.node(keyframe, term, sensor.modality) for term in seen.terms))
+            for term in seen.terms:
+                addition.hang(keyframe, graph.node(keyframe, term, sensor.modality))
             if guess is not None:
                 self._search.expect(sensor, here, odometry, view)
-                self._search.keep(sensor, here, odometry, partial(laplace_evidence, here, *view.guess, correction))
-                view.guess = se2_kernels.moved(view.pose, correction.delta), correction.covariance[:3, :3]
+                evidence = partial(laplace_evidence, here, view.pose, view.covariance, correction)
+                self._search.keep(sensor, here, odometry, evidence)
+                view.pose = se2_kernels.moved(view.pose, correction.delta)
+                view.covariance = correction.covariance[:3, :3]
         if guess is None:
             return None
-        guess = view.guess
+        guess = view.pose, view.covariance
         for mapper in graph.mappers:
             if keyframe is graph.newest and m.t == keyframe.t:
                 guess = mapper.take(m, keyframe, guess, self._graph_view(sensor), addition, is_new=is_new)

@@ -7,7 +7,7 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.graph.variables import gtsam_errors
+from factorgraph_loc.fusion.graph.variables import GTSAM_ERRORS
 
 MAX_ITERATIONS = 100
 CONVERGED_GAIN = 1e-6  # of the cost
@@ -50,7 +50,6 @@ def damped_step(
     for key, size in sizes.items():
         graph.add(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(size), np.zeros(size), UNITS[size]))
     try:
-        with gtsam_errors():
-            return graph.optimize()
-    except RuntimeError:
+        return graph.optimize()
+    except GTSAM_ERRORS:
         return None

@@ -15,21 +15,23 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
 
 import gtsam
 import numpy as np
 
 from factorgraph_loc.fusion.graph.variables import Node, Values, frame_motions, is_place, is_pose, read, to_gtsam
-from factors.graph import Factor, gaussian_factor, jacobian_factors, silenced
+from factors.graph import gaussian_factor, jacobian_factors
 from factors.se2 import Array
 
 
 class LinearFactors:
     """Our factors in a solver, and where that linearises its variables: those that moved as far as ``threshold``, at each update
-    whose number ``skip`` divides. ``on_failure`` is told of a factor that cannot be linearised, which then says nothing; without
-    it that is an error."""
+    whose number ``skip`` divides. ``on_failure`` is called with the reason where a factor cannot be linearised, which is then left
+    out."""
 
-    def __init__(self, threshold: float, skip: int, on_failure: Callable[[str], None] | None) -> None:
+    def __init__(self, threshold: float, skip: int, on_failure: Callable[[str], None]) -> None:
         self._threshold, self._skip, self._on_failure = threshold, skip, on_failure
         self._updates = 0
         self.at: Values = {}  # where each variable is linearised
@@ -47,8 +49,9 @@ class LinearFactors:
     ) -> tuple[gtsam.NonlinearFactorGraph, list[int]]:
         """All that the next update is to add, which is to be told by :meth:`place`, and the slots of what it is to remove: factors
         on variables that it will linearise elsewhere are replaced."""
-        self._added = self._moved(solver)
-        removed = [linear.slot for linear in self._added]
+        self._updates += 1
+        self._added = self._moved(solver) if self.at and not self._updates % self._skip else []
+        removed = [linear.slot for linear in self._added] if self._added else []
         self._slots.difference_update(removed)
         self.at |= values
         graph = gtsam.NonlinearFactorGraph()
@@ -62,24 +65,17 @@ class LinearFactors:
             self._added.append(linear)
             for key in node.keys:
                 self._on[key][id(linear)] = linear
-        for linear, linearized in zip(self._added, self._linearized(), strict=True):
+        ours = list(map(_PLACED, self._added))
+        for linear, linearized in zip(self._added, jacobian_factors(ours, self.at, self._on_failure), strict=True):
             linear.slot = graph.size()
-            graph.add(self._placed(linear.node.keys, linearized))
+            keys = linear.node.keys
+            # a factor does without the point that it is linearised at where the solver never leaves that
+            held = self._held and not self._held.keys().isdisjoint(keys)
+            graph.add(self._on_held(keys, linearized) if held else gtsam.LinearContainerFactor(linearized))
         return graph, removed
 
-    def _linearized(self) -> list[gtsam.GaussianFactor]:
-        """What is to be added, linearised. It does without a point that it is linearised at: the solver never leaves that."""
-        factors: list[tuple[Factor, tuple[int, ...]]] = []
-        for node in (linear.node for linear in self._added):
-            assert node.factor is not None
-            told = self._on_failure
-            factors.append((node.factor if told is None else silenced(node.factor, node.rows, told), node.keys))
-        return jacobian_factors(factors, self.at)
-
-    def _placed(self, keys: Sequence[int], linearized: gtsam.GaussianFactor) -> gtsam.LinearContainerFactor:
-        """A linearised factor for the solver. One on what that holds has the point that it is linearised at."""
-        if self._held.keys().isdisjoint(keys):
-            return gtsam.LinearContainerFactor(linearized)
+    def _on_held(self, keys: Sequence[int], linearized: gtsam.GaussianFactor) -> gtsam.LinearContainerFactor:
+        """A linearised factor on what the solver holds, with the point that it is linearised at."""
         jacobian, right = linearized.jacobian()
         motions, ends = frame_motions({key: self._held.get(key, self.at[key]) for key in keys})
         if sum(map(is_place, keys)) > 1:  # else it tells where the place is in the world
@@ -115,9 +111,6 @@ class LinearFactors:
 
     def _moved(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother) -> list[_Linear]:
         """Those that are to be linearised anew."""
-        self._updates += 1
-        if not self.at or self._updates % self._skip:
-            return []
         keys, ends = list(self.at), np.cumsum([len(value) for value in self.at.values()])
         change = np.maximum.reduceat(np.abs(solver.getDelta().vector(keys)), np.append(0, ends[:-1]))
         moved = [keys[i] for i in np.flatnonzero(change >= self._threshold).tolist()]
@@ -147,13 +140,15 @@ class LinearFactors:
         return list(moved)
 
 
+@dataclass(slots=True, eq=False)
 class _Linear:
     """One of our factors, and its slot in the solver."""
 
-    __slots__ = ("node", "slot")
+    node: Node
+    slot: int = -1
 
-    def __init__(self, node: Node) -> None:
-        self.node, self.slot = node, -1
+
+_PLACED = attrgetter("node.factor", "node.keys", "node.rows")
 
 
 def unaware(jacobian: Array, motions: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The variables of a graph by GTSAM's keys, and what hangs on them.
+"""The variables of a graph by GTSAM's keys, its keyframes, and the factors on them.
 
 A variable is a pose (3,), or a vector: roll and pitch (2,) of the robot at a pose, constants of a sensor that are estimated, or the
 position of a landmark (2,) or point (3,).
@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from types import TracebackType
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
-from factors import se2_kernels
+from factors import positive, se2, se2_kernels
 from factors.graph import Factor, pose_array
+from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
 Values = dict[int, Array]
+GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)  # all that GTSAM raises
 
 _POSE, _TILT, _POINT, _LANDMARK = ord("x"), ord("t"), ord("p"), ord("l")
 _CHARACTER = 56  # bits of a key below its character
@@ -106,15 +108,61 @@ class Node:
         return any(is_pose(key) for key in self.keys)
 
 
-class gtsam_errors:  # noqa: N801 - used as a function
-    """A context in which whatever GTSAM throws, and what cannot be linearised for it, becomes a RuntimeError."""
+Guess = tuple[Array, Array]  # a pose (3,) and its body-frame covariance (3, 3)
 
-    def __enter__(self) -> None:
-        pass
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        if isinstance(error, (IndexError, ValueError)):
-            raise RuntimeError(str(error)) from error
+@dataclass
+class Keyframe:
+    """A pose variable of the graph: its time, the odometry there, and the factors of what is seen from it.
+
+    ``from_previous``: the motion since the keyframe before, and ``factor``, the factor made of it. ``is_elsewhere``: whether the
+    robot was carried there from the keyframe before. ``causal``: the estimate while it was the newest one; ``final``: the estimate
+    with which it has left a window.
+    """
+
+    index: int
+    t: float
+    odometry: ChainState
+    from_previous: Increment | None
+    factor: Factor | None = None
+    is_elsewhere: bool = False
+    nodes: list[Node] = field(default_factory=list)
+    causal: Guess | None = None
+    final: Guess | None = None
+    key: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.key = pose_key(self.index)
+
+
+class TickAt(NamedTuple):
+    """A stamp at which the trajectory is wanted, the number of the keyframe before it, and the odometry there."""
+
+    t: float
+    keyframe: int
+    odometry: ChainState
+
+
+@dataclass
+class Addition:
+    """What a measurement adds to the graph: factors, and new variables with their guesses."""
+
+    nodes: list[Node] = field(default_factory=list)
+    values: Values = field(default_factory=dict)
+
+    def hang(self, keyframe: Keyframe, *nodes: Node) -> None:
+        """Add factors, and keep them with a keyframe."""
+        keyframe.nodes += nodes
+        self.nodes += nodes
+
+
+# Gauss-Newton steps lead astray where points tell little: squared Mahalanobis distance of a pose from its guess
+JUMPED = 50.0
+
+
+def jumps(guess: Guess, pose: Array) -> bool:
+    """Whether ``pose`` (3,) is where the robot, by the ``guess`` of it, cannot be."""
+    return not positive.squared(se2.log(se2.between(guess[0], pose)), guess[1]) < JUMPED
 
 
 def retract(key: int, value: Array, step: Array) -> Array:

@@ -1,18 +1,12 @@
-"""What a graph estimator is made of: its settings, keyframes, what a measurement adds, and where the trajectory is wanted."""
+"""Settings of the graph estimators."""
 
 import math
-from dataclasses import dataclass, field
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from pydantic import Field, PlainSerializer, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.fusion.graph.variables import Node, Values, pose_key
 from factorgraph_loc.model.setup import MapUse
-from factors import positive, se2
-from factors.graph import Factor
-from factors.motion import ChainState, Increment
-from factors.se2 import Array
 
 
 class GraphSettings(FileModel):
@@ -67,49 +61,8 @@ class SmootherSettings(GraphSettings):
         return self
 
 
-@dataclass
-class Keyframe:
-    """A pose variable of the graph: its time, the odometry there, and the sightings and scans that hang on it."""
+class BatchSettings(GraphSettings):
+    """Settings of the batch estimator."""
 
-    index: int
-    t: float
-    odometry: ChainState
-    from_previous: Increment | None
-    factor: Factor | None = None  # of the odometry from the one before, once it was asked for
-    is_elsewhere: bool = False  # the robot was carried there from the one before
-    nodes: list[Node] = field(default_factory=list)
-
-    @property
-    def key(self) -> int:
-        return pose_key(self.index)
-
-
-Guess = tuple[Array, Array]  # a pose (3,) and its body-frame covariance (3, 3)
-# Gauss-Newton steps lead astray where points tell little: squared Mahalanobis distance of a pose from its guess
-JUMPED = 50.0
-
-
-def jumps(guess: Guess, pose: Array) -> bool:
-    """Whether ``pose`` (3,) is where the robot, by the ``guess`` of it, cannot be."""
-    return not positive.squared(se2.log(se2.between(guess[0], pose)), guess[1]) < JUMPED
-
-
-@dataclass
-class Addition:
-    """What a measurement adds to the graph: factors, and new variables with their guesses."""
-
-    nodes: list[Node] = field(default_factory=list)
-    values: Values = field(default_factory=dict)
-
-    def hang(self, keyframe: Keyframe, *nodes: Node) -> None:
-        """Add factors, and keep them with a keyframe."""
-        keyframe.nodes += nodes
-        self.nodes += nodes
-
-
-class TickAt(NamedTuple):
-    """A stamp at which the trajectory is wanted, the keyframe before it, and the odometry there."""
-
-    t: float
-    keyframe: int
-    odometry: ChainState
+    widest_loss: Annotated[float, Field(ge=1.0, le=1000.0)] = 8.0
+    """how many times wider than its own scale the robust loss begins; 1 for a plain robust start"""
