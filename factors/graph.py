@@ -116,8 +116,8 @@ def gaussian_factor(keys: Sequence[int], residual: Array, blocks: Sequence[Array
     unit = _unit(len(residual))
     if len(blocks) > MOST_TERMS:
         return gtsam.GaussianConditional(list(zip(keys, blocks, strict=True)), 1, -residual, unit)
-    terms: Any = chain.from_iterable(zip(keys, blocks, strict=True))
-    return gtsam.JacobianFactor(*terms, -residual, unit)
+    arguments: list[Any] = [*chain.from_iterable(zip(keys, blocks, strict=True)), -residual, unit]
+    return gtsam.JacobianFactor(*arguments)
 
 
 @lru_cache(maxsize=256)

@@ -198,12 +198,12 @@ def _print_further(scores: Mapping[str, Any], *, rpe: bool) -> None:
 
 def _print_consistency(scores: Mapping[str, Any]) -> None:
     for name, value in scores.items():
-        if name.startswith("nis.") and name.endswith(".mean_per_dof") and value is not None:
-            sensor = name.removeprefix("nis.").removesuffix(".mean_per_dof")
+        if name.startswith("nis.") and name.endswith(".median_ratio") and value is not None:
+            sensor = name.removeprefix("nis.").removesuffix(".median_ratio")
             # the median, because a few gross outliers dominate the mean
             share = 100.0 * scores[f"nis.{sensor}.beyond_95"]
             show.line(
-                f"{sensor}: normalised innovation squared {value:.2f} per degree of freedom, ideal 1; "
+                f"{sensor}: normalised innovation squared {value:.2f} times the expected median, ideal 1; "
                 f"{share:.1f} % beyond the 95 % bound, ideal 5"
             )
 

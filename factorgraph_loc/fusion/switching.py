@@ -1,13 +1,13 @@
 """The paper's fusion rule: RFID when tags are read, vision otherwise (Raoui, Bouyakhf, Devy, ICINCO 2011, section 5).
 
-A scan in which a tag of the map is read gives the word to the particle filter, one without gives it to the EKF on what the camera
-sees; who has not the word is told nothing but odometry. The word is handed over as mean and covariance of the pose, so that
-constants of the odometry which are uncertain count as noise in both. The final trajectory is smoothed over all hand-overs
-(Rauch, Tung, Striebel, 1965), from what was believed at each time.
+A scan in which a tag of the map is read makes the particle filter active, one without makes the EKF active, which uses all other
+sensors. The other filter processes odometry only. At a hand-over the new filter starts from mean and covariance of the pose, so
+that uncertain constants of the odometry count as noise in both. The final trajectory is smoothed over all hand-overs (Rauch, Tung,
+Striebel, 1965), from the causal estimates.
 """
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, cast
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -21,14 +21,13 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.binding import bound_sensors
 from factorgraph_loc.sensors.motion import Motion
+from factorgraph_loc.sensors.registry import sensor_of
 from factors import positive, se2
 from factors.motion import ChainState, Increment, propagate
 from factors.se2 import Array
 
-TAGS = "rfid"  # the modality of scans of tags
-TAG_SENSORS = ("rfid", "rssi", "phase")
-LANDMARK_SENSORS = ("camera", "sightings", "bearing_range")
 JUMPED = 50.0  # Mahalanobis distance squared beyond which an estimate did not come from the one before
 LEAST = np.diag((1e-4, 1e-4, 1e-4)) ** 2  # m, m, rad: particles that agree to the last digit are no Gaussian
 
@@ -59,9 +58,13 @@ class Switching:
     def __init__(self, setup: Setup, settings: SwitchingSettings) -> None:
         self.diagnostics = Diagnostics()
         self._smooth = settings.smooth
-        self._known = frozenset(setup.world.tags)
-        by_tags = replace(setup, sensors=tuple(s for s in setup.sensors if s not in LANDMARK_SENSORS))
-        by_sight = replace(setup, sensors=tuple(s for s in setup.sensors if s not in TAG_SENSORS))
+        self._motion = Motion(setup.rig, setup.sensors, Diagnostics())
+        sensors = bound_sensors(setup, self._motion, Diagnostics())
+        self._scanners = {name: sensor for name, sensor in sensors.items() if sensor.gathers}
+        scanning = {sensor_of(name).name for name in self._scanners}
+        others = {sensor_of(name).name for name in sensors} - scanning
+        by_tags = replace(setup, sensors=tuple(s for s in setup.sensors if sensor_of(s).name not in others))
+        by_sight = replace(setup, sensors=tuple(s for s in setup.sensors if sensor_of(s).name not in scanning))
         delay = settings.max_delay
         of_tags = ParticleFilterSettings(
             max_delay=delay, smooth=False, self_calibration=False, particles=settings.particles
@@ -69,11 +72,9 @@ class Switching:
         of_sight = EkfSettings(max_delay=delay, smooth=False, self_calibration=False)
         self._tags: Filter = ParticleFilter(by_tags, of_tags, self.diagnostics)
         self._vision: Filter = Ekf(by_sight, of_sight, self.diagnostics)
-        by_scans = TAG_SENSORS[0] in setup.sensors
-        self.supports_unknown_start = by_scans or self._vision.supports_unknown_start
-        self.supports_unknown_heading = by_scans or self._vision.supports_unknown_heading
-        self._motion = Motion(setup.rig, setup.sensors, Diagnostics())
-        self._active: Filter = self._tags if by_scans else self._vision
+        self.supports_unknown_start = bool(scanning) or self._vision.supports_unknown_start
+        self.supports_unknown_heading = bool(scanning) or self._vision.supports_unknown_heading
+        self._active: Filter = self._tags if scanning else self._vision
         self._newest_scan = -np.inf
         self._ticks: list[float] = []
         self._records: dict[float, _PoseBelief] = {}  # by their times: the last one counts
@@ -86,31 +87,35 @@ class Switching:
         """Take one measurement, in time or late by at most ``max_delay``."""
         if measurement.is_motion:
             self._tags.process(measurement)
-            late = dict(self.diagnostics.late)
+            counted = self.diagnostics.ignored, self.diagnostics.late
+            before = [dict(counts) for counts in counted]
             self._vision.process(measurement)
-            self.diagnostics.late = late  # the second filter counted the same row
+            for counts, once in zip(counted, before, strict=True):  # the second filter counted the same rows
+                counts.clear()
+                counts.update(once)
             self._motion.add(measurement)
             return
-        if measurement.modality == TAGS and measurement.t >= self._newest_scan:
+        scanner = self._scanners.get(measurement.modality)
+        if scanner is not None and measurement.t >= self._newest_scan:
             self._newest_scan = measurement.t
-            read = any(tag in self._known for tag in cast(Any, measurement).tags)
-            self._hand_over(self._tags if read else self._vision)
+            scan = scanner.evidence(measurement)
+            self._hand_over(self._tags if scan is not None and scan.found else self._vision)
         if isinstance(measurement, Tick):
             self._ticks.append(measurement.t)
-        if isinstance(measurement, Tick) or (measurement.modality == TAGS) == (self._active is self._tags):
+        if isinstance(measurement, Tick) or (scanner is not None) == (self._active is self._tags):
             self._active.process(measurement)
             self._record()
-        elif measurement.modality == TAGS:
-            self.diagnostics.ignore("rfid while no tag is read", measurement.count)
+        elif scanner is not None:
+            self.diagnostics.ignore(f"{measurement.modality} while no tag is read", measurement.count)
         else:
             self.diagnostics.ignore("landmarks while tags are read")
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The estimate of the filter that has the word."""
+        """The estimate of the active filter."""
         return self._active.estimate(t)
 
     def belief(self, t: float | None = None) -> Belief:
-        """The belief of the filter that has the word."""
+        """The belief of the active filter."""
         return self._active.belief(t)
 
     def learnt(self) -> Learnt:
@@ -138,7 +143,7 @@ class Switching:
         self._records = {t: record for t, record in self._records.items() if t >= before}
 
     def _hand_over(self, other: Filter) -> None:
-        """Give the word to ``other``; without a known pose there is nothing to hand over."""
+        """Make ``other`` the active filter, unless there is no pose to start it from."""
         if other is self._active:
             return
         now = self._active.estimate()

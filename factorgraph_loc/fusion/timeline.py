@@ -15,7 +15,7 @@ from pydantic import Field
 from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.fusion.base import EVERY
 from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, gaussian_belief
-from factorgraph_loc.model.diagnostics import Diagnostics, Written
+from factorgraph_loc.model.diagnostics import Addition, Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
@@ -45,7 +45,7 @@ class Taken(NamedTuple):
     odometry: ChainState
     records: int
     ticks: int
-    written: Written
+    written: list[Addition]
 
 
 class Filter(ABC):
@@ -227,15 +227,16 @@ class Filter(ABC):
     def _take(self, m: Measurement) -> None:
         self._anchor()
         before = (self._state, self._t, self._odometry, len(self._records), len(self._ticks))
-        mark = self.diagnostics.mark()
+        written = self.diagnostics.record()
         self._move(m.t)
         if isinstance(m, Tick):
             self._ticks.append(m.t)
             self._pass(m)
         else:
             self._see(m)
+        self.diagnostics.added = None
         self._records.append(self._record())
-        self._taken.append(Taken(m, *before, self.diagnostics.since(mark)))
+        self._taken.append(Taken(m, *before, written))
         while self._taken[0].measurement.t < m.t - self._max_delay:
             self._taken.popleft()
 

@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
+from operator import attrgetter
 from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
@@ -344,9 +347,9 @@ class ResidualObservation:
     def at_its_time(self) -> Observation | None:
         return None
 
-    @property
+    @cached_property
     def blocks(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(name for term in self.terms for name in term.blocks))
+        return tuple(dict.fromkeys(chain.from_iterable(map(attrgetter("blocks"), self.terms))))
 
     @property
     def factors(self) -> list[SightingFactor]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import gtsam
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
@@ -25,7 +24,6 @@ from factors.odometry.model import (
     OdometryFactor,
     OdometryModel,
     ScaleFreeOdometryFactor,
-    between_factor,
     slip,
 )
 from factors.se2 import Array
@@ -194,9 +192,6 @@ class Motion:
         """An increment without constants as a factor on two poses."""
         return OdometryFactor(increment)
 
-    def native(self, keys: tuple[int, int], increment: Increment) -> gtsam.NonlinearFactor:
-        """An increment without constants as a GTSAM factor on two poses."""
-        return between_factor(*keys, increment)
 
     def twist(self, t: float) -> Array:
         """The robot's velocity (3,) just before ``t``, in the robot frame."""

@@ -76,11 +76,15 @@ class FeatureMatcher:
     ) -> tuple[SlamState, Match]:
         """The state, less certain by ``added`` (3, 3) in x, y and heading if the pixels tell of wheels that slipped, and
         :meth:`match`. ``rarity``: minus the logarithm of how probable that is."""
-        mark, slipped = self._diagnostics.mark(), state.widened(added)
+        slipped, diagnostics = state.widened(added), self._diagnostics
+        before, noted = diagnostics.added, diagnostics.record()
         match = self.match(m, slipped, eye)
+        diagnostics.added = before
         if len(match.pixels) >= ENOUGH and _slip(match, state, eye, added) > rarity:
+            if before is not None:
+                before += noted
             return slipped, match
-        self._diagnostics.take_back(self._diagnostics.since(mark))
+        diagnostics.take_back(noted)
         return state, self.match(m, state, eye)
 
     def new(self, m: Pixels, state: SlamState, eye: Eye, match: Match, tracks: frozenset[int]) -> list[int]:

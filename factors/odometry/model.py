@@ -13,7 +13,6 @@ import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -158,12 +157,6 @@ def composed(t: Array | NDArray[np.int64], moves: Array) -> tuple[NDArray[np.int
         place = int(np.searchsorted(last, row))
         out[place] = se2.compose(out[place], moves[row])
     return last, out
-
-
-def between_factor(from_key: int, to_key: int, increment: Increment) -> gtsam.NonlinearFactor:
-    """The increment as a GTSAM factor between two ``Pose2`` variables."""
-    noise = gtsam.noiseModel.Gaussian.Covariance(increment.covariance)
-    return gtsam.BetweenFactorPose2(from_key, to_key, gtsam.Pose2(*increment.delta), noise)
 
 
 class OdometryStack:

@@ -181,7 +181,7 @@ def test_without_a_reference_nis_counts_and_times_are_reported():
     t = np.arange(5) * 0.1
     scores = score(result_of(t, np.zeros((5, 3)), ("localized",) * 5, diagnostics=diagnostics), log_of(t, None))
     assert scores["causal.position_rmse"] is None
-    assert scores["nis.bearing_range.mean_per_dof"] == pytest.approx(33.0 / 6.0)
+    assert scores["nis.bearing_range.median_ratio"] == pytest.approx(2.0 / (2.0 * np.log(2.0)))
     assert scores["nis.bearing_range.beyond_95"] == pytest.approx(1.0 / 3.0)
     assert scores["nis.bearing_range.count"] == 3
     assert scores["ignored.unknown landmark"] == scores["ignored.total"] == 3
@@ -223,8 +223,9 @@ def test_innovations_without_degrees_of_freedom_say_nothing():
     diagnostics.residuals = {"bearing_range.range": [np.nan, 3.0], "bearing_range.bearing": [np.nan]}
     t = np.arange(5) * 0.1
     scores = score(result_of(t, np.zeros((5, 3)), ("localized",) * 5, diagnostics=diagnostics), log_of(t, None))
-    assert (scores["nis.rfid.mean_per_dof"], scores["nis.rfid.beyond_95"], scores["nis.rfid.count"]) == (1.5, 0.0, 4)
-    assert (scores["nis.phase.mean_per_dof"], scores["nis.phase.beyond_95"]) == (None, None)
+    assert scores["nis.rfid.median_ratio"] == pytest.approx(1.5 / np.log(2.0))
+    assert (scores["nis.rfid.beyond_95"], scores["nis.rfid.count"]) == (0.0, 4)
+    assert (scores["nis.phase.median_ratio"], scores["nis.phase.beyond_95"]) == (None, None)
     assert (scores["residual.bearing_range.range.rms"], scores["residual.bearing_range.range.median_abs"]) == (3.0, 3.0)
     assert (scores["residual.bearing_range.bearing.rms"], scores["residual.bearing_range.bearing.median_abs"]) == (
         None,

@@ -84,13 +84,13 @@ def test_what_is_taken_back_leaves_no_trace():
     diagnostics.innovation("camera", 1.0, 2.0, 2)
     diagnostics.ignore("stranger", 2)
     before = repr(diagnostics)
-    mark = diagnostics.mark()
+    added = diagnostics.record()
     diagnostics.innovation("camera", 2.0, 2.0, 2)
     diagnostics.innovation("rfid", 2.0, 1.0, 1)
     diagnostics.add_residuals("camera.u", (1.0, 2.0))
     diagnostics.ignore("stranger")
     diagnostics.reject("astray", 3)
-    diagnostics.take_back(diagnostics.since(mark))
+    diagnostics.take_back(added)
     assert repr(diagnostics) == before
 
 
@@ -98,9 +98,9 @@ def test_counts_that_did_not_rise_are_not_taken_back():
     """Images without a feature are ignored as 0 features."""
     diagnostics, written = Diagnostics(), []
     for _ in range(2):
-        mark = diagnostics.mark()
+        added = diagnostics.record()
         diagnostics.ignore("camera", 0)
-        written.append(diagnostics.since(mark))
+        written.append(added)
     for one in reversed(written):
         diagnostics.take_back(one)
     assert not any(diagnostics.ignored.values())
@@ -115,10 +115,10 @@ def test_rows_that_were_dropped_meanwhile_cannot_be_taken_back():
     """A robot that runs for long keeps the last rows alone, fewer than it may go back by."""
     diagnostics, written = Diagnostics(), []
     for t in range(3):
-        mark = diagnostics.mark()
+        added = diagnostics.record()
         for _ in range(4):
             diagnostics.innovation("camera", float(t), 2.0, 2)
-        written.append(diagnostics.since(mark))
+        written.append(added)
     del diagnostics.nis["camera"][:-5]
     for one in reversed(written):
         diagnostics.take_back(one)
@@ -129,10 +129,10 @@ def test_rows_are_taken_back_whatever_came_after_them():
     """A late look is taken after newer ones; going back to between them leaves its row, and takes theirs."""
     diagnostics, written = Diagnostics(), {}
     for t in (5.0, 6.0, 4.9):
-        mark = diagnostics.mark()
+        added = diagnostics.record()
         diagnostics.innovation("camera", t, 2.0, 2)
         diagnostics.add_residuals("camera.u", (10.0 * t,))
-        written[t] = diagnostics.since(mark)
+        written[t] = added
     for t in (6.0, 5.0):
         diagnostics.take_back(written[t])
     assert diagnostics.nis == {"camera": [(4.9, 2.0, 2)]}

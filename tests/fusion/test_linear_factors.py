@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.fusion.graph.linear_factors import unaware
+from factorgraph_loc.fusion.graph.solver import unaware
 from factorgraph_loc.fusion.graph.variables import (
     constants_key,
     frame_motions,

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.graph.solver import MARGIN, FullHistory, MarginalSummary, Window
+from factorgraph_loc.fusion.graph.solver import MARGIN, FullHistory, Window
+from factorgraph_loc.fusion.graph.summary import MarginalSummary
 from factorgraph_loc.fusion.graph.variables import Node, index_of, is_pose, landmark_key, pose_key, read, to_gtsam
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factors import se2

@@ -10,6 +10,7 @@ from factorgraph_loc.fusion import registry
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.measurement import Tick
+from factorgraph_loc.sensors.odometry.measurement import YawRate
 from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation import simulate as simulate_office
@@ -88,6 +89,13 @@ def test_what_the_other_filter_would_take_is_counted(office):
     assert ignored["rfid while no tag is read"] > 0
     sightings = sum(1 for _ in office.measurements(("bearing_range",)))
     assert ignored["landmarks while tags are read"] < sightings
+
+
+def test_rows_that_neither_filter_uses_are_counted_once(office):
+    estimator = made(office)
+    estimator.initialize(PosePrior(0.0, office.reference.poses[0], np.eye(3)))
+    estimator.process(YawRate(0.1, 0.2))
+    assert estimator.diagnostics.ignored == {"yaw rate": 1}
 
 
 def test_vision_and_smoothing_help(office):

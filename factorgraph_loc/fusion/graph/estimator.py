@@ -30,7 +30,7 @@ from factorgraph_loc.fusion.graph.variables import Keyframe
 from factorgraph_loc.fusion.mapping import Mapper
 from factorgraph_loc.fusion.search import DURATION, Refuted, Search, Tracked
 from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, gaussian_belief
-from factorgraph_loc.model.diagnostics import NOTHING_WRITTEN, Diagnostics, Written
+from factorgraph_loc.model.diagnostics import Addition, Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
@@ -39,7 +39,7 @@ from factorgraph_loc.sensors.binding import bound_sensors
 from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2
-from factors.motion import Increment
+from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
 __all__ = ["Batch", "BatchSettings", "Smoother", "SmootherSettings"]
@@ -101,7 +101,8 @@ class Smoother:
             self._backend = Incremental(self._graph, settings, widest if settings.final_only else 1.0)
         self._builder = Builder(self._graph, self._backend, self._search, settings)
         # the last measurements, in the order in which they were taken, with what the diagnostics say of them
-        self._recent: deque[tuple[Measurement, Written]] = deque()
+        self._recent: deque[tuple[Measurement, list[Addition]]] = deque()
+        self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # at the last measurement
         self._behind: deque[Measurement] = deque()  # what was seen and is still to be taken in, after a track has begun
         self._conclusion: _Conclusion | None = None  # the end, until something is taken
 
@@ -203,17 +204,19 @@ class Smoother:
             self.diagnostics.drop_late(m.modality, m.count)
 
     def _take(self, m: Measurement) -> None:
-        mark = self.diagnostics.mark()
+        added = self.diagnostics.record()
         if not self._graph.is_anchored:
             self._graph.anchor()
+        self._odometry = self._motion.state(m.t)
         if isinstance(m, Tick):
-            self._builder.pass_time(m.t)
-        elif not self._builder.take(m):
+            self._builder.pass_time(self._odometry)
+        elif not self._builder.take(m, self._odometry):
             self._drop_late(m)
-        self._remember(m, self.diagnostics.since(mark))
+        self.diagnostics.added = None
+        self._remember(m, added)
 
-    def _remember(self, m: Measurement, written: Written = NOTHING_WRITTEN) -> None:
-        self._recent.append((m, written))
+    def _remember(self, m: Measurement, added: list[Addition]) -> None:
+        self._recent.append((m, added))
         while self._recent[0][0].t < m.t - (DURATION if self._search.start is None else START_KEPT):
             self._recent.popleft()
 
@@ -237,7 +240,7 @@ class Smoother:
         told = self._search.advance(m.t) if isinstance(m, Tick) else self._search.look(m, self._motion.state(m.t))
         if not told and self._search.newest is None and not self._search.waits and start is None:
             return  # the run begins with the first measurement that tells something
-        self._remember(m)
+        self._remember(m, [])
         best = self._search.best if told else None
         if best is None:
             return
@@ -251,10 +254,13 @@ class Smoother:
         self._replay(replay)
 
     def _doubt(self, m: Measurement) -> None:
-        """See whether what is seen refutes the track, and go on at the place that it tells."""
+        """See whether the measurement refutes the track, and go on at the place that the search finds instead."""
+        graph, odometry = self._graph, self._odometry
 
         def track() -> Tracked:
-            return Tracked(self._motion.state(m.t), *self._graph.moved(m.t)[:2])
+            if m.t <= graph.newest.t:
+                return Tracked(odometry, graph.pose, graph.covariance)
+            return Tracked(odometry, *graph.moved(m.t)[:2])
 
         def back(t: float, here: Array) -> Array:
             return self._placed(t, PosePrior(m.t, here, FOUND))

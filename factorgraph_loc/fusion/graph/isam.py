@@ -16,7 +16,8 @@ from factorgraph_loc.fusion.graph.batch import solve_whole, whole_problem
 from factorgraph_loc.fusion.graph.graph import Graph
 from factorgraph_loc.fusion.graph.marginals import IndeterminateError, covariances
 from factorgraph_loc.fusion.graph.settings import SmootherSettings
-from factorgraph_loc.fusion.graph.solver import MARGIN, WITH_POINTS, FullHistory, MarginalSummary, Window, is_missing
+from factorgraph_loc.fusion.graph.solver import MARGIN, WITH_POINTS, FullHistory, Window
+from factorgraph_loc.fusion.graph.summary import MarginalSummary, is_missing
 from factorgraph_loc.fusion.graph.variables import (
     GTSAM_ERRORS,
     Addition,
@@ -31,6 +32,7 @@ from factorgraph_loc.fusion.graph.variables import (
     jumps,
     tilt_key,
 )
+from factorgraph_loc.fusion.layout import MOTION
 from factors import positive, se2
 from factors.se2 import Array
 
@@ -304,11 +306,15 @@ class Incremental:
         return stamps | {key: k.t for k in keyframes for key in (k.key, tilt_key(k.index)) if key in values}
 
     def _odometry_node(self, keyframe: Keyframe) -> Node:
-        factor, keys = self._graph.odometry_factor(keyframe)
-        if len(keys) > 2 or self._maps:  # GTSAM's own do not follow where points have gone
+        step = keyframe.from_previous
+        assert step is not None
+        if self._maps or (MOTION in self._graph.keys and not keyframe.is_elsewhere):
+            factor, keys = self._graph.odometry_factor(keyframe)
             return Node(keys, factor, 3)
-        assert keyframe.from_previous is not None
-        return Node(keys, native=self._graph.motion.native((keys[0], keys[1]), keyframe.from_previous))
+        # GTSAM's own factors do not follow where points have gone
+        before, noise = keyframe.key - 1, gtsam.noiseModel.Gaussian.Covariance(step.covariance)
+        native = gtsam.BetweenFactorPose2(before, keyframe.key, gtsam.Pose2(*step.delta), noise)
+        return Node((before, keyframe.key), native=native)
 
     def _new_solver(self, factorization: str) -> FullHistory | Window:
         parameters = gtsam.ISAM2Params()

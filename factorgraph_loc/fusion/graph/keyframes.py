@@ -28,7 +28,7 @@ from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation, Sensor
 from factors import se2_kernels
 from factors.graph import VectorPriorFactor
-from factors.motion import Increment
+from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
 ITERATIONS_OF_GUESS = 1
@@ -113,21 +113,20 @@ class Builder:
         self._waiting: list[Observation] = []  # on the newest keyframe
         self._gatherer: Sensor | None = None  # whose they are
 
-    def pass_time(self, t: float) -> None:
-        """A tick."""
-        graph = self._graph
+    def pass_time(self, odometry: ChainState) -> None:
+        """A tick, with the ``odometry`` there."""
+        graph, t = self._graph, odometry.t
         graph.t = max(graph.t, t)
         if t - graph.newest.t >= self._settings.keyframe_max_interval:
-            self._add_keyframe(t, None)
-        before = graph.before(t)
-        graph.ticks.append(TickAt(t, before.index, graph.motion.state(t)))
+            self._add_keyframe(odometry, None)
+        graph.ticks.append(TickAt(t, graph.before(t).index, odometry))
 
-    def take(self, m: Measurement) -> bool:
-        """Take a measurement; False where it is too late."""
+    def take(self, m: Measurement, odometry: ChainState) -> bool:
+        """Take a measurement, with the ``odometry`` at its time; False where it is too late."""
         graph, sensor = self._graph, self._graph.sensors[m.modality]
         graph.t, newest = max(graph.t, m.t), graph.newest
         if m.t - newest.t >= self._interval(sensor) or (m.t > newest.t and self._is_due(m)):
-            self._add_keyframe(m.t, None if sensor.gathers else m)
+            self._add_keyframe(odometry, None if sensor.gathers else m)
             if not sensor.gathers:
                 return True
             newest = graph.newest
@@ -136,10 +135,11 @@ class Builder:
             return False
         offset = graph.since(before, m.t) if m.t > before.t else None
         if sensor.gathers and before is newest:
-            self._gather_from(sensor, m, offset)
+            self._gather_from(sensor, m, odometry, offset)
             return True
         addition = Addition(self.gather())
-        guess = self._see(before, m, offset, (graph.pose, graph.covariance) if before is newest else None, addition)
+        guess = (graph.pose, graph.covariance) if before is newest else None
+        guess = self._see(before, m, odometry, offset, guess, addition)
         if addition.nodes:
             self._backend.attach(before, addition, guess)
         return True
@@ -174,15 +174,14 @@ class Builder:
             return self._settings.keyframe_interval
         return sensor.keyframe_every if self._settings.landmarks == "known" else MAPPING_KEYFRAME_INTERVAL
 
-    def _gather_from(self, sensor: Sensor, m: Measurement, offset: Increment | None) -> None:
-        """Update the newest pose by what a sensor tells, which waits from now on."""
+    def _gather_from(self, sensor: Sensor, m: Measurement, odometry: ChainState, offset: Increment | None) -> None:
+        """Update the newest pose by the observations of a sensor, which wait from now on."""
         graph = self._graph
         if self._gatherer is not sensor:
             nodes = self.gather()
             if nodes:
                 self._backend.attach(graph.newest, Addition(nodes), (graph.pose, graph.covariance))
             self._gatherer = sensor
-        odometry = graph.motion.state(m.t)
         guess = graph.pose, graph.covariance
         view = _KeyframeView(graph, self._backend, graph.newest, guess, offset, newest=True)
         for seen in sensor.observe(m, view):
@@ -198,16 +197,15 @@ class Builder:
             graph.newest.causal = graph.pose, graph.covariance = view.pose, view.covariance
             self._search.keep(sensor, here, odometry, evidence)
 
-    def _add_keyframe(self, t: float, m: Measurement | None) -> None:
-        graph, motion = self._graph, self._graph.motion
-        newest, odometry = graph.newest, motion.state(t)
-        keyframe = Keyframe(newest.index + 1, t, odometry, motion.relative(newest.odometry, odometry))
+    def _add_keyframe(self, odometry: ChainState, m: Measurement | None) -> None:
+        graph, newest, t = self._graph, self._graph.newest, odometry.t
+        keyframe = Keyframe(newest.index + 1, t, odometry, graph.motion.relative(newest.odometry, odometry))
         pose, covariance, _ = graph.moved(t)
         addition = Addition(self.gather())
         graph.append(keyframe)
         guess: Guess | None = (pose, covariance)
         if m is not None:
-            guess = self._see(keyframe, m, None, guess, addition, is_new=True)
+            guess = self._see(keyframe, m, odometry, None, guess, addition, is_new=True)
         assert guess is not None
         self._backend.extend(keyframe, addition, guess)
 
@@ -215,6 +213,7 @@ class Builder:
         self,
         keyframe: Keyframe,
         m: Measurement,
+        odometry: ChainState,
         offset: Increment | None,
         guess: Guess | None,
         addition: Addition,
@@ -227,7 +226,6 @@ class Builder:
         older one: what is not yet in the graph stays out, and the innovation is that of its causal estimate.
         """
         graph, sensor = self._graph, self._graph.sensors[m.modality]
-        odometry = graph.motion.state(m.t)
         expected = keyframe.causal if guess is None else guess
         assert expected is not None
         view = _KeyframeView(graph, self._backend, keyframe, expected, offset, newest=guess is not None)

@@ -1,30 +1,36 @@
 """iSAM2 with the full history, and with a window that poses leave, behind one set of methods.
 
-Our own factors are given to it as linear ones (:mod:`.linear_factors`).
+A callback from GTSAM copies all variables, and returns to Python for each factor. So our own factors are linearised here, where
+iSAM2 linearises its variables, and replaced in the update that moves these. Were one left behind, the factors would no longer agree
+on what a turn of the whole graph does to the poses, and would contain false information on the heading (Huang, Mourikis,
+Roumeliotis, International Journal of Robotics Research 29(5), 2010).
 
-GTSAM marginalises a variable into linear factors on those that it shared factors with. They and the priors hold all that the
-window's own measurements do not tell, correlations included: a window that is built anew begins with them. Marginals of single
-variables in their place would count the measurements among them twice, and lose what they have in common.
+iSAM2 never linearises again the variables of marginal factors, as these cannot follow. But far from the estimate a factor means
+nothing. So ours are linearised at the estimate there, too, with the nearest Jacobian that agrees with the marginal factors on such
+turns (Hesch, Kottas, Bowman, Roumeliotis, IEEE Transactions on Robotics 30(1), 2014, section V). That is a smaller change if all
+that is held may follow the estimates by one translation, which does not change the information of marginal factors on turns.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, cast
 
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.graph.linear_factors import LinearFactors
+from factorgraph_loc.fusion.graph.summary import MarginalSummary, oldest_pose
 from factorgraph_loc.fusion.graph.variables import (
     GTSAM_ERRORS,
     Node,
     Values,
-    index_of,
+    frame_motions,
     is_constant,
-    is_of_keyframe,
+    is_place,
     is_point,
     is_pose,
     leaving_key,
@@ -32,10 +38,10 @@ from factorgraph_loc.fusion.graph.variables import (
     retract,
     to_gtsam,
 )
+from factors.graph import gaussian_factor, jacobian_factors
 from factors.positive_kernels import inverse
 from factors.se2 import Array
 
-KINDS = (gtsam.LinearContainerFactor, gtsam.PriorFactorPose2, gtsam.PriorFactorVector)
 # s that a pose may stay longer in a window, so that several are read at a time; less with points, which make it large
 MARGIN, WITH_POINTS = 2.0, 1.0
 FOREVER = 1e300  # s; a lag with which only the variables that are added to leave at once do so
@@ -91,7 +97,7 @@ class FullHistory:
         if key not in self._touched:
             return read(self._isam, key)
         step = np.linalg.solve(*self._isam.marginalFactor(key).jacobian())
-        return retract(key, self._ours.at[key], step)
+        return retract(key, self._ours.at[key], np.asarray(step, dtype=float))
 
     def covariance(self, key: int) -> Array:
         """Marginal covariance of a variable, poses in the body frame."""
@@ -127,12 +133,10 @@ class Window(FullHistory):
         self._left: _State = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, frozenset()
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
-        # points leave when they are seen no more
         stamps = dict.fromkeys(values, t)
         for node in nodes:
-            for key in node.keys:
-                if is_point(key):
-                    stamps[key] = t
+            if is_point(node.keys[-1]):  # points leave when they are seen no more
+                stamps[node.keys[-1]] = t
         self._add((), nodes, values, stamps)
 
     def begin(
@@ -222,72 +226,133 @@ def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[i
     return out
 
 
-def oldest_pose(keys: Iterable[int]) -> int:
-    """The index of the oldest pose among ``keys``, 0 if there is none."""
-    return min((index_of(key) for key in keys if is_pose(key)), default=0)
+class LinearFactors:
+    """Our factors in a solver, and where that linearises its variables: those that moved as far as ``threshold``, at each update
+    whose number ``skip`` divides. ``on_failure`` is called with the reason where a factor cannot be linearised, which is then left
+    out."""
 
+    def __init__(self, threshold: float, skip: int, on_failure: Callable[[str], None]) -> None:
+        self._threshold, self._skip, self._on_failure = threshold, skip, on_failure
+        self._updates = 0
+        self.at: Values = {}  # where each variable is linearised
+        self._held: Values = {}  # places that iSAM2 does not move: where it has them, but for a translation of all
+        self._on: defaultdict[int, dict[int, _Linear]] = defaultdict(dict)  # the factors on each, by their identity
+        self._slots: set[int] = set()
+        self._added: list[_Linear] = []  # those of the last update, with their places in it as slots
 
-@dataclass(frozen=True)
-class MarginalSummary:
-    """``factors``: marginal ones, and priors; ``keys`` of all variables of the graph; ``at``: where each is linearised."""
+    def added(
+        self,
+        solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother,
+        factors: Sequence[gtsam.NonlinearFactor],
+        nodes: Sequence[Node],
+        values: Values,
+    ) -> tuple[gtsam.NonlinearFactorGraph, list[int]]:
+        """All that the next update is to add, which is to be told by :meth:`place`, and the slots of what it is to remove: factors
+        on variables that it will linearise elsewhere are replaced."""
+        self._updates += 1
+        self._added = self._moved(solver) if self.at and not self._updates % self._skip else []
+        removed = [linear.slot for linear in self._added] if self._added else []
+        self._slots.difference_update(removed)
+        self.at |= values
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in factors:
+            graph.add(factor)
+        for node in nodes:
+            if node.native is not None:
+                graph.add(node.native)
+                continue
+            linear = _Linear(node)
+            self._added.append(linear)
+            for key in node.keys:
+                self._on[key][id(linear)] = linear
+        ours = list(map(_PLACED, self._added))
+        for linear, linearized in zip(self._added, jacobian_factors(ours, self.at, self._on_failure), strict=True):
+            linear.slot = graph.size()
+            keys = linear.node.keys
+            # a factor does without the point that it is linearised at where the solver never leaves that
+            held = self._held and not self._held.keys().isdisjoint(keys)
+            graph.add(self._on_held(keys, linearized) if held else gtsam.LinearContainerFactor(linearized))
+        return graph, removed
 
-    factors: tuple[gtsam.NonlinearFactor, ...]
-    keys: frozenset[int]
-    at: Values
+    def _on_held(self, keys: Sequence[int], linearized: gtsam.GaussianFactor) -> gtsam.LinearContainerFactor:
+        """A linearised factor on what the solver holds, with the point that it is linearised at."""
+        jacobian, right = linearized.jacobian()
+        motions, ends = frame_motions({key: self._held.get(key, self.at[key]) for key in keys})
+        if sum(map(is_place, keys)) > 1:  # else it tells where the place is in the world
+            jacobian = unaware(jacobian, motions)
+        factor = gaussian_factor(keys, -right, np.split(jacobian, ends[:-1], axis=1))
+        return gtsam.LinearContainerFactor(factor, to_gtsam({key: self.at[key] for key in keys}))
 
-    @classmethod
-    def of(
-        cls, graph: gtsam.NonlinearFactorGraph, held: gtsam.Values, at: Values, ours: Collection[int] = ()
-    ) -> MarginalSummary:
-        """Of a graph that iSAM2 has linearised where it ``held`` the variables, to be linearised ``at`` there. ``ours``: places of
-        factors of our own, which are not marginal ones."""
-        every = (graph.at(i) for i in range(graph.size()) if i not in ours)
-        there = to_gtsam(at)
+    def place(self, slots: Sequence[int]) -> None:
+        """Take where the solver has put what was added."""
+        for linear in self._added:
+            linear.slot = slots[linear.slot]
+            self._slots.add(linear.slot)
 
-        def placed(factor: gtsam.LinearContainerFactor) -> gtsam.LinearContainerFactor:
-            """iSAM2 never moves what a marginal factor is on, and so gives it no place: elsewhere it needs one."""
-            return gtsam.LinearContainerFactor(
-                gtsam.LinearContainerFactor(factor.factor(), held).linearize(there), there
-            )
-
-        kept = tuple(
-            placed(f) if isinstance(f, gtsam.LinearContainerFactor) else f for f in every if isinstance(f, KINDS)
-        )
-        return cls(kept, frozenset(graph.keyVector()), at)
+    def forget(self, key: int) -> None:
+        """A variable has left the solver, with all factors on it."""
+        del self.at[key]
+        self._held.pop(key, None)
+        for linear in self._on.pop(key, {}).values():
+            self._slots.discard(linear.slot)
+            for other in linear.node.keys:
+                if other != key:
+                    self._on[other].pop(id(linear), None)
 
     @property
-    def oldest(self) -> int:
-        """The index of the oldest pose."""
-        return oldest_pose(self.keys)
+    def framed(self) -> Values:
+        """Where a new solver is to linearise the variables, with what is held as far from each other as it was then."""
+        return self.at | self._held
 
-    def before(self, pose: int) -> MarginalSummary:
-        """What is left once the poses from the index ``pose`` on are taken back: others come under their keys."""
-        kept = frozenset(key for key in self.keys if not is_of_keyframe(key) or index_of(key) < pose)
-        return MarginalSummary(tuple(self.on(kept)), kept, {key: self.at[key] for key in kept})
+    @property
+    def slots(self) -> frozenset[int]:
+        """Where they are in the solver."""
+        return frozenset(self._slots)
 
-    def on(self, present: Collection[int]) -> list[gtsam.NonlinearFactor]:
-        """The factors on variables that are ``present``, with all that those on others tell of these."""
-        kept: list[gtsam.NonlinearFactor] = []
-        linear, gone, at = gtsam.GaussianFactorGraph(), set[int](), to_gtsam(self.at)
-        for factor in self.factors:
-            absent = [key for key in factor.keys() if key not in present]  # noqa: SIM118
-            gone.update(absent)
-            if absent:
-                linear.add(factor.linearize(at))
-            else:
-                kept.append(factor)
-        if gone:
-            order = gtsam.Ordering()
-            for key in sorted(gone):
-                order.push_back(key)
-            _, rest = linear.eliminatePartialMultifrontal(order)
-            kept += [gtsam.LinearContainerFactor(rest.at(i), at) for i in range(rest.size())]
-        return kept
+    def _moved(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother) -> list[_Linear]:
+        """Those that are to be linearised anew."""
+        keys, ends = list(self.at), np.cumsum([len(value) for value in self.at.values()])
+        change = np.maximum.reduceat(np.abs(solver.getDelta().vector(keys)), np.append(0, ends[:-1]))
+        moved = [keys[i] for i in np.flatnonzero(change >= self._threshold).tolist()]
+        if not moved:
+            return []
+        isam = solver if isinstance(solver, gtsam.ISAM2) else solver.getISAM2()
+        fixed = isam.getFixedVariables()  # what marginal factors are on
+        anew = [key for key in moved if not fixed.count(key)]
+        self.at |= {key: read(solver, key) for key in anew}
+        anew += self._followed({key: read(solver, key) for key in keys if is_place(key) and fixed.count(key)})
+        return list({number: linear for key in anew for number, linear in self._on.get(key, {}).items()}.values())
+
+    def _followed(self, held: Values) -> list[int]:
+        """Of the places that iSAM2 holds, given their estimates, those whose factors are to be linearised anew.
+
+        None if they are poses only: in a known map GTSAM's factors of the odometry stay behind."""
+        if all(map(is_pose, held)):
+            return []
+        for key in held:
+            self._held.setdefault(key, self.at[key])
+        way = np.mean([held[key][:2] - self._held[key][:2] for key in held], axis=0)
+        moved = {key: now for key, now in held.items() if np.abs(now - self.at[key]).max() >= self._threshold}
+        if np.abs(way).max() >= self._threshold:
+            self._held |= {key: np.append(self._held[key][:2] + way, self._held[key][2:]) for key in held}
+            moved = held
+        self.at |= moved
+        return list(moved)
 
 
-def is_missing(node: Node, present: Collection[int], known: Collection[int]) -> bool:
-    """Whether a factor is to be added to a graph of the variables ``present``, of which a summary tells those that are ``known``:
-    it holds priors of what is no pose, and what hangs on a pose that is gone."""
-    if any(key not in present for key in node.keys):
-        return False
-    return node.has_pose or node.keys[0] not in known
+@dataclass(slots=True, eq=False)
+class _Linear:
+    """One of our factors, and its slot in the solver."""
+
+    node: Node
+    slot: int = -1
+
+
+_PLACED = attrgetter("node.factor", "node.keys", "node.rows")
+
+
+def unaware(jacobian: Array, motions: Array) -> Array:
+    """The matrix nearest to a ``jacobian`` (m, n) that tells nothing of any of the ``motions`` (n, 3) of its variables (Hesch,
+    Kottas, Bowman, Roumeliotis, IEEE Transactions on Robotics 30(1), 2014, section V)."""
+    basis = np.linalg.qr(motions)[0]
+    return np.asarray(jacobian - jacobian @ basis @ basis.T)

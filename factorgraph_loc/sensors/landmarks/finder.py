@@ -283,8 +283,8 @@ class TrackMonitor:
             self._stamps.pop()
         del self._stamps[:-KEPT]
         self._stamps.append((t, beyond, len(seen.points)))
-        last = self._last()
-        share = sum(s[1] for s in last) / max(1, sum(s[2] for s in last))
+        counts = tuple(zip(*self._last(), strict=True))
+        share = sum(counts[1]) / max(1, sum(counts[2])) if counts else 0.0
         if share > SHARE or (self._since is not None and share >= SHARE / 2.0):
             self._since = self._beginning()
         else:

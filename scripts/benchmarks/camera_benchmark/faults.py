@@ -119,7 +119,7 @@ def said(one: Attempt, right: Attempt) -> str:
     parts = [short(text.partition(": ")[2]) for text in one.warnings if text not in right.warnings]
     events = Counter(re.sub(r" since [\d.]+ s", "", text) for text in one.events if text not in right.events)
     parts += [short(text) + (f" ({times} times)" if times > 1 else "") for text, times in events.items()]
-    for name, key in (("NIS", "nis.camera.mean_per_dof"), ("rejected", "rejected.total"), ("late", "late.total")):
+    for name, key in (("NIS", "nis.camera.median_ratio"), ("rejected", "rejected.total"), ("late", "late.total")):
         now, before = one.figures.get(key), right.figures.get(key)
         if now is not None and before is not None and abs(now - before) > 0.2 * abs(before):
             parts.append(f"{name} {before:.3g} → {now:.3g}")
