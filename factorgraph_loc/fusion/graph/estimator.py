@@ -24,7 +24,7 @@ from factorgraph_loc.fusion.base import EVERY
 from factorgraph_loc.fusion.graph.batch import AtTheEnd
 from factorgraph_loc.fusion.graph.graph import Graph
 from factorgraph_loc.fusion.graph.isam import Incremental
-from factorgraph_loc.fusion.graph.keyframes import Builder
+from factorgraph_loc.fusion.graph.keyframes import Backend, Builder
 from factorgraph_loc.fusion.graph.settings import BatchSettings, SmootherSettings
 from factorgraph_loc.fusion.graph.variables import Keyframe
 from factorgraph_loc.fusion.mapping import Mapper
@@ -94,7 +94,7 @@ class Smoother:
         self._search.remember()
         # where landmarks are estimated too, they cannot tell the place
         self.supports_unknown_start = settings.landmarks == "known"
-        self._backend: AtTheEnd | Incremental
+        self._backend: Backend
         if settings.final_only and not any(mapper.estimates for mapper in mappers):
             self._backend = AtTheEnd(self._graph, widest)
         else:

@@ -134,7 +134,8 @@ class Incremental:
             self._update(addition)
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        """Take what was added to a keyframe that is in the graph."""
+        """Take what was added to a keyframe that is in the graph. ``guess``: pose and covariance of the newest keyframe after the
+        update, where it is that."""
         if guess is None or not (self._waits or keyframe.t < self._solved + self._solve_every):
             self._update(addition)
             return

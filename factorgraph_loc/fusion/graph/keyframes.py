@@ -1,24 +1,27 @@
-"""Turns measurements into a graph: where keyframes stand, and what becomes a factor on them.
+"""The keyframe rule: where poses of the graph are, and which of them each measurement belongs to.
 
-A keyframe stands at each stamp of a sensor, unless the one before is nearer than its interval, and at least every
-``keyframe_max_interval``. What is seen between two keyframes, or arrives late, becomes a factor on the earlier one, displaced by
-the odometry since.
+A keyframe is added at a measurement that comes at least an interval after the last keyframe. The interval is that of the setting
+``keyframe_interval``; by default it is the sensor's ``keyframe_every``, or longer where landmarks are estimated. A sensor that
+gathers always has its own. A mapper of points may need a keyframe earlier (``is_due``), and at a tick one is added after
+``keyframe_max_interval``. Other measurements, late ones included, become factors on the keyframe before them, displaced by the
+odometry since.
 
-Sensors that gather, as RFID readers do, come many times a second and each time tell little. Their observations from one keyframe to
-the next make few factors, which enter the graph with the next keyframe; until then the newest pose is updated by them alone, as a
-filter would.
+Sensors that gather, as RFID readers do, come many times a second, each time with little information. Their observations on one
+keyframe become few factors, which enter the graph with the next keyframe. Until then the newest pose is updated by them alone, as
+in a filter.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Protocol
 
 import gtsam
 import numpy as np
 
+from factorgraph_loc.fusion.graph.batch import AtTheEnd
 from factorgraph_loc.fusion.graph.graph import Graph
+from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.graph.settings import GraphSettings
 from factorgraph_loc.fusion.graph.variables import Addition, Guess, Keyframe, Node, TickAt
 from factorgraph_loc.fusion.layout import MOTION
@@ -34,25 +37,7 @@ from factors.se2 import Array
 ITERATIONS_OF_GUESS = 1
 MAPPING_KEYFRAME_INTERVAL = 0.5  # s, where landmarks are estimated too
 
-
-class Backend(Protocol):
-    """What keeps a graph solved, or its guess; it brings pose and covariance of the newest keyframe up to date."""
-
-    def extend(self, keyframe: Keyframe, addition: Addition, guess: Guess) -> None:
-        """Take a new keyframe with the ``guess`` of its pose, and what came with it."""
-
-    def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        """Take what was added to a keyframe that is in the graph. ``guess``: pose and covariance of the newest keyframe after the
-        update, where it is that."""
-
-    def current(self, key: int) -> Array:
-        """The newest estimate of a variable that is in the graph."""
-
-    def is_open(self, keyframe: int) -> bool:
-        """Whether factors may still be added to a keyframe."""
-
-    def is_kept(self, keyframe: int) -> bool:
-        """Whether a keyframe is part of the final problem."""
+Backend = AtTheEnd | Incremental  # keeps the graph solved, or its guess
 
 
 class _KeyframeView:
@@ -110,8 +95,8 @@ class Builder:
 
     def __init__(self, graph: Graph, backend: Backend, search: Search, settings: GraphSettings) -> None:
         self._graph, self._backend, self._search, self._settings = graph, backend, search, settings
-        self._waiting: list[Observation] = []  # on the newest keyframe
-        self._gatherer: Sensor | None = None  # whose they are
+        self._waiting: list[Observation] = []  # of a sensor that gathers, on the newest keyframe
+        self._gatherer: Sensor | None = None  # that sensor
 
     def pass_time(self, odometry: ChainState) -> None:
         """A tick, with the ``odometry`` there."""
@@ -124,29 +109,36 @@ class Builder:
     def take(self, m: Measurement, odometry: ChainState) -> bool:
         """Take a measurement, with the ``odometry`` at its time; False where it is too late."""
         graph, sensor = self._graph, self._graph.sensors[m.modality]
-        graph.t, newest = max(graph.t, m.t), graph.newest
-        if m.t - newest.t >= self._interval(sensor) or (m.t > newest.t and self._is_due(m)):
+        graph.t = max(graph.t, m.t)
+        if self._needs_keyframe(m, sensor):
             self._add_keyframe(odometry, None if sensor.gathers else m)
             if not sensor.gathers:
                 return True
-            newest = graph.newest
+        newest = graph.newest
         before = newest if m.t >= newest.t else graph.before(m.t)
         if before is not newest and not self._backend.is_open(before.index):
             return False
         offset = graph.since(before, m.t) if m.t > before.t else None
-        if sensor.gathers and before is newest:
-            self._gather_from(sensor, m, odometry, offset)
+        guess = (graph.pose, graph.covariance) if before is newest else None
+        if sensor.gathers and guess is not None:
+            self._gather_from(sensor, m, odometry, offset, guess)
             return True
         addition = Addition(self.gather())
-        guess = (graph.pose, graph.covariance) if before is newest else None
         guess = self._see(before, m, odometry, offset, guess, addition)
         if addition.nodes:
             self._backend.attach(before, addition, guess)
         return True
 
-    def _is_due(self, m: Measurement) -> bool:
-        """Whether a mapper needs a keyframe at a measurement."""
-        return any(mapper.is_due(m) for mapper in self._graph.mappers) if self._graph.mappers else False
+    def _needs_keyframe(self, m: Measurement, sensor: Sensor) -> bool:
+        """Whether a measurement is to have a keyframe at its time."""
+        since, interval = m.t - self._graph.newest.t, sensor.keyframe_every
+        if not sensor.gathers:
+            if self._settings.keyframe_interval is not None:
+                interval = self._settings.keyframe_interval
+            elif self._settings.landmarks != "known":
+                interval = MAPPING_KEYFRAME_INTERVAL
+        mappers = self._graph.mappers
+        return since >= interval or (since > 0.0 and bool(mappers) and any(mapper.is_due(m) for mapper in mappers))
 
     def gather(self) -> list[Node]:
         """What waits on the newest keyframe becomes factors of it."""
@@ -166,36 +158,53 @@ class Builder:
         """A new track begins: nothing waits."""
         self._waiting = []
 
-    def _interval(self, sensor: Sensor) -> float:
-        """How far [s] keyframes for a sensor are apart."""
-        if sensor.gathers:
-            return sensor.keyframe_every
-        if self._settings.keyframe_interval is not None:
-            return self._settings.keyframe_interval
-        return sensor.keyframe_every if self._settings.landmarks == "known" else MAPPING_KEYFRAME_INTERVAL
-
-    def _gather_from(self, sensor: Sensor, m: Measurement, odometry: ChainState, offset: Increment | None) -> None:
-        """Update the newest pose by the observations of a sensor, which wait from now on."""
+    def _gather_from(
+        self, sensor: Sensor, m: Measurement, odometry: ChainState, offset: Increment | None, guess: Guess
+    ) -> None:
+        """Update the newest pose, of which there is a ``guess``, by the observations of a sensor, which wait from now on."""
         graph = self._graph
         if self._gatherer is not sensor:
             nodes = self.gather()
             if nodes:
-                self._backend.attach(graph.newest, Addition(nodes), (graph.pose, graph.covariance))
+                self._backend.attach(graph.newest, Addition(nodes), guess)
+                guess = graph.pose, graph.covariance
             self._gatherer = sensor
-        guess = graph.pose, graph.covariance
         view = _KeyframeView(graph, self._backend, graph.newest, guess, offset, newest=True)
+        if self._observe(sensor, m, view, odometry, None):
+            graph.newest.causal = graph.pose, graph.covariance = view.pose, view.covariance
+
+    def _observe(
+        self, sensor: Sensor, m: Measurement, view: _KeyframeView, odometry: ChainState, addition: Addition | None
+    ) -> bool:
+        """Add the observations of a measurement to an ``addition``, or where that is None to those that wait; the estimate of the
+        newest keyframe in the ``view`` is corrected by each. Returns whether any was applied."""
+        applied = False
         for seen in sensor.observe(m, view):
-            if isinstance(seen, NewVariable | Link):
+            if isinstance(seen, Link):
+                if addition is not None:
+                    self._add_link(seen, sensor, view.keyframe, addition)
+                continue
+            if isinstance(seen, NewVariable):
+                if addition is not None:
+                    self._add_block(seen, sensor, view, addition)
                 continue
             here = view.on_pose(seen)
             correction = here.correct(view.pose, view.covariance, {}, {}, here.iterations or ITERATIONS_OF_GUESS)
             if seen.is_judged and not sensor.judge(here, correction, view):
                 continue
-            evidence = partial(laplace_evidence, here, view.pose, view.covariance, correction)
-            self._waiting.append(seen)
-            view.pose, view.covariance = se2_kernels.moved(view.pose, correction.delta), correction.covariance
-            graph.newest.causal = graph.pose, graph.covariance = view.pose, view.covariance
-            self._search.keep(sensor, here, odometry, evidence)
+            applied = True
+            if addition is None:
+                self._waiting.append(seen)
+            else:
+                for term in seen.terms:
+                    addition.hang(view.keyframe, self._graph.node(view.keyframe, term, sensor.modality))
+            if view.newest:
+                self._search.expect(sensor, here, odometry, view)
+                evidence = partial(laplace_evidence, here, view.pose, view.covariance, correction)
+                self._search.keep(sensor, here, odometry, evidence)
+                view.pose = se2_kernels.moved(view.pose, correction.delta)
+                view.covariance = correction.covariance[:3, :3]
+        return applied
 
     def _add_keyframe(self, odometry: ChainState, m: Measurement | None) -> None:
         graph, newest, t = self._graph, self._graph.newest, odometry.t
@@ -229,25 +238,7 @@ class Builder:
         expected = keyframe.causal if guess is None else guess
         assert expected is not None
         view = _KeyframeView(graph, self._backend, keyframe, expected, offset, newest=guess is not None)
-        for seen in sensor.observe(m, view):
-            if isinstance(seen, Link):
-                self._add_link(seen, sensor, keyframe, addition)
-                continue
-            if isinstance(seen, NewVariable):
-                self._add_block(seen, sensor, view, addition)
-                continue
-            here = view.on_pose(seen)
-            correction = here.correct(view.pose, view.covariance, {}, {}, here.iterations or ITERATIONS_OF_GUESS)
-            if seen.is_judged and not sensor.judge(here, correction, view):
-                continue
-            for term in seen.terms:
-                addition.hang(keyframe, graph.node(keyframe, term, sensor.modality))
-            if guess is not None:
-                self._search.expect(sensor, here, odometry, view)
-                evidence = partial(laplace_evidence, here, view.pose, view.covariance, correction)
-                self._search.keep(sensor, here, odometry, evidence)
-                view.pose = se2_kernels.moved(view.pose, correction.delta)
-                view.covariance = correction.covariance[:3, :3]
+        self._observe(sensor, m, view, odometry, addition)
         if guess is None:
             return None
         guess = view.pose, view.covariance
