@@ -71,7 +71,7 @@ def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool
     )
 
 
-class Motion:
+class Motion(OdometryChain):
     """Collects rows of wheel odometry and gyro, and gives the relative motion between any two recent times.
 
     A gyro replaces the rotation of the wheels if ``sensors`` include ``imu``. ``constants``: the P calibration constants that are
@@ -81,23 +81,15 @@ class Motion:
     def __init__(
         self, rig: Rig, sensors: tuple[str, ...], diagnostics: Diagnostics, *, self_calibration: bool = False
     ) -> None:
-        self._rig = rig
-        self._constants_as_noise = not self_calibration
         self.constants = rig.estimated("odometry") if self_calibration else NOTHING
-        self._indices = np.array(self.constants.indices, dtype=np.int64)
-        self._use_gyro = "imu" in sensors
-        self._use_wheels = "odometry" in sensors
-        self.horizon = HORIZON
-        self._chain = self._new_chain()
+        self._use_wheels, use_gyro = "odometry" in sensors, "imu" in sensors
+        model = odometry_model(rig, use_gyro=use_gyro, constants_as_noise=not self_calibration)
+        super().__init__(model, use_gyro=use_gyro, horizon=HORIZON, estimated=self.constants.indices)
         self._diagnostics = diagnostics
 
     def keep(self, horizon: float) -> None:
         """Keep the odometry of the last ``horizon`` seconds."""
-        self.horizon = self._chain.horizon = horizon
-
-    def _new_chain(self) -> OdometryChain:
-        model = odometry_model(self._rig, use_gyro=self._use_gyro, constants_as_noise=self._constants_as_noise)
-        return OdometryChain(model, use_gyro=self._use_gyro, horizon=self.horizon)
+        self.horizon = horizon
 
     def add(self, m: Measurement) -> None:
         """Add a row, or :class:`~factorgraph_loc.model.measurement.Rows`. Rows of an unused sensor are counted as ignored, those
@@ -105,13 +97,13 @@ class Motion:
         kept: int
         match m:
             case Rows(kind=kind) if kind is VelocityOdometry and self._use_wheels:
-                kept = self._chain.add_velocities(m.times, *m.values)
+                kept = self.add_velocities(m.times, *m.values)
             case YawRate() if self._use_gyro:
-                kept = self._chain.add_yaw_rate(m.t, m.w)
+                kept = self.add_yaw_rate(m.t, m.w)
             case VelocityOdometry() if self._use_wheels:
-                kept = self._chain.add_velocity(m.t, m.v, m.w)
+                kept = self.add_velocity(m.t, m.v, m.w)
             case IncrementOdometry() if self._use_wheels:
-                kept = self._chain.add_increment(m.t, m.dx, m.dy, m.dtheta)
+                kept = self.add_increment(m.t, m.dx, m.dy, m.dtheta)
             case _:
                 self._diagnostics.ignore("yaw rate" if isinstance(m, YawRate) else m.sensor, m.count)
                 return
@@ -120,43 +112,16 @@ class Motion:
 
     def state(self, t: float) -> ChainState:
         """The state of the integrated odometry at ``t``. RunFailedError if the rows of then are no longer kept."""
-        if t < self._chain.begin:
+        if t < self.begin:
             raise RunFailedError(
-                f"odometry: the motion at {t:.3f} s was asked for, but only that from {self._chain.begin:.3f} s on is kept"
+                f"odometry: the motion at {t:.3f} s was asked for, but only that from {self.begin:.3f} s on is kept"
             )
-        return self._chain.state(t)
-
-    def relative(self, start: ChainState, end: ChainState) -> Increment:
-        """The relative motion between two states, with its covariance."""
-        return self._chain.relative(start, end)
-
-    def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
-        """The state at ``t``, and the relative motion from ``start`` to it."""
-        return self._chain.travelled(start, t)
-
-    def moved(
-        self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array
-    ) -> tuple[Array, Array, Array]:
-        """A pose (3,) with body-frame ``covariance`` (3, 3) at ``start``, moved to ``t``, for ``constants`` (P,): the pose, and its
-        covariance in the body frame and in the world frame."""
-        return self._chain.moved(start, t, pose, covariance, constants, self._indices)
-
-    def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
-        """The relative motions between states (N, 8), for ``constants`` (P,): poses (N, 3) and covariances (N, 3, 3)."""
-        return self._chain.relatives(starts, ends, constants, self._indices)
+        return super().state(t)
 
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
         """Corrected ``delta`` (3,) of an increment for ``constants`` (P,), and its Jacobian (3, P) in the tangent space."""
         delta, jacobian = kernels.changed(se2.log(increment.delta), increment.moving, constants, self._indices)
         return delta, jacobian
-
-    def predicted(
-        self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array, first: int
-    ) -> tuple[ChainState, Array, Array, Array, Array]:
-        """Predict a Gaussian from ``start`` to ``t``: the state there, the pose (3,), the first rows (3, S) of the transition (the
-        other rows are those of the identity), the covariance (3, 3) that the motion adds to the first three components, and the
-        covariance (S, S) of the error state, in which the columns of ``constants`` (P,) begin at ``first``."""
-        return self._chain.predicted(start, t, pose, covariance, constants, self._indices, first)
 
     def recalibrated(self, increment: Increment, constants: Array) -> Increment:
         """An increment corrected for ``constants`` (P,)."""
@@ -168,7 +133,7 @@ class Motion:
     def poses_at(self, start: ChainState, t: Array, constants: Array) -> Array:
         """Poses (R, 3) at times (R,) relative to the pose at ``start``, for ``constants`` (P,), linearised as in
         :func:`factors.odometry.model.recalibrated`."""
-        states = self._chain.states(t)
+        states = self.states(t)
         deltas = se2.between(np.array((start.x, start.y, start.heading)), states[:, 1:4])
         if not self.constants.names:
             return deltas
@@ -186,12 +151,11 @@ class Motion:
 
     def slip(self, increment: Increment) -> tuple[Array, float]:
         """The additional covariance (3, 3) of an increment if wheels slip, and minus the log-probability of that."""
-        return slip(self._chain.model, increment, use_gyro=self._use_gyro)
+        return slip(self.model, increment, use_gyro=self._use_gyro)
 
     def exact_factor(self, increment: Increment) -> OdometryFactor:
         """An increment without constants as a factor on two poses."""
         return OdometryFactor(increment)
-
 
     def twist(self, t: float) -> Array:
         """The robot's velocity (3,) just before ``t``, in the robot frame."""

@@ -8,6 +8,7 @@ While the wheels report rest the robot is at rest, whatever noise and bias of th
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -33,18 +34,22 @@ from factors.odometry.chain_kernels import (
 )
 from factors.odometry.kernels import relative, relatives
 from factors.odometry.model import OdometryModel, composed
-from factors.se2 import Array, Integers
+from factors.se2 import Array
 
 
 class OdometryChain:
     """The integrated odometry of a run, as a chain of knots in its own frame.
 
     Rows arrive in order of time, or late (then the knots after them are computed again). After the last row its velocity is held.
-    Rows more than ``horizon`` seconds before the newest one are forgotten; adding an older row returns False.
+    Rows more than ``horizon`` seconds before the newest one are forgotten; adding an older row returns False. ``estimated``: the
+    numbers, in :data:`~factors.odometry.model.PARAMETERS`, of P constants for which motions are corrected.
     """
 
-    def __init__(self, model: OdometryModel, *, use_gyro: bool = False, horizon: float = 5.0) -> None:
+    def __init__(
+        self, model: OdometryModel, *, use_gyro: bool = False, horizon: float = 5.0, estimated: Sequence[int] = ()
+    ) -> None:
         self.model = model
+        self._indices = np.array(estimated, dtype=np.int64)
         self._use_gyro = use_gyro
         self.horizon = horizon
         self._rows = np.zeros((256, ROW))
@@ -130,10 +135,11 @@ class OdometryChain:
         pose: Array,
         covariance: Array,
         constants: Array,
-        indices: Integers,
         first: int,
     ) -> tuple[ChainState, Array, Array, Array, Array]:
-        """A Gaussian at ``start``, predicted to ``t``; see :meth:`factorgraph_loc.sensors.motion.Motion.predicted`."""
+        """Predict a Gaussian from ``start`` to ``t``: the state there, the pose (3,), the first rows (3, S) of the transition (the
+        other rows are those of the identity), the covariance (3, 3) that the motion adds to the first three components, and the
+        covariance (S, S) of the error state, in which the columns of ``constants`` (P,) begin at ``first``."""
         size = len(covariance)
         at, transition, noise, after = np.empty(3), np.empty((3, size)), np.empty((3, 3)), np.empty((size, size))
         # into arrays that are there: each that compiled code returns takes longer than its arithmetic
@@ -147,7 +153,7 @@ class OdometryChain:
             pose,
             covariance,
             constants,
-            indices,
+            self._indices,
             first,
             at,
             transition,
@@ -157,19 +163,19 @@ class OdometryChain:
         return ChainState(*end), at, transition, noise, after
 
     def moved(
-        self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array, indices: Integers
+        self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array
     ) -> tuple[Array, Array, Array]:
-        """A pose (3,) at ``start``, moved to ``t`` under changed ``constants`` (P,): the pose there, and its body-frame and world
-        covariances, from its body-frame ``covariance`` (3, 3)."""
+        """A pose (3,) with body-frame ``covariance`` (3, 3) at ``start``, moved to ``t``, for ``constants`` (P,): the pose, and its
+        covariance in the body frame and in the world frame."""
         known = self._knots, self._count, self._constants, self._noise
         before = np.ascontiguousarray(covariance)  # for each other order in memory it would be compiled anew
-        at, body, world = moved_to(*known, tuple(start), t, pose, before, constants, indices)
+        at, body, world = moved_to(*known, tuple(start), t, pose, before, constants, self._indices)
         return at, body, world
 
-    def relatives(self, starts: Array, ends: Array, constants: Array, indices: Integers) -> tuple[Array, Array]:
-        """The motions between states (N, 8), see :meth:`states`, under changed ``constants`` (P,): poses (N, 3) and covariances
+    def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
+        """The relative motions between states (N, 8), see :meth:`states`, for ``constants`` (P,): poses (N, 3) and covariances
         (N, 3, 3)."""
-        deltas, covariances = relatives(self._noise, starts, ends, constants, indices)
+        deltas, covariances = relatives(self._noise, starts, ends, constants, self._indices)
         return deltas, covariances
 
     def _insert(self, t: float, kind: float, a: float, b: float, c: float) -> bool:

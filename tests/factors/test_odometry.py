@@ -383,17 +383,17 @@ def test_a_robot_that_turns_is_slower_than_commanded():
 
 
 def test_a_pose_is_moved_along_the_odometry_by_one_call_as_by_several():
-    chain = velocities(NOISY, [(0.0, 1.0, 0.5), (0.3, 0.7, -0.8), (1.1, 0.0, 0.0)])
+    chain = velocities(NOISY, [(0.0, 1.0, 0.5), (0.3, 0.7, -0.8), (1.1, 0.0, 0.0)], estimated=(0, 2))
     pose, covariance = np.array((2.0, -1.0, 3.0)), np.diag((0.1, 0.2, 0.05)) ** 2
-    constants, indices = np.array((0.03, -0.01)), np.array((0, 2))
+    constants = np.array((0.03, -0.01))
     start, end = chain.state(0.2), chain.state(1.4)
     increment = chain.relative(start, end)
     delta, _ = recalibrated(increment, np.array((0.03, 0.0, -0.01, 0.0)))
-    at, body, world = chain.moved(start, 1.4, pose, covariance, constants, indices)
+    at, body, world = chain.moved(start, 1.4, pose, covariance, constants)
     np.testing.assert_allclose(at, se2.compose(pose, delta), atol=1e-12)
     expected = propagate(covariance, Increment(delta, increment.covariance, increment.duration))
     np.testing.assert_allclose(body, expected, atol=1e-15)
     np.testing.assert_allclose(world, se2.body_to_world(at, body), atol=1e-15)
-    deltas, covariances = chain.relatives(np.array([start]), np.array([end]), constants, indices)
+    deltas, covariances = chain.relatives(np.array([start]), np.array([end]), constants)
     np.testing.assert_allclose(deltas[0], delta, atol=1e-12)
     np.testing.assert_allclose(covariances[0], increment.covariance, atol=1e-15)

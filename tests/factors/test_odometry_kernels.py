@@ -103,13 +103,13 @@ def test_a_whitener_is_the_inverse_of_the_root(rng):
 
 
 def test_a_gaussian_in_one_call_is_predicted_along_the_motion():
-    chain = OdometryChain(OdometryModel(along=Growth(0.1, 0.2, 0.3)))
+    constants, indices = np.array((0.02, -0.01)), np.array((0, 2))
+    chain = OdometryChain(OdometryModel(along=Growth(0.1, 0.2, 0.3)), estimated=indices)
     for row in ((0.0, 0.5, 0.1), (0.3, 0.4, -0.2), (1.0, 0.3, 0.3)):
         chain.add_velocity(*row)
     start, pose = chain.state(0.2), np.array((1.0, 2.0, 3.0))
     root = np.random.default_rng(3).standard_normal((6, 6))
-    constants, indices = np.array((0.02, -0.01)), np.array((0, 2))
-    end, at, transition, noise, after = chain.predicted(start, 1.7, pose, root @ root.T, constants, indices, 4)
+    end, at, transition, noise, after = chain.predicted(start, 1.7, pose, root @ root.T, constants, 4)
     expected, motion = chain.travelled(start, 1.7)
     delta, by_changes = recalibrated(motion, np.array((0.02, 0.0, -0.01, 0.0)))
     whole = np.eye(6)

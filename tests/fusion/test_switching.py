@@ -35,7 +35,7 @@ def position_rmse(log, t, poses):
 def scan(t, *tags):
     count = len(tags)
     nothing = np.full(count, np.nan)
-    return RfidScan(t, ("0",), np.zeros(count, dtype=np.int64), tags, np.zeros(count), nothing, nothing, nothing)
+    return RfidScan(t, ("1",), np.zeros(count, dtype=np.int64), tags, np.zeros(count), nothing, nothing, nothing)
 
 
 def made(log, sensors=BOTH, **settings):
