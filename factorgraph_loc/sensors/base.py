@@ -9,9 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import chain
-from operator import attrgetter
 from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
@@ -347,9 +344,9 @@ class ResidualObservation:
     def at_its_time(self) -> Observation | None:
         return None
 
-    @cached_property
+    @property
     def blocks(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(chain.from_iterable(map(attrgetter("blocks"), self.terms))))
+        return tuple(dict.fromkeys(name for term in self.terms for name in term.blocks))
 
     @property
     def factors(self) -> list[SightingFactor]:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Measurement, Rows
@@ -109,14 +108,6 @@ class Motion(OdometryChain):
                 return
         if kept < m.count:
             self._diagnostics.drop_late("odometry", m.count - kept)
-
-    def state(self, t: float) -> ChainState:
-        """The state of the integrated odometry at ``t``. RunFailedError if the rows of then are no longer kept."""
-        if t < self.begin:
-            raise RunFailedError(
-                f"odometry: the motion at {t:.3f} s was asked for, but only that from {self.begin:.3f} s on is kept"
-            )
-        return super().state(t)
 
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
         """Corrected ``delta`` (3,) of an increment for ``constants`` (P,), and its Jacobian (3, P) in the tangent space."""

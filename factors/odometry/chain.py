@@ -107,8 +107,10 @@ class OdometryChain:
         self._extend(t[last], INCREMENT, se2.log(moves))
 
     def state(self, t: float) -> ChainState:
-        """The state of the chain at ``t``, which must not be before ``begin``; before the first knot the motion is unknown and
-        the pose constant."""
+        """The state of the chain at ``t``; before the first knot the motion is unknown and the pose constant. ValueError if the
+        rows of then are no longer kept."""
+        if t < self.begin:
+            raise ValueError(f"the motion at {t:.3f} s was asked for, but only that from {self.begin:.3f} s on is kept")
         return ChainState(*state_at(self._knots, self._count, t, self._constants))
 
     def states(self, t: Array) -> Array:

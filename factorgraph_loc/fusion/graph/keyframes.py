@@ -208,7 +208,7 @@ class Builder:
 
     def _add_keyframe(self, odometry: ChainState, m: Measurement | None) -> None:
         graph, newest, t = self._graph, self._graph.newest, odometry.t
-        keyframe = Keyframe(newest.index + 1, t, odometry, graph.motion.relative(newest.odometry, odometry))
+        keyframe = Keyframe(newest.index + 1, t, *graph.motion.travelled(newest.odometry, t))
         pose, covariance, _ = graph.moved(t)
         addition = Addition(self.gather())
         graph.append(keyframe)
