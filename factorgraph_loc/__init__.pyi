@@ -58,7 +58,7 @@ from factorgraph_loc.model.pose_path import PosePath as PosePath
 from factorgraph_loc.model.trajectory3 import Trajectory3 as Trajectory3
 from factorgraph_loc.model.world import World as World
 from factorgraph_loc.sensors.camera.measurement import PixelSightings as PixelSightings
-from factorgraph_loc.sensors.camera.stream import (
+from factorgraph_loc.sensors.camera.measurement import (
     FeatureStream as FeatureStream,
     ImageStream as ImageStream,
     SightingStream as SightingStream,

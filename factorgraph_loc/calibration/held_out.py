@@ -11,7 +11,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.calibrating import Calibrator
-from factorgraph_loc.sensors.odometry.calibration.constants import odometry_of
+from factorgraph_loc.sensors.odometry.calibration import odometry_of
 
 QUARTERS = 4  # stretches that a log is divided into
 WARM_UP = 2.0  # s of odometry before a stretch, for the delay of commands

@@ -23,8 +23,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Measurement, Rows, Tick
 from factorgraph_loc.model.result import Timings
 from factorgraph_loc.model.scoring import Ticks
-from factorgraph_loc.sensors.camera.map_frame import MapFrame
-from factorgraph_loc.sensors.interfaces import PreparedLog
+from factorgraph_loc.sensors.camera.use import MapFrame, PreparedLog
 from factorgraph_loc.text import listed
 from factors.se2 import Array
 

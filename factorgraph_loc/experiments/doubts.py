@@ -9,7 +9,7 @@ from factorgraph_loc.evaluation.pairing import pairs
 from factorgraph_loc.model.belief import Status
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera.map_frame import MapFrame
+from factorgraph_loc.sensors.camera.use import MapFrame
 from factorgraph_loc.sensors.registry import detecting
 
 MOSTLY = 0.9  # fraction of the time with estimates

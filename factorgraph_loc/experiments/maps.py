@@ -32,7 +32,7 @@ from factorgraph_loc.plugins import MAP_ESTIMATORS
 from factorgraph_loc.sensors.camera.frontend import with_features
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.interfaces import lacking_section
-from factorgraph_loc.sensors.landmarks import mapping as landmarks_mapping
+from factorgraph_loc.sensors.landmarks.summary import require_mappable
 from factorgraph_loc.sensors.registry import sensors
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
@@ -175,7 +175,7 @@ def _of_landmarks(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
         )
     if "landmarks" in settings:
         raise InputError(f"--set is {estimator}.landmarks, but a map is made without the log's map, or with --extend")
-    landmarks_mapping.check(log)
+    require_mappable(log)
     if options.extend and not log.world.landmarks:
         raise InputError(f"{log.name}: has no map that could be extended; leave --extend out")
     source = ""

@@ -12,7 +12,7 @@ from factorgraph_loc.files.models import FARTHEST, FileModel, nearest
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, PosePrior
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.camera.prepare import prepare
+from factorgraph_loc.sensors.camera.use import prepare
 from factorgraph_loc.sensors.interfaces import Use, lacking_section
 from factorgraph_loc.sensors.registry import channels, functions, moving, parent_of
 from factorgraph_loc.text import listed, quoted

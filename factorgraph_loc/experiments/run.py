@@ -34,8 +34,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import TURN
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Ticks, check_max_gap, check_tick_gap
-from factorgraph_loc.sensors.camera.map_frame import MapFrame
-from factorgraph_loc.sensors.camera.prepare import prepare
+from factorgraph_loc.sensors.camera.use import MapFrame, prepare
 from factorgraph_loc.sensors.interfaces import Ending
 from factorgraph_loc.sensors.registry import detecting, functions, moving
 from factorgraph_loc.version import __version__

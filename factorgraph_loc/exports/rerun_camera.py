@@ -12,7 +12,7 @@ from factorgraph_loc.exports.runs import StoredRun
 from factorgraph_loc.exports.scene import GAP, LIT, SEEN
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera import draw
+from factorgraph_loc.sensors.camera import summary as pictures_of
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factors.camera import model as reprojection
 from factors.se2 import Array
@@ -32,7 +32,7 @@ def record_camera(recording: rr.RecordingStream, log: Log, runs: Sequence[Stored
     import rerun as rr  # noqa: PLC0415
 
     settings = log.rig.find(CameraSettings)
-    if settings is None or not draw.has_pictures(log):
+    if settings is None or not pictures_of.has_pictures(log):
         return
     model, at, poses = settings.model(), camera_path(log, runs), _carrier(log, runs)
     if at != CAMERA:
@@ -45,14 +45,14 @@ def record_camera(recording: rr.RecordingStream, log: Log, runs: Sequence[Stored
         image_plane_distance=FRUSTUM,
     )
     recording.log(at, lens, static=True)
-    for some in _batches(draw.images(log)):
+    for some in _batches(pictures_of.images(log)):
         _pictures(recording, f"{at}/image", some)
         if log.world.points is not None and poses is not None:
             t = np.array([t for t, _ in some])
             expected = [_expected(model, pose, log.world.points.positions) for pose in poses.at(t, max_gap=GAP)]
             _pixels_over_time(recording, f"{at}/image/map", t, expected)
             recording.log(f"{at}/image/map", rr.Points2D.from_fields(radii=2.0, colors=LIT), static=True)
-    seen = list(draw.sightings(log))
+    seen = list(pictures_of.sightings(log))
     if seen:
         labels = [name for _, names, _ in seen for name in names]
         t = np.array([t for t, _, _ in seen])

@@ -26,8 +26,8 @@ from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera.draw import has_pictures
 from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.summary import has_pictures
 from factors.se2 import Array
 
 if TYPE_CHECKING:

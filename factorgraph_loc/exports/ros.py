@@ -22,7 +22,7 @@ from factorgraph_loc.files.temporary import temporary_folder, writing
 from factorgraph_loc.io.bags.file import require_rosbags
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera import draw
+from factorgraph_loc.sensors.camera import summary as pictures_of
 from factors.se2 import Array
 
 MAP, BASE, CAMERA, REFERENCE = "map", "base_link", "camera", "reference"
@@ -126,7 +126,7 @@ def _planar(trajectory: Trajectory) -> list[list[float]]:
 
 
 def _images(log: Log, make: "_Maker") -> Iterator[Message]:
-    for t, jpeg in draw.images(log):
+    for t, jpeg in pictures_of.images(log):
         t_ns = log.t0_ns + round(t * 1e9)
         content = {"format": "jpeg", "data": np.frombuffer(jpeg, dtype=np.uint8)}
         yield (

@@ -25,7 +25,7 @@ from factorgraph_loc.model.measurement import TURN
 from factorgraph_loc.model.pose_path import upright
 from factorgraph_loc.model.trajectory import Trajectory, write_tum
 from factorgraph_loc.model.trajectory3 import Trajectory3
-from factorgraph_loc.sensors.landmarks.located import located_landmarks
+from factorgraph_loc.sensors.landmarks.summary import located_landmarks
 from factorgraph_loc.sensors.motion import whole_motion
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.text import listed

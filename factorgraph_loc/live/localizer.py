@@ -27,15 +27,14 @@ from factorgraph_loc.model.scoring import Ticks
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import load
-from factorgraph_loc.sensors.camera.map_frame import MapFrame
-from factorgraph_loc.sensors.camera.prepare import frontend_of, uses_images
 from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.use import MapFrame, frontend_of, uses_images
 from factorgraph_loc.sensors.pushed import checked
 from factorgraph_loc.sensors.registry import channels
 from factorgraph_loc.sensors.rfid.pushed import RfidRead, scan_of
 
 if TYPE_CHECKING:
-    from factorgraph_loc.sensors.camera.live import LiveFrontend
+    from factorgraph_loc.sensors.camera.frontend import LiveFrontend
 
 LAG = 10.0  # s: default window of the smoother
 HISTORY = 60.0  # s
@@ -148,7 +147,7 @@ class Localizer:
         with self._image_lock:
             if self._frontend is None:
                 # imported here because OpenCV is not needed without images
-                from factorgraph_loc.sensors.camera.live import LiveFrontend  # noqa: PLC0415
+                from factorgraph_loc.sensors.camera.frontend import LiveFrontend  # noqa: PLC0415
 
                 camera = self._rig.of(CameraSettings)
                 self._frontend = LiveFrontend(frontend_of(self._rig, self._world), camera.model())

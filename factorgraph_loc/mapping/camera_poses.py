@@ -10,8 +10,8 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.mapping.triangulation import Cameras, Integers
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera.prepare import frames_of
 from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.use import frames_of
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera.model import CameraModel, camera_pose
 from factors.se2 import Array

@@ -49,17 +49,6 @@ class Use:
 
 
 @dataclass(frozen=True)
-class PreparedLog:
-    """A ``log`` that can be run, with images replaced by features. ``images``: number of images whose features were computed or
-    loaded from the cache, in ``seconds``."""
-
-    log: Log
-    warnings: tuple[str, ...] = ()
-    images: int = 0
-    seconds: float = 0.0
-
-
-@dataclass(frozen=True)
 class Ending:
     """The end of a run: ``diagnostics`` of the estimator and ``final_diagnostics`` of the ``final`` trajectory; what was
     ``learnt``."""

@@ -17,6 +17,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factors.se2 import Array
 
 WORTH = 2.0  # logs that the uncertainty of the input rig counts as: few logs tell little of a scatter
+REFERENCE_GAP = 0.35  # s; longest interpolated gap between reference poses
 CLEARLY = 2.0  # standard errors; a mean that is nearer to the rig's value is chance
 
 

@@ -13,8 +13,8 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.processes import run_each
+from factorgraph_loc.sensors.camera.measurement import ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.sensors.interfaces import times as times_of
 from factorgraph_loc.simulation.renderer import Image, Renderer
 from factorgraph_loc.simulation.scene import make_scene

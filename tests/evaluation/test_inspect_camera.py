@@ -13,9 +13,9 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.mounting_check import mounting_problems
+from factorgraph_loc.sensors.camera.measurement import ImageStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
+from factorgraph_loc.sensors.camera.summary import mounting_problems
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 
 CAMERA = CameraSettings(

@@ -13,8 +13,8 @@ from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.measurement import FeatureStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.stream import FeatureStream, SightingStream
 from factorgraph_loc.vision.frame import CameraFrame
 
 NO_POINTS = "straight: the map has no points that a camera could find: give --world"

@@ -13,9 +13,9 @@ from factorgraph_loc.experiments.compare import compare
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.sensors.camera import frontend
-from factorgraph_loc.sensors.camera.prepare import frontend_of
+from factorgraph_loc.sensors.camera.measurement import ImageStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
+from factorgraph_loc.sensors.camera.use import frontend_of
 from factorgraph_loc.vision.settings import FrontendSettings
 
 CAMERA = CameraSettings(

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from factorgraph_loc.exports import scene
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera import draw
-from factorgraph_loc.sensors.camera.stream import ImageStream
+from factorgraph_loc.sensors.camera import summary as pictures_of
+from factorgraph_loc.sensors.camera.measurement import ImageStream
 
 
 def lights_of(log):
@@ -44,7 +44,7 @@ def test_an_ellipse_holds_95_percent():
 
 
 def test_pictures_become_jpegs(log):
-    pictures = list(draw.images(log))
+    pictures = list(pictures_of.images(log))
     assert [t for t, _ in pictures] == [0.5, 1.5, 2.5]
     for i, (_, content) in enumerate(pictures):
         picture = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_COLOR)
@@ -53,7 +53,7 @@ def test_pictures_become_jpegs(log):
     jpeg = log.streams["camera"].file[0].with_suffix(".jpg")
     jpeg.write_bytes(pictures[1][1])
     kept = replace(log, streams={"camera": ImageStream(np.zeros(1), [jpeg])})
-    assert next(draw.images(kept))[1] == pictures[1][1]
+    assert next(pictures_of.images(kept))[1] == pictures[1][1]
 
 
 def test_a_path_is_cut_at_gaps():

@@ -15,8 +15,8 @@ from factorgraph_loc.fusion.registry import ESTIMATORS
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.measurement import ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.stream import ImageStream
 
 READS = ("odometry", "rfid")
 FEW = {"particles": 150, "min_particles": 100, "smooth": False}

@@ -14,7 +14,7 @@ from factorgraph_loc.files.columns import LATEST, STAMP
 from factorgraph_loc.io.checks import require_bounds, require_one_span
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import StartPose
-from factorgraph_loc.sensors.camera.columns import SIGHTINGS
+from factorgraph_loc.sensors.camera.tables import SIGHTINGS
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.odometry.tables import IMU, INCREMENTS, VELOCITIES

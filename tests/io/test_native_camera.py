@@ -8,7 +8,7 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.native.native import write_native
-from factorgraph_loc.sensors.camera.stream import ImageStream, SightingStream
+from factorgraph_loc.sensors.camera.measurement import ImageStream, SightingStream
 
 CAMERA = "t_ns,file\n1100000000,a.png\n1300000000,b.png\n1500000000,c.png\n"
 PIXELS = "t_ns,landmark,u,v\n1200000000,door,10.5,20\n1200000000,lamp,-3,400.25\n1400000000,door,11,21\n"

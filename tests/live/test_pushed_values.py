@@ -25,8 +25,8 @@ from factorgraph_loc import (
     YawRate,
 )
 from factorgraph_loc.live.start import prior_of
-from factorgraph_loc.sensors.camera.columns import FEATURES
-from factorgraph_loc.sensors.camera.pushed import PIXELS
+from factorgraph_loc.sensors.camera.tables import FEATURES
+from factorgraph_loc.sensors.camera.tables import PAIRS as PIXELS
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
 from factorgraph_loc.sensors.odometry.tables import IMU, INCREMENTS, VELOCITIES
 from factorgraph_loc.sensors.pushed import checked

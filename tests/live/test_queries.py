@@ -15,8 +15,8 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.measurement import SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.stream import SightingStream
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors.camera import model as reprojection

@@ -16,8 +16,7 @@ from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.sensors.camera.stream import FeatureStream
+from factorgraph_loc.sensors.camera.measurement import FeatureStream, PixelSightings
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factorgraph_loc.simulation import preset, simulate

@@ -14,7 +14,7 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.mapping.point_maps import chosen
 from factorgraph_loc.maps.common_error import CommonError
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.stream import FeatureStream
+from factorgraph_loc.sensors.camera.measurement import FeatureStream
 
 SECONDS, EVERY = 24.0, 0.4  # s
 SEEDS = range(21, 25)

@@ -15,8 +15,8 @@ from factorgraph_loc.fusion.graph.variables import pose_key
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.measurement import FeatureStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
-from factorgraph_loc.sensors.camera.stream import FeatureStream, SightingStream
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
 

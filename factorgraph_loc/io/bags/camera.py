@@ -21,8 +21,8 @@ from factorgraph_loc.files.temporary import locked, sweep, temporary_folder, wri
 from factorgraph_loc.io.bags.fields import TopicSettings, as_nanoseconds
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.listeners import Stamper
+from factorgraph_loc.sensors.camera.measurement import ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.stream import ImageStream
 from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.feature_cache import cache_folder
 from factors.se2 import Array

@@ -15,7 +15,7 @@ from factorgraph_loc.io.bags.tables import DescribedRows, RowsOfTopic, TableTopi
 from factorgraph_loc.maps.markers import corner_names
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Axes, Turned
-from factorgraph_loc.sensors.camera.columns import SIGHTINGS
+from factorgraph_loc.sensors.camera.tables import SIGHTINGS
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
 from factorgraph_loc.sensors.tables import stream_of
 from factorgraph_loc.text import listed

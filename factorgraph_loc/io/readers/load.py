@@ -204,7 +204,7 @@ def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log
     )
     require_bounds(log)
     if source.markers is not None:
-        from factorgraph_loc.sensors.camera.markers import with_markers  # noqa: PLC0415 - most logs do not need OpenCV
+        from factorgraph_loc.sensors.camera.frontend import with_markers  # noqa: PLC0415 - most logs do not need OpenCV
 
         log = with_markers(log, source.markers.family)
     warnings = list(log.warnings)

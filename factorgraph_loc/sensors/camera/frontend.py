@@ -1,11 +1,13 @@
-"""Detection and tracking of image features, in parallel, with a cache in the user's cache folder.
+"""Features, tracks and fiducial markers of images: of a log, in parallel, with a cache in the user's cache folder; and online.
 
 Cache keys are hashes of the image's bytes, the settings and the code, so a changed image or feature is computed again, and equal
 images in two logs are computed once.
 """
 
 import hashlib
+import json
 import os
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -18,19 +20,22 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.files.bounded import IMAGE, read_bytes
+from factorgraph_loc.maps.markers import MarkerFamily, corner_names
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.processes import ProcessDiedError, run_each
+from factorgraph_loc.sensors.camera.measurement import FeatureStream, ImageStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
 from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder
 from factorgraph_loc.vision.features import Extractor, extractor
+from factorgraph_loc.vision.fiducials import find_markers
 from factorgraph_loc.vision.found import ImageFeatures, decode, encode
 from factorgraph_loc.vision.frame import CameraFrame
-from factorgraph_loc.vision.images import read_image
+from factorgraph_loc.vision.images import as_image, read_image
 from factorgraph_loc.vision.keypoints import Integers
 from factorgraph_loc.vision.settings import FrontendSettings
-from factorgraph_loc.vision.tracks import follow
-from factors.camera.model import CameraModel
+from factorgraph_loc.vision.tracks import follow, pairs
+from factors.camera.model import CameraModel, undistorted
+from factors.se2 import Array
 
 # what features depend on, and what tracks depend on in addition
 FEATURE_CODE = (
@@ -245,3 +250,122 @@ def code_version(names: tuple[str, ...]) -> str:
     for name in names:
         digest.update(package.joinpath(name).read_bytes())
     return digest.hexdigest()
+
+
+CODE = ("fiducials.py", "images.py")  # files that the result depends on
+Marked = list[tuple[int, list[list[float]]]]  # marker numbers and the pixels of their corners
+
+
+def with_markers(log: Log, family: MarkerFamily) -> Log:
+    """Add the marker corners in the images of a log as the stream ``sightings``, with names ``FAMILY-NUMBER/CORNER``.
+
+    Results are cached. InputError if the log has no images, or already has sightings.
+    """
+    stream = log.streams.get("camera")
+    if not isinstance(stream, ImageStream) or not len(stream.t):
+        raise InputError(f"{log.name}: has no images to detect markers in")
+    if "sightings" in log.streams:
+        raise InputError(f"{log.name}: already has sightings, expected either these or [markers]")
+    kept = FeatureCache(cache_folder())
+    t: list[float] = []
+    names: list[str] = []
+    pixels: list[list[float]] = []
+    faults: list[str] = []
+    for stamp, file in zip(stream.t.tolist(), stream.file, strict=True):
+        try:
+            seen = _marked(file, family, kept)
+        except InputError as error:
+            faults.append(str(error))
+            continue
+        for number, corners in seen:
+            names += corner_names(f"{family}-{number}")
+            pixels += corners
+            t += [stamp] * len(corners)
+    kept.trim()
+    warnings = [f"markers: {len(faults)} images cannot be used, the first: {faults[0]}"] if faults else []
+    if not names:
+        warnings.append(f"markers: no marker of {family} was found in {len(stream.t)} images")
+        return replace(log, warnings=(*log.warnings, *warnings))
+    u, v = np.array(pixels).T
+    return replace(
+        log,
+        streams={**log.streams, "sightings": SightingStream(np.array(t), names, u, v)},
+        warnings=(*log.warnings, *warnings),
+    )
+
+
+def _marked(file: Path, family: MarkerFamily, kept: FeatureCache) -> Marked:
+    content = read_bytes(file, IMAGE)
+    about = f"markers {family} {code_version(CODE)} "
+    key = hashlib.sha256(about.encode() + content).hexdigest()
+    stored = kept.read(key)
+    if stored is not None:
+        return [(int(number), corners) for number, corners in json.loads(stored)]
+    seen = [(number, corners.tolist()) for number, corners in find_markers(read_image(file), family)]
+    kept.write(key, json.dumps(seen).encode())
+    return seen
+
+
+@dataclass
+class _RecentImage:
+    """A recent image: directions (K, 2) and track numbers (K,) of its features, and which the next image did not match."""
+
+    found: ImageFeatures
+    directions: Array
+    numbers: Integers
+    missed: Integers
+
+
+class LiveFrontend:
+    """Detects and tracks features, keeping the last two images. Not thread-safe."""
+
+    def __init__(self, settings: FrontendSettings, camera: CameraModel) -> None:
+        self._feature, self._camera = settings.feature, camera
+        self._extractor = extractor(settings.feature, settings.count, everywhere=settings.everywhere)
+        self._last: deque[_RecentImage] = deque(maxlen=2)
+        self._following = 0
+
+    def frame(self, t: float, image: object) -> CameraFrame:
+        """The features of an image taken at ``t`` [s], an array as in :func:`~factorgraph_loc.vision.images.as_image`.
+
+        InputError if it is no such array, or has another size than the camera is calibrated for.
+        """
+        pixels = as_image(image, f"image at {t:.3f} s")
+        height, width = pixels.shape[:2]
+        if (width, height) != (self._camera.width, self._camera.height):
+            raise InputError(
+                f"image at {t:.3f} s: has {width} x {height} px, expected {self._camera.width} x {self._camera.height}"
+            )
+        found = decode(encode(*self._extractor.detectAndCompute(pixels)))
+        numbers = self._follow(found)
+        return CameraFrame(t, self._feature, found.pixels, found.sizes, found.descriptors, numbers)
+
+    def _follow(self, found: ImageFeatures) -> Integers:
+        """Track numbers (K,) of the features of the next image; see :func:`~factorgraph_loc.vision.tracks.follow`."""
+        every = np.arange(len(found.pixels))
+        numbers = np.full(len(every), -1, dtype=np.int64)
+        here = _RecentImage(found, undistorted(self._camera, found.pixels), numbers, every)
+        if self._last:
+            last = self._last[-1]
+            near = self._pairs(last, np.arange(len(last.numbers)), here, every)
+            numbers[near[:, 1]] = last.numbers[near[:, 0]]
+            last.missed = np.setdiff1d(np.arange(len(last.numbers)), near[:, 0])
+            if len(self._last) > 1:
+                before = self._last[0]
+                far = self._pairs(before, before.missed, here, np.setdiff1d(every, near[:, 1]))
+                numbers[far[:, 1]] = before.numbers[far[:, 0]]
+        fresh = np.flatnonzero(numbers < 0)
+        numbers[fresh] = self._following + np.arange(len(fresh))
+        self._following += len(fresh)
+        self._last.append(here)
+        return numbers
+
+    def _pairs(self, a: _RecentImage, first: Integers, b: _RecentImage, second: Integers) -> Integers:
+        """Matches (M, 2) between features ``first`` of one image and ``second`` of another."""
+        found = pairs(
+            (a.directions[first], a.found.descriptors[first]),
+            (b.directions[second], b.found.descriptors[second]),
+            self._camera,
+            binary=self._extractor.binary,
+        )
+        return np.column_stack((first[found[:, 0]], second[found[:, 1]]))

@@ -1,4 +1,4 @@
-"""The camera settings of a rig."""
+"""The camera settings of a rig, and the settings of simulated pixels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.model.settings import Angle, Offset, SensorSettings
+from factorgraph_loc.model.settings import Angle, Hertz, Metres, Offset, SensorSettings, Share
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
@@ -18,7 +18,7 @@ Focal = Annotated[float, Field(gt=1.0, le=1e5), InUnit("px")]
 Pixel = Annotated[float, Field(ge=-1e5, le=1e5), InUnit("px")]
 Lens = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Side = Annotated[int, Field(ge=16, le=100_000), InUnit("px")]
-Metres = Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")]
+Distance = Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")]
 Turn = Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")]
 WIDEST_ANGLE = math.degrees(math.atan(math.sqrt(reprojection.WIDEST)))
 
@@ -26,11 +26,11 @@ WIDEST_ANGLE = math.degrees(math.atan(math.sqrt(reprojection.WIDEST)))
 class CameraUncertainty(FileModel):
     """Standard deviations of constants that differ between robots or runs; those above 0 are estimated."""
 
-    x: Metres = 0.0
+    x: Distance = 0.0
     """standard deviation of the constant"""
-    y: Metres = 0.0
+    y: Distance = 0.0
     """standard deviation of the constant"""
-    z: Metres = 0.0
+    z: Distance = 0.0
     """standard deviation of the constant"""
     roll: Turn = 0.0
     """standard deviation of a rotation about the robot's x axis"""
@@ -112,3 +112,16 @@ class CameraSettings(SensorSettings):
             robust=self.robust,
             tempering=self.tempering,
         )
+
+
+class PixelSettings(FileModel):
+    """Detection of named points."""
+
+    rate: Hertz = 5.0
+    """observations per second"""
+    max_points: Annotated[int, Field(ge=1, le=10_000)] = 20
+    """most points at once, chosen at random among the visible ones"""
+    max_depth: Metres = 10.0
+    """distance ahead to which points are seen"""
+    wrong: Share = 0.0
+    """share of points that are reported at a random pixel"""

@@ -3,7 +3,7 @@
 from factorgraph_loc.model.sections import Layer, Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
-__all__ = ["SENSOR", "located", "mapping", "measurement", "settings"]
+__all__ = ["SENSOR", "measurement", "settings", "summary"]
 
 SENSOR = SensorType(
     "landmarks",
@@ -27,14 +27,14 @@ SENSOR = SensorType(
     undetected="no landmark of the map was seen",
     bind="factorgraph_loc.sensors.landmarks.bound:bind",
     summarize="factorgraph_loc.sensors.landmarks.summary:summarize",
-    check="factorgraph_loc.sensors.landmarks.describe:check",
-    draw="factorgraph_loc.sensors.landmarks.describe:draw",
+    check="factorgraph_loc.sensors.landmarks.summary:check",
+    draw="factorgraph_loc.sensors.landmarks.summary:draw",
     simulation={
         "sightings": Section("factorgraph_loc.sensors.landmarks.settings:SightingSettings", always=True),
     },
-    simulate="factorgraph_loc.sensors.landmarks.simulation:simulate",
-    looks="factorgraph_loc.sensors.landmarks.simulation:looks",
-    on_robot="factorgraph_loc.sensors.landmarks.simulation:on_robot",
-    forecast="factorgraph_loc.sensors.landmarks.forecast:forecast",
+    simulate="factorgraph_loc.sensors.landmarks.simulate:simulate",
+    looks="factorgraph_loc.sensors.landmarks.simulate:looks",
+    on_robot="factorgraph_loc.sensors.landmarks.simulate:on_robot",
+    forecast="factorgraph_loc.sensors.landmarks.simulate:forecast",
     calibrator="factorgraph_loc.sensors.landmarks.calibrator:CALIBRATOR",
 )

@@ -4,34 +4,30 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Hashable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Self, cast
 
 import numpy as np
 
-from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import GOING_BACK
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
-from factorgraph_loc.sensors.known_position import KnownPosition
-from factorgraph_loc.sensors.landmarks.finder import Hypothesis, Relocalizer, TrackMonitor
-from factorgraph_loc.sensors.landmarks.located import NewLandmarks
+from factorgraph_loc.sensors.landmarks.finder import LandmarkFinder
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks, together
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
-from factorgraph_loc.sensors.motion import Motion
+from factors import positive
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor
 from factors.landmarks.model import PARAMETERS, TIME_OFFSET
-from factors.motion import ChainState
 from factors.se2 import Array
-from factors.update import Correction, landmark_update
+from factors.update import GATE, Correction, landmark_update
 
 SURVEYED_ITERATIONS = 4
 WORK = 8  # of a landmark, for one of many poses that are weighed by a compiled call
 SMALL = 40  # size of error states whose matrices are inverted by compiled code
-SEARCH_INTERVAL = 1.0  # s between searches while the track is suspicious
+MAX_PENDING = 5  # sightings per landmark that wait for another to agree
 
 
 @dataclass(frozen=True)
@@ -113,6 +109,31 @@ class LandmarkObservation(ResidualObservation):
         return type(self)(self.t, (Term(factor, (), 2 * len(factor.points)),), self.surveyed)
 
 
+Sighted = tuple[float, LandmarkObservation]  # with the time [s] of the pose that saw it
+
+
+@dataclass(frozen=True)
+class NewLandmarks:
+    """Sightings of landmarks that are not initialized yet: two must agree on the position, because one may be an outlier.
+
+    Immutable, because filters go back to an earlier state when a measurement is late.
+    """
+
+    pending: Mapping[str, tuple[tuple[Array, Array, Sighted], ...]] = field(default_factory=dict)
+
+    def propose(
+        self, name: str, point: Array, covariance: Array, sighting: Sighted
+    ) -> tuple[NewLandmarks, Sighted | None]:
+        """Add a sighting that puts the landmark at ``point`` (2,) with ``covariance`` (2, 2). Returns the new pending sightings,
+        and an earlier sighting that agrees, or None."""
+        waiting = self.pending.get(name, ())
+        for earlier, spread, candidate in reversed(waiting):
+            apart = point - earlier
+            if positive.squared(apart, spread + covariance) < GATE:
+                return NewLandmarks({other: rows for other, rows in self.pending.items() if other != name}), candidate
+        return NewLandmarks({**self.pending, name: (*waiting, (point, covariance, sighting))[-MAX_PENDING:]}), None
+
+
 class LandmarkSensor(Sensor):
     """Identified landmarks. For ``use`` of the map see :class:`KnownLandmarks`. A landmark that is not in the map becomes a block
     ``bearing_range/NAME`` once two sightings agree on its position."""
@@ -127,8 +148,8 @@ class LandmarkSensor(Sensor):
         # sightings before the start are counted when they are used there
         self._sought = KnownLandmarks(setup, Diagnostics())
         self._shared = (self.modality,) if constants.names else ()
-        self._new: NewLandmarks[tuple[float, LandmarkObservation]] = NewLandmarks()
-        self._before: deque[tuple[float, NewLandmarks[tuple[float, LandmarkObservation]]]] = deque()
+        self._new: NewLandmarks = NewLandmarks()
+        self._before: deque[tuple[float, NewLandmarks]] = deque()
         self._finder: LandmarkFinder | None = None
         if use == "known" and self._landmarks.known:
             self.finder = self._finder = LandmarkFinder(self._sought, motion, setup.world.positions())
@@ -201,68 +222,6 @@ class LandmarkSensor(Sensor):
     def restart(self, t: float) -> None:
         self._new = NewLandmarks()
         self._before.clear()
-
-
-class LandmarkFinder:
-    """A :class:`~factorgraph_loc.sensors.base.Finder`: hypotheses from the sightings of the last minute, and a track monitor."""
-
-    at_once = False
-
-    def __init__(self, landmarks: KnownLandmarks, motion: Motion, positions: Array) -> None:
-        self._landmarks = landmarks
-        self._relocalizer = Relocalizer(motion, positions)
-        self._monitor = TrackMonitor()
-        self.newest: ChainState | None = None
-
-    @property
-    def start(self) -> KnownPosition | None:
-        return self._relocalizer.start
-
-    @start.setter
-    def start(self, start: KnownPosition | None) -> None:
-        self._relocalizer.start = start
-
-    @property
-    def hypotheses(self) -> tuple[Hypothesis, ...]:
-        return self._relocalizer.hypotheses
-
-    @property
-    def best(self) -> PosePrior | None:
-        return self._relocalizer.best
-
-    @property
-    def suspicious_since(self) -> float | None:
-        """The time since which most landmarks are not where they are predicted."""
-        return self._monitor.suspicious_since
-
-    def look(self, m: BearingRange, odometry: ChainState) -> bool:
-        seen = self._landmarks.factor(m)
-        if seen is None:
-            return False
-        self._relocalizer.add(odometry, seen)
-        self._relocalizer.search()
-        self.newest = odometry
-        return True
-
-    def sample(self, rng: np.random.Generator, count: int) -> Array:
-        return self._relocalizer.sample(rng, count)
-
-    def follow(self, observation: LandmarkObservation, odometry: ChainState, view: View) -> None:
-        seen = observation.on_pose({name: np.asarray(view.value(name)) for name in observation.blocks}, {}).measured
-        self._relocalizer.add(odometry, seen)
-        self._monitor.add(observation.t, seen, view.pose, view.covariance)
-
-    def refuted_since(self, m: BearingRange, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
-        since = self._monitor.suspicious_since
-        if since is None or (self.newest is not None and odometry.t < self.newest.t + SEARCH_INTERVAL):
-            return None
-        self._relocalizer.forget(since)
-        self._relocalizer.search()
-        self.newest = odometry
-        return since if self._relocalizer.refutes(pose, covariance) else None
-
-    def clear(self) -> None:
-        self._monitor.clear()
 
 
 def bind(binding: Binding) -> LandmarkSensor | None:

@@ -13,7 +13,7 @@ from factorgraph_loc.fitting.robust import Constant, Integers, spread
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
-from factorgraph_loc.sensors.odometry.calibration.constants import REFERENCE_GAP
+from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
 from factors.landmarks import model as bearing_range
 from factors.se2 import Array
 

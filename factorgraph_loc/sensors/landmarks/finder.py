@@ -12,12 +12,16 @@ from __future__ import annotations
 import bisect
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.model.belief import Mode, PosePrior, Status
+from factorgraph_loc.sensors.base import View
 from factorgraph_loc.sensors.known_position import KnownPosition
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks
 from factorgraph_loc.sensors.landmarks.window import Sighting, SightingWindow
 from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
@@ -49,6 +53,7 @@ STAMPS, MONITORED = 4, 2.0  # minimum number of timestamps, and their duration i
 KEPT = 100  # timestamps
 BEYOND = 2.0  # times the gate
 SHARE = 0.6  # of the landmarks
+SEARCH_INTERVAL = 1.0  # s between searches while the track is suspicious
 
 
 @dataclass(frozen=True)
@@ -306,3 +311,65 @@ class TrackMonitor:
             if self._stamps[i][0] <= self._stamps[-1][0] - MONITORED:
                 return self._stamps[i:]
         return []
+
+
+class LandmarkFinder:
+    """A :class:`~factorgraph_loc.sensors.base.Finder`: hypotheses from the sightings of the last minute, and a track monitor."""
+
+    at_once = False
+
+    def __init__(self, landmarks: KnownLandmarks, motion: Motion, positions: Array) -> None:
+        self._landmarks = landmarks
+        self._relocalizer = Relocalizer(motion, positions)
+        self._monitor = TrackMonitor()
+        self.newest: ChainState | None = None
+
+    @property
+    def start(self) -> KnownPosition | None:
+        return self._relocalizer.start
+
+    @start.setter
+    def start(self, start: KnownPosition | None) -> None:
+        self._relocalizer.start = start
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        return self._relocalizer.hypotheses
+
+    @property
+    def best(self) -> PosePrior | None:
+        return self._relocalizer.best
+
+    @property
+    def suspicious_since(self) -> float | None:
+        """The time since which most landmarks are not where they are predicted."""
+        return self._monitor.suspicious_since
+
+    def look(self, m: BearingRange, odometry: ChainState) -> bool:
+        seen = self._landmarks.factor(m)
+        if seen is None:
+            return False
+        self._relocalizer.add(odometry, seen)
+        self._relocalizer.search()
+        self.newest = odometry
+        return True
+
+    def sample(self, rng: np.random.Generator, count: int) -> Array:
+        return self._relocalizer.sample(rng, count)
+
+    def follow(self, observation: Any, odometry: ChainState, view: View) -> None:
+        seen = observation.on_pose({name: np.asarray(view.value(name)) for name in observation.blocks}, {}).measured
+        self._relocalizer.add(odometry, seen)
+        self._monitor.add(observation.t, seen, view.pose, view.covariance)
+
+    def refuted_since(self, m: BearingRange, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
+        since = self._monitor.suspicious_since
+        if since is None or (self.newest is not None and odometry.t < self.newest.t + SEARCH_INTERVAL):
+            return None
+        self._relocalizer.forget(since)
+        self._relocalizer.search()
+        self.newest = odometry
+        return since if self._relocalizer.refutes(pose, covariance) else None
+
+    def clear(self) -> None:
+        self._monitor.clear()

@@ -1,25 +1,30 @@
-"""Summary of the landmark sightings in a log, with warnings about them and the map.
+"""Landmarks in a log: summary with warnings about sightings and map, positions in the robot frame, and checks before a run.
 
 With a reference, the position of each landmark is also estimated from its sightings at the reference poses: by the robust median
 of ranges and bearings, or by robust trilateration from ranges alone. A landmark far from its map position is a suspect. Sightings
 are also compared with the predictions from the reference at various time shifts.
 """
 
+from __future__ import annotations
+
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors import interfaces
-from factorgraph_loc.sensors.interfaces import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP, Summary
+from factorgraph_loc.sensors.interfaces import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP, Marks, Summary, Use
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factors import se2
 from factors.landmarks import model as bearing_range
+from factors.landmarks.model import located, sigmas
 from factors.se2 import Array
 
 MIN_SIGHTINGS = 10  # minimum for a statement about a landmark
@@ -207,3 +212,81 @@ def _shifted(log: Log) -> list[str]:
         return []
     shift = float(shifts[best])
     return [interfaces.line("bearing_range", shift, "the reference", "bearing_range", -shift)]
+
+
+def check(use: Use) -> Use:
+    """InputError if landmarks are to be estimated (setting ``landmarks`` of the estimator) but no sighting determines the
+    position of one or shows a landmark of the map."""
+    log, wanted = use.log, getattr(use.settings, "landmarks", "known")
+    stream = log.streams.get("bearing_range")
+    if wanted == "known" or "bearing_range" not in use.sensors:
+        return use
+    if not isinstance(stream, BearingRangeStream) or not len(stream.t):
+        return use
+    if np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)):
+        return use
+    if wanted == "extended" and any(landmark in log.world.landmarks for landmark in stream.landmark):
+        return use
+    lacks = "bearing" if np.any(np.isfinite(stream.range)) else "range"
+    name = use.estimator
+    raise InputError(
+        f"{log.name}: {name}.landmarks is {wanted}, but no sighting has a {lacks}, so no landmark can be located; give a map of "
+        f"them (--world) with {name}.landmarks=known, or leave out bearing_range (--sensors)"
+    )
+
+
+def draw(log: Log) -> Marks:
+    """The landmarks of the map, on the floor, and the times of their sightings."""
+    places = log.world.positions()
+    positions = np.column_stack((places, np.zeros(len(places))))
+    stream = log.streams.get("bearing_range")
+    t, seen = np.empty(0), tuple[str, ...]()
+    if isinstance(stream, BearingRangeStream):
+        t, seen = stream.t + log.rig.time_offset("bearing_range"), tuple(stream.landmark)
+    return Marks("landmarks", tuple(log.world.landmarks), positions, t, seen, marker="^", size=7.0, order=4.0)
+
+
+def require_mappable(log: Log) -> None:
+    """InputError if the log's sightings cannot locate any landmark."""
+    stream = log.streams.get("bearing_range")
+    if not isinstance(stream, BearingRangeStream) or not len(stream.t):
+        raise InputError(f"{log.name}: has no sightings of landmarks (bearing_range), so there is nothing to map")
+    if log.rig.find(BearingRangeSettings) is None:
+        raise InputError(f"{log.name}: its rig has no [bearing_range], expected the sensor's noise and mounting")
+    if not np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)):
+        lacking, what = ("bearing", "range") if np.isfinite(stream.range).any() else ("range", "bearing")
+        raise InputError(
+            f"{log.name}: no sighting has a {lacking}; from a {what} alone a landmark cannot be located, so it cannot be mapped"
+        )
+
+
+DELTA = 1e-6  # m or rad; of numerical derivatives
+
+
+class LocatedLandmark(NamedTuple):
+    """A ``landmark`` seen at ``t`` [s of the log] at ``point`` (2,) [m] with ``covariance`` (2, 2) [m^2], in the robot frame."""
+
+    t: float
+    landmark: str
+    point: Array
+    covariance: Array
+
+
+def located_landmarks(log: Log, sensors: Collection[str], names: Collection[str]) -> list[LocatedLandmark]:
+    """The landmarks in ``names`` for which range and bearing were measured at once; empty if the log's sightings are not among
+    ``sensors``, or its rig lacks the sensor."""
+    stream, settings = log.streams.get("bearing_range"), log.rig.find(BearingRangeSettings)
+    if "bearing_range" not in sensors or not isinstance(stream, BearingRangeStream) or settings is None:
+        return []
+    model = settings.model()
+    whole = np.flatnonzero(np.isfinite(stream.range) & np.isfinite(stream.bearing))
+    rows = [i for i in whole.tolist() if stream.landmark[i] in names]
+    ranges, bearings = stream.range[rows], stream.bearing[rows]
+    points = located(model, ranges, bearings)
+    spreads = sigmas(model, ranges)
+    t = (stream.t[rows] + log.rig.time_offset("bearing_range")).tolist()
+    by_range = (located(model, ranges + DELTA, bearings) - points) / DELTA
+    by_bearing = (located(model, ranges, bearings + DELTA) - points) / DELTA
+    jacobians = np.stack((by_range, by_bearing), axis=-1) * spreads[:, None, :]
+    covariances = jacobians @ np.swapaxes(jacobians, 1, 2)
+    return [LocatedLandmark(t[k], stream.landmark[i], points[k], covariances[k]) for k, i in enumerate(rows)]

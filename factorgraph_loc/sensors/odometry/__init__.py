@@ -44,5 +44,5 @@ SENSOR = SensorType(
     },
     summarize="factorgraph_loc.sensors.odometry.summary:summarize",
     simulate="factorgraph_loc.sensors.odometry.simulation:simulate",
-    calibrator="factorgraph_loc.sensors.odometry.calibration.calibrator:CALIBRATOR",
+    calibrator="factorgraph_loc.sensors.odometry.calibrator:CALIBRATOR",
 )

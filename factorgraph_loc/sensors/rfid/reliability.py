@@ -15,13 +15,12 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.reliability import Reliability
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.interfaces import Use
-from factorgraph_loc.sensors.odometry.calibration.constants import REFERENCE_GAP
 from factorgraph_loc.sensors.rfid.consistency import BAND, DIFFERENT, FEWEST, ReadGroups
 from factorgraph_loc.sensors.rfid.monitor import BLOCK, POSSIBLE
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.rfid.tag_map import tag_map
-from factorgraph_loc.sensors.smoothed import possible_poses
+from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, possible_poses
 from factors.rfid.detection import ExpectedReads, RfidLikelihood
 from factors.se2 import Array, Integers, transform_from
 

@@ -26,7 +26,7 @@ from factorgraph_loc.maps.points import PointMap, read_points, write_points
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera.frontend import FEATURE_CODE, TRACK_CODE, code_version
-from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
+from factorgraph_loc.sensors.camera.measurement import FeatureStream, ImageStream
 from factorgraph_loc.simulation import film, preset, simulate, with_images
 from factorgraph_loc.simulation.filming import JPEG
 from factorgraph_loc.simulation.settings import SimulationSettings

@@ -13,8 +13,8 @@ import numpy as np
 
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.frontend import with_features
-from factorgraph_loc.sensors.camera.prepare import frontend_of
-from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
+from factorgraph_loc.sensors.camera.measurement import FeatureStream, ImageStream
+from factorgraph_loc.sensors.camera.use import frontend_of
 from factorgraph_loc.simulation.filming import JPEG
 
 EACH = 5  # images that are missing, truncated, or of another size

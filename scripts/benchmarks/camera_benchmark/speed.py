@@ -21,7 +21,7 @@ from factorgraph_loc.experiments.preparation import use_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.sensors.camera import frontend
-from factorgraph_loc.sensors.camera.prepare import prepare
+from factorgraph_loc.sensors.camera.use import prepare
 from factorgraph_loc.simulation import film, preset, simulate, with_images
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.feature_cache import VARIABLE

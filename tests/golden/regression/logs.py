@@ -21,8 +21,8 @@ from factorgraph_loc.maps.markers import Marker, corner_points
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.measurement import FeatureStream
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
-from factorgraph_loc.sensors.camera.stream import FeatureStream
 from factorgraph_loc.simulation import preset, simulate
 
 SECONDS = 12.0  # of a drive among landmarks

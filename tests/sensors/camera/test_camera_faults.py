@@ -9,8 +9,8 @@ from camera_world import CAMERA, simulate, weave, with_camera, with_frames, with
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.measurement import FeatureStream
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
-from factorgraph_loc.sensors.camera.stream import FeatureStream
 from factors import se2
 
 CONFIGS = {

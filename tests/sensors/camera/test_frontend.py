@@ -16,8 +16,8 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera import frontend
 from factorgraph_loc.sensors.camera.frontend import with_features
+from factorgraph_loc.sensors.camera.measurement import FeatureStream, ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.stream import FeatureStream, ImageStream
 from factorgraph_loc.vision.feature_cache import FeatureCache
 from factorgraph_loc.vision.features import EXTRACTORS, extractor
 from factorgraph_loc.vision.settings import FrontendSettings

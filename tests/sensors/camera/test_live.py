@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.sensors.camera.live import LiveFrontend
+from factorgraph_loc.sensors.camera.frontend import LiveFrontend
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.settings import FrontendSettings
 from factorgraph_loc.vision.tracks import follow

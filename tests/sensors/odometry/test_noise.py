@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.sensors.odometry.calibration.constants import cut, integrated
-from factorgraph_loc.sensors.odometry.calibration.noise import fit_noise
+from factorgraph_loc.sensors.odometry.calibration import cut, fit_noise, integrated
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import OdometrySettings
 from factors.odometry.chain import OdometryChain

@@ -16,7 +16,6 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import Settled
-from factorgraph_loc.sensors.odometry.calibration.constants import REFERENCE_GAP
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor
 from factorgraph_loc.sensors.rfid.calibration.learn import CALIBRATED, floor_of, written
 from factorgraph_loc.sensors.rfid.calibration.pairs import BLOCKS, TagPairs, modelled, pairs_of
@@ -24,7 +23,7 @@ from factorgraph_loc.sensors.rfid.calibration.refit import Refit, refit_beam, re
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, rounds_of
 from factorgraph_loc.sensors.rfid.calibration.tempering import bursts
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings
-from factorgraph_loc.sensors.smoothed import Corrections, Smoothed, pooled, possible_poses
+from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, Corrections, Smoothed, pooled, possible_poses
 from factorgraph_loc.text import quoted
 from factors.rfid.adjustment import MOST_CERTAIN, PARAMETERS, rate_of
 from factors.rfid.model import FEATURES, BeamModel, DetectionModel, GridModel, LogisticModel

@@ -16,9 +16,16 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import BLOCKS, ConstantsCalibrator, ConstantsFound, Settled, Told, Unit
 from factorgraph_loc.sensors.motion import odometry_model
-from factorgraph_loc.sensors.odometry.calibration import constants as odometry
-from factorgraph_loc.sensors.odometry.calibration.constants import Windows, cut, odometry_of
-from factorgraph_loc.sensors.odometry.calibration.noise import BLACKOUT, LENGTHS, NoiseFit, fit_noise
+from factorgraph_loc.sensors.odometry import calibration as odometry
+from factorgraph_loc.sensors.odometry.calibration import (
+    BLACKOUT,
+    LENGTHS,
+    NoiseFit,
+    Windows,
+    cut,
+    fit_noise,
+    odometry_of,
+)
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factors.odometry.model import OdometryModel
