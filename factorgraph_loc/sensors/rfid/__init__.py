@@ -7,7 +7,6 @@ __all__ = [
     "SENSOR",
     "calibration",
     "columns",
-    "forecast",
     "grids",
     "map",
     "measurement",
