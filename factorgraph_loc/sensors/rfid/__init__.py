@@ -7,6 +7,7 @@ __all__ = [
     "SENSOR",
     "calibration",
     "columns",
+    "forecast",
     "grids",
     "map",
     "measurement",
