@@ -2,6 +2,7 @@
 
 __all__ = [
     "bounded",
+    "cells",
     "checks",
     "column_mapping",
     "columns",

@@ -2,33 +2,23 @@
 
 CSV with any separator, with or without header, or JSON lines. The cells are read as text."""
 
-import csv
-import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import UTC, datetime
-from decimal import Decimal
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.columns import LATEST, Column, require_span
-from factorgraph_loc.files.models import FileModel, InUnit, nearest, parse_json, read_text
-from factorgraph_loc.files.tables import Cells
-from factorgraph_loc.text import listed, quoted, told, well_formed
-from factors.se2 import Array
+from factorgraph_loc.files.cells import Cells, csv_rows, rows_of_length
+from factorgraph_loc.files.models import FileModel, InUnit, inside, nearest, parse_json, read_text
+from factorgraph_loc.text import listed, quoted, well_formed
+from factors.se2 import Integers
 
 JSON_SUFFIXES = (".jsonl", ".ndjson", ".json")
 COMMENT = ("#", "//")
-SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten of a nanosecond
-ISO = "iso"
-MOST_DIGITS = 20  # of a timestamp before its decimal point
 
 EpcCase = Literal["as written", "upper", "lower"]
 Alternatives = tuple[str, ...]  # columns of which one must be there
@@ -81,87 +71,13 @@ class TimedMapping(ColumnMapping):
     """added to all timestamps"""
 
 
-@dataclass(frozen=True)
-class Mapped:
-    """N rows of a file by ``fields``; ``passed``: number of skipped JSON objects, which have none of the fields; ``left_out``:
-    columns of the file that are not mapped; ``unwanted``: number of other rows than those of ``where``."""
-
-    cells: Cells
-    mapping: ColumnMapping
-    fields: tuple[str, ...]
-    passed: int = 0
-    left_out: tuple[str, ...] = ()
-    unwanted: int = 0
-
-    @property
-    def path(self) -> Path:
-        return self.cells.path
-
-    @property
-    def rows(self) -> NDArray[np.int64]:
-        """Line numbers (N,) of the rows in the file."""
-        return np.array(self.cells.rows, dtype=np.int64)
-
-    def texts(self, field: str) -> Sequence[str]:
-        """The cells (N) of a field as text."""
-        return self.cells.columns[self.mapping.columns[field]]
-
-    def names(self, column: Column) -> list[str]:
-        """The names (N) in the field that ``column`` describes; InputError if one is missing."""
-        return self.cells.names(self.mapping.columns[column.name], column)
-
-    def invalid(self, field: str, i: int, expected: str) -> InputError:
-        """The error for cell ``i`` of a field."""
-        column = self.mapping.columns[field]
-        return bad_field(self.path, column, self.texts(field)[i], expected, row=self.cells.rows[i])
-
-    def numbers(self, field: str, column: Column) -> Array:
-        """The numbers (N,) in the field that ``column`` describes, in its unit; NaN if empty."""
-        name = self.mapping.columns[field]
-        cells = self.cells
-        if self.mapping.decimal == ",":
-            plain = [text.replace(",", ".") for text in cells.columns[name]]
-            cells = Cells(cells.path, cells.rows, {name: plain})
-        return cells.numbers(name, column, self.mapping.units.get(field, 1.0))
-
-    def stamps(self, field: str, offset: float = 0.0) -> NDArray[np.int64]:
-        """The timestamps (N,) of a field in nanoseconds, plus ``offset`` [s]. Times without a zone are UTC."""
-        unit = self.mapping.units.get(field)
-        if unit not in {*SECONDS, ISO}:
-            expected = f"one of {', '.join(SECONDS)} or {ISO}"
-            raise InputError(f"{self.path}: the unit of {field} is {quoted(unit)}, expected {expected}: units.{field}")
-        shift = round(offset * 1e9)
-        out = np.empty(len(self.cells.rows), dtype=np.int64)
-        for i, text in enumerate(self.texts(field)):
-            try:
-                stamp = iso_nanoseconds(text) if unit == ISO else self._decimal(text, SECONDS[str(unit)])
-                if abs(stamp + shift) > LATEST:
-                    raise OverflowError
-            except (ValueError, ArithmeticError):
-                most = LATEST / 10 ** SECONDS.get(str(unit), 0)
-                expected = f"a number of {unit} in {-most:g} to {most:g}"
-                if unit == ISO:
-                    expected = "a date and time, 2026-01-31T12:00:00.5Z"
-                raise self.invalid(field, i, expected) from None
-            out[i] = stamp + shift
-        require_span([(self.path, self.cells.rows, out)])
-        return out
-
-    def _decimal(self, text: str, power: int) -> int:
-        """A decimal number times ten to the ``power``, rounded, without floating-point errors."""
-        number = Decimal(text.replace(self.mapping.decimal, "."))
-        if not number.is_finite() or number.adjusted() > MOST_DIGITS:  # checked before the digits are expanded
-            raise OverflowError
-        return round(number.scaleb(power))
-
-
 def read_mapped(
     path: Path,
     mapping: ColumnMapping,
     shapes: Sequence[Collection[str]],
     optional: Collection[str] = (),
     either: Collection[str] = (),
-) -> Mapped:
+) -> Cells:
     """Read the rows of a file whose mapped fields are those of one of ``shapes``, and perhaps some of ``optional``.
 
     The column of an optional field may be missing, but not those of all mapped fields of ``either``. InputError names file, row and
@@ -183,16 +99,80 @@ def read_mapped(
         needed.append(tuple(mapping.columns[field] for field in either if field in given))
     read = _read_json_lines if path.suffix.lower() in JSON_SUFFIXES else _read_csv
     found = read(path, mapping, needed)
-    if not found.cells.rows:
+    if not len(found.rows):
         raise InputError(f"{path}: contains no rows{' as chosen by where' if mapping.where else ''}")
     return found
 
 
-def _mapped(cells: Cells, mapping: ColumnMapping, there: Iterable[str], unwanted: int, passed: int = 0) -> Mapped:
-    """The ``cells`` of a file with the columns ``there`` by fields."""
-    fields = tuple(field for field, column in mapping.columns.items() if column in cells.columns)
-    left_out = tuple(name for name in there if name not in cells.columns and name not in mapping.where)
-    return Mapped(cells, mapping, fields, passed, left_out, unwanted)
+def _mapped(
+    path: Path,
+    rows: Integers,
+    columns: Mapping[str, Sequence[str]],
+    mapping: ColumnMapping,
+    there: Iterable[str],
+    *,
+    unwanted: int,
+    passed: int = 0,
+) -> Cells:
+    """The cells by field of the ``columns`` of a file, which has the columns ``there``."""
+    fields = {field: columns[name] for field, name in mapping.columns.items() if name in columns}
+    read = {*mapping.columns.values(), *mapping.where}
+    left_out = tuple(name for name in there if name not in read)
+    labels, units = mapping.columns, mapping.units
+    return Cells(path, rows, fields, labels, units, mapping.decimal, left_out, passed, unwanted)
+
+
+class TableFolder:
+    """A folder of tables, with notes on what is not read of them.
+
+    ``warnings``: lines about the content of the tables. Several mappings may read one file. What one of them reads is
+    not left out.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.warnings: list[str] = []
+        self._read: dict[Path, list[tuple[Cells, ColumnMapping]]] = {}
+
+    def file(self, name: str) -> Path:
+        """The path of a file in the folder; InputError if it lies elsewhere."""
+        return inside(self.path, name, self.path)
+
+    def read(self, mapping: ColumnMapping, shapes: Sequence[Collection[str]]) -> Cells:
+        """Read the table of a mapping as :func:`read_mapped`, and note what is left out of it."""
+        return self.noted(read_mapped(self.file(mapping.file), mapping, shapes), mapping)
+
+    def noted(self, cells: Cells, mapping: ColumnMapping) -> Cells:
+        """Note what the ``cells`` leave out of their file, and return them."""
+        if cells.passed:
+            self.warnings.append(f"{cells.path}: {cells.passed} objects that lack mapped columns are skipped")
+        self._read.setdefault(cells.path, []).append((cells, mapping))
+        return cells
+
+    def left_out(self) -> list[str]:
+        """A line for each file with rows that no mapping chooses, and one for all files with the same columns that are not read."""
+        lines = []
+        columns: dict[tuple[str, ...], list[str]] = {}
+        for path, tables in self._read.items():
+            read: set[int] = set()
+            count = tables[0][0].unwanted + len(tables[0][0].rows)
+            others = count if all(cells.unwanted for cells, _ in tables) else 0
+            for rows in (cells.rows.tolist() for cells, _ in tables):
+                others -= sum(row not in read for row in rows)  # a line of JSON may hold several
+                read.update(rows)
+            if others > 0:
+                names = listed(dict.fromkeys(name for _, mapping in tables for name in mapping.where))
+                lines.append(
+                    f"{path.name}: {others} of {count + tables[0][0].passed} rows have another {names} than where says"
+                )
+            never = [set(cells.left_out) for cells, _ in tables]
+            names_of = tuple(name for name in tables[0][0].left_out if all(name in unread for unread in never))
+            columns.setdefault(names_of, []).append(path.name)
+        for unread, (first, *more) in columns.items():
+            if unread:
+                files = f"{first} and {len(more)} more files" if more else first
+                lines.append(f"{files}: columns that are not read: {listed(unread)}")
+        return lines
 
 
 def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
@@ -202,29 +182,17 @@ def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
     return [epc.upper() if case == "upper" else epc.lower() for epc in epcs]
 
 
-def iso_nanoseconds(text: str) -> int:
-    """An ISO 8601 date and time as nanoseconds since 1970; without a zone it is UTC. ValueError if the text is invalid."""
-    # datetime has microseconds only
-    fraction = re.search(r"[.,](\d+)", text)
-    whole = text.replace(fraction.group(0), "", 1) if fraction else text
-    moment = datetime.fromisoformat(whole.strip())
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=UTC)
-    digits = fraction.group(1) if fraction else ""
-    return int(moment.timestamp()) * 10**9 + int((digits + "0" * 9)[:9])
-
-
-def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Mapped:
+def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
     """The mapped cells of the chosen rows of a table."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = _split_comments(numbered)
     if not content:
         raise InputError(f"{path}: contains no rows")
-    parsed = _cells_of(path, content, mapping.separator)
+    parsed = _parsed(path, content, mapping.separator)
     body: Iterable[tuple[int, list[str]]]
     if mapping.header:
         first_row, first = next(parsed)
-        named = next(_cells_of(path, comments[-1:], mapping.separator), (0, []))[1]
+        named = next(_parsed(path, comments[-1:], mapping.separator), (0, []))[1]
         # a comment with as many names as there are columns is the header, unless the first row contains the names
         in_comment = _has(named, needed) or (len(named) == len(first) and not _has(first, needed))
         header = named if in_comment else first
@@ -237,18 +205,10 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
         header = _numbers(len(first))
     _require_columns(path, mapping, needed, header, first_row)
     chosen = _places(header, mapping.chosen())
-    rows, table, unwanted = [], [], 0
-    for row, parts in body:
-        if not _is_chosen(parts, chosen):
-            unwanted += 1
-            continue
-        if len(parts) != len(header):
-            raise bad_field(path, "row", ",".join(parts), f"{len(header)} values: {','.join(header)}", row=row)
-        rows.append(row)
-        table.append(parts)
-    places = _places(header, dict.fromkeys(mapping.columns.values()))
-    columns = {header[i]: [parts[i] for parts in table] for i in places}
-    return _mapped(Cells(path, rows, columns), mapping, header, unwanted)
+    every = list(body)
+    kept = [one for one in every if _is_chosen(one[1], chosen)]
+    rows, columns = rows_of_length(path, header, kept)
+    return _mapped(path, rows, columns, mapping, header, unwanted=len(every) - len(kept))
 
 
 def _numbers(count: int) -> list[str]:
@@ -274,16 +234,11 @@ def _split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, s
     return comments, content
 
 
-def _cells_of(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> Iterator[tuple[int, list[str]]]:
+def _parsed(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> Iterator[tuple[int, list[str]]]:
     if separator == " ":  # any number of blanks
-        yield from ((row, line.split()) for row, line in lines)
-        return
-    reader = csv.reader((line for _, line in lines), delimiter=separator, skipinitialspace=True, strict=True)
-    try:
-        for parts in reader:
-            yield lines[reader.line_num - 1][0], [part.strip() for part in parts]
-    except csv.Error as error:
-        raise InputError(f"{path}:{lines[reader.line_num - 1][0]}: is not CSV: {told(error)}") from error
+        return ((row, line.split()) for row, line in lines)
+    rows = csv_rows(path, lines, delimiter=separator, skipinitialspace=True)
+    return ((row, [part.strip() for part in parts]) for row, parts in rows)
 
 
 def _has(names: Collection[str], needed: Sequence[Alternatives]) -> bool:
@@ -303,7 +258,7 @@ def _require_columns(
             raise InputError(f"{path}:{row}: has the column {quoted(column)} more than once")
 
 
-def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Mapped:
+def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
     """The mapped cells of the chosen objects of JSON lines (one object or a list of them per line) that have all ``needed``
     columns."""
     rows: list[int] = []
@@ -333,8 +288,9 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Altern
     for alternatives in needed:
         if passed and not seen.intersection(alternatives):
             raise InputError(f"{path}: no object has {quoted(alternatives[0])}, the first has {listed(keys)}")
-    cells = Cells(path, rows, {column: values for column, values in columns.items() if column in seen})
-    return _mapped(cells, mapping, there, unwanted, passed)
+    found_columns = {column: values for column, values in columns.items() if column in seen}
+    numbers = np.array(rows, dtype=np.int64)
+    return _mapped(path, numbers, found_columns, mapping, there, unwanted=unwanted, passed=passed)
 
 
 def _text(value: Any) -> str:

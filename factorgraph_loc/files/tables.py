@@ -1,88 +1,37 @@
 """The tables of the native format: CSV with a header, or Parquet with the same columns."""
 
-import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import polars as pl
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.bounded import CELLS, DATA, foreign, limited_memory, quiet, read_bytes, require_size
-from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table
+from factorgraph_loc.files.cells import NAMES, NUMBERS, Cells, csv_rows, rows_of_length
+from factorgraph_loc.files.columns import Column, Table
 from factorgraph_loc.files.models import Model, nearest, parse_model, read_text, write_bytes, write_text
-from factorgraph_loc.text import told
 from factors.se2 import Array, Integers
 
 Shape = tuple[str, ...]  # the names of columns
-NUMBERS, NAMES = ("number", "whole"), ("name", "file")  # kinds of columns
 KINDS = {"stamp": pl.Int64, "whole": pl.Int64, "number": pl.Float64, "name": pl.String, "file": pl.String}
-
-
-@dataclass(frozen=True)
-class Cells:
-    """N rows of a CSV: ``rows``: N line numbers in ``path``; ``columns``: N cells by name."""
-
-    path: Path
-    rows: Sequence[int]
-    columns: Mapping[str, Sequence[str]]
-
-    def numbers(self, name: str, column: Column, unit: str | float = 1.0) -> Array:
-        """The numbers (N,) of a column, converted from ``unit`` to that of ``column``. An empty cell is NaN.
-
-        InputError at the first cell that is no number, not finite, or outside of the column's bounds.
-        """
-        cells = self.columns[name]
-        found: list[float] = []
-        try:
-            for cell in cells:
-                found.append(float(cell) if cell else math.nan)
-        except ValueError:
-            i = len(found)
-            raise bad_field(self.path, name, cells[i], "a number", row=self.rows[i]) from None
-        values = np.array(found, dtype=float)
-        if written := [i for i in np.flatnonzero(~np.isfinite(values)).tolist() if cells[i]]:
-            raise bad_field(self.path, name, cells[written[0]], "a finite number", row=self.rows[written[0]])
-        told, factor = column.in_unit(unit, self.path)
-        if not column.may_lack and "" in cells:
-            raise bad_field(self.path, name, "", told.expected, row=self.rows[list(cells).index("")])
-        told.require(self.path, self.rows, values, name)
-        return values if factor == 1.0 else values * factor
-
-    def names(self, name: str, column: Column) -> list[str]:
-        """The texts (N) of a column; InputError at the first that is empty."""
-        cells = self.columns[name]
-        if "" in cells:
-            raise bad_field(self.path, name, "", column.doc, row=self.rows[list(cells).index("")])
-        return list(cells)
 
 
 def read_cells(path: Path, shapes: Sequence[Shape]) -> tuple[Cells, Shape]:
     """The cells of a CSV, and the first of ``shapes`` whose columns it has. InputError names file and row of invalid content."""
-    rows: list[int] = []
-    cells: list[list[str]] = []
-    reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
-    try:
-        header = [name.strip() for name in next(reader, [])]
-        if not any(header):
-            raise InputError(f"{path}: is empty, expected a header {' or '.join(','.join(s) for s in shapes)}")
-        shape = shape_of(path, header, shapes)
-        for parts in reader:
-            if len(parts) <= 1 and not "".join(parts).strip():
-                continue
-            if len(parts) != len(header):
-                expected = f"{len(header)} values: {','.join(header)}"
-                raise bad_field(path, "row", ",".join(parts), expected, row=reader.line_num)
-            rows.append(reader.line_num)
-            cells.append(parts)
-    except csv.Error as error:
-        raise InputError(f"{path}:{reader.line_num}: is not CSV: {told(error)}") from error
-    columns = [[parts[i] for parts in cells] for i in range(len(header))]
-    return Cells(path, rows, dict(zip(header, columns, strict=True))), shape
+    lines = list(enumerate(io.StringIO(read_text(path), newline=""), start=1))
+    parsed = csv_rows(path, lines)
+    header = [name.strip() for name in next(parsed, (1, []))[1]]
+    if not any(header):
+        raise InputError(f"{path}: is empty, expected a header {' or '.join(','.join(s) for s in shapes)}")
+    shape = shape_of(path, header, shapes)
+    filled = ((row, parts) for row, parts in parsed if len(parts) > 1 or "".join(parts).strip())
+    rows, columns = rows_of_length(path, header, filled)
+    return Cells(path, rows, columns, left_out=tuple(name for name in header if name not in shape)), shape
 
 
 def shape_of(path: Path, header: Sequence[str], shapes: Sequence[Shape]) -> Shape:
@@ -104,19 +53,19 @@ def shape_of(path: Path, header: Sequence[str], shapes: Sequence[Shape]) -> Shap
 def rows_by_name(
     kind: type[Model],
     path: Path,
-    rows: Sequence[int],
+    rows: Integers,
     column: Column,
     names: Sequence[str],
     numbers: Mapping[str, Array],
 ) -> dict[str, Model]:
     """The N rows of a table as models of ``kind`` by their ``names`` in ``column``.
 
-    ``rows``: N line numbers in ``path``; ``numbers``: values (N,) by field, NaN for the default of the field. InputError names file
-    and row of an empty or repeated name, and of an invalid value.
+    ``rows`` (N,): line numbers in ``path``; ``numbers``: values (N,) by field, NaN for the default of the field. InputError names
+    file and row of an empty or repeated name, and of an invalid value.
     """
     found: dict[str, Model] = {}
     seen: dict[str, int] = {}
-    for i, (row, name) in enumerate(zip(rows, names, strict=True)):
+    for i, (row, name) in enumerate(zip(rows.tolist(), names, strict=True)):
         if not name or name in seen:
             expected = f"another name than in row {seen[name]}" if name else column.doc
             raise bad_field(path, column.name, name, expected, row=row)
@@ -168,6 +117,14 @@ class TableRows:
     names: dict[str, list[str]]
     left_out: tuple[str, ...] = ()
 
+    @classmethod
+    def of(cls, cells: Cells, columns: Iterable[Column], t_ns: Integers) -> Self:
+        """The rows with these timestamps and the cells of ``columns``. InputError at an invalid cell."""
+        told = list(columns)
+        numbers = {column.name: cells.numbers(column.name, column) for column in told if column.kind in NUMBERS}
+        names = {column.name: cells.names(column.name, column) for column in told if column.kind in NAMES}
+        return cls(cells.path, cells.rows, t_ns, numbers, names, cells.left_out)
+
     def rows_at(self, which: Integers) -> Self:
         """The rows with indices ``which`` (M,), in that order."""
         return type(self)(
@@ -186,9 +143,33 @@ def read_table(path: Path, tables: Sequence[Table]) -> TableRows:
     """
     shapes = [shape for table in tables for shape in table.shapes]
     columns = {column.name: column for table in tables for column in table.columns}
-    read = _read_parquet if path.suffix == ".parquet" else _read_csv
     with limited_memory(path, path.stat().st_size if path.is_file() else 0):
-        return read(path, columns, shapes)
+        if path.suffix == ".parquet":
+            cells, shape = _cells_of_parquet(path, columns, shapes)
+        else:
+            cells, shape = read_cells(path, shapes)
+        return TableRows.of(cells, (columns[name] for name in shape), cells.nanoseconds())
+
+
+def _cells_of_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> tuple[Cells, Shape]:
+    """The cells of a Parquet file, and the one of ``shapes`` whose columns it has."""
+    frame = read_parquet(path)
+    shape = shape_of(path, frame.columns, shapes)
+    found: dict[str, Any] = {}
+    for name in shape:
+        kind = frame[name].dtype
+        if columns[name].kind in NAMES:
+            found[name] = text_column(frame, name, path)
+        elif columns[name].kind in NUMBERS:
+            if not kind.is_numeric() and kind != pl.Null:
+                raise InputError(f"{path}: {name} is of type {kind}, expected numbers")
+            found[name] = frame[name].cast(pl.Float64).to_numpy().copy()
+        elif not kind.is_integer():
+            raise InputError(f"{path}: {name} is of type {kind}, expected integers, nanoseconds")
+        else:
+            found[name] = frame[name].to_list()
+    rows = np.arange(1, frame.height + 1, dtype=np.int64)
+    return Cells(path, rows, found, left_out=tuple(name for name in frame.columns if name not in shape)), shape
 
 
 def write_parquet(frame: pl.DataFrame, path: Path) -> None:
@@ -208,61 +189,3 @@ def write_table(path: Path, tables: Sequence[Table], columns: Mapping[str, Array
         write_parquet(frame, path)
     else:
         write_text(path, frame.write_csv())
-
-
-def _read_csv(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> TableRows:
-    cells, shape = read_cells(path, shapes)
-    told = [columns[name] for name in shape]
-    return TableRows(
-        path,
-        np.array(cells.rows, dtype=np.int64),
-        _stamps(path, cells.rows, cells.columns[STAMP.name]),
-        {c.name: cells.numbers(c.name, c) for c in told if c.kind in NUMBERS},
-        {c.name: cells.names(c.name, c) for c in told if c.kind in NAMES},
-        tuple(name for name in cells.columns if name not in shape),
-    )
-
-
-def _stamps(path: Path, rows: Sequence[int], cells: Sequence[str]) -> Integers:
-    stamps: list[int] = []
-    try:
-        for cell in cells:
-            if abs(stamp := int(cell)) > LATEST:
-                raise OverflowError
-            stamps.append(stamp)
-    except (ValueError, OverflowError):
-        i = len(stamps)
-        raise bad_field(path, STAMP.name, cells[i], STAMP.expected, row=rows[i]) from None
-    return np.array(stamps, dtype=np.int64)
-
-
-def _read_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> TableRows:
-    frame = read_parquet(path)
-    shape = shape_of(path, frame.columns, shapes)
-    rows = np.arange(1, frame.height + 1, dtype=np.int64)
-    if not frame[STAMP.name].dtype.is_integer():
-        raise InputError(f"{path}: {STAMP.name} is of type {frame[STAMP.name].dtype}, expected integers, nanoseconds")
-    stamps = frame[STAMP.name].cast(pl.Int64, strict=False)
-    if missing := np.flatnonzero(stamps.is_null().to_numpy()).tolist():
-        raise bad_field(
-            path, STAMP.name, frame[STAMP.name][missing[0]], "a whole number of nanoseconds", row=missing[0] + 1
-        )
-    t_ns = stamps.to_numpy().copy()
-    STAMP.require(path, rows, t_ns)
-    numbers = {}
-    for name in shape:
-        if columns[name].kind not in NUMBERS:
-            continue
-        column = frame[name]
-        if not column.dtype.is_numeric() and column.dtype != pl.Null:
-            raise InputError(f"{path}: {name} is of type {column.dtype}, expected numbers")
-        infinite = np.flatnonzero(~column.cast(pl.Float64).is_finite().fill_null(True).to_numpy())
-        if len(infinite):
-            i = int(infinite[0])
-            raise bad_field(path, name, column[i], "a finite number, or nothing", row=i + 1)
-        numbers[name] = column.cast(pl.Float64).to_numpy().copy()
-        columns[name].require(path, rows, numbers[name])
-    texts = [columns[name] for name in shape if columns[name].kind in NAMES]
-    cells = Cells(path, rows.tolist(), {c.name: text_column(frame, c.name, path) for c in texts})
-    names = {c.name: cells.names(c.name, c) for c in texts}
-    return TableRows(path, rows, t_ns, numbers, names, tuple(name for name in frame.columns if name not in shape))

@@ -7,8 +7,10 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 from factorgraph_loc.sensors.odometry.settings import DifferentialDrive, OdometrySettings
 from factors import se2
 from factors.se2 import Array, Integers
@@ -92,6 +94,12 @@ def velocities_of_wheels(speeds: Array, track: float) -> Array:
     """Speed and turn rate (N, 2) of a differential drive from the speeds (N, 2) of its left and right wheel; or so for ways."""
     left, right = speeds.T
     return np.column_stack(((left + right) / 2.0, (right - left) / track))
+
+
+def odometry_stream(t_ns: Integers, values: Array, t0_ns: int) -> IncrementStream | VelocityStream:
+    """The stream of velocities (N, 2), or of increments (N, 3), at N timestamps [ns]."""
+    t = checks.seconds(t_ns, t0_ns)
+    return IncrementStream(t, *values.T) if values.shape[1] == 3 else VelocityStream(t, *np.ascontiguousarray(values.T))
 
 
 def _unwound(ways: Array, scale: float) -> Array:

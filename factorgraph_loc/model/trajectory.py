@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.columns import LATEST, POSES
-from factorgraph_loc.files.models import read_text, write_text
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.models import write_text
 from factorgraph_loc.model.pose_path import PosePath
 from factors import se2
 from factors.se2 import Array, Integers
@@ -224,37 +223,6 @@ def averaged(covariances: Array, before: Integers, after: Integers, fraction: Ar
     return np.asarray((1.0 - weight) * covariances[before] + weight * covariances[after])
 
 
-def read_tum_rows(path: Path) -> tuple[Integers, Integers, Array]:
-    """The rows of a TUM file in any order: line numbers (N,), timestamps (N,) in nanoseconds, and (N, 7) x, y, z [m] and the
-    quaternion x, y, z, w."""
-    rows: list[int] = []
-    stamps: list[int] = []
-    values: list[list[float]] = []
-    lines = read_text(path).split("\n")
-    for row, line in enumerate(lines, start=1):
-        parts = line.split()
-        if not parts or parts[0].startswith("#"):
-            continue
-        if len(parts) != 8:
-            raise bad_field(path, "row", line.strip(), "8 values: t x y z qx qy qz qw", row=row)
-        try:
-            stamps.append(nanoseconds(parts[0]))
-            values.append([float(p) for p in parts[1:]])
-        except (ValueError, OverflowError):
-            raise bad_field(path, "row", line.strip(), "8 finite numbers", row=row) from None
-        rows.append(row)
-    if not rows:
-        raise InputError(f"{path}: contains no poses, expected at least one row")
-    table = np.array(values)
-    bad = np.flatnonzero(~np.all(np.isfinite(table), axis=1))
-    if len(bad):
-        raise bad_field(path, "row", lines[rows[bad[0]] - 1].strip(), "8 finite numbers", row=rows[bad[0]])
-    numbers = np.array(rows, dtype=np.int64)
-    for column, found in zip(POSES.columns[1:8], table.T, strict=True):
-        column.require(path, numbers, found)
-    return numbers, np.array(stamps, dtype=np.int64), table
-
-
 def write_tum(trajectory: Exchange, path: str | Path, t0_ns: int = 0) -> None:
     """Write a TUM file with absolute timestamps in decimal seconds."""
     rows = [f"{decimal_seconds(t, t0_ns)} {row}\n" for t, row in zip(trajectory.t, trajectory._tum(), strict=True)]
@@ -266,16 +234,3 @@ def decimal_seconds(t: float, t0_ns: int) -> str:
     t_ns = t0_ns + round(t * 1e9)
     sign, (whole, fraction) = "-" if t_ns < 0 else "", divmod(abs(t_ns), 10**9)
     return f"{sign}{whole}.{fraction:09d}"
-
-
-def nanoseconds(stamp: str) -> int:
-    """A timestamp in decimal seconds as nanoseconds, exact for absolute times."""
-    whole, _, fraction = stamp.partition(".")
-    if whole.lstrip("+-").isdigit() and (fraction == "" or fraction.isdigit()):
-        ns = int((fraction + "000000000")[:9])
-        total = int(whole) * 10**9 + (-ns if whole.startswith("-") else ns)
-    else:
-        total = round(float(stamp) * 1e9)
-    if abs(total) > LATEST:
-        raise OverflowError(f"{stamp} s is beyond 64 bits of nanoseconds")
-    return total

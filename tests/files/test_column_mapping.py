@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.column_mapping import SECONDS, ColumnMapping, Mapped, iso_nanoseconds, read_mapped
+from factorgraph_loc.files.cells import SECONDS, Cells, iso_nanoseconds
+from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
 from factorgraph_loc.files.columns import POSES
-from factorgraph_loc.files.tables import Cells
 from factorgraph_loc.sensors.rfid.columns import TAGS
 
 STAMPS = st.integers(-(2**61), 2**61)
@@ -20,8 +20,8 @@ STAMPS = st.integers(-(2**61), 2**61)
 
 def mapped(texts, **more):
     """A column ``c`` that is mapped to ``t``."""
-    mapping = ColumnMapping(file="a.csv", columns={"t": "c"}, **more)
-    return Mapped(Cells(Path("a.csv"), range(2, len(texts) + 2), {"c": texts}), mapping, ("t",))
+    rows = np.arange(2, len(texts) + 2)
+    return Cells(Path("a.csv"), rows, {"t": texts}, {"t": "c"}, **more)
 
 
 @given(stamps=st.lists(STAMPS, min_size=1, max_size=5), unit=st.sampled_from(list(SECONDS)), mark=st.sampled_from(".,"))
@@ -91,7 +91,7 @@ def test_columns_by_number_and_by_factor(read):
 
 def test_optional_columns_may_be_missing(read):
     found = read("x\n1\n", columns={"a": "x", "b": "y"}, optional=("b",))
-    assert found.fields == ("a",)
+    assert list(found.columns) == ["a"]
 
 
 @pytest.mark.parametrize("where", [{"kind": "tag"}, {"kind": ("tag", "none"), "n": (1, 2)}, {"ok": True}])

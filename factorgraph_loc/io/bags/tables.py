@@ -10,10 +10,11 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files.cells import NAMES, NUMBERS
 from factorgraph_loc.files.column_mapping import ReadNames, in_case
 from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table
 from factorgraph_loc.files.models import InUnit
-from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
+from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.io.bags.fields import LIST, Fields, TopicSettings, as_nanoseconds, as_number, as_text
 from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
 from factorgraph_loc.model.measurement import Stream

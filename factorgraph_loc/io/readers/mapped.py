@@ -10,22 +10,16 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.column_mapping import ColumnMapping, Mapped, TimedMapping, read_mapped
+from factorgraph_loc.files.column_mapping import ColumnMapping, TableFolder, TimedMapping, read_mapped
 from factorgraph_loc.files.columns import ANGLE, STAMPS, Table, named
 from factorgraph_loc.files.models import FileModel, add_fields
-from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
+from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.io.motions import odometry_stream
 from factorgraph_loc.io.native import native
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.io.native.world_file import parse_world
-from factorgraph_loc.io.readers.mapped_poses import (
-    OdometryFile,
-    ReferenceFile,
-    odometry_stream,
-    read_odometry,
-    read_reference,
-)
+from factorgraph_loc.io.readers.mapped_poses import OdometryFile, ReferenceFile, read_odometry, read_reference
 from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_reads
-from factorgraph_loc.io.readers.table_folder import TableFolder
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Turned, about_z
@@ -143,19 +137,19 @@ def _table(folder: TableFolder, tables: Sequence[Table], mapping: TimedMapping) 
     columns = {column.name: column for table in tables for column in table.columns}
     if isinstance(mapping, ImuFile):
         shapes, columns = (*shapes, ("t", *RATES)), columns | {name: replace(RATE, name=name) for name in RATES}
-    mapped = folder.read(mapping, shapes)
-    known = [columns[name] for name in mapped.fields if name != "t"]
-    names = {column.name: mapped.names(column) for column in known if column.kind in NAMES}
-    unknown = {name: np.full(len(mapped.rows), np.nan) for name, column in columns.items() if column.may_lack}
-    numbers = unknown | {column.name: mapped.numbers(column.name, column) for column in known if column.kind in NUMBERS}
+    cells = folder.read(mapping, shapes)
+    known = [columns[name] for name in cells.columns if name != "t"]
+    rows = TableRows.of(cells, known, cells.stamps("t", mapping.clock_offset))
+    unknown = {name: np.full(len(rows.rows), np.nan) for name, column in columns.items() if column.may_lack}
+    numbers = unknown | rows.numbers
     for column in known:
         if column.units is STAMPS:  # another time, by the same clock
             numbers[column.name] = numbers[column.name] + 1e9 * mapping.clock_offset
         if column.units is ANGLE:
             numbers[column.name] = se2.wrap(numbers[column.name])  # others count from 0 to 2 pi
     if isinstance(mapping, ImuFile):
-        numbers = {"w": _about_z(mapped, mapping, numbers)}
-    rows = TableRows(mapped.path, mapped.rows, mapped.stamps("t", mapping.clock_offset), numbers, names)
+        numbers = {"w": _about_z(rows, mapping, numbers)}
+    rows = replace(rows, numbers=numbers)
     if isinstance(mapping, NamedFile) and mapping.names is not None:
         return _in_map(rows, folder, mapping.names)
     return rows
@@ -180,7 +174,8 @@ def _names(path: Path, naming: NamesFile) -> dict[str, str]:
     """The names in the map by those in the table of a sensor; InputError if one occurs twice."""
     mapped = read_mapped(path, naming, (("file_name", "name"),))
     known: dict[str, str] = {}
-    for i, (name, meaning) in enumerate(zip(mapped.names(FILE_NAME), mapped.names(MAP_NAME), strict=True)):
+    pairs = zip(mapped.names("file_name", FILE_NAME), mapped.names("name", MAP_NAME), strict=True)
+    for i, (name, meaning) in enumerate(pairs):
         if name in known:
             raise mapped.invalid("file_name", i, "each name once")
         known[name] = meaning
@@ -195,13 +190,11 @@ def _shapes(table: Table) -> tuple[tuple[str, ...], ...]:
     return tuple((*needed, *names) for names in some) or (needed,)
 
 
-def _about_z(mapped: Mapped, mapping: ImuFile, numbers: dict[str, Array]) -> Array:
+def _about_z(rows: TableRows, mapping: ImuFile, numbers: dict[str, Array]) -> Array:
     if "w" not in numbers:
-        return about_z(mapped.path, mapped.rows, np.column_stack([numbers[n] for n in RATES]), mapping.turned())
+        return about_z(rows.path, rows.rows, np.column_stack([numbers[n] for n in RATES]), mapping.turned())
     if mapping.is_given():
-        raise InputError(
-            f"{mapped.path}: axes and mounting apply to rates about three axes, expected columns wx, wy, wz"
-        )
+        raise InputError(f"{rows.path}: axes and mounting apply to rates about three axes, expected columns wx, wy, wz")
     return numbers["w"]
 
 

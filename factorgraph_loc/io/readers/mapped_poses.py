@@ -8,15 +8,14 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError, require
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.column_mapping import Mapped, TimedMapping
+from factorgraph_loc.files.cells import Cells
+from factorgraph_loc.files.column_mapping import TableFolder, TimedMapping
 from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.motions import TURNS, WHEELS
 from factorgraph_loc.io.readers.pose_file import read_kitti, read_pose_file
-from factorgraph_loc.io.readers.table_folder import TableFolder
 from factorgraph_loc.model.planar import Turned, on_floor, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 from factorgraph_loc.sensors.odometry.tables import INCREMENTS, VELOCITIES, WAYS
 from factorgraph_loc.sensors.odometry.tables import WHEELS as WHEEL_COLUMNS
 from factors import se2
@@ -72,7 +71,7 @@ def read_odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers,
         t_ns, poses = _in_format(folder, options)
         return t_ns, motions.after_rest(motions.between_poses(path, t_ns, poses, warnings))
     mapped = folder.read(options, ODOMETRY)
-    side = next((name for name in WHEELS if name in mapped.fields), None)
+    side = next((name for name in WHEELS if name in mapped.columns), None)
     if side is None and (options.track is not None or options.radius is not None):
         raise InputError(f"{path}: track and radius are for columns of wheels, such as left and right")
     size, track = options.sizes(path, side, turns=side in TURNS) if side else (1.0, 0.0)
@@ -98,12 +97,6 @@ def read_odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers,
     return t_ns, motions.after_rest(moves)
 
 
-def odometry_stream(t_ns: Integers, values: Array, t0_ns: int) -> IncrementStream | VelocityStream:
-    """The stream of what :func:`read_odometry` returns."""
-    t = checks.seconds(t_ns, t0_ns)
-    return IncrementStream(t, *values.T) if values.shape[1] == 3 else VelocityStream(t, *values.T)
-
-
 def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> Trajectory:
     """The reference in seconds after ``t0_ns``; InputError names file and row of an invalid value."""
     path, warnings = folder.file(options.file), folder.warnings
@@ -111,7 +104,7 @@ def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> T
         t_ns, poses = _in_format(folder, options)
         return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=options.has_heading)
     mapped = folder.read(options, (*POSES, ("t", "x", "y")))
-    if "heading" not in mapped.fields and "qw" not in mapped.fields and options.has_heading:
+    if "heading" not in mapped.columns and "qw" not in mapped.columns and options.has_heading:
         raise InputError(f"{path}: columns maps no heading: set has_heading = false if there is none")
     t_ns, columns = _columns(mapped, options.clock_offset)
     poses = _planar(path, mapped.rows, columns, options, warnings)
@@ -138,8 +131,8 @@ def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array
     return found.t_ns + round(options.clock_offset * 1e9), found.on_floor(folder.warnings, turned)
 
 
-def _columns(mapped: Mapped, offset: float) -> tuple[Integers, dict[str, Array]]:
-    return mapped.stamps("t", offset), {n: mapped.numbers(n, COLUMNS[n]) for n in mapped.fields if n != "t"}
+def _columns(mapped: Cells, offset: float) -> tuple[Integers, dict[str, Array]]:
+    return mapped.stamps("t", offset), {n: mapped.numbers(n, COLUMNS[n]) for n in mapped.columns if n != "t"}
 
 
 def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turned, warnings: list[str]) -> Array:

@@ -13,19 +13,19 @@ from pydantic import Field, model_validator
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import bounded
+from factorgraph_loc.files.cells import Cells
 from factorgraph_loc.files.column_mapping import (
     ColumnMapping,
     EpcCase,
-    Mapped,
     ReadNames,
+    TableFolder,
     TimedMapping,
     in_case,
     read_mapped,
 )
 from factorgraph_loc.files.columns import PURE, Column
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.files.tables import Cells, TableRows
-from factorgraph_loc.io.readers.table_folder import TableFolder
+from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.sensors.rfid.columns import RFID
 from factorgraph_loc.sensors.rfid.tables import SIGNALS, check_reads
 from factorgraph_loc.text import listed, quoted
@@ -91,7 +91,7 @@ PRESETS: dict[str, dict[str, dict[str, str]]] = {
 }
 
 
-def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Mapped:
+def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
     """The reads of a table whose columns of strengths are a pattern, ``rssi_*``, with a row for each cell that is not empty.
 
     What ``*`` stands for in a column's name is its antenna, or its tag if ``columns`` maps the antenna or ``antenna``, the only
@@ -112,18 +112,15 @@ def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Mapped
     strengths = {f"{NAME}{column}": column for column in names}
     told = mapping.model_copy(update={"columns": fixed | strengths, "units": units})
     wide = read_mapped(path, told, (tuple(fixed),), tuple(strengths))
-    cells = wide.cells.columns
-    reads = [(i, column) for i in range(len(wide.rows)) for column in names if cells[column][i]]
+    reads = [(i, name) for i in range(len(wide.rows)) for name in strengths if wide.columns[name][i]]
     if not reads:
         raise InputError(f"{path}: contains no reads: all cells of {quoted(pattern)} are empty")
-    columns = {column: [cells[column][i] for i, _ in reads] for column in fixed.values()}
-    columns[pattern] = [cells[column][i] for i, column in reads]
-    columns[NAME + pattern] = [names[column] for _, column in reads]
-    of_reads = mapping.model_copy(update={"columns": mapping.columns | {missing: NAME + pattern}})
-    rows = [wide.cells.rows[i] for i, _ in reads]
-    return Mapped(
-        Cells(path, rows, columns), of_reads, tuple(of_reads.columns), wide.passed, wide.left_out, wide.unwanted
-    )
+    columns = {field: [wide.columns[field][i] for i, _ in reads] for field in fixed}
+    columns["rssi"] = [wide.columns[name][i] for i, name in reads]
+    columns[missing] = [names[strengths[name]] for _, name in reads]
+    labels = {**fixed, "rssi": pattern, missing: NAME + pattern}
+    rows = wide.rows[[i for i, _ in reads]]
+    return replace(wide, rows=rows, columns=columns, labels=labels, units=mapping.units)
 
 
 class Channels(FileModel):
@@ -207,13 +204,12 @@ def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
     if {"channel", "frequency"} <= set(options.columns):
         raise InputError(f"{path}: columns maps frequency and channel, expected one of them")
     shapes = REQUIRED[0] if options.antenna is None else REQUIRED[1]
-    mapped = folder.noted(
-        read_wide(path, options, options.antenna) if wide else read_mapped(path, options, shapes, OPTIONAL, EPCS)
-    )
+    cells = read_wide(path, options, options.antenna) if wide else read_mapped(path, options, shapes, OPTIONAL, EPCS)
+    mapped = folder.noted(cells, options)
     t_ns = mapped.stamps("t", options.clock_offset)
-    antennas = [options.antenna] * len(t_ns) if options.antenna else mapped.names(RFID["antenna"])
+    antennas = [options.antenna] * len(t_ns) if options.antenna else mapped.names("antenna", RFID["antenna"])
     numbers = {name: _signal(mapped, name) for name in SIGNALS}
-    if "channel" in mapped.fields:
+    if "channel" in mapped.columns:
         numbers["frequency"] = _frequencies(mapped, options.channels)
     table = TableRows(
         path,
@@ -226,24 +222,24 @@ def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
     return joined(path, [_with_last(table, mapped, options, folder.warnings)])
 
 
-def _signal(mapped: Mapped, name: str) -> Array:
-    return mapped.numbers(name, RFID[name]) if name in mapped.fields else np.full(len(mapped.rows), np.nan)
+def _signal(mapped: Cells, name: str) -> Array:
+    return mapped.numbers(name, RFID[name]) if name in mapped.columns else np.full(len(mapped.rows), np.nan)
 
 
-def _epcs(mapped: Mapped, case: EpcCase) -> list[str]:
+def _epcs(mapped: Cells, case: EpcCase) -> list[str]:
     """EPCs in the notation of the map: hexadecimal, without the Python bytes marks of some sllurp versions."""
-    texts = list(mapped.texts("epc")) if "epc" in mapped.fields else [""] * len(mapped.rows)
-    if "epc_base64" in mapped.fields:
+    texts = mapped.texts("epc") if "epc" in mapped.columns else [""] * len(mapped.rows)
+    if "epc_base64" in mapped.columns:
         coded = mapped.texts("epc_base64")
         texts = [text or _from_base64(mapped, i, coded[i]) for i, text in enumerate(texts)]
     if "" in texts:
-        field = "epc" if "epc" in mapped.fields else "epc_base64"
+        field = "epc" if "epc" in mapped.columns else "epc_base64"
         raise mapped.invalid(field, texts.index(""), RFID["epc"].doc)
     plain = [text[2:-1] if text.startswith("b'") and text.endswith("'") else text for text in texts]
     return in_case(plain, case)
 
 
-def _from_base64(mapped: Mapped, i: int, text: str) -> str:
+def _from_base64(mapped: Cells, i: int, text: str) -> str:
     """The EPC in row ``i`` in hexadecimal, in upper case as Impinj's readers write it."""
     try:
         return base64.b64decode(text.translate(STANDARD) + "=" * (-len(text) % 4), validate=True).hex().upper()
@@ -251,7 +247,7 @@ def _from_base64(mapped: Mapped, i: int, text: str) -> str:
         raise mapped.invalid("epc_base64", i, "an EPC in base64") from None
 
 
-def _frequencies(mapped: Mapped, channels: tuple[float, ...] | Channels | None) -> Array:
+def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -> Array:
     """The frequencies (N,) [Hz] of channels, which are numbered from 1."""
     number = mapped.numbers("channel", CHANNEL)
     last = len(channels) if isinstance(channels, tuple) else 1000
@@ -265,10 +261,10 @@ def _frequencies(mapped: Mapped, channels: tuple[float, ...] | Channels | None) 
     return np.asarray(table[np.where(np.isnan(number), len(table), number).astype(np.int64) - 1])
 
 
-def _with_last(table: TableRows, mapped: Mapped, options: RfidFile, warnings: list[str]) -> TableRows:
+def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: list[str]) -> TableRows:
     """Add a second read, of which only the time is known, for each row that summarizes several."""
-    if "last" not in mapped.fields:
-        if "count" in mapped.fields and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):
+    if "last" not in mapped.columns:
+        if "count" in mapped.columns and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):
             warnings.append(
                 f"{table.path}: {many} rows summarize several reads with one timestamp, which count as one read each"
             )
@@ -278,7 +274,7 @@ def _with_last(table: TableRows, mapped: Mapped, options: RfidFile, warnings: li
     if len(wrong):
         raise mapped.invalid("last", int(wrong[0]), "a time not before the first")
     several = last_ns > table.t_ns
-    if "count" in mapped.fields:
+    if "count" in mapped.columns:
         count = np.nan_to_num(mapped.numbers("count", COUNT), nan=1.0)
         several &= count > 1.0
         if more := int(np.sum(np.maximum(count - np.where(several, 2.0, 1.0), 0.0))):

@@ -3,6 +3,7 @@
 Poses are quaternions in TUM and EuRoC files, and 3x4 matrices in KITTI files.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -11,12 +12,12 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field, require
 from factorgraph_loc.files import checks
+from factorgraph_loc.files.cells import Cells
 from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
 from factorgraph_loc.files.columns import POSES, PURE, within
 from factorgraph_loc.files.models import FARTHEST, read_text
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.pose_path import PosePath
-from factorgraph_loc.model.trajectory import read_tum_rows
 from factors.camera import model as reprojection
 from factors.se2 import Array, Integers
 
@@ -27,9 +28,12 @@ ENTRY = within("entry", PURE, FARTHEST, "of the matrix of a pose")
 EUROC = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 TUM = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 Format = Literal["tum", "kitti", "euroc"]
-EXPECTED = (
-    "8 values (TUM: t x y z qx qy qz qw), 12 (KITTI), or 8 or more with commas (EuRoC: t, x, y, z, qw, qx, qy, qz)"
-)
+FORMATS: dict[Format, str] = {
+    "tum": "8 values (TUM: t x y z qx qy qz qw)",
+    "kitti": "12 (KITTI)",
+    "euroc": "8 or more with commas (EuRoC: t, x, y, z, qw, qx, qy, qz)",
+}
+EXPECTED = "{tum}, {kitti}, or {euroc}".format(**FORMATS)
 
 
 def read_kitti(path: Path, times: Path) -> PosePath:
@@ -39,67 +43,60 @@ def read_kitti(path: Path, times: Path) -> PosePath:
     ready for autonomous driving?", CVPR 2012). They are converted to x forward and z up. InputError names file and row.
     """
     matrices = read_matrices(path)
-    t_ns = stamps_of(path, len(matrices), times)
+    t_ns = read_times(times)
+    if len(t_ns) < len(matrices):
+        expected = f"at least {len(matrices)}, one for each pose of {path.name}"
+        raise bad_field(times, "number of rows", len(t_ns), expected)
     u, _, vt = np.linalg.svd(matrices[:, :, :3])
     ahead = reprojection.FORWARD
-    return PosePath(str(path), matrices[:, :, 3] @ ahead.T, ahead @ (u @ vt) @ ahead.T, t_ns)
-
-
-def stamps_of(path: Path, count: int, times: Path) -> Integers:
-    """The timestamps (N,) [ns] of the ``count`` poses of ``path``, the first lines of ``times``; InputError if it has fewer."""
-    stamps = read_times(times)
-    if len(stamps) < count:
-        raise bad_field(times, "number of rows", len(stamps), f"at least {count}, one for each pose of {path.name}")
-    return stamps[:count]
+    return PosePath(str(path), matrices[:, :, 3] @ ahead.T, ahead @ (u @ vt) @ ahead.T, t_ns[: len(matrices)])
 
 
 def read_matrices(path: Path) -> Array:
     """The poses (N, 3, 4), rotation and position, of a file in KITTI's format, as they are written. InputError names file and
     row."""
-    columns = {field: str(i) for i, field in enumerate(MATRIX, start=1)}
-    mapping = ColumnMapping(file=path.name, columns=columns, separator=" ", header=False)
-    mapped = read_mapped(path, mapping, (MATRIX,))
-    matrices = np.column_stack([mapped.numbers(field, ENTRY) for field in MATRIX]).reshape(-1, 3, 4)
+    cells = _read(path, MATRIX, " ")
+    matrices = np.column_stack([cells.numbers(field, ENTRY) for field in MATRIX]).reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
     off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
     valid = ~((off > ORTHONORMAL) | (np.linalg.det(rotations) < 0.0))
-    require(valid, path, mapped.rows, "rotation", rotations, "an orthonormal matrix")
+    require(valid, path, cells.rows, "rotation", rotations, "an orthonormal matrix")
     return matrices
 
 
 def read_times(path: Path) -> Integers:
     """The timestamps (N,) [ns] of a file with one per line, in seconds; InputError if they do not increase."""
-    columns = ColumnMapping(file=path.name, columns={"t": "1"}, units={"t": "s"}, separator=" ", header=False)
-    mapped = read_mapped(path, columns, (("t",),))
-    t_ns = mapped.stamps("t")
-    require(np.diff(t_ns) > 0, path, mapped.rows[1:], "time", t_ns[1:], "nanoseconds after those of the row before")
+    cells = _read(path, ("t",), " ", "s")
+    t_ns = cells.stamps("t")
+    require(np.diff(t_ns) > 0, path, cells.rows[1:], "time", t_ns[1:], "nanoseconds after those of the row before")
     return t_ns
 
 
-def read_euroc_rows(path: Path) -> tuple[Integers, Integers, Array]:
-    """The rows of a EuRoC file in any order, as :func:`~factorgraph_loc.model.trajectory.read_tum_rows`."""
-    named = {name: str(i) for i, name in enumerate(EUROC, start=1)}
-    mapping = ColumnMapping(file=path.name, columns=named, units={"t": "ns"}, separator=",", header=False)
-    mapped = read_mapped(path, mapping, (EUROC,))
-    table = np.column_stack([mapped.numbers(name, POSES[name]) for name in TUM[1:]])
-    return mapped.rows, mapped.stamps("t"), table
+def _read(path: Path, columns: Sequence[str], separator: Literal[" ", ","], unit: str | None = None) -> Cells:
+    """The cells of a file without header, with at least these columns; ``unit``: of the timestamps."""
+    numbered = {name: str(i) for i, name in enumerate(columns, start=1)}
+    units: dict[str, str | float] = {} if unit is None else {"t": unit}
+    mapping = ColumnMapping(file=path.name, columns=numbered, units=units, separator=separator, header=False)
+    return read_mapped(path, mapping, (columns,))
 
 
 def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
     """The poses in a file of TUM, KITTI or EuRoC format, by default the one that its first row has; the last one of equal
     timestamps. InputError names file and row."""
-    if kind is None:
-        row, first = _first_row(path)
-        kind = _format(first)
-        if kind is None:
-            raise bad_field(path, "row", first, EXPECTED, row=row)
-    if kind == "kitti":
+    row, first = _first_row(path)
+    found = _format(first)
+    if found is None or kind not in (None, found):
+        raise bad_field(path, "row", first, EXPECTED if kind is None else FORMATS[kind], row=row)
+    if found == "kitti":
         matrices = read_matrices(path)
         return PosePath(str(path), matrices[:, :, 3], matrices[:, :, :3], None)
     warnings: list[str] = []
-    rows, t_ns, table = read_euroc_rows(path) if kind == "euroc" else read_tum_rows(path)
-    rotations = rotations_of(path, rows, table[:, 3:])
-    keep = checks.in_order(path, rows, t_ns, warnings)
+    cells = _read(path, EUROC, ",", "ns") if found == "euroc" else _read(path, TUM, " ", "s")
+    cells = replace(cells, labels={})  # names of columns say more than numbers
+    table = np.column_stack([cells.numbers(name, POSES[name]) for name in TUM[1:]])
+    t_ns = cells.stamps("t")
+    rotations = rotations_of(path, cells.rows, table[:, 3:])
+    keep = checks.in_order(path, cells.rows, t_ns, warnings)
     return replace(PosePath(str(path), table[:, :3], rotations, t_ns).rows(keep), warnings=tuple(warnings))
 
 

@@ -37,7 +37,7 @@ def read_landmarks(path: Path, mapping: ColumnMapping) -> dict[str, Landmark]:
     used. InputError names file, row and field of an invalid value, or of a duplicate name."""
     position = ("landmark", "x", "y")
     mapped = read_mapped(path, mapping, (position, (*position, "sigma"), (*position, "sigma_x", "sigma_y")))
-    numbers = {name: mapped.numbers(name, LANDMARKS[name]) for name in mapped.fields if name != "landmark"}
+    numbers = {name: mapped.numbers(name, LANDMARKS[name]) for name in mapped.columns if name != "landmark"}
     if "sigma_x" in numbers:
         numbers["sigma"] = np.fmax(numbers.pop("sigma_x"), numbers.pop("sigma_y"))
-    return rows_by_name(Landmark, path, mapped.cells.rows, LANDMARKS["landmark"], mapped.texts("landmark"), numbers)
+    return rows_by_name(Landmark, path, mapped.rows, LANDMARKS["landmark"], mapped.texts("landmark"), numbers)

@@ -71,15 +71,15 @@ def read_tags(path: Path) -> dict[str, Tag]:
     """
     cells, shape = read_cells(path, (TAG_COLUMNS_WITH_SIGMA, TAG_COLUMNS))
     numbers = {name: cells.numbers(name, TAGS[name]) for name in shape[1:]}
-    return rows_by_name(Tag, path, cells.rows, TAGS["epc"], cells.columns["epc"], numbers)
+    return rows_by_name(Tag, path, cells.rows, TAGS["epc"], cells.texts("epc"), numbers)
 
 
 def read_mapped_tags(path: Path, mapping: TagsFile) -> dict[str, Tag]:
     """Read a foreign table; InputError as in :func:`read_tags`."""
     mapped = read_mapped(path, mapping, (("epc", "x", "y"),), ("z", "facing", "sigma"))
-    numbers = {name: mapped.numbers(name, TAGS[name]) for name in mapped.fields if name != "epc"}
+    numbers = {name: mapped.numbers(name, TAGS[name]) for name in mapped.columns if name != "epc"}
     epcs = in_case(mapped.texts("epc"), mapping.epc_case)
-    return rows_by_name(Tag, path, mapped.cells.rows, TAGS["epc"], epcs, numbers)
+    return rows_by_name(Tag, path, mapped.rows, TAGS["epc"], epcs, numbers)
 
 
 def write_tags(tags: Mapping[str, Tag], path: Path) -> None:
