@@ -10,7 +10,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.inspect import Inspection, inspect
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import temporary_folder, writing
-from factorgraph_loc.io.bags.proposed import BagManifest, manifest_of_bag
+from factorgraph_loc.io.bags.manifest import BagManifest, manifest_of_bag
 from factorgraph_loc.io.native.native import require_new, write_native
 from factorgraph_loc.io.readers import Dataset, describe
 from factorgraph_loc.model.log import Log

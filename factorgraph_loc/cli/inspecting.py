@@ -14,7 +14,7 @@ from factorgraph_loc.errors import InputError
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.inspect import Inspection, StreamSummary
-    from factorgraph_loc.io.bags.proposed import TopicUse
+    from factorgraph_loc.io.bags.manifest import TopicUse
     from factorgraph_loc.model.log import Log
 
 BagPath = Annotated[Path, typer.Argument(metavar="BAG", help="A .bag, .mcap or .db3, or the folder of a ROS 2 bag.")]
@@ -169,7 +169,7 @@ def _document(log: Log, found: Inspection) -> dict[str, Any]:
 
 def manifest(bag: BagPath, json: Json = False) -> None:
     """Propose a manifest for a ROS bag: which topic is which sensor. Write it to a file and check it."""
-    from factorgraph_loc.io.bags.proposed import manifest_of_bag
+    from factorgraph_loc.io.bags.manifest import manifest_of_bag
 
     found = manifest_of_bag(bag, Path.cwd())
     if found.folder != Path.cwd().resolve():
@@ -183,7 +183,7 @@ def manifest(bag: BagPath, json: Json = False) -> None:
 
 def info_of_bag(bag: Path, json: Json) -> None:
     """Print the topics of a bag."""
-    from factorgraph_loc.io.bags.proposed import manifest_of_bag
+    from factorgraph_loc.io.bags.manifest import manifest_of_bag
 
     found = manifest_of_bag(bag, Path.cwd())
     if json:

@@ -40,7 +40,7 @@ class FileModel(BaseModel):
     A docstring below a field is its meaning; see :mod:`factorgraph_loc.files.settings`.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """A copy with updated values. Numbers are clipped to the bounds of their fields, so that computed settings remain

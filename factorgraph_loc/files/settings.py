@@ -6,14 +6,10 @@ A field of a :class:`~factorgraph_loc.files.models.FileModel` has its bounds fro
 
 from __future__ import annotations
 
-import ast
 import inspect
 import math
-import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
-from itertools import pairwise
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -67,7 +63,7 @@ def settings_in(model: type[BaseModel], prefix: str = "", default: BaseModel | N
         required = value is PydanticUndefined
         value = None if required else value
         parts = list(_parts(_Part(field.annotation, tuple(field.metadata))))
-        meaning = " ".join((field.description or _meaning(model, name)).split())
+        meaning = " ".join((field.description or "").split())
         for setting in (
             *_own(key, parts, Setting(key, "", 1, value, required, -math.inf, math.inf, (), "", meaning)),
             *_nested(key, parts, value),
@@ -113,29 +109,6 @@ def first_sentence(documented: Any) -> str:
     """The first sentence of a docstring, on one line; empty without one."""
     text = " ".join((inspect.getdoc(documented) or "").split()).replace("``", "")
     return text.partition(". ")[0].rstrip(".") + "." if text else ""
-
-
-def _meaning(model: type[BaseModel], name: str) -> str:
-    """The docstring below a field; empty without one."""
-    for one in model.__mro__:
-        if name in inspect.get_annotations(one):
-            return _docstrings(one).get(name, "")
-    return ""
-
-
-@cache
-def _docstrings(model: type[Any]) -> dict[str, str]:
-    """The docstrings below the fields of a class itself. pydantic would read its source for them whenever the class is made."""
-    found: dict[str, str] = {}
-    try:
-        (made,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
-    except (OSError, TypeError):  # of a class typed at a prompt there is no source
-        return found
-    for field, below in pairwise(made.body if isinstance(made, ast.ClassDef) else ()):
-        match field, below:
-            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
-                found[name] = text
-    return found
 
 
 def _parts(part: _Part) -> Iterator[_Part]:

@@ -15,11 +15,10 @@ import numpy as np
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.bags import rosbag
 from factorgraph_loc.io.bags.file import is_bag, require_rosbags
-from factorgraph_loc.io.bags.poses import check_rotations, seven
+from factorgraph_loc.io.bags.poses import checked_rotations, seven
 from factorgraph_loc.io.readers import read_log
 from factorgraph_loc.io.readers.pose_file import read_pose_file
 from factorgraph_loc.io.results import FILES
-from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.pose_path import PosePath, require_poses
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
@@ -163,8 +162,7 @@ def _messages() -> Any:
 def _path(name: str, table: Array, t_ns: Any) -> PosePath:
     """The path of rows (N, 7) with position and quaternion. InputError if one is not finite, or no unit quaternion."""
     rows = np.arange(1, len(table) + 1)
-    check_rotations(name, rows, table)
-    found = PosePath(name, table[:, :3], rotations_of(name, rows, table[:, 3:]), t_ns)
+    found = PosePath(name, table[:, :3], checked_rotations(name, rows, table), t_ns)
     require_poses(found)
     return found
 

@@ -9,8 +9,7 @@ from rosbags.typesys import get_types_from_msg
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.io.bags.file import open_bag
-from factorgraph_loc.io.bags.manifest import propose, read_fields
-from factorgraph_loc.io.bags.proposed import manifest_of, manifest_text, remarks
+from factorgraph_loc.io.bags.manifest import manifest_of_bag, propose, read_fields
 
 T0 = 1_700_000_000_000_000_000
 
@@ -22,10 +21,9 @@ def proposal(tmp_path, bag_maker):
     def call(fill):
         with bag_maker(tmp_path / "drive.bag") as made:
             fill(made)
+        text = manifest_of_bag(tmp_path / "drive.bag", tmp_path).text
         with open_bag(tmp_path / "drive.bag") as bag:
-            found = propose(bag)
-            text = manifest_text(manifest_of(found, "drive.bag", {}), remarks(bag, found, {}))
-            return found, tomllib.loads(text), text
+            return propose(bag), tomllib.loads(text), text
 
     return call
 

@@ -1,3 +1,3 @@
 """Reading of ROS 1 and ROS 2 bags."""
 
-__all__ = ["file", "poses", "proposed", "rosbag"]
+__all__ = ["file", "manifest", "poses", "rosbag"]

@@ -18,9 +18,8 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.files.temporary import locked, sweep, temporary_folder, writing
-from factorgraph_loc.io.bags.fields import TopicSettings, as_nanoseconds
 from factorgraph_loc.io.bags.file import Bag, Stamped
-from factorgraph_loc.io.bags.listeners import Stamper
+from factorgraph_loc.io.bags.topics import Stamper, TopicSettings, as_nanoseconds
 from factorgraph_loc.sensors.camera.measurement import ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.text import quoted

@@ -12,7 +12,6 @@ import bz2
 import shutil
 import sys
 import tempfile
-from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,13 +20,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-import numpy as np
-
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import DEFINITION, opened, require_size
 from factorgraph_loc.files.models import inside, nearest
 from factorgraph_loc.text import quoted, told
-from factors.se2 import Array, Integers
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection, MessageDefinition
@@ -296,35 +292,3 @@ def _told(path: Path) -> Iterator[None]:
         text = told(error)
         hint = next((hint for words, hint in HINTS.items() if words in text), "")
         raise InputError(f"{path}: cannot be read as a bag: {text.rstrip('.')}{'; ' + hint if hint else ''}") from error
-
-
-class TopicRows:
-    """N rows of ``width`` numbers with timestamps, and the numbers of their messages, counted from 1 within the topic."""
-
-    def __init__(self, source: str, width: int) -> None:
-        self.source = source
-        self._width = width
-        self._row = array("q")
-        self._t_ns = array("q")
-        self._values = array("d")
-
-    def append(self, item: Stamped, t_ns: int, values: tuple[float, ...]) -> None:
-        self._row.append(item.row)
-        self._t_ns.append(t_ns)
-        self._values.extend(values)
-
-    def __len__(self) -> int:
-        return len(self._row)
-
-    @property
-    def rows(self) -> Integers:
-        return np.array(self._row, dtype=np.int64)
-
-    @property
-    def t_ns(self) -> Integers:
-        return np.array(self._t_ns, dtype=np.int64)
-
-    @property
-    def values(self) -> Array:
-        """The numbers (N, width)."""
-        return np.array(self._values, dtype=float).reshape(-1, self._width)

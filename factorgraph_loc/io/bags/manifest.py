@@ -1,19 +1,22 @@
 """A proposed manifest for a bag: the sensor of each topic, by message types and common names."""
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+
+import tomli_w
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.bags.camera import COMPRESSED, INFO, RAW
-from factorgraph_loc.io.bags.fields import LIST, TF, has_header, leaves
-from factorgraph_loc.io.bags.file import Bag, Topic
-from factorgraph_loc.io.bags.frames import ODOMETRY as ORIGINS
-from factorgraph_loc.io.bags.frames import ROBOT, STATIC, WORLD, Tree, tree_of
-from factorgraph_loc.io.bags.landmarks import CORNERS, DETECTIONS
+from factorgraph_loc.io.bags.file import Bag, Topic, open_bag
 from factorgraph_loc.io.bags.motion import IMU, JOINTS, ODOMETRY, TWISTS
-from factorgraph_loc.io.bags.poses import POINT, POSES
+from factorgraph_loc.io.bags.poses import ODOMETRY as ORIGINS
+from factorgraph_loc.io.bags.poses import POINT, POSES, ROBOT, STATIC, WORLD, Tree, tree_of
+from factorgraph_loc.io.bags.tables import CORNERS, DETECTIONS
+from factorgraph_loc.io.bags.topics import LIST, TF, has_header, leaves
 from factorgraph_loc.text import listed
 
 TRUTH = re.compile(
@@ -30,33 +33,16 @@ NOT_MEASURED = re.compile(r"goal|cmd|command|target|plan|initialpose", re.IGNORE
 
 INITIAL_POSE = ("/initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
-# common names of the last part of a field's path, without underscores
+# common names of the last part of a field's path, without underscores and without a unit at the end
 NAMES: dict[str, tuple[str, ...]] = {
     "epc": ("epc", "epchex", "tagepc", "tagid", "epcid", "uid", "tag"),
     "antenna": ("antenna", "antennaid", "antennaport", "antennaname", "ant", "port", "portnumber", "readerport"),
-    "rssi": ("rssi", "peakrssi", "rssidbm", "signalstrength"),
-    "phase": ("phase", "phaseangle", "rfphase", "rfphaseangle", "phasedegrees", "phasedeg", "phaseradians", "phaserad"),
-    "frequency": (
-        "frequency",
-        "freq",
-        "frequencyhz",
-        "frequencykhz",
-        "frequencymhz",
-        "carrier",
-        "channelfrequency",
-        "channelmhz",
-        "channelkhz",
-    ),
-    "stamp": (
-        "firstseen",
-        "firstseenus",
-        "firstseenms",
-        "firstseentimestamp",
-        "firstseentimestamputc",
-        "readtime",
-        "timestamp",
-    ),
+    "rssi": ("rssi", "peakrssi", "signalstrength"),
+    "phase": ("phase", "phaseangle", "rfphase", "rfphaseangle"),
+    "frequency": ("frequency", "freq", "carrier", "channelfrequency", "channelmhz", "channelkhz"),
+    "stamp": ("firstseen", "firstseentimestamp", "firstseentimestamputc", "readtime", "timestamp"),
 }
+UNIT = re.compile(r"(deg(rees)?|rad(ians)?|[mk]?hz|[mun]s|dbm)$")
 # the same of a range to a radio or another landmark, the likeliest first
 LANDMARK = ("anchorid", "anchor", "anchorname", "responderid", "beaconid", "beacon", "landmarkid", "nodeid", "id")
 RANGE = ("range", "distance", "dist", "dis", "rangem", "distancem")
@@ -66,6 +52,67 @@ UNITS = {
     "frequency": {"mhz": "MHz", "khz": "kHz", "hz": "Hz"},
     "stamp": {"us": "us", "ms": "ms", "ns": "ns"},
 }
+
+
+BESIDE = {
+    "rig": 'no rig is given: set rig = "NAME.rig.toml" to a file next to this one; `fgloc rigs new` writes one',
+    "world": 'no map is given: set world = "NAME.world.toml" to a file next to this one with tags and landmarks',
+}
+UNUSED = {
+    "sensor_msgs/msg/LaserScan": "laser scan",
+    "sensor_msgs/msg/MultiEchoLaserScan": "laser scan",
+    "sensor_msgs/msg/PointCloud": "point cloud",
+    "sensor_msgs/msg/PointCloud2": "point cloud",
+    "velodyne_msgs/msg/VelodyneScan": "point cloud",
+    "livox_ros_driver/msg/CustomMsg": "point cloud",
+    "livox_ros_driver2/msg/CustomMsg": "point cloud",
+    "sensor_msgs/msg/NavSatFix": "GNSS",
+    "sensor_msgs/msg/NavSatStatus": "GNSS",
+    "gps_common/msg/GPSFix": "GNSS",
+    "gps_msgs/msg/GPSFix": "GNSS",
+    "nmea_msgs/msg/Sentence": "GNSS",
+    "ublox_msgs/msg/NavPVT": "GNSS",
+    "sensor_msgs/msg/Range": "sonar or infrared range",
+    "sensor_msgs/msg/MagneticField": "magnetometer",
+    "sensor_msgs/msg/FluidPressure": "pressure",
+    "sensor_msgs/msg/Temperature": "temperature",
+    "sensor_msgs/msg/BatteryState": "battery",
+    "sensor_msgs/msg/Joy": "joystick",
+    "geometry_msgs/msg/WrenchStamped": "force",
+    "nav_msgs/msg/OccupancyGrid": "grid map",
+    "nav_msgs/msg/Path": "path",
+    "stereo_msgs/msg/DisparityImage": "depth image",
+    "dvs_msgs/msg/EventArray": "event camera",
+    "diagnostic_msgs/msg/DiagnosticArray": "diagnostics",
+    "rosgraph_msgs/msg/Log": "messages of programs",
+    "rcl_interfaces/msg/Log": "messages of programs",
+}
+
+
+@dataclass(frozen=True)
+class TopicUse:
+    """A topic of a bag. ``rate``: messages per second, None for fewer than two; ``use``: what it is taken for, or None; ``unused``:
+    what it carries that nothing here uses, such as a laser scan, or None."""
+
+    topic: str
+    type: str
+    messages: int
+    rate: float | None
+    use: str | None
+    unused: str | None
+
+
+@dataclass(frozen=True)
+class BagManifest:
+    """A proposed manifest: its ``content``, and its ``text`` as TOML with ``remarks`` as comments. Its paths are relative to
+    ``folder``. ``duration``: of the bag [s]; ``topics``: all that are in it."""
+
+    content: Mapping[str, Any]
+    remarks: tuple[str, ...]
+    text: str
+    folder: Path
+    duration: float
+    topics: tuple[TopicUse, ...]
 
 
 @dataclass
@@ -83,6 +130,45 @@ class Proposal:
             self.uses[topics[0].name] = sensor
         if topics[1:]:
             self.notes.append(f"{sensor} could also be {', '.join(topic.name for topic in topics[1:])}")
+
+
+def manifest_of_bag(bag: Path, here: Path) -> BagManifest:
+    """Propose a manifest to be saved in ``here``, if the bag is below that folder, else beside the bag. InputError if the bag
+    cannot be read."""
+    path, here = Path(os.path.realpath(bag)), here.resolve()
+    root = here if path.is_relative_to(here) else path.parent
+    with open_bag(path) as opened:
+        proposal = propose(opened)
+        span = opened.duration
+        topics = tuple(
+            TopicUse(
+                topic.name,
+                topic.type,
+                topic.count,
+                (topic.count - 1) / span if span > 0.0 and topic.count > 1 else None,
+                proposal.uses.get(topic.name),
+                None if topic.name in proposal.uses else UNUSED.get(topic.type),
+            )
+            for topic in opened.topics.values()
+        )
+    remarks = list(proposal.notes)
+    content: dict[str, Any] = {"title": f"The bag {path.name}", "reader": "rosbag"}
+    content["path"] = path.relative_to(root).as_posix()
+    stem = path.with_suffix("") if path.is_file() else path
+    for kind, advice in BESIDE.items():
+        if (file := stem.with_name(f"{stem.name}.{kind}.toml")).is_file():
+            content[kind] = file.relative_to(root).as_posix()
+        else:
+            remarks.append(advice)
+    for topic in topics:
+        if topic.use is None:
+            what = f", {topic.unused}: nothing here uses it" if topic.unused else ""
+            remarks.append(f"not used: {topic.topic} ({topic.type}, {topic.messages} messages){what}")
+    content |= {"licence": "none stated", "origin": "your own recording"}
+    options = dict(sorted(proposal.options.items(), key=lambda item: isinstance(item[1], dict)))  # tables last
+    comments = "".join(f"# {line}\n" for line in remarks)
+    text = f"{tomli_w.dumps(content)}{comments}\n{tomli_w.dumps({'options': options})}"
+    return BagManifest(content | {"options": options}, tuple(remarks), text, root, span, topics)
 
 
 def propose(bag: Bag) -> Proposal:
@@ -283,15 +369,19 @@ def range_fields(paths: Sequence[str]) -> dict[str, str]:
 def read_fields(paths: Sequence[str]) -> dict[str, str]:
     """The fields of a read among the paths of a message type, by common names."""
     out = {}
+    usable = [path for path in paths if path.count(LIST) <= 1 and not path.startswith("header.")]
     for name, known in NAMES.items():
-        fitting = [p for p in paths if p.count(LIST) <= 1 and _plain(p) in known and not p.startswith("header.")]
+        fitting = [(rank, len(path), path) for path in usable if (rank := _rank(_plain(path), known)) is not None]
         if fitting:
-            out[name] = min(fitting, key=lambda p: (known.index(_plain(p)), len(p)))
+            out[name] = min(fitting)[-1]
     if "stamp" not in out:  # the timestamp of a read in the message of its EPC
-        stamps = [p for p in paths if p.endswith("stamp") and LIST in p]
-        if stamps:
-            out["stamp"] = stamps[0]
+        out |= {"stamp": path for path in reversed(paths) if path.endswith("stamp") and LIST in path}
     return out
+
+
+def _rank(name: str, known: Sequence[str]) -> int | None:
+    """The index of a name in ``known``, with its unit or without; None if it is unknown."""
+    return next((known.index(text) for text in (name, UNIT.sub("", name)) if text in known), None)
 
 
 def _units(fields: Mapping[str, str]) -> dict[str, str]:

@@ -4,7 +4,7 @@ topic, or joints of one message.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -13,13 +13,11 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import nearest
 from factorgraph_loc.io import motions
-from factorgraph_loc.io.bags.fields import TF, Fields, TopicSettings, as_number, getter
-from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
-from factorgraph_loc.io.bags.frames import FrameReference, StaticFrames, poses_of_topic
-from factorgraph_loc.io.bags.listeners import Listeners
-from factorgraph_loc.io.bags.poses import POSES, Poses, PoseTopic
+from factorgraph_loc.io.bags.file import Bag, Stamped
+from factorgraph_loc.io.bags.poses import POSES, PoseTopic, StaticFrames, poses_of_topic
+from factorgraph_loc.io.bags.topics import LIST, TF, Listeners, TopicRows, TopicSettings, check_path
 from factorgraph_loc.model.planar import Turned, about_z
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
+from factorgraph_loc.sensors.odometry.measurement import YawRateStream
 from factorgraph_loc.text import quoted
 from factors.se2 import Array, Integers
 
@@ -28,10 +26,11 @@ APART = 0.5  # of the usual time between messages of a wheel: more between left 
 ODOMETRY = "nav_msgs/msg/Odometry"
 TWISTS = {  # path of the twist by type
     "geometry_msgs/msg/Twist": "",
-    "geometry_msgs/msg/TwistStamped": "twist",
+    "geometry_msgs/msg/TwistStamped": "twist.",
 }
 IMU = "sensor_msgs/msg/Imu"
-Motion = IncrementStream | VelocityStream
+# timestamps (N,) [ns], and velocities (N, 2) or increments (N, 3), after the bag is read; adds to the warnings
+Motion = Callable[[list[str]], tuple[Integers, Array]]
 
 
 class WheelSettings(motions.WheelSizes):
@@ -67,7 +66,7 @@ class JointRows:
             return
         if self._wheels.left in names and self._wheels.right in names:  # other messages contain other joints
             wheels = (values[names.index(self._wheels.left)], values[names.index(self._wheels.right)])
-            self.rows.append(item, t_ns, (float(wheels[0]), float(wheels[1])))
+            self.rows.append(item, t_ns, wheels)
 
     def pairs(self, warnings: list[str]) -> tuple[Integers, Array]:
         """Timestamps (N,), and the left and the right number (N, 2). InputError if no message has both joints."""
@@ -76,23 +75,7 @@ class JointRows:
             raise InputError(
                 f"{self.rows.source}: has no message with both wheels, {quoted(wrong)}{nearest(wrong, sorted(self._seen))}"
             )
-        return finite_rows(self.rows, ("left wheel", "right wheel"), warnings)
-
-
-class OneWheel:
-    """Collects a number from each message of a topic."""
-
-    def __init__(self, bag: Bag, topic: str, path: str) -> None:
-        self._fields = Fields(bag, bag.topic(topic), {"wheel": path})
-        self.rows = TopicRows(f"{bag.path} {topic}", 1)
-        if self._fields.has_list:
-            raise InputError(
-                f"{self.rows.source}: odometry.wheels has {quoted(path)}, expected the field of one number"
-            )
-
-    def add(self, item: Stamped, t_ns: int) -> None:
-        ((value,),) = self._fields.rows(item.message, item.row)
-        self.rows.append(item, t_ns, (as_number(value),))
+        return self.rows.in_order(("left wheel", "right wheel"), warnings)
 
 
 class TwoWheels:
@@ -103,8 +86,8 @@ class TwoWheels:
 
     def pairs(self, warnings: list[str]) -> tuple[Integers, Array]:
         """Timestamps (N,), and the left and the right number (N, 2). InputError if the topics have no time in common."""
-        l_ns, left = finite_rows(self.rows, ("wheel",), warnings)
-        r_ns, right = finite_rows(self._right, ("wheel",), warnings)
+        l_ns, left = self.rows.in_order(("wheel",), warnings)
+        r_ns, right = self._right.in_order(("wheel",), warnings)
         after = np.clip(np.searchsorted(r_ns, l_ns), 0, len(r_ns) - 1)
         before = np.maximum(after - 1, 0)
         near = np.where(np.abs(r_ns[before] - l_ns) <= np.abs(r_ns[after] - l_ns), before, after)
@@ -117,18 +100,6 @@ class TwoWheels:
             warnings.append(f"{self.rows.source}: {lost} messages have none of the right wheel near in time")
         alone = np.append(np.diff(t_ns) > 0, True)  # the last one of equal stamps
         return t_ns[alone], np.hstack((left[keep], right[near[keep]]))[alone]
-
-
-def finite_rows(rows: TopicRows, names: Sequence[str], warnings: list[str]) -> tuple[Integers, Array]:
-    """Timestamps (N,) and numbers (N, K) in order of time, all finite; InputError names the invalid message."""
-    checks.require_finite(rows.source, rows.rows, names, rows.values)
-    keep = checks.in_order(rows.source, rows.rows, rows.t_ns, warnings)
-    return rows.t_ns[keep], rows.values[keep]
-
-
-def velocities(t_ns: Integers, values: Array) -> VelocityStream:
-    """Speeds and turn rates (N, 2) at N timestamps as a stream."""
-    return VelocityStream(checks.seconds(t_ns, int(t_ns[0])), *np.ascontiguousarray(values.T))
 
 
 class OdometryTopic(PoseTopic):
@@ -147,64 +118,6 @@ class ImuTopic(TopicSettings, Turned):
     """frame of the IMU, whose orientation is in tf_static; without it use axes and mounting"""
 
 
-class PoseMotion:
-    """Odometry from poses in its own frame, or from transforms: the motion between consecutive poses."""
-
-    def __init__(self, poses: Poses | FrameReference, turned: Turned) -> None:
-        self._poses, self._turned = poses, turned
-
-    def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
-        """Absolute timestamps (N,) and the stream, whose timestamps start at 0."""
-        path = self._poses.path(warnings)
-        assert path.t_ns is not None
-        poses = path.on_floor(warnings, self._turned)
-        return path.t_ns, increments(path.t_ns, motions.between_poses(path.name, path.t_ns, poses, warnings))
-
-
-class TwistMotion:
-    """Odometry from velocities, each held until the next."""
-
-    def __init__(self, bag: Bag, options: OdometryTopic) -> None:
-        self._twist = getter(TWISTS.get(bag.topic(options.topic).type, "twist.twist"))
-        self._rows = TopicRows(f"{bag.path} {options.topic}", 2)
-
-    def add(self, item: Stamped, t_ns: int) -> None:
-        twist = self._twist(item.message)
-        self._rows.append(item, t_ns, (twist.linear.x, twist.angular.z))
-
-    def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
-        t_ns, values = finite_rows(self._rows, ("v", "w"), warnings)
-        return t_ns, velocities(t_ns, values)
-
-
-class WheelMotion:
-    """Odometry from the angles or angular velocities of two wheels, of joints or with a topic each."""
-
-    def __init__(self, listeners: Listeners, options: OdometryTopic, wheels: WheelSettings) -> None:
-        bag = listeners.bag
-        self._wheels = wheels
-        self._are_speeds = options.use == "twist"
-        self._rows: JointRows | TwoWheels
-        if wheels.right_topic is None:
-            rows = JointRows(bag, options.topic, wheels, "velocity" if self._are_speeds else "position")
-            self._rows = listeners.listen(options, rows)
-        else:
-            left = listeners.listen(options, OneWheel(bag, options.topic, wheels.left))
-            of_right = options.model_copy(update={"topic": wheels.right_topic})
-            right = listeners.listen(of_right, OneWheel(bag, wheels.right_topic, wheels.right))
-            self._rows = TwoWheels(left.rows, right.rows)
-
-    def stream(self, warnings: list[str]) -> tuple[Integers, Motion]:
-        source = self._rows.rows.source
-        size, track = self._wheels.sizes(source, "odometry.wheels", turns=self._wheels.unit == "rad")
-        t_ns, numbers = self._rows.pairs(warnings)
-        ways = size * numbers
-        if self._are_speeds:
-            return t_ns, velocities(t_ns, motions.velocities_of_wheels(ways, track))
-        moves = motions.between_wheels(source, t_ns, ways, np.full(2, size), track, warnings)
-        return t_ns, increments(t_ns, moves)
-
-
 class YawRates:
     """The turn rate of an IMU."""
 
@@ -213,11 +126,9 @@ class YawRates:
         if options.frame is not None and options.is_given():
             raise InputError(f"{bag.path} {topic.name}: tf_static has the frame, expected no axes or mounting")
         self._options, self._frames = options, frames
-        self._rows = TopicRows(f"{bag.path} {options.topic}", 3)
-
-    def add(self, item: Stamped, t_ns: int) -> None:
-        rate = item.message.angular_velocity
-        self._rows.append(item, t_ns, (rate.x, rate.y, rate.z))
+        paths = [f"angular_velocity.{axis}" for axis in "xyz"]
+        self._rows = TopicRows(f"{bag.path} {options.topic}", 3, paths)
+        self.add = self._rows.add
 
     def stream(self, t0_ns: int, warnings: list[str]) -> YawRateStream:
         """Turn rates about the robot's z axis; only the axes of the IMU that contribute must be finite."""
@@ -230,9 +141,7 @@ class YawRates:
         return YawRateStream(checks.seconds(t_ns[keep], t0_ns), w[keep])
 
 
-def odometry(
-    listeners: Listeners, options: OdometryTopic, static: StaticFrames
-) -> PoseMotion | TwistMotion | WheelMotion:
+def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
     """Register the collectors of an odometry topic, by message type, and return its motion."""
     bag, source = listeners.bag, f"{listeners.bag.path} {options.topic}"
     known = () if options.wheels else sorted({*POSES, *TWISTS, JOINTS, *TF})
@@ -247,12 +156,57 @@ def odometry(
     if options.wheels is not None and kind not in TF:
         if kind != JOINTS and options.wheels.right_topic is None:
             raise InputError(f"{source}: odometry.wheels.right_topic is missing, as {kind} has no joints")
-        return WheelMotion(listeners, options, options.wheels)
+        return _of_wheels(listeners, options, options.wheels)
     if poses:
-        return PoseMotion(poses_of_topic(listeners, options, static), options)
-    return listeners.listen(options, TwistMotion(bag, options))
+        return _of_poses(listeners, options, static)
+    twist = TWISTS.get(kind, "twist.twist.")
+    rows = listeners.listen(options, TopicRows(source, 2, (f"{twist}linear.x", f"{twist}angular.z")))
+    return lambda warnings: rows.in_order(("v", "w"), warnings)
 
 
-def increments(t_ns: Integers, moves: Array) -> IncrementStream:
-    """The motions (N - 1, 3) between N timestamps as increments; the first row only defines the start."""
-    return IncrementStream(checks.seconds(t_ns, int(t_ns[0])), *motions.after_rest(moves).T)
+def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
+    """The motion between consecutive poses in the frame of odometry, or between transforms."""
+    poses = poses_of_topic(listeners, options, static)
+
+    def motion(warnings: list[str]) -> tuple[Integers, Array]:
+        path = poses.path(warnings)
+        assert path.t_ns is not None
+        moves = motions.between_poses(path.name, path.t_ns, path.on_floor(warnings, options), warnings)
+        return path.t_ns, motions.after_rest(moves)
+
+    return motion
+
+
+def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettings) -> Motion:
+    """The motion from the angles, distances or speeds of two wheels, of joints or with a topic each."""
+    bag = listeners.bag
+    are_speeds = options.use == "twist"
+    rows: JointRows | TwoWheels
+    if wheels.right_topic is None:
+        collector = JointRows(bag, options.topic, wheels, "velocity" if are_speeds else "position")
+        rows = listeners.listen(options, collector)
+    else:
+        of_right = options.model_copy(update={"topic": wheels.right_topic})
+        left = listeners.listen(options, _wheel(bag, options.topic, wheels.left))
+        rows = TwoWheels(left, listeners.listen(of_right, _wheel(bag, wheels.right_topic, wheels.right)))
+
+    def motion(warnings: list[str]) -> tuple[Integers, Array]:
+        source = rows.rows.source
+        size, track = wheels.sizes(source, "odometry.wheels", turns=wheels.unit == "rad")
+        t_ns, numbers = rows.pairs(warnings)
+        if are_speeds:
+            return t_ns, motions.velocities_of_wheels(size * numbers, track)
+        moves = motions.between_wheels(source, t_ns, size * numbers, np.full(2, size), track, warnings)
+        return t_ns, motions.after_rest(moves)
+
+    return motion
+
+
+def _wheel(bag: Bag, topic: str, path: str) -> TopicRows:
+    """Collects the number of a wheel from each message of a topic."""
+    source = f"{bag.path} {topic}"
+    found = bag.topic(topic)
+    check_path(bag.store(topic), found, path, f"{bag.path}: topic {topic}: wheel")
+    if LIST in path:
+        raise InputError(f"{source}: odometry.wheels has {quoted(path)}, expected the field of one number")
+    return TopicRows(source, 1, (path,))

@@ -1,28 +1,43 @@
-"""Poses in a bag: odometry, and the reference for scoring."""
+"""Poses in a bag: of odometry, the reference and the start, and coordinate frames (tf).
 
-from collections.abc import Callable
-from operator import attrgetter
+Static transforms give the mounting of sensors; a chain of transforms gives a trajectory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.errors import bad_field
+from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
-from factorgraph_loc.io.bags.fields import TopicSettings
-from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
+from factorgraph_loc.files.models import nearest
+from factorgraph_loc.io.bags.file import Bag, Stamped
+from factorgraph_loc.io.bags.topics import TF, Listeners, Stamper, TopicRows, TopicSettings, as_nanoseconds
 from factorgraph_loc.model.log import StartPose
-from factorgraph_loc.model.planar import Turned, require_unit, rotations_of
+from factorgraph_loc.model.planar import Turned, rotations_of
 from factorgraph_loc.model.pose_path import PosePath
+from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
+from factorgraph_loc.text import listed, quoted, told
 from factors.se2 import Array, Integers
 
+SEVEN = ("x", "y", "z", "qx", "qy", "qz", "qw")
 POINT = "geometry_msgs/msg/PointStamped"
 WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-POSES: dict[str, Callable[[Any], Any]] = {
-    "nav_msgs/msg/Odometry": attrgetter("pose.pose"),
-    "geometry_msgs/msg/PoseStamped": attrgetter("pose"),
-    WITH_COVARIANCE: attrgetter("pose.pose"),
-    "geometry_msgs/msg/TransformStamped": attrgetter("transform"),
+POSES = {  # the path of the pose by message type
+    "nav_msgs/msg/Odometry": "pose.pose",
+    "geometry_msgs/msg/PoseStamped": "pose",
+    WITH_COVARIANCE: "pose.pose",
+    "geometry_msgs/msg/TransformStamped": "transform",
 }
+STATIC = "/tf_static"
+MANY = 2000  # messages of a topic that are looked at
+ROBOT = ("base_link", "base_footprint", "base")
+ODOMETRY = ("odom", "odom_combined", "odometry")
+WORLD = ("mocap", "vicon", "optitrack", "world", "map")  # what is measured comes before what may be an estimate
 
 
 class PoseTopic(TopicSettings, Turned):
@@ -49,27 +64,23 @@ class Poses:
     """Collects the poses of a topic; points are poses without heading."""
 
     def __init__(self, bag: Bag, name: str) -> None:
-        topic = bag.topic(name, *sorted({*POSES, POINT}))
-        self._are_points = topic.type == POINT
-        self._pose = POSES.get(topic.type, attrgetter("point"))
+        kind = bag.topic(name, *sorted({*POSES, POINT})).type
+        self._are_points = kind == POINT
+        pose = POSES.get(kind, "point")
         # transforms have translation and rotation, poses position and orientation
-        self._parts = (
-            ("translation", "rotation") if topic.type.endswith("TransformStamped") else ("position", "orientation")
-        )
-        self._rows = TopicRows(f"{bag.path} {name}", 7)
-
-    def add(self, item: Stamped, t_ns: int) -> None:
-        pose = self._pose(item.message)
+        position, rotation = ("translation", "rotation") if pose == "transform" else ("position", "orientation")
+        paths = [f"{pose}.{position}.{axis}" for axis in "xyz"] + [f"{pose}.{rotation}.{axis}" for axis in "xyzw"]
         if self._are_points:
-            self._rows.append(item, t_ns, (pose.x, pose.y, pose.z, 0.0, 0.0, 0.0, 1.0))
-        else:
-            self._rows.append(item, t_ns, seven(pose, *self._parts))
+            paths = [f"{pose}.{axis}" for axis in "xyz"]
+        self._rows = TopicRows(f"{bag.path} {name}", len(paths), paths)
+        self.add = self._rows.add
 
     def path(self, warnings: list[str], t0_ns: int = 0) -> PosePath:
         """The poses, the last one of equal timestamps; InputError names the invalid message."""
         source, rows, t_ns, values = self._rows.source, self._rows.rows, self._rows.t_ns, self._rows.values
-        check_rotations(source, rows, values)
-        rotations = rotations_of(source, rows, values[:, 3:])
+        if self._are_points:
+            values = np.column_stack((values, np.tile((0.0, 0.0, 0.0, 1.0), (len(values), 1))))
+        rotations = checked_rotations(source, rows, values)
         path = PosePath(source, values[:, :3], rotations, t_ns, not self._are_points)
         return path.rows(checks.in_order(source, rows, t_ns, warnings))
 
@@ -93,9 +104,7 @@ class Start:
         """The start; InputError if a variance of x, y or heading is not positive."""
         assert self._found is not None
         t_ns, values, variances = self._found
-        first = np.ones(1, dtype=np.int64)
-        check_rotations(self._source, first, values)
-        turns = rotations_of(self._source, first, values[:, 3:])
+        turns = checked_rotations(self._source, np.ones(1, dtype=np.int64), values)
         pose = PosePath(self._source, values[:, :3], turns, None).on_floor(warnings, self._turned)[0]
         for name, variance in zip(("xx", "yy", "yaw"), variances.tolist(), strict=True):
             if not 0.0 < variance < np.inf:
@@ -109,7 +118,209 @@ def seven(pose: Any, position: str = "position", orientation: str = "orientation
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
-def check_rotations(source: str, rows: Integers, table: Array) -> None:
-    """InputError if positions and quaternions (N, 7) are not finite, or a quaternion is not a unit quaternion."""
-    checks.require_finite(source, rows, ("x", "y", "z", "qx", "qy", "qz", "qw"), table)
-    require_unit(source, rows, table[:, 3:])
+def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
+    """Rotations (N, 3, 3) of positions and quaternions (N, 7). InputError if a number is not finite, or a quaternion is not a unit
+    quaternion."""
+    checks.require_finite(source, rows, SEVEN, table)
+    return rotations_of(source, rows, table[:, 3:])
+
+
+class StaticFrames:
+    """Collects static transforms: parent and pose of each frame. ``base``: the frame of the robot."""
+
+    def __init__(self, base: str = ROBOT[0]) -> None:
+        self.base = base
+        self.parents: dict[str, tuple[str, Array]] = {}
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        for transform in item.message.transforms:
+            values = np.array([seven(transform.transform, "translation", "rotation")])
+            rotations = checked_rotations(item.topic, np.array([item.row]), values)
+            parent = plain(transform.header.frame_id)
+            self.parents[plain(transform.child_frame_id)] = (parent, matrices(values[:, :3], rotations)[0])
+
+    def pose(self, frame: str) -> Array | None:
+        """The pose (4, 4) of ``frame`` on the robot; None if no transforms connect them."""
+        ours, theirs = self._up(plain(frame)), self._up(plain(self.base))
+        common = next((name for name in ours if name in theirs), None)
+        return None if common is None else np.linalg.inv(theirs[common]) @ ours[common]
+
+    def known(self, source: str, frame: str) -> Array:
+        """As :meth:`pose`; InputError if no transforms connect the frames."""
+        pose = self.pose(frame)
+        if pose is None:
+            there = listed(sorted(self.parents)) or "none"
+            raise InputError(f"{source}: tf_static has no pose of {frame} on {self.base}; frames: {there}")
+        return pose
+
+    def _up(self, frame: str) -> dict[str, Array]:
+        """The poses of ``frame`` in itself and in all frames above it, nearest first."""
+        out = {frame: np.eye(4)}
+        while frame in self.parents and self.parents[frame][0] not in out:
+            parent, pose = self.parents[frame]
+            out[parent] = pose @ out[frame]
+            frame = parent
+        return out
+
+
+class FrameReference:
+    """Collects transforms, and composes the trajectory of the topic's ``child`` in its ``parent``. InputError if one of these two
+    frames is missing."""
+
+    def __init__(self, bag: Bag, topic: PoseTopic, stamper: Stamper, static: StaticFrames) -> None:
+        self._source = f"{bag.path} {topic.topic}"
+        if topic.parent is None or topic.child is None:
+            raise InputError(f"{self._source}: parent and child are missing: two frames, such as map and base_link")
+        self._parent, self._child = plain(topic.parent), plain(topic.child)
+        self._stamper, self._static = stamper, static
+        self._edges: dict[str, TopicRows] = {}  # from each frame to its parent, in order of arrival
+        self._parents: dict[str, str] = {}
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        for transform in item.message.transforms:
+            child, parent = plain(transform.child_frame_id), plain(transform.header.frame_id)
+            self._parents[child] = parent
+            edge = self._edges.setdefault(child, TopicRows(self._source, 7))
+            stamp = self._stamper.choose(as_nanoseconds(transform.header.stamp, 1), t_ns)
+            edge.append(item, stamp, seven(transform.transform, "translation", "rotation"))
+
+    def path(self, warnings: list[str], t0_ns: int | None = None) -> PosePath:
+        """The poses at the timestamps of the most frequent transform where all are known; the others are interpolated, at times
+        after ``t0_ns``, by default that of the first transform."""
+        if t0_ns is None:
+            t0_ns = min((int(edge.t_ns[0]) for edge in self._edges.values()), default=0)
+        moving: list[Trajectory3] = []
+        steps: list[tuple[int, Array]] = []
+        before: Array = np.eye(4)
+        for name in self._chain():
+            if name in self._edges:
+                steps.append((len(moving), before))
+                moving.append(self._edge(name, t0_ns, warnings))
+                before = np.eye(4)
+            else:
+                before = self._static.parents[name][1] @ before
+        if not moving:
+            raise InputError(f"{self._source}: {self._child} does not move in {self._parent}, expected frames that do")
+        t = max(moving, key=len).t
+        t = t[(t >= max(m.t[0] for m in moving)) & (t <= min(m.t[-1] for m in moving))]
+        if not len(t):
+            raise InputError(
+                f"{self._source}: the transforms from {self._child} to {self._parent} have no time in common"
+            )
+        poses = np.broadcast_to(np.eye(4), (len(t), 4, 4))
+        for i, fixed in steps:
+            at = moving[i].at(t)
+            poses = matrices(at.positions, at.rotations) @ fixed @ poses
+        poses = before @ poses
+        return path_of(Trajectory3(t, poses[:, :3, 3], poses[:, :3, :3]), self._source, t0_ns)
+
+    def _chain(self) -> list[str]:
+        """The frames from the child up to the parent, without the parent."""
+        chain: list[str] = []
+        frame = self._child
+        parents = {name: parent for name, (parent, _) in self._static.parents.items()}
+        parents |= self._parents
+        while frame != self._parent:
+            if frame not in parents or frame in chain:
+                known = sorted({*parents, *parents.values()})
+                wrong = next((name for name in (self._parent, self._child) if name not in known), None)
+                hint = (
+                    f"there is no frame {quoted(wrong)}{nearest(wrong, known)}"
+                    if wrong
+                    else f"it ends at {quoted(frame)}"
+                )
+                raise InputError(f"{self._source}: no transforms connect {self._child} to {self._parent}: {hint}")
+            chain.append(frame)
+            frame = parents[frame]
+        return chain
+
+    def _edge(self, name: str, t0_ns: int, warnings: list[str]) -> Trajectory3:
+        edge = self._edges[name]
+        source = f"{self._source} {self._parents[name]} to {name}"
+        rotations = checked_rotations(source, edge.rows, edge.values)
+        keep = checks.in_order(source, edge.rows, edge.t_ns, warnings)
+        return Trajectory3(checks.seconds(edge.t_ns[keep], t0_ns), edge.values[keep, :3], rotations[keep])
+
+
+def static_frames(listeners: Listeners, base: str) -> StaticFrames:
+    """Register a collector for the static transforms of the bag, if it has any, and return it."""
+    bag, frames = listeners.bag, StaticFrames(base)
+    if STATIC in bag.topics and bag.topics[STATIC].type in TF and bag.topics[STATIC].count:
+        listeners.add(STATIC, frames, listeners.stamper(STATIC, None), timed=False)
+    return frames
+
+
+def poses_of_topic(listeners: Listeners, options: PoseTopic, frames: StaticFrames) -> Poses | FrameReference:
+    """Register a collector for a topic of poses, or of tf with two frames, and return it."""
+    bag, stamper = listeners.bag, listeners.stamper(options.topic, options.clock)
+    is_tf = bag.topic(options.topic).type in TF
+    poses = FrameReference(bag, options, stamper, frames) if is_tf else Poses(bag, options.topic)
+    listeners.add(options.topic, poses, stamper)
+    return poses
+
+
+def plain(frame: str) -> str:
+    """A frame's name in ROS 2 notation, without the leading slash of some bags."""
+    return frame.lstrip("/")
+
+
+def matrices(positions: Array, rotations: Array) -> Array:
+    """Poses (N, 4, 4) with positions (N, 3) and rotations (N, 3, 3)."""
+    out = np.tile(np.eye(4), (len(positions), 1, 1))
+    out[:, :3, 3], out[:, :3, :3] = positions, rotations
+    return out
+
+
+@dataclass(frozen=True)
+class Tree:
+    """``parents``: the parent of each frame; ``topic``: that of the moving frames, "" if none moves; ``moving``: these frames."""
+
+    parents: Mapping[str, str]
+    topic: str
+    moving: frozenset[str]
+
+    def robot(self) -> str | None:
+        """The frame of the robot, by its usual names."""
+        return next((name for name in ROBOT if name in self.parents), None)
+
+    def above(self, frame: str, names: tuple[str, ...]) -> str | None:
+        """The first of ``names`` that is above ``frame``, which moves in it."""
+        moves = False
+        known: set[str] = set()
+        seen = {frame}
+        while frame in self.parents and self.parents[frame] not in seen:
+            moves |= frame in self.moving
+            frame = self.parents[frame]
+            seen.add(frame)
+            if moves:
+                known.add(frame)
+        return next((name for name in names if name in known), None)
+
+
+def tree_of(bag: Bag, notes: list[str]) -> Tree:
+    """The frames in the transforms of a bag. A topic that cannot be read is told of in ``notes``."""
+    parents: dict[str, str] = {}
+    moving: set[str] = set()
+    topic = ""
+    for one in bag.topics.values():
+        if one.type not in TF or not one.count:
+            continue
+        found: dict[str, str] = {}
+        try:
+            found.update(_edges(bag, one.name))
+        except InputError as error:
+            notes.append(str(error))
+        except (AttributeError, TypeError, ValueError) as error:
+            notes.append(f"{bag.path}: topic {one.name} is defined in the bag unlike in ROS: {told(error)}")
+        parents |= found
+        if one.name != STATIC:
+            moving |= found.keys()
+            topic = topic or one.name
+    return Tree(parents, topic, frozenset(moving))
+
+
+def _edges(bag: Bag, topic: str) -> Iterator[tuple[str, str]]:
+    for item in islice(bag.messages([topic]), MANY):
+        transforms: Any = item.message.transforms
+        for transform in transforms:
+            yield plain(transform.child_frame_id), plain(transform.header.frame_id)

@@ -16,15 +16,25 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, add_fields, parse_model
 from factorgraph_loc.io.bags.camera import CameraTopic, Images, Info
-from factorgraph_loc.io.bags.fields import TF, Clock
 from factorgraph_loc.io.bags.file import Bag, open_bag
-from factorgraph_loc.io.bags.frames import ROBOT, STATIC, StaticFrames, poses_of_topic, static_frames
-from factorgraph_loc.io.bags.landmarks import Landmarks, LandmarkTopic, rows_of_table
-from factorgraph_loc.io.bags.listeners import Gatherer, Listeners, report
+from factorgraph_loc.io.bags.manifest import UNUSED
 from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, YawRates, odometry
-from factorgraph_loc.io.bags.poses import POINT, POSES, PoseTopic, ReferenceTopic, Start, StartTopic
-from factorgraph_loc.io.bags.proposed import UNUSED
-from factorgraph_loc.io.bags.tables import Reads, RfidTopic, TableTopic
+from factorgraph_loc.io.bags.poses import (
+    POINT,
+    POSES,
+    ROBOT,
+    STATIC,
+    PoseTopic,
+    ReferenceTopic,
+    Start,
+    StartTopic,
+    StaticFrames,
+    poses_of_topic,
+    static_frames,
+)
+from factorgraph_loc.io.bags.tables import Landmarks, LandmarkTopic, Reads, RfidTopic, TableTopic, rows_of_table
+from factorgraph_loc.io.bags.topics import TF, Clock, Gatherer, Listeners, report
+from factorgraph_loc.io.motions import odometry_stream
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.model.log import NOT_READ, RIG_NOTES, Log
 from factorgraph_loc.model.measurement import Stream
@@ -125,9 +135,10 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     listeners.run()
 
     clock, warnings = report(listeners.stampers, options.clock)
-    t_ns, moved = motion.stream(warnings)
+    t_ns, moves = motion(warnings)
     t0_ns = int(t_ns[0])
-    streams = {"odometry": moved} | {name: sensor.stream(t0_ns, warnings) for name, sensor in sensors.items()}
+    streams: dict[str, Stream] = {"odometry": odometry_stream(t_ns, moves, t0_ns)}
+    streams |= {name: sensor.stream(t0_ns, warnings) for name, sensor in sensors.items()}
     reference = None
     if poses and told:
         path = poses.path(warnings, t0_ns)

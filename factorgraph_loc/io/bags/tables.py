@@ -1,4 +1,7 @@
-"""Sensor tables in a bag whose rows are messages or list elements, and RFID reads, by a mapping of fields."""
+"""Tables of sensors in a bag by a mapping of fields; a row is a message, or an element of a list in it.
+
+RFID reads have inventory rounds. Landmarks may be poses or corners of detected markers.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,21 +13,41 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import checks
 from factorgraph_loc.files.cells import NAMES, NUMBERS
 from factorgraph_loc.files.column_mapping import ReadNames, in_case
-from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table
+from factorgraph_loc.files.columns import LATEST, POSES, STAMP, Column, Table
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.files.tables import TableRows
-from factorgraph_loc.io.bags.fields import LIST, Fields, TopicSettings, as_nanoseconds, as_number, as_text
-from factorgraph_loc.io.bags.file import Bag, Stamped, TopicRows
+from factorgraph_loc.io.bags.file import Bag, Stamped
+from factorgraph_loc.io.bags.poses import StaticFrames
+from factorgraph_loc.io.bags.topics import LIST, Fields, TopicRows, TopicSettings, as_nanoseconds, as_text, leaves
+from factorgraph_loc.maps.markers import corner_names
 from factorgraph_loc.model.measurement import Stream
+from factorgraph_loc.model.planar import Axes, Turned
+from factorgraph_loc.sensors.camera.tables import SIGHTINGS
+from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
 from factorgraph_loc.sensors.rfid import tables as native_rfid
 from factorgraph_loc.sensors.rfid.columns import RFID
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.tables import stream_of
 from factorgraph_loc.text import listed
-from factors.se2 import Array
 
+LandmarkField = Literal["landmark", "range", "bearing", "x", "y", "z"]
+CORNERS = "apriltag_msgs/msg/AprilTagDetectionArray"  # detections as pixels: centre and four corners
+
+CORNER_FIELDS = ("detections[].family", "detections[].id", "detections[].corners[].x", "detections[].corners[].y")
+
+_POSE = "pose.position"
+# messages of marker detectors: the marker's name, and its position in the camera's optical frame
+DETECTIONS: dict[str, tuple[str, str]] = {
+    "apriltag_ros/msg/AprilTagDetectionArray": ("detections[].id", f"detections[].pose.pose.{_POSE}"),
+    "aruco_msgs/msg/MarkerArray": ("markers[].id", f"markers[].pose.{_POSE}"),
+    "aruco_opencv_msgs/msg/ArucoDetection": ("markers[].marker_id", f"markers[].{_POSE}"),
+    "ros2_aruco_interfaces/msg/ArucoMarkers": ("marker_ids[]", "poses[].position"),
+    "fiducial_msgs/msg/FiducialTransformArray": ("transforms[].fiducial_id", "transforms[].transform.translation"),
+}
+PLACES = tuple(replace(POSES[axis], may_lack=True) for axis in "xyz")  # in the sensor frame
 ReadField = Literal["epc", "antenna", "rssi", "phase", "frequency", "stamp"]
 READ = [RFID[name] for name in ("epc", "antenna", *native_rfid.SIGNALS)]
 STAMP_OF_READ = replace(STAMP, name="stamp")
@@ -41,17 +64,20 @@ class TableTopic(TopicSettings):
 
 class RowsOfTopic:
     """Collects rows of a topic: ``columns`` of names and of numbers, by the ``fields`` of its messages; missing numbers are NaN.
-    ``units``: names or factors by column."""
+    ``units``: names or factors by column; ``table``: description of the rows."""
 
     def __init__(
         self,
         bag: Bag,
         topic: str,
         fields: Mapping[Any, str],
-        columns: Sequence[Column],
-        units: Mapping[Any, str | float],
+        table: Table,
+        columns: Sequence[Column] | None = None,
+        units: Mapping[Any, str | float] | None = None,
     ) -> None:
         self._fields = Fields(bag, bag.topic(topic), fields)
+        self._table = table
+        columns, units = columns or table.columns[1:], units or {}
         self._named = [column for column in columns if column.kind in NAMES]
         numbered = [column for column in columns if column.kind in NUMBERS]
         self._numbered = [column.name for column in numbered]
@@ -67,7 +93,7 @@ class RowsOfTopic:
             stamp = self._stamp(found, t_ns, item.row)
             for column in self._named:
                 self._names[column.name].append(self._name(column, found, item.row))
-            self._rows.append(item, stamp, tuple(as_number(found.get(name, math.nan)) for name in self._numbered))
+            self._rows.append(item, stamp, [found.get(name, math.nan) for name in self._numbered])
 
     def _stamp(self, found: Mapping[Any, Any], t_ns: int, row: int) -> int:
         """The timestamp [ns] of a row with the values ``found`` by field, in a message that has ``t_ns``."""
@@ -79,24 +105,10 @@ class RowsOfTopic:
             return text
         raise bad_field(self._rows.source, column.name, text, column.doc, row=row)
 
-    def rows_of(self, numbers: Mapping[str, Array] | None = None) -> TableRows:
-        """The collected rows, or the rows with other ``numbers`` (N,) computed from them."""
-        if numbers is None:
-            numbers = dict(zip(self._numbered, (self._rows.values * self._units).T, strict=True))
-        return TableRows(Path(self._rows.source), self._rows.rows, self._rows.t_ns, dict(numbers), self._names)
-
-
-class DescribedRows(RowsOfTopic):
-    """Collects the rows of a table that needs only its description."""
-
-    def __init__(self, bag: Bag, options: TableTopic, table: Table) -> None:
-        columns = {column.name: column for column in table.columns[1:]}
-        fields = options.fields or {name: name for name in columns}
-        needed = {name for name, column in columns.items() if not column.may_lack}
-        if not needed <= set(fields) <= set(columns):
-            raise InputError(f"{bag.path} {options.topic}: fields are {listed(fields)}, expected {listed(columns)}")
-        super().__init__(bag, options.topic, fields, table.columns[1:], options.units)
-        self._table = table
+    def rows_of(self) -> TableRows:
+        """The collected rows."""
+        numbers = dict(zip(self._numbered, (self._rows.values * self._units).T, strict=True))
+        return TableRows(Path(self._rows.source), self._rows.rows, self._rows.t_ns, numbers, self._names)
 
     def stream(self, t0_ns: int, warnings: list[str]) -> Stream:
         """The rows as a stream; problems are an InputError or a warning."""
@@ -128,7 +140,7 @@ class Reads(RowsOfTopic):
             raise InputError(f"{source}: fields.epc is missing")
         if ("antenna" in options.fields) == (options.antenna is not None):
             raise InputError(f"{source}: expected either fields.antenna, or antenna, the name of the only one")
-        super().__init__(bag, options.topic, options.fields, READ, options.units)
+        super().__init__(bag, options.topic, options.fields, RFID, READ, options.units)
         self._stamp_unit = round(STAMP_OF_READ.in_unit(options.units.get("stamp", "us"), source)[1])
         # the antenna of a message without reads
         self._listening = None
@@ -189,3 +201,87 @@ class Reads(RowsOfTopic):
             return self._options.antenna
         name = super()._name(column, found, row)
         return self._options.antennas.get(name, name)
+
+
+class LandmarkTopic(TopicSettings, Turned):
+    """A topic of landmarks, such as those of common marker detectors."""
+
+    fields: dict[LandmarkField, str] | None = None
+    """paths of the landmark's name, and of its range and bearing, or of its position x, y, z in the sensor frame; known for
+    common marker detectors"""
+    axes: Axes = "optical"
+    """axes of the sensor that point forward, left and up: body (x, y, z), optical (z, -x, -y), or such a list"""
+    frame: str | None = None
+    """frame of the sensor, whose pose is in tf_static; without it use axes and mounting"""
+
+
+class Landmarks(RowsOfTopic):
+    """Collects ranges and bearings of a topic, or the positions from which they are computed."""
+
+    def __init__(self, bag: Bag, options: LandmarkTopic, frames: StaticFrames) -> None:
+        topic = bag.topic(options.topic)
+        self._options, self._frames = options, frames
+        fields: dict[Any, str] = dict(options.fields or {})
+        if not fields:
+            if topic.type not in DETECTIONS:
+                known = ", ".join(DETECTIONS)
+                raise InputError(
+                    f"{bag.path}: topic {topic.name} is of type {topic.type}: give its fields; known without: {known}"
+                )
+            name, place = DETECTIONS[topic.type]
+            fields = {"landmark": name} | {axis: f"{place}.{axis}" for axis in "xyz"}
+        self._places = "x" in fields
+        wanted = {"landmark", "x", "y", "z"} if self._places else {"landmark", "range", "bearing"}
+        if "landmark" not in fields or not set(fields) <= wanted or len(fields) < (4 if self._places else 2):
+            expected = "landmark with x, y and z, or with range, bearing or both"
+            raise InputError(f"{bag.path} {topic.name}: fields are {listed(fields)}, expected {expected}")
+        columns = (BEARING_RANGE["landmark"], *PLACES) if self._places else None
+        super().__init__(bag, options.topic, fields, BEARING_RANGE, columns)
+
+    def rows_of(self) -> TableRows:
+        """Ranges along the floor and bearings, in the robot frame if the sensor's pose is known."""
+        rows = super().rows_of()
+        if not self._places:
+            return rows
+        places = self._rows.values
+        checks.require_finite(self._rows.source, self._rows.rows, "xyz", places)
+        pose = np.eye(4)
+        if self._options.frame is not None:
+            pose = self._frames.known(self._rows.source, self._options.frame)
+        else:
+            pose[:3, :3] = self._options.turned()
+        x, y, _ = (places @ pose[:3, :3].T + pose[:3, 3]).T
+        return replace(rows, numbers={"range": np.hypot(x, y), "bearing": np.arctan2(y, x)})
+
+
+class Corners(RowsOfTopic):
+    """Collects the corners of AprilTags as pixels of named points. The names are ``FAMILY-NUMBER/0`` to ``/3``, see
+    :func:`factorgraph_loc.maps.markers.corner_names`."""
+
+    def __init__(self, bag: Bag, name: str) -> None:
+        topic = bag.topic(name, CORNERS)
+        known = leaves(bag.store(name), topic.type)
+        if lacking := [path for path in CORNER_FIELDS if path not in known]:
+            raise InputError(f"{bag.path}: topic {name} ({topic.type}) lacks {listed(lacking)}")
+        super().__init__(bag, name, {}, SIGHTINGS)
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        """Add the pixels of a message."""
+        for found in item.message.detections:
+            names = corner_names(f"{found.family}-{found.id}")
+            # apriltag starts at the lower left corner and continues with the lower right one
+            for name, corner in zip(reversed(names), found.corners, strict=True):
+                self._names["landmark"].append(name)
+                self._rows.append(item, t_ns, (corner.x, corner.y))
+
+
+def rows_of_table(bag: Bag, options: TableTopic, table: Table) -> RowsOfTopic:
+    """The collector of a topic of rows of ``table``; the corners of AprilTags need no fields."""
+    if table.name == SIGHTINGS.name and not options.fields and bag.topic(options.topic).type == CORNERS:
+        return Corners(bag, options.topic)
+    columns = {column.name: column for column in table.columns[1:]}
+    fields = options.fields or {name: name for name in columns}
+    needed = {name for name, column in columns.items() if not column.may_lack}
+    if not needed <= set(fields) <= set(columns):
+        raise InputError(f"{bag.path} {options.topic}: fields are {listed(fields)}, expected {listed(columns)}")
+    return RowsOfTopic(bag, options.topic, fields, table, units=options.units)

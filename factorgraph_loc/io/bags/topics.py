@@ -1,0 +1,298 @@
+"""The topics of a bag: the fields and the timestamps of their messages, and the collectors that keep them.
+
+A field has a path: ``tag.epc``, or ``reads[].tag.epc`` for a list. Paths are checked against the message type before messages
+are read; errors list the available fields. Timestamps are those of headers (time of measurement) or of the recording.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Callable, Mapping, Sequence
+from itertools import repeat
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import checks
+from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.io.bags.file import Bag, Stamped, Topic
+from factorgraph_loc.text import listed, quoted, told
+from factors.se2 import Array, Integers
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+LIST = "[]"
+BYTES = ("uint8", "byte", "char", "octet")  # a list of these is one value, such as an EPC
+TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+HEADER = "std_msgs/msg/Header"
+DEPTH = 6  # nesting levels of messages
+
+Row = tuple[Any, ...]
+Clock = Literal["header", "receive"]
+TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # the latter in old bags
+APART = 0.5  # s; larger differences between topics are clock offsets, not delays
+
+
+class TopicSettings(FileModel):
+    """The settings that all topics have."""
+
+    topic: str
+    """name of the topic"""
+    clock: Clock | None = None
+    """timestamps of message headers or of receipt; by default as for the bag"""
+
+
+class Fields:
+    """Some fields of the messages of a topic. ``rows``: tuples of their values, in the order of ``names``, one for each element of
+    the lists in the paths, or one per message without lists."""
+
+    def __init__(self, bag: Bag, topic: Topic, paths: Mapping[Any, str]) -> None:
+        self.names = tuple(paths)
+        self._where = f"{bag.path}: topic {topic.name}"
+        for name, path in paths.items():
+            check_path(bag.store(topic.name), topic, path, f"{self._where}: {name}")
+        self._getters = [_getter(path) for path in paths.values()]
+        self._are_lists = [LIST in path for path in paths.values()]
+
+    def rows(self, message: Any, row: int) -> list[Row]:
+        """The rows of message number ``row``; InputError if its lists have different lengths."""
+        values = [get(message) for get in self._getters]
+        if not any(self._are_lists):
+            return [tuple(values)]
+        lengths = [len(value) for value, is_list in zip(values, self._are_lists, strict=True) if is_list]
+        if len(set(lengths)) > 1:
+            told = ", ".join(map(str, lengths))
+            raise InputError(f"{self._where}: message {row} has lists of {told} elements, expected lists of one length")
+        columns = (v if is_list else repeat(v) for v, is_list in zip(values, self._are_lists, strict=True))
+        return list(zip(*columns, strict=False))  # as many as the lists have elements
+
+
+def check_path(store: Typestore, topic: Topic, path: str, where: str) -> None:
+    """InputError with the available fields if the messages lack ``path``."""
+    known = leaves(store, topic.type)
+    if path not in known and path + LIST not in known:
+        raise InputError(f"{where} is {quoted(path)}, which {topic.type} lacks; its fields: {listed(known)}")
+    if path.count(LIST) > 1:
+        raise InputError(f"{where} is {quoted(path)}, a list within a list, expected at most one {LIST}")
+
+
+def leaves(store: Typestore, kind: str, prefix: str = "", depth: int = DEPTH) -> list[str]:
+    """The paths of all numbers, texts, bytes and timestamps in a message type."""
+    out: list[str] = []
+    definition: Any = store.fielddefs[kind][1]
+    for name, (form, detail) in definition:
+        path, label, inner = f"{prefix}{name}", form.name, detail
+        if label in {"ARRAY", "SEQUENCE"}:
+            (element, inner), _ = detail
+            label = element.name
+            path += "" if label == "BASE" and inner[0] in BYTES else LIST
+        if label == "BASE" or inner in TIMES:
+            out.append(path)
+        elif depth and inner in store.fielddefs:
+            out += leaves(store, str(inner), f"{path}.", depth - 1)
+    return out
+
+
+def has_header(bag: Bag, topic: Topic) -> bool:
+    """Whether the messages of a topic begin with a header."""
+    fields: Any = bag.store(topic.name).fielddefs[topic.type][1]
+    return bool(fields) and fields[0][0] == "header" and fields[0][1][1] == HEADER
+
+
+def as_text(value: Any) -> str:
+    """A name: text unchanged, bytes as hexadecimal digits (an EPC), a number in decimal digits."""
+    if isinstance(value, str):
+        return value.strip()
+    if isinstance(value, np.ndarray) and value.dtype == np.uint8:
+        return value.tobytes().hex().upper()
+    if isinstance(value, (bytes, bytearray)):
+        return value.hex().upper()
+    if isinstance(value, (np.ndarray, list)):  # marker numbers of a bundle
+        return "-".join(str(part) for part in value)
+    return str(value)
+
+
+def as_number(value: Any) -> float:
+    """A number, or NaN for another value."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def as_nanoseconds(value: Any, unit: int) -> int:
+    """A timestamp: a ROS time, or a number in units of ``unit`` nanoseconds. ValueError for another value."""
+    if hasattr(value, "nanosec"):
+        return int(value.sec) * 10**9 + int(value.nanosec)
+    if isinstance(value, int):
+        return value * unit
+    return round(float(value) * unit)
+
+
+def _getter(path: str) -> Callable[[Any], Any]:
+    """A getter of the field at a path, or of that field of the elements of a list."""
+    outer, is_list, inner = path.partition(LIST)
+    get = attrgetter(outer)
+    if not is_list:
+        return get
+    within: Callable[[Any], Any] = attrgetter(inner.lstrip(".")) if inner else lambda element: element
+    return lambda message: [within(element) for element in get(message)]
+
+
+class TopicRows:
+    """Collects N rows of numbers with timestamps, and the numbers of their messages, counted from 1 within the topic.
+
+    ``paths``: fields of which each message has one row; without them, rows are appended. NaN for what is no number.
+    """
+
+    def __init__(self, source: str, width: int, paths: Sequence[str] = ()) -> None:
+        self.source = source
+        self._width = width
+        self._get = attrgetter(*paths) if paths else None
+        self._row, self._t_ns, self._values = array("q"), array("q"), array("d")
+
+    def add(self, item: Stamped, t_ns: int) -> None:
+        """Add the row of a message."""
+        assert self._get is not None
+        found = self._get(item.message)
+        self.append(item, t_ns, found if self._width > 1 else (found,))
+
+    def append(self, item: Stamped, t_ns: int, values: Sequence[Any]) -> None:
+        self._row.append(item.row)
+        self._t_ns.append(t_ns)
+        self._values.extend(map(as_number, values))
+
+    def __len__(self) -> int:
+        return len(self._row)
+
+    @property
+    def rows(self) -> Integers:
+        return np.array(self._row, dtype=np.int64)
+
+    @property
+    def t_ns(self) -> Integers:
+        return np.array(self._t_ns, dtype=np.int64)
+
+    @property
+    def values(self) -> Array:
+        """The numbers (N, width)."""
+        return np.array(self._values, dtype=float).reshape(-1, self._width)
+
+    def in_order(self, names: Sequence[str], warnings: list[str]) -> tuple[Integers, Array]:
+        """Timestamps (M,) and numbers (M, width) in order of time, all finite; InputError names the invalid message."""
+        checks.require_finite(self.source, self.rows, names, self.values)
+        keep = checks.in_order(self.source, self.rows, self.t_ns, warnings)
+        return self.t_ns[keep], self.values[keep]
+
+
+class Gatherer(Protocol):
+    """Collects the needed data from the messages of one topic; messages are not kept, so they are validated here."""
+
+    def add(self, item: Stamped, t_ns: int) -> None: ...
+
+
+G = TypeVar("G", bound=Gatherer)
+
+
+class Listeners:
+    """The collectors of each topic, with their clocks."""
+
+    def __init__(self, bag: Bag, clock: Clock) -> None:
+        self.bag, self.clock = bag, clock
+        self.stampers: list[Stamper] = []
+        self._of: dict[str, list[tuple[Stamper, Gatherer]]] = {}
+
+    def stamper(self, topic: str, clock: Clock | None) -> Stamper:
+        """The timestamps of a topic, by its own clock or that of the bag."""
+        return Stamper(self.bag, self.bag.topic(topic), clock or self.clock)
+
+    def add(self, topic: str, gatherer: Gatherer, stamper: Stamper, *, timed: bool = True) -> None:
+        """Register a collector. ``timed``: whether timestamps of the topic are meaningful."""
+        self._of.setdefault(topic, []).append((stamper, gatherer))
+        if timed:
+            self.stampers.append(stamper)
+
+    def listen(self, options: TopicSettings, gatherer: G) -> G:
+        """Register a collector for a topic and return it."""
+        self.add(options.topic, gatherer, self.stamper(options.topic, options.clock))
+        return gatherer
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The topics that are read."""
+        return tuple(self._of)
+
+    def run(self) -> None:
+        """Read the bag."""
+        for item in self.bag.messages(list(self._of)):
+            for stamper, gatherer in self._of[item.topic]:
+                try:
+                    gatherer.add(item, stamper.stamp(item))
+                except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+                    kind = self.bag.topics[item.topic].type
+                    where = f"{self.bag.path} {item.topic}:{item.row}"
+                    raise InputError(f"{where}: {kind} is defined in the bag unlike in ROS: {told(error)}") from error
+        for stamper in self.stampers:
+            stamper.check()
+
+
+class Stamper:
+    """Timestamps of the messages of one topic [ns], by a ``clock``; the time of receipt for messages without a header. For tf,
+    whose headers are nested, use :meth:`choose`."""
+
+    def __init__(self, bag: Bag, topic: Topic, clock: Clock) -> None:
+        self.topic = topic
+        self._before = has_header(bag, topic)
+        self.has_header = self._before or topic.type in TF
+        self._where = f"{bag.path}: topic {topic.name}"
+        self.uses_header = self.has_header and clock == "header"
+        self._delays = array("q")
+        self._any_set = False
+
+    def stamp(self, item: Stamped) -> int:
+        if not self._before:
+            return item.received
+        return self.choose(as_nanoseconds(item.message.header.stamp, 1), item.received)
+
+    def choose(self, in_header: int, received: int) -> int:
+        """The timestamp of a header or the time of receipt [ns], by the clock."""
+        self._any_set |= in_header != 0
+        self._delays.append(received - in_header)
+        return in_header if self.uses_header else received
+
+    def check(self) -> None:
+        """InputError if headers are used but all their timestamps are 0."""
+        if self.uses_header and len(self._delays) > 1 and not self._any_set:
+            raise InputError(f'{self._where}: the stamps of all headers are 0: set clock = "receive" in the manifest')
+
+    def delay(self) -> float | None:
+        """Median delay of receipt after the header's timestamp [s]; None without valid headers."""
+        if not self._any_set:
+            return None
+        return float(np.median(np.frombuffer(self._delays, dtype=np.int64))) / 1e9
+
+
+def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[str]]:
+    """A line on the clock used and the delays found, and warnings."""
+    delays = {s.topic.name: delay for s in stampers if (delay := s.delay()) is not None}
+    line = "header stamps" if clock == "header" else "time of receipt"
+    if bare := sorted({s.topic.name for s in stampers if not s.has_header}):
+        line += f"; without headers, as received: {', '.join(bare)}" if clock == "header" else ""
+    if delays:
+        line += "; received after the header's stamp (median): "
+        line += ", ".join(f"{name} {delay:.3f} s" for name, delay in sorted(delays.items()))
+    warnings = []
+    # the delay is 0 if the recorder sets both timestamps
+    compared = {s.topic.name: s.delay() if s.uses_header else 0.0 for s in stampers}
+    known = {name: delay for name, delay in compared.items() if delay is not None}
+    if known and max(known.values()) - min(known.values()) > APART:
+        low, high = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
+        warnings.append(
+            f"the clocks of {low} and {high} differ by {known[high] - known[low]:.3f} s: "
+            "choose clock in the manifest, or set time_offset in the rig"
+        )
+    return line, warnings
