@@ -10,7 +10,7 @@ import pytest
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fusion import registry as estimators
-from factorgraph_loc.io.readers import registry as readers
+from factorgraph_loc.io.readers import reader
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS, load
 from factorgraph_loc.sensors import registry
@@ -71,7 +71,7 @@ def test_estimators_and_readers_of_another_package(install, sonar):
     install(("estimators", "guess", "sonar:Guess"), ("readers", "sonar_log", "sonar"))
     assert estimators.estimator_type("guess") is sonar.Guess
     assert isinstance(estimators.settings_of("guess", {}), sonar.GuessSettings)
-    assert readers.reader("sonar_log").read is print
+    assert reader("sonar_log").read is print
     sonar.Guess.__doc__, sonar.Guess.modalities, sonar.Guess.causal = "Guesses. Often.", {"rfid"}, False
     found = estimators.describe("guess")
     assert (found.about, found.causal, found.smoothed) == ("Guesses.", False, True)

@@ -11,8 +11,7 @@ from factorgraph_loc.files import shipped
 from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.files.shipped import manifests, readers, rigs
 from factorgraph_loc.io.native.rig_file import read_rig
-from factorgraph_loc.io.readers import READERS, describe, load, read_manifest, verify
-from factorgraph_loc.io.readers.registry import reader
+from factorgraph_loc.io.readers import READERS, describe, load, read_manifest, reader, verify
 
 MANIFEST = 'title = "t"\nreader = "mrclam"\npath = "set"\nlicence = "none"\norigin = "here"\n'
 

@@ -375,7 +375,7 @@ def read_fields(paths: Sequence[str]) -> dict[str, str]:
         if fitting:
             out[name] = min(fitting)[-1]
     if "stamp" not in out:  # the timestamp of a read in the message of its EPC
-        out |= {"stamp": path for path in reversed(paths) if path.endswith("stamp") and LIST in path}
+        out.update([("stamp", path) for path in paths if path.endswith("stamp") and LIST in path][:1])
     return out
 
 

@@ -1,8 +1,7 @@
 """Readers of log formats, one module each, and ``load``, which selects the reader."""
 
-from factorgraph_loc.io.readers.load import load, read_log
+from factorgraph_loc.io.readers.load import load, read_log, reader
 from factorgraph_loc.io.readers.manifests import Dataset, Manifest, describe, read_manifest, verify
-from factorgraph_loc.io.readers.registry import reader
 from factorgraph_loc.plugins import READERS
 
 __all__ = [

@@ -1,9 +1,9 @@
-"""The registry of readers: modules with a model of ``Options`` and a function ``read(path, options)``."""
+"""The logs of files in any format, each read by a module with a model of ``Options`` and a function ``read(path, options)``."""
 
 import itertools
 import math
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +11,21 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import kind
 from factorgraph_loc.files.column_mapping import JSON_SUFFIXES
 from factorgraph_loc.files.data_root import EXPECTED, find_data_root, named_path
-from factorgraph_loc.files.models import nearest, parse_model, read_toml
+from factorgraph_loc.files.models import FileModel, nearest, parse_model, read_toml
+from factorgraph_loc.files.settings import first_sentence
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.io.bags.file import is_bag, require_metadata
 from factorgraph_loc.io.checks import look_over, require_bounds
 from factorgraph_loc.io.motions import with_wheels_in, with_wheels_of
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig
 from factorgraph_loc.io.native.world_file import read_world
-from factorgraph_loc.io.readers import registry as readers
-from factorgraph_loc.io.readers.manifests import Manifest, StartSettings, read_manifest
+from factorgraph_loc.io.readers.manifests import Manifest, read_manifest
 from factorgraph_loc.io.readers.pose_file import is_pose_file
-from factorgraph_loc.maps.markers import MarkerSettings
 from factorgraph_loc.model.log import RIG_NOTES, Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.text import listed, one_line
+from factorgraph_loc.plugins import READERS
+from factorgraph_loc.text import listed, one_line, quoted
 
 RUN_FILE = "run.toml"
 MOST = 1000  # maximum number of logs from lists of options
@@ -33,18 +33,32 @@ TABLES = (".csv", *JSON_SUFFIXES)
 
 
 @dataclass(frozen=True)
+class Reader:
+    """A reader: the model of its options, ``read(path, options)``, which returns the log, and one sentence ``about`` its format."""
+
+    options: type[FileModel]
+    read: Callable[[Path | None, Any], Log]
+    about: str
+
+
+def reader(name: str) -> Reader:
+    """The reader of a format; InputError with the most similar name if it is unknown."""
+    if name not in READERS:
+        raise InputError(f"there is no reader {quoted(name)}{nearest(name, list(READERS))}")
+    module = READERS[name]
+    return Reader(module.Options, module.read, first_sentence(module))
+
+
+@dataclass(frozen=True)
 class _Source:
-    """What to read, and what to add to the reader's log."""
+    """What to read, and what to add to the reader's log; ``name``: None for the reader's name."""
 
     reader: str
     path: Path | None
-    name: str | None = None  # None for the reader's name
-    options: Mapping[str, Any] = field(default_factory=dict)
+    name: str | None = None
     rig: Rig | None = None
     world: World | None = None
-    start: StartSettings | None = None
-    markers: MarkerSettings | None = None
-    metadata: Mapping[str, str] = field(default_factory=dict)
+    manifest: Manifest | None = None
 
 
 def load(
@@ -67,7 +81,8 @@ def load(
     given = dict(options or {})
     given_files = [what for what, file in (("rig", rig), ("world", world)) if file is not None]
     source = _find(str(log), data_root, reader, given_files)
-    choices = {key: _choices(value) for key, value in source.options.items()}
+    described = source.manifest.options if source.manifest else {}
+    choices = {key: _choices(value) for key, value in described.items()}
     # lists are given as text with commas on the command line
     choices |= {
         key: [part.strip() for part in value.split(",")] if isinstance(value, str) else _choices(value)
@@ -114,16 +129,16 @@ def _choices(value: Any) -> list[Any]:
     return list(value) if isinstance(value, (list, tuple)) else [value]
 
 
-def _find(log: str, data_root: str | Path | None, reader: str | None, given: Collection[str]) -> _Source:
+def _find(log: str, data_root: str | Path | None, named: str | None, given: Collection[str]) -> _Source:
     path = Path(log)
-    if reader is not None:
-        readers.reader(reader)  # report a wrong reader before a wrong path
+    if named is not None:
+        reader(named)  # report a wrong reader before a wrong path
     if kind(path) not in ("", "a file", "a folder"):
         raise InputError(f"{log}: is {kind(path)}, expected a file or a folder")
-    if reader is not None:
+    if named is not None:
         if not path.exists():
             raise InputError(f"{log}: does not exist")
-        return _Source(reader, path, None if reader == "native" else _name(path))
+        return _Source(named, path, None if named == "native" else _name(path))
     if path.is_dir() and (path / RUN_FILE).is_file():
         path /= RUN_FILE
     if path.exists() and is_bag(path):
@@ -175,38 +190,37 @@ def _from_manifest(file: Path, data_root: str | Path | None, given: Collection[s
         if name is not None
     }
     return _Source(
-        reader=manifest.reader,
-        path=path,
-        name=None if file.name == RUN_FILE else file.stem,
-        options=manifest.options,
-        rig=read_rig(files["rig"]) if "rig" in files else None,
-        world=read_world(files["world"]) if "world" in files else None,
-        start=manifest.start,
-        markers=manifest.markers,
-        metadata={"title": manifest.title, "licence": manifest.licence, "origin": manifest.origin},
+        manifest.reader,
+        path,
+        None if file.name == RUN_FILE else file.stem,
+        read_rig(files["rig"]) if "rig" in files else None,
+        read_world(files["world"]) if "world" in files else None,
+        manifest,
     )
 
 
 def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log:
     """One log; ``naming``: options that are appended to its name to make it unique."""
-    chosen = readers.reader(source.reader)
+    chosen, manifest = reader(source.reader), source.manifest
     options = with_wheels_of(source.rig, options)
     log = chosen.read(source.path, parse_model(chosen.options, options, f"options of reader {source.reader}"))
     name = "-".join([source.name or log.name, *(f"{key}{options[key]}" for key in naming)])
-    told = {key: text for key, text in log.metadata.items() if source.rig is None or key != RIG_NOTES}
+    metadata = {key: text for key, text in log.metadata.items() if source.rig is None or key != RIG_NOTES}
+    if manifest is not None:
+        metadata |= {"title": manifest.title, "licence": manifest.licence, "origin": manifest.origin}
     log = replace(
         log,
         name=name,
         rig=source.rig or log.rig,
         world=source.world or log.world,
-        start=source.start.pose(log.t0_ns) if source.start else log.start,
-        metadata={**told, **source.metadata},
+        start=manifest.start.pose(log.t0_ns) if manifest and manifest.start else log.start,
+        metadata=metadata,
     )
     require_bounds(log)
-    if source.markers is not None:
+    if manifest is not None and manifest.markers is not None:
         from factorgraph_loc.sensors.camera.frontend import with_markers  # noqa: PLC0415 - most logs do not need OpenCV
 
-        log = with_markers(log, source.markers.family)
+        log = with_markers(log, manifest.markers.family)
     warnings = list(log.warnings)
     if "imu" in log.streams and "imu" not in log.rig.sensors:
         if log.rig is DEFAULT_RIG:
