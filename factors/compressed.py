@@ -14,6 +14,7 @@ import math
 import numpy as np
 
 from factors.compiled import compiled
+from factors.gaussian_kernels import root
 from factors.se2 import Array
 
 RELATIVE_RIDGE = 1e-9  # of the mean curvature, against division by zero
@@ -21,18 +22,7 @@ RIDGE = 1e-10
 LEAST = 1e-12  # a cost of zero has no gradient
 
 
-@compiled
-def _cholesky(matrix: Array, lower: Array) -> None:
-    d = len(matrix)
-    for i in range(d):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= lower[i, k] * lower[j, k]
-            lower[i, j] = math.sqrt(max(total, RIDGE)) if i == j else total / lower[j, j]
-
-
-@compiled
+@compiled(error_model="numpy")
 def _whitened(lower: Array, vector: Array, out: Array) -> float:
     """Compute L^-1 v into ``out`` and return its squared norm."""
     squared = 0.0
@@ -45,43 +35,33 @@ def _whitened(lower: Array, vector: Array, out: Array) -> float:
     return squared
 
 
-@compiled
-def _compress(nll: float, gradient: Array, information: Array, residual: Array, jacobian: Array) -> None:
-    d = len(gradient)
-    curvature = information.copy()
-    trace = 0.0
-    for i in range(d):
+@compiled(error_model="numpy")
+def _compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, Array]:
+    size, curvature, trace = len(gradient), information.copy(), 0.0
+    residual, jacobian = np.empty(size + 1), np.zeros((size + 1, size))
+    for i in range(size):
         trace += curvature[i, i]
-    for i in range(d):
-        curvature[i, i] += RELATIVE_RIDGE * trace / d + RIDGE
-    lower = np.zeros((d, d))
-    _cholesky(curvature, lower)
-    squared = _whitened(lower, gradient, residual)
-    floor = max(2.0 * nll, LEAST)
+    for i in range(size):
+        curvature[i, i] += RELATIVE_RIDGE * trace / size + RIDGE
+    lower, _ = root(curvature)
+    squared, floor = _whitened(lower, gradient, residual), max(2.0 * nll, LEAST)
     if squared > floor:
         raised = 1.0 / floor - 1.0 / squared
-        for i in range(d):
-            for j in range(d):
+        for i in range(size):
+            for j in range(size):
                 curvature[i, j] += raised * gradient[i] * gradient[j]
-        _cholesky(curvature, lower)
+        lower, _ = root(curvature)
         squared = _whitened(lower, gradient, residual)
-    residual[d] = math.sqrt(max(2.0 * nll - squared, 0.0))
-    for i in range(d):
+    residual[size] = math.sqrt(max(2.0 * nll - squared, 0.0))
+    for i in range(size):
         for j in range(i + 1):
             jacobian[j, i] = lower[i, j]
+    return residual, jacobian
 
 
 def compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, Array]:
     """Residual (d + 1,) and Jacobian (d + 1, d) of a cost ``nll`` >= 0 with ``gradient`` (d,) and symmetric positive semi-definite
     ``information`` (d, d); see the module. All are finite for any rank of the information."""
-    d = len(gradient)
-    residual = np.empty(d + 1)
-    jacobian = np.zeros((d + 1, d))
-    _compress(
-        float(nll),
-        np.ascontiguousarray(gradient, dtype=float),
-        np.ascontiguousarray(information, dtype=float),
-        residual,
-        jacobian,
-    )
+    arrays = np.ascontiguousarray(gradient, dtype=float), np.ascontiguousarray(information, dtype=float)
+    residual, jacobian = _compressed(float(nll), *arrays)
     return residual, jacobian

@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from factors import gaussian_kernels
 from factors.compiled import compiled
 from factors.se2 import Array
 
@@ -37,28 +38,21 @@ def sound(covariance: Array) -> Array:
     return covariance if np.linalg.eigvalsh(shares)[0] > LEAST else nearest(covariance)
 
 
-@compiled
+@compiled(error_model="numpy")
 def is_clear(covariance: Array) -> bool:
     """Whether a covariance (D, D) is finite and far from singular, so that it is its own :func:`sound` covariance."""
-    size, left = len(covariance), np.empty(covariance.shape)
-    determinant = 1.0
+    size, shares = len(covariance), np.empty(covariance.shape)
     for i in range(size):
         if not 0.0 < covariance[i, i] < np.inf:
             return False
-    for i in range(size):
-        # the lower root of the correlations, row by row
         for j in range(i + 1):
-            rest = covariance[i, j] / math.sqrt(covariance[i, i]) / math.sqrt(covariance[j, j])
-            for k in range(j):
-                rest -= left[i, k] * left[j, k]
-            if j < i:
-                left[i, j] = rest / left[j, j]
-            elif not rest > 0.0:
-                return False
-            else:
-                left[i, i], determinant = math.sqrt(rest), determinant * rest
+            shares[i, j] = covariance[i, j] / math.sqrt(covariance[i, i]) / math.sqrt(covariance[j, j])
+    lower, exists = gaussian_kernels.root(shares)
+    determinant = 1.0
+    for i in range(size):
+        determinant *= lower[i, i] * lower[i, i]
     # with such a determinant the smallest eigenvalue of a correlation matrix is far above LEAST: det < e * smallest
-    return determinant > CLEAR
+    return exists and determinant > CLEAR
 
 
 def whitener(covariances: Array) -> Array:

@@ -1,7 +1,7 @@
 """The robust, iterated Kalman update in information form.
 
-Robust, because an outlier must neither dominate nor be rejected by a wrong prediction. Pixels of known points, which are many and
-frequent, have a compiled version (:mod:`factors.camera.update_kernels`).
+Robust, because an outlier must neither dominate nor be rejected by a wrong prediction. Landmarks of a map have a compiled version
+(:mod:`factors.landmarks.update_kernels`), because an EKF updates so often that calls of NumPy would take most of its time.
 """
 
 from __future__ import annotations
@@ -12,16 +12,10 @@ from typing import Protocol
 
 import numpy as np
 
-from factors import positive, se2
-from factors.camera import update_kernels as pixel_kernels
-from factors.camera.factor import ReprojectionFactor
-from factors.landmarks import update_kernels as landmark_kernels
-from factors.landmarks.factor import BearingRangeFactor
-from factors.landmarks.model import packed
+from factors import gaussian_kernels, positive
 from factors.se2 import Array
 
 CONVERGED = 1e-6  # m and rad; convergence limit of an iterated update
-TILT = 2  # roll and pitch, which all points of an image have in common
 GATE = 9.21  # 99 % of chi-square with two degrees of freedom
 GATES = {1: 6.63, 2: GATE, 3: 11.34}  # by degrees of freedom
 
@@ -58,70 +52,6 @@ class Correction:
     evidence: float | None = None
 
 
-def robust_update(
-    factor: ReprojectionFactor, pose: Array, covariance: Array, iterations: int, converged: float = CONVERGED
-) -> Correction:
-    """Kalman update of ``pose`` (3,) and correlated states by points in an image, as a factor on the pose only; see
-    :func:`update_state`.
-
-    ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation.
-    """
-    arrays = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
-    try:
-        found = Correction(*pixel_kernels.updated(factor.packed(), *arrays, iterations, converged, GATE), factor.dof())
-        _require_sound(found.delta, found.covariance)
-    except np.linalg.LinAlgError:
-        return image_update(factor, pose, covariance, (), (), iterations, converged)
-    return found
-
-
-def image_update(
-    factor: ReprojectionFactor,
-    pose: Array,
-    covariance: Array,
-    values: Sequence[Array],
-    columns: Sequence[slice],
-    iterations: int,
-    converged: float = CONVERGED,
-) -> Correction:
-    """:func:`robust_update` by a factor on other ``values`` too, whose ``columns`` in the error state are given. The covariance is
-    that of perturbations of the updated pose: pixels are so much better than a survey that it matters."""
-    size = len(covariance)
-
-    def linearize(delta: Array) -> tuple[Array, Array]:
-        at = [v + delta[column] for v, column in zip(values, columns, strict=True)]
-        residual, blocks = factor.whitened([se2.compose(pose, se2.exp(delta[:3])), *at])
-        jacobian = np.zeros((*residual.shape, len(delta)))
-        for column, block in zip((slice(3), *columns, slice(size, None)), blocks, strict=True):
-            jacobian[..., column] = block
-        jacobian[..., :3] = jacobian[..., :3] @ se2.right_jacobian(delta[:3])
-        return residual + blocks[-1] @ delta[size:], jacobian
-
-    found = update_state(linearize, covariance, factor.weight, iterations, factor.dof(), converged, TILT)
-    reset = np.eye(size)
-    reset[:3, :3] = se2.right_jacobian(found.delta[:3])
-    return replace(found, covariance=reset @ found.covariance @ reset.T)
-
-
-def landmark_update(
-    factor: BearingRangeFactor,
-    pose: Array,
-    covariance: Array,
-    constants: Array,
-    first: int,
-    iterations: int,
-    converged: float = CONVERGED,
-) -> Correction | None:
-    """:func:`update_state` by landmarks of a map, compiled; None for others, and where the information form has not the digits.
-    ``constants`` (P,): those that are estimated, whose columns begin at ``first``."""
-    if factor.free:
-        return None
-    before = np.ascontiguousarray(covariance)  # for each other order in memory it would be compiled anew
-    known = packed(factor.model), factor.look, pose, before, constants, factor.places, first
-    there, delta, after, residual, nis, dof = landmark_kernels.updated(*known, iterations, converged, GATE)
-    return Correction(delta, after, residual, nis, dof) if there else None
-
-
 def update_state(
     linearize: Callable[[Array], tuple[Array, Array]],
     covariance: Array,
@@ -143,7 +73,8 @@ def update_state(
     """
     size, priors = len(covariance), [covariance]
     if common:  # where the sightings are tempered, so are these
-        priors = [np.eye(size + common), np.eye(size + common) / weight(np.zeros(1))[0]]
+        tempering = weight(np.zeros(1))[0]
+        priors = [np.eye(size + common) / share for share in sorted({1.0, tempering}, reverse=True)]
         for prior in priors:
             prior[:size, :size] = covariance
     iterated = priors[0], weight, iterations, dof, converged
@@ -173,9 +104,10 @@ def _iterated(
     converged: float,
 ) -> Correction:
     zero = np.zeros(len(covariance))
-    residual, blocks = linearize(zero)
+    residual, blocks = map(np.ascontiguousarray, linearize(zero))  # compiled code is compiled anew for others
     size = blocks.shape[2]
-    widening = np.maximum(1.0, _each(residual, blocks, covariance[:size, :size]) / GATES[blocks.shape[1]])
+    squared = gaussian_kernels.normalised(residual, blocks, np.arange(size), np.ascontiguousarray(covariance))
+    widening = np.maximum(1.0, squared / GATES[blocks.shape[1]])
     delta, updated = first_solve(blocks, residual, np.ones(len(residual)), zero[:size])
     # by the matrix inversion lemma
     pull = np.einsum("kij,ki->j", blocks, residual)
@@ -188,7 +120,7 @@ def _iterated(
         if np.abs(delta - before).max() < converged:
             break
         before = delta
-        residual, blocks = linearize(delta)
+        residual, blocks = map(np.ascontiguousarray, linearize(delta))
         weights = weight(np.einsum("ki,ki->k", residual, residual))
         delta, updated = solve(blocks, residual, weights, delta[:size])
     return Correction(delta, (updated + updated.T) / 2.0, first, nis, dof)
@@ -198,13 +130,10 @@ def _informed(prior: Array) -> _Solver:
     """A solver with the ``prior`` information (S, S)."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
-        size = len(at)
-        jacobian = blocks.reshape(-1, size)
-        weighted = jacobian.T * np.repeat(weight, blocks.shape[1])
         information = prior.copy()
-        information[:size, :size] += weighted @ jacobian
+        pull = gaussian_kernels.inform(residual, blocks, np.arange(len(at)), weight, at, information)
         updated = np.asarray(np.linalg.inv(information), dtype=float)
-        return updated[:, :size] @ (weighted @ (jacobian @ at - residual.ravel())), updated
+        return updated[:, : len(at)] @ pull, updated
 
     return solve
 
@@ -230,15 +159,3 @@ def _require_sound(delta: Array, covariance: Array) -> None:
     np.linalg.cholesky(covariance)
     if not np.all(np.isfinite(delta)):
         raise np.linalg.LinAlgError("an update is not finite")
-
-
-def _each(residual: Array, blocks: Array, covariance: Array) -> Array:
-    """Normalised innovation squared (K,) of each sighting."""
-    s = blocks @ covariance @ blocks.transpose(0, 2, 1)
-    if s.shape[1] != 2:
-        return np.asarray(positive.squared(residual, np.eye(s.shape[1]) + s))
-    a, b, c = s[:, 0, 0] + 1.0, s[:, 0, 1], s[:, 1, 1] + 1.0
-    x, y = residual[:, 0], residual[:, 1]
-    # rounding may cancel the difference completely, which is never less than that
-    determinant = np.maximum(a * c - b * b, 0.5 * (a + c))
-    return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / determinant)

@@ -26,7 +26,7 @@ from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable
 from factorgraph_loc.sensors.binding import bound_sensors
-from factors import positive, rts_kernels, se2, se2_kernels
+from factors import gaussian_kernels, positive, se2, se2_kernels
 from factors.se2 import Array
 
 NOWHERE = slice(POSE, POSE)  # the columns of a block that there is not
@@ -84,7 +84,7 @@ class _Step(NamedTuple):
 
     def covariance(self, before: Array) -> Array:
         """The covariance (S, S) after the prediction, from that before."""
-        return np.asarray(rts_kernels.predicted(before, self.transition, self.noise))
+        return np.asarray(gaussian_kernels.predicted(before, self.transition, self.noise))
 
 
 class _Record(NamedTuple):
@@ -210,7 +210,7 @@ class Ekf(Filter):
         after = after.first(len(here.covariance))
         change = np.concatenate((se2_kernels.twist_to(step.pose, after.pose), after.rest - here.rest))
         try:
-            found = rts_kernels.smoothed(here.covariance, step.transition, step.noise, change, after.covariance)
+            found = gaussian_kernels.smoothed(here.covariance, step.transition, step.noise, change, after.covariance)
         except np.linalg.LinAlgError:
             found = None
         if found is not None and _is_sound(found[1]):
@@ -324,4 +324,4 @@ class Ekf(Filter):
 def _is_sound(covariance: Array) -> bool:
     """Whether rounding left a covariance symmetric and positive."""
     # LAPACK's own, as this is asked at each step
-    return not rts_kernels.is_skew(covariance, SKEW) and bool(dpotrf(covariance, lower=1)[1] == 0)
+    return not gaussian_kernels.is_skew(covariance, SKEW) and bool(dpotrf(covariance, lower=1)[1] == 0)

@@ -20,6 +20,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.rfid.calibration.phase import phase_reads
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
+from factors.least_squares import minimum
 from factors.rfid.detection import TagArray
 from factors.rfid.phase import PhaseLikelihood, PhaseModel, PhaseReads
 from factors.se2 import Array
@@ -101,12 +102,12 @@ def _refined(
     likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, information: Array, off: Array
 ) -> tuple[Array, Array]:
     """The displacement (2,) at the nearest optimum, and the information (2, 2) there."""
-    curvature = information
-    for _ in range(ITERATIONS):
-        score = likelihood.score(np.array((*-off, 0.0)), reads)
-        curvature = score.information[0, :2, :2] + information
-        step = np.linalg.solve(curvature, score.gradient[0, :2] - information @ (off + start))
-        off = off + step * min(1.0, STEP / max(float(np.hypot(*step)), 1e-12))
-        if np.hypot(*step) < CONVERGED:
-            break
-    return off, curvature
+
+    def at(off: Array) -> tuple[float, Array, Array]:
+        score, moved = likelihood.score(np.array((*-off, 0.0)), reads), off + start
+        gradient = information @ moved - score.gradient[0, :2]
+        cost = float(score.nll[0] + 0.5 * moved @ information @ moved)
+        return cost, gradient, score.information[0, :2, :2] + information
+
+    found, _, curvature = minimum(at, off, ITERATIONS, CONVERGED, largest=STEP)
+    return found, curvature

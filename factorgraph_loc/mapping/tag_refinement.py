@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.least_squares import minima
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.model import RfidModel, probability
@@ -16,7 +17,6 @@ from factors.se2 import Array
 LEAST = 0.05  # probability of a read that defines the reach of an antenna
 ITERATIONS = 30
 CONVERGED = 1e-3  # m
-MAX_DAMPING = 1e6
 LARGEST_STEP = 0.5  # m
 STEP = 0.02  # m, of the numerical curvature
 CHUNK = 256  # candidates refined at once, to bound the memory
@@ -60,58 +60,27 @@ def refine(
         part = slice(first, first + CHUNK)
         tag, facing = candidates.tag[part], candidates.facing[part]
         mine = TagReadCounts(looks.offsets, looks.antennas, looks.rounds, np.ascontiguousarray(looks.hits[:, tag]))
-        problem = _Refinement(model, mine, heights[tag], facing)
-        places[part], nll[part], information = problem.solve(places[part])
+        places[part], nll[part], information = _refined(model, mine, heights[tag], facing, places[part])
         covariances[part] = np.linalg.inv(information + prior)
     return TagCandidates(candidates.tag, places, candidates.facing), nll, covariances
 
 
-@dataclass(frozen=True, eq=False)
-class _Refinement:
-    """C positions at once, each with its own column of hits."""
+def _refined(
+    model: RfidModel, looks: TagReadCounts, heights: Array, facing: Array, places: Array
+) -> tuple[Array, Array, Array]:
+    """Positions (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2), of C tags at once, each with its own
+    column of hits. The information is the observed curvature where it is positive definite, else the Fisher information."""
 
-    model: RfidModel
-    looks: TagReadCounts
-    heights: Array
-    facing: Array
-
-    def at(self, places: Array) -> tuple[Array, Array, Array]:
-        tags = TagArray(np.column_stack((places, self.heights)), self.facing)
-        return RfidLikelihood(self.model, tags).by_tag(np.zeros(3), self.looks)
-
-    def solve(self, places: Array) -> tuple[Array, Array, Array]:
-        """Positions (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2): the observed curvature where
-        it is positive definite, else the Fisher information.
-        """
-        nll, gradient, information = self.at(places)
-        places, damping = places.copy(), np.full(len(places), 1e-3)
-        moving = np.arange(len(places))
-        for _ in range(ITERATIONS):
-            scale = damping * (np.trace(information[moving], axis1=1, axis2=2) + 1e-6)
-            damped = information[moving] + scale[:, None, None] * np.eye(2)
-            step = -np.linalg.solve(damped, gradient[moving, :, None])[..., 0]
-            step *= np.minimum(1.0, LARGEST_STEP / np.maximum(np.hypot(*step.T), 1e-12))[:, None]
-            tried = self._only(moving).at(places[moving] + step)
-            better = tried[0] <= nll[moving]
-            taken = moving[better]
-            places[taken] += step[better]
-            nll[taken], gradient[taken], information[taken] = (part[better] for part in tried)
-            damping = np.where(better, damping / 10.0, damping * 10.0)
-            on = (np.hypot(*step.T) > CONVERGED) & (damping < MAX_DAMPING)
-            moving, damping = moving[on], damping[on]
-            if not len(moving):
-                break
-        return places, nll, self._curvature(places, information)
-
-    def _only(self, which: NDArray[np.int64]) -> _Refinement:
-        looks = self.looks
+    def at(places: Array, which: NDArray[np.int64]) -> tuple[Array, Array, Array]:
         hits = np.ascontiguousarray(looks.hits[:, which])
         mine = TagReadCounts(looks.offsets, looks.antennas, looks.rounds, hits)
-        return _Refinement(self.model, mine, self.heights[which], self.facing[which])
+        tags = TagArray(np.column_stack((places, heights[which])), facing[which])
+        return RfidLikelihood(model, tags).by_tag(np.zeros(3), mine)
 
-    def _curvature(self, places: Array, information: Array) -> Array:
-        columns = [(self.at(places + STEP * e)[1] - self.at(places - STEP * e)[1]) / (2.0 * STEP) for e in np.eye(2)]
-        curvature = np.stack(columns, axis=2)
-        curvature = (curvature + curvature.transpose(0, 2, 1)) / 2.0
-        good = np.linalg.eigvalsh(curvature)[:, 0] > 0.1 * np.linalg.eigvalsh(information)[:, 0]
-        return np.where(good[:, None, None], curvature, information)
+    found, every = minima(at, places, ITERATIONS, CONVERGED, largest=LARGEST_STEP), np.arange(len(places))
+    states, information = found.states, found.curvatures
+    columns = [(at(states + STEP * e, every)[1] - at(states - STEP * e, every)[1]) / (2.0 * STEP) for e in np.eye(2)]
+    curvature = np.stack(columns, axis=2)
+    curvature = (curvature + curvature.transpose(0, 2, 1)) / 2.0
+    good = np.linalg.eigvalsh(curvature)[:, 0] > 0.1 * np.linalg.eigvalsh(information)[:, 0]
+    return states, found.costs, np.where(good[:, None, None], curvature, information)

@@ -14,11 +14,10 @@ from factorgraph_loc.fusion.graph.variables import Guess, Keyframe
 from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, lifted
 from factorgraph_loc.vision.consensus import agreeing
 from factors import positive
-from factors.camera.factor import ReprojectionFactor
+from factors.camera.factor import ReprojectionFactor, image_update
 from factors.camera.model import CameraModel
 from factors.motion import Increment, propagate
 from factors.se2 import Array
-from factors.update import robust_update
 
 ENOUGH = 6  # points that must agree
 COMMON = np.diag((0.02, 0.02, 0.005)) ** 2  # m, rad: error that all points may have in common
@@ -69,7 +68,7 @@ def _evidence(
     if np.count_nonzero(agrees) < ENOUGH:
         return 0.0
     factor = ReprojectionFactor(model, points[agrees], pixels[agrees], point_covariances=of_points[agrees])
-    found = robust_update(factor, pose, spreads[1], ITERATIONS, SETTLED)
+    found = image_update(factor, pose, spreads[1], ITERATIONS, SETTLED)
     # what the image tells by itself
     after = positive.inverse(found.covariance)
     told = positive.inverse(positive.nearest(after - positive.inverse(spreads[1])))

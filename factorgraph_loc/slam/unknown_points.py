@@ -33,14 +33,13 @@ from factorgraph_loc.vision.spread import spread_out
 from factors import positive, se2
 from factors.camera import model as reprojection
 from factors.camera import update_kernels as pixel_kernels
-from factors.camera.factor import ReprojectionFactor
+from factors.camera.factor import ReprojectionFactor, image_update
 from factors.camera.floor import TiltScale
 from factors.camera.kernels import NEAREST
 from factors.camera.model import CameraModel, recalibrated
 from factors.camera.point import PointFactor, PointPrior
 from factors.graph import VectorPriorFactor
 from factors.se2 import Array
-from factors.update import robust_update
 
 PER_KEYFRAME, WAITING = 40, 160  # maximum number of estimated points per keyframe, and of points waiting
 STRIKES = 2
@@ -306,7 +305,7 @@ class UnknownPoints:
                 leaning = pixel_kernels.leaning(factor.packed(), *guess)
                 floor, unlevel = self._floor.learnt(*leaning, model.tilt)
                 factor = replace(factor, model=replace(model, tilt=unlevel))
-                update = robust_update(factor, *guess, ITERATIONS, SETTLED)
+                update = image_update(factor, *guess, ITERATIONS, SETTLED)
                 pose = se2.compose(guess[0], se2.exp(update.delta))
                 if which is recent and jumps(near, pose):  # a few wrong points agree, too
                     continue

@@ -22,7 +22,10 @@ from factors.camera.model import (
 from factors.displaced import carried, common_error, delayed, displaced
 from factors.robust import huber_loss, huber_weight
 from factors.se2 import Array
+from factors.se2_kernels import moved
+from factors.update import CONVERGED, Correction, update_state
 
+TILT = 2  # roll and pitch, which all points of an image have in common
 NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
 
 
@@ -146,6 +149,45 @@ class ReprojectionFactor:
     def dof(self) -> int:
         """Number of measured pixel coordinates."""
         return 2 * len(self.pixels)
+
+
+def image_update(
+    factor: ReprojectionFactor,
+    pose: Array,
+    covariance: Array,
+    iterations: int,
+    converged: float = CONVERGED,
+    values: Sequence[Array] = (),
+    columns: Sequence[slice] = (),
+) -> Correction:
+    """Kalman update of ``pose`` (3,) and correlated states by points in an image; see :func:`~factors.update.update_state`.
+
+    ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation. ``values``: the
+    other values of the factor, whose ``columns`` in the error state are given. With these the covariance is that of perturbations
+    of the updated pose, because pixels are so much more accurate than a survey that it matters.
+    """
+    size = len(covariance)
+    seen = factor.packed() if factor.of_pose_alone else None
+
+    def linearize(delta: Array) -> tuple[Array, Array]:
+        if seen is not None and size == len(pose):
+            residual, jacobian = pixel_kernels.whitened(seen, moved(pose, delta))
+            return residual + jacobian[..., size:] @ delta[size:], jacobian
+        at = [v + delta[column] for v, column in zip(values, columns, strict=True)]
+        residual, blocks = factor.whitened([se2.compose(pose, se2.exp(delta[:3])), *at])
+        jacobian = np.zeros((*residual.shape, len(delta)))
+        for column, block in zip((slice(3), *columns, slice(size, None)), blocks, strict=True):
+            jacobian[..., column] = block
+        if values:
+            jacobian[..., :3] = jacobian[..., :3] @ se2.right_jacobian(delta[:3])
+        return residual + blocks[-1] @ delta[size:], jacobian
+
+    found = update_state(linearize, covariance, factor.weight, iterations, factor.dof(), converged, TILT)
+    if not values:
+        return found
+    reset = np.eye(size)
+    reset[:3, :3] = se2.right_jacobian(found.delta[:3])
+    return replace(found, covariance=reset @ found.covariance @ reset.T)
 
 
 def _turns(estimated: tuple[int, ...], changes: Array) -> Array:

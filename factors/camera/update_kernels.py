@@ -1,8 +1,4 @@
-"""Compiled Kalman update by known points in an image.
-
-Equal to the update in information form (:mod:`factors.update`) by a factor of :mod:`factors.camera.factor` on the pose. Compiled,
-because an update uses a dozen small matrices, for which NumPy's overhead exceeds the arithmetic.
-"""
+"""Known points in an image, compiled: a factor of :mod:`factors.camera.factor` on the pose and the tilt of the robot."""
 
 import math
 from typing import NamedTuple
@@ -11,9 +7,9 @@ import numpy as np
 
 from factors.camera.kernels import Lens, in_camera, mounting, pixel
 from factors.compiled import compiled
+from factors.gaussian_kernels import corrected
 from factors.robust import huber_weight
 from factors.se2 import Array
-from factors.se2_kernels import exp
 from factors.small_kernels import inverse, put
 
 Row = tuple[float, float, float]
@@ -123,60 +119,14 @@ def marginal(residual: Array, jacobian: Array, robust: float, tempering: float) 
 
 
 @compiled(error_model="numpy")
-def updated(
-    seen: Seen, pose: Array, covariance: Array, iterations: int, converged: float, gate: float
-) -> tuple[Array, Array, Array, float]:
-    """See :func:`~factors.update.robust_update`: correction (S,) and covariance (S, S) afterwards; whitened residuals (K, 2) at the
-    prediction, and their normalised square. ``gate``: of a single point."""
-    n, size = len(seen.points), len(covariance) + 2  # the tilt comes last
-    prior = np.eye(size)
-    put(inverse(covariance), prior)
-    first, jacobian = np.empty((n, 2)), np.empty((n, 2, WIDTH))
-    _whiten(seen, pose[0], pose[1], pose[2], first, jacobian)
-    weights, before = np.ones(n), np.zeros(size)
-    delta, after, pull = _solved(prior, first, jacobian, weights, before)
-    nis = 0.0
-    for k in range(n):
-        nis += first[k, 0] ** 2 + first[k, 1] ** 2
-    for i in range(WIDTH):
-        for j in range(WIDTH):
-            nis -= pull[i] * after[_place(i, size), _place(j, size)] * pull[j]
-    prior[size - 2, size - 2] = prior[size - 1, size - 1] = seen.tempering
-    widest = 1.0
-    for k in range(n):
-        widening = max(1.0, _normalised(first[k], jacobian[k], covariance) / gate)
-        widest = max(widest, widening)
-        weights[k] = seen.tempering / (widening * widening)
-    if widest > 1.0 or seen.tempering < 1.0:
-        delta, after, pull = _solved(prior, first, jacobian, weights, before)
-    residual = np.empty((n, 2))
-    for _ in range(iterations - 1):
-        step = 0.0
-        for i in range(size):
-            step = max(step, abs(delta[i] - before[i]))
-        if step < converged:
-            break
-        before = delta
-        dx, dy, turned = exp(delta[0], delta[1], delta[2])
-        c, s = math.cos(pose[2]), math.sin(pose[2])
-        _whiten(seen, pose[0] + c * dx - s * dy, pose[1] + s * dx + c * dy, pose[2] + turned, residual, jacobian)
-        for k in range(n):
-            weights[k] = _weight(seen, residual[k], jacobian[k], delta[size - 2], delta[size - 1])
-        delta, after, pull = _solved(prior, residual, jacobian, weights, before)
-    for i in range(size):
-        for j in range(i):
-            after[i, j] = after[j, i] = 0.5 * (after[i, j] + after[j, i])
-    return delta[: size - 2].copy(), after[: size - 2, : size - 2].copy(), first, nis
-
-
-@compiled(error_model="numpy")
 def leaning(seen: Seen, pose: Array, covariance: Array) -> tuple[Array, Array]:
     """Roll and pitch (2,) [rad] of a robot at a ``pose`` (3,) with this ``covariance`` (3, 3), as least squares find them in an
     image, and their covariance (2, 2)."""
     residual, jacobian = whitened(seen, pose)
     prior = np.eye(WIDTH)
     put(inverse(covariance), prior)
-    delta, after, _ = _solved(prior, residual, jacobian, np.ones(len(residual)), np.zeros(WIDTH))
+    known = np.arange(WIDTH), np.ones(len(residual)), np.zeros(WIDTH)
+    _, delta, after, _ = corrected(prior, residual, jacobian, *known)
     return seen.tilt * delta[3:], seen.tilt**2 * after[3:, 3:]
 
 
@@ -223,14 +173,6 @@ def _product(matrix: Array, p: Row, q: Row) -> float:
     y = matrix[1, 0] * q[0] + matrix[1, 1] * q[1] + matrix[1, 2] * q[2]
     z = matrix[2, 0] * q[0] + matrix[2, 1] * q[1] + matrix[2, 2] * q[2]
     return float(p[0] * x + p[1] * y + p[2] * z)
-
-
-@compiled(inline="always")
-def _weight(seen: Seen, residual: Array, jacobian: Array, roll: float, pitch: float) -> float:
-    """The robust weight, tempered, of a whitened residual (2,) of a robot that tilts."""
-    u = residual[0] + jacobian[0, 3] * roll + jacobian[0, 4] * pitch
-    v = residual[1] + jacobian[1, 3] * roll + jacobian[1, 4] * pitch
-    return float(seen.tempering * huber_weight(u * u + v * v, seen.robust))
 
 
 @compiled(error_model="numpy")
@@ -304,50 +246,3 @@ def _along(rotation: Array, by_local: Row, scale: float) -> Row:
         a * rotation[1, 0] + b * rotation[1, 1] + c * rotation[1, 2],
         a * rotation[2, 0] + b * rotation[2, 1] + c * rotation[2, 2],
     )
-
-
-@compiled(inline="always")
-def _place(i: int, size: int) -> int:
-    """Of a column of the Jacobian in a state of this ``size``, which ends with the tilt."""
-    return i if i < 3 else size - WIDTH + i
-
-
-@compiled(error_model="numpy")
-def _solved(prior: Array, residual: Array, jacobian: Array, weights: Array, at: Array) -> tuple[Array, Array, Array]:
-    """Correction (S,) and covariance (S, S) from weighted residuals (K, 2) linearised at the correction ``at`` (S,), and the
-    gradient (5,) at the correction. The residuals are those without a tilt."""
-    size, pull, told = len(prior), np.zeros(WIDTH), np.zeros((WIDTH, WIDTH))
-    for k in range(len(residual)):
-        w = weights[k]
-        for r in range(2):
-            e = -residual[k, r]
-            for i in range(3):
-                e += jacobian[k, r, i] * at[i]
-            for i in range(WIDTH):
-                weighted = w * jacobian[k, r, i]
-                pull[i] += e * weighted
-                for j in range(i + 1):
-                    told[i, j] += weighted * jacobian[k, r, j]
-    information = prior.copy()
-    for i in range(WIDTH):
-        for j in range(WIDTH):
-            information[_place(i, size), _place(j, size)] += told[max(i, j), min(i, j)]
-    after = inverse(information)
-    delta = np.zeros(size)
-    for i in range(size):
-        for j in range(WIDTH):
-            delta[i] += after[i, _place(j, size)] * pull[j]
-    return delta, after, pull
-
-
-@compiled(inline="always")
-def _normalised(residual: Array, jacobian: Array, covariance: Array) -> float:
-    """Normalised innovation squared of a single point."""
-    p = (jacobian[0, 0], jacobian[0, 1], jacobian[0, 2])
-    q = (jacobian[1, 0], jacobian[1, 1], jacobian[1, 2])
-    a, b, c = 1.0 + _product(covariance, p, p), _product(covariance, p, q), 1.0 + _product(covariance, q, q)
-    for i in range(3, WIDTH):
-        tp, tq = jacobian[0, i], jacobian[1, i]
-        a, b, c = a + tp * tp, b + tp * tq, c + tq * tq
-    x, y = residual[0], residual[1]
-    return float((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))

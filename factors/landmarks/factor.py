@@ -25,6 +25,7 @@ from factors.landmarks.model import (
 )
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array, Integers
+from factors.update import CONVERGED, GATE, Correction
 
 NOTHING = np.zeros(0)  # values of constants, where none are estimated
 _NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # for a look without offset or without its covariance
@@ -188,6 +189,25 @@ class BearingRangeFactor:
         # the whitened residual stays zero: by_value dv + by_point dp = noise
         to_point = _inverse(blocks[-1][0])
         return point, [-to_point @ block[0] for block in blocks[:-1]], to_point @ to_point.T
+
+
+def landmark_update(
+    factor: BearingRangeFactor,
+    pose: Array,
+    covariance: Array,
+    constants: Array,
+    first: int,
+    iterations: int,
+    converged: float = CONVERGED,
+) -> Correction | None:
+    """:func:`~factors.update.update_state` by landmarks of a map, compiled; None for others, and where the information form is
+    numerically insufficient. ``constants`` (P,): those that are estimated, whose columns begin at ``first``."""
+    if factor.free:
+        return None
+    before = np.ascontiguousarray(covariance)  # for each other order in memory it would be compiled anew
+    known = packed(factor.model), factor.look, pose, before, constants, factor.places, first
+    there, delta, after, residual, nis, dof = update_kernels.updated(*known, iterations, converged, GATE)
+    return Correction(delta, after, residual, nis, dof) if there else None
 
 
 class BearingRangeStack:

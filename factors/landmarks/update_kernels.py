@@ -8,10 +8,10 @@ import math
 import numpy as np
 
 from factors.compiled import compiled
+from factors.gaussian_kernels import corrected, inverse, normalised
+from factors.gaussian_kernels import root as lower_root
 from factors.landmarks.kernels import Look, linearize
 from factors.landmarks.model import BEARING_SIGMA, PARAMETERS, RANGE_SIGMA, RELATIVE, ROBUST
-from factors.positive_kernels import inverse
-from factors.positive_kernels import root as lower_root
 from factors.robust import geman_mcclure_weight
 from factors.se2 import Array, Integers
 from factors.se2_kernels import exp
@@ -52,20 +52,20 @@ def updated(
     prior, there = inverse(covariance)
     if not there:
         return False, before, covariance, residual, 0.0, measured
-    there, delta, after, pull = _solved(prior, residual, jacobian, columns, weights, before)
+    there, delta, after, pull = corrected(prior, residual, jacobian, columns, weights, before)
     if not there:
         return False, before, covariance, residual, 0.0, measured
-    nis, widest = 0.0, 1.0
+    nis, widest, squared = 0.0, 1.0, normalised(residual, jacobian, columns, covariance)
     for k in range(count):
         nis += residual[k, 0] ** 2 + residual[k, 1] ** 2
-        widening = max(1.0, _normalised(residual[k], jacobian[k], columns, covariance) / gate)
+        widening = max(1.0, squared[k] / gate)
         widest = max(widest, widening)
         weights[k] = 1.0 / (widening * widening)
     for i in range(len(columns)):
         for j in range(len(columns)):
             nis -= pull[i] * after[columns[i], columns[j]] * pull[j]
     if widest > 1.0:
-        there, delta, after, _ = _solved(prior, residual, jacobian, columns, weights, before)
+        there, delta, after, _ = corrected(prior, residual, jacobian, columns, weights, before)
     now, moved = residual.copy(), pose.copy()
     for _ in range(iterations - 1):
         if not there or np.abs(delta - before).max() < converged:
@@ -77,7 +77,7 @@ def updated(
         _linearized(model, look, moved, values + delta[columns[3:]], indices, now, jacobian)
         for k in range(count):
             weights[k] = geman_mcclure_weight(now[k, 0] ** 2 + now[k, 1] ** 2, model[ROBUST])
-        there, delta, after, _ = _solved(prior, now, jacobian, columns, weights, before)
+        there, delta, after, _ = corrected(prior, now, jacobian, columns, weights, before)
     there = there and bool(np.all(np.isfinite(delta))) and lower_root(after)[1]
     return there, delta, after, residual, max(0.0, nis), measured
 
@@ -134,47 +134,3 @@ def _linearized(
                 jacobian[k, i, j] = by_pose[k, i, j]
             for j in range(len(values)):
                 jacobian[k, i, 3 + j] = by_sensor[k, i, indices[j]]
-
-
-@compiled(error_model="numpy")
-def _solved(
-    prior: Array, residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array
-) -> tuple[bool, Array, Array, Array]:
-    """Whether there is one, then the correction (S,), the covariance (S, S) after it, and the weighted residuals (D,) through their
-    Jacobian; linearised at the correction ``at`` (S,), from the information ``prior`` (S, S)."""
-    size, wide = len(prior), len(columns)
-    information, pull = prior.copy(), np.zeros(wide)
-    for k in range(len(residual)):
-        for i in range(2):
-            row = jacobian[k, i]
-            wanted = -residual[k, i]
-            for a in range(wide):
-                wanted += row[a] * at[columns[a]]
-            for a in range(wide):
-                weighted = weights[k] * row[a]
-                pull[a] += weighted * wanted
-                for b in range(wide):
-                    information[columns[a], columns[b]] += weighted * row[b]
-    after, there = inverse(information)
-    delta = np.zeros(size)
-    if there:
-        for i in range(size):
-            for a in range(wide):
-                delta[i] += after[i, columns[a]] * pull[a]
-    return there, delta, after, pull
-
-
-@compiled(error_model="numpy")
-def _normalised(residual: Array, jacobian: Array, columns: Integers, covariance: Array) -> float:
-    """Normalised innovation squared of one landmark by itself: residual (2,) and Jacobian (2, D)."""
-    a, b, c = 1.0, 0.0, 1.0
-    for i in range(len(columns)):
-        for j in range(len(columns)):
-            spread = covariance[columns[i], columns[j]]
-            a += jacobian[0, i] * spread * jacobian[0, j]
-            b += jacobian[0, i] * spread * jacobian[1, j]
-            c += jacobian[1, i] * spread * jacobian[1, j]
-    x, y = residual[0], residual[1]
-    # rounding may take all of the difference, which is never less than that
-    determinant = max(a * c - b * b, 0.5 * (a + c))
-    return float((c * x * x - 2.0 * b * x * y + a * y * y) / determinant)

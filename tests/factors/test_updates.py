@@ -8,9 +8,9 @@ import pytest
 from factorgraph_loc.sensors.base import ResidualObservation, Term
 from factors import se2
 from factors import update as robust_update_module
-from factors.camera.factor import ReprojectionFactor
+from factors.camera.factor import ReprojectionFactor, image_update
 from factors.camera.model import CameraModel, camera_pose, predict
-from factors.landmarks.factor import BearingRangeFactor
+from factors.landmarks.factor import BearingRangeFactor, landmark_update
 from factors.landmarks.model import BearingRangeModel
 from factors.landmarks.model import predict as predict_landmarks
 from factors.rfid import kernels as rfid_kernels
@@ -19,7 +19,7 @@ from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, RfidModel
-from factors.update import landmark_update, robust_update, update_state
+from factors.update import update_state
 
 CLOSE = 1e-8  # standard deviations
 
@@ -30,7 +30,7 @@ def rng():
 
 
 def by_pixels(factor, pose, covariance, iterations):
-    """What :func:`robust_update` makes of points, by NumPy."""
+    """What :func:`image_update` makes of points, by NumPy."""
     twin, size = replace(factor, estimated=(2,)), len(covariance)
 
     def linearize(delta):
@@ -66,7 +66,7 @@ def test_by_pixels(rng, iterations, size, tempering):
         pixels[0] += 50.0
         factor = ReprojectionFactor(model, points, pixels)
         start, covariance = se2.compose(pose, se2.exp(0.05 * rng.standard_normal(3))), spread(rng, size, 0.05)
-        found = robust_update(factor, start, covariance, iterations, 1e-3)
+        found = image_update(factor, start, covariance, iterations, 1e-3)
         expected = by_pixels(factor, start, covariance, iterations)
         sigmas = np.sqrt(np.diag(expected.covariance))
         close(found.delta, expected.delta, sigmas)

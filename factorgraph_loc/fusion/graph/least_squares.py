@@ -36,7 +36,7 @@ def optimum(
             continue
         gained = cost - new_cost
         state, cost, damping = new, new_cost, damping / 10.0
-        if gained < CONVERGED_GAIN * cost:
+        if gained <= CONVERGED_GAIN * cost:
             break
     return state, cost, iteration
 

@@ -38,8 +38,8 @@ from factorgraph_loc.fusion.graph.variables import (
     retract,
     to_gtsam,
 )
+from factors.gaussian_kernels import inverse
 from factors.graph import gaussian_factor, jacobian_factors
-from factors.positive_kernels import inverse
 from factors.se2 import Array
 
 # s that a pose may stay longer in a window, so that several are read at a time; less with points, which make it large

@@ -33,12 +33,12 @@ from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.vision.relocalization import FoundOnFloor
 from factors import positive, se2
 from factors.camera import model as reprojection
-from factors.camera.factor import ReprojectionFactor
+from factors.camera.factor import ReprojectionFactor, image_update
 from factors.camera.floor import TiltScale
 from factors.camera.model import TIME_OFFSET
 from factors.motion import ChainState, propagate
 from factors.se2 import Array
-from factors.update import Correction, image_update, robust_update
+from factors.update import Correction
 
 PASS = 10.0  # s: looks within it have the error of a point's survey in common, where that is not estimated
 SOLVE_EVERY = 0.45  # s between solver updates; in between, images only update the newest pose, as in a filter
@@ -76,12 +76,10 @@ class PixelObservation(ResidualObservation):
             size = 3 + len(self.held[0])
             both = np.zeros((size, size))
             both[:3, :3], both[3:, 3:] = covariance, self.held[1]
-            found = image_update(self.seen, pose, both, self.held[:1], (slice(3, size),), iterations, self.settled)
+            found = image_update(self.seen, pose, both, iterations, self.settled, self.held[:1], (slice(3, size),))
             return replace(found, delta=found.delta[:3], covariance=found.covariance[:3, :3])
-        if self.seen.of_pose_alone:
-            return robust_update(self.seen, pose, covariance, iterations, self.settled)
         at, places = [values[name] for name in self.blocks], [columns[name] for name in self.blocks]
-        return image_update(self.seen, pose, covariance, at, places, iterations, self.settled)
+        return image_update(self.seen, pose, covariance, iterations, self.settled, at, places)
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
         factor, spreads = self.seen, None

@@ -19,10 +19,10 @@ from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks, together
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factors import positive
 from factors.graph import Factor
-from factors.landmarks.factor import BearingRangeFactor
+from factors.landmarks.factor import BearingRangeFactor, landmark_update
 from factors.landmarks.model import PARAMETERS, TIME_OFFSET
 from factors.se2 import Array
-from factors.update import GATE, Correction, landmark_update
+from factors.update import GATE, Correction
 
 SURVEYED_ITERATIONS = 4
 WORK = 8  # of a landmark, for one of many poses that are weighed by a compiled call

@@ -11,15 +11,17 @@ from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
 from factors.landmarks.model import BearingRangeModel, jacobians, located, residuals, sigmas
+from factors.least_squares import minima
 from factors.motion import ChainState
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 RECENT = 6  # landmarks whose last sightings generate candidates
 CIRCLE = 72  # candidates around a landmark
 HEADINGS = 24  # per candidate, if there is no bearing
 RADII = (0.7, 1.5, 3.0, 6.0)  # m, if there is no range
 BASELINE = 0.3  # m; minimum distance of two landmarks that are aligned
+CONVERGED = 1e-4  # m, rad: step of a candidate after which it is not refined further
 FLAT = np.diag((1e-4, 1e-4, 1e-1))  # information of the flat prior: 1/m^2, 1/m^2, 1/rad^2
 
 
@@ -134,18 +136,16 @@ class SightingWindow:
         self, poses: Array, whitener: Array, iterations: int, spread: Array | None = None
     ) -> tuple[Array, Array]:
         """Poses (N, 3) after Levenberg-Marquardt iterations on the losses, with body-frame covariances (N, 3, 3)."""
-        damping = np.full((len(poses), 1, 1), 1e-2)
-        loss = self.losses(poses, whitener, spread)
-        for _ in range(iterations):
+
+        def at(poses: Array, _: Integers) -> tuple[Array, Array, Array]:
             information, gradient = self._normal_equations(poses, whitener, spread)
-            damped = information + damping * np.eye(3) * np.einsum("nii->ni", information)[:, None]
-            step = np.clip(-np.linalg.solve(damped, gradient[..., None])[..., 0], -1.0, 1.0)
-            tried = se2.compose(poses, se2.exp(step))
-            tried_loss = self.losses(tried, whitener, spread)
-            better = tried_loss < loss
-            poses, loss = np.where(better[:, None], tried, poses), np.where(better, tried_loss, loss)
-            damping = np.where(better[:, None, None], 0.1 * damping, 10.0 * damping)
-        return poses, np.asarray(np.linalg.inv(self._normal_equations(poses, whitener, spread)[0]))
+            return self.losses(poses, whitener, spread), gradient, information
+
+        def moved(poses: Array, steps: Array) -> Array:
+            return se2.compose(poses, se2.exp(steps))
+
+        found = minima(at, poses, iterations, CONVERGED, moved=moved, largest=1.0)
+        return found.states, np.asarray(np.linalg.inv(found.curvatures))
 
     def fused(self, pose: Array, whitener: Array, iterations: int) -> tuple[Array, Array]:
         """A hypothesis (3,) after Gauss-Newton with correlated odometry errors, and its body-frame covariance (3, 3). The path is

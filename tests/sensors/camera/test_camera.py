@@ -26,7 +26,7 @@ from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNo
 from factorgraph_loc.vision.frame import CameraFrame
 from factors import se2
 from factors.camera import model as reprojection
-from factors.update import robust_update
+from factors.camera.factor import image_update
 
 CONFIGS = {
     "ekf": RunConfig("ekf"),
@@ -312,7 +312,7 @@ def test_an_update_is_taken_to_the_optimum():
     start, covariance = se2.compose(pose, np.array((0.3, -0.2, 0.1))), np.diag((0.4, 0.4, 0.2)) ** 2
     factor = known.factor(m, Predicted(start, covariance))
     assert len(factor.points) == len(rows)
-    update = robust_update(factor, start, covariance, ITERATIONS, SETTLED)
+    update = image_update(factor, start, covariance, ITERATIONS, SETTLED)
     error = se2.log(se2.between(pose, se2.compose(start, se2.exp(update.delta))))
     assert np.all(np.abs(error) < 0.3 * np.sqrt(np.diag(update.covariance)))
 

@@ -14,7 +14,7 @@ from factorgraph_loc.sensors.rfid.calibration.choice import Kind, fit
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor
 from factorgraph_loc.sensors.rfid.calibration.pairs import (
     BLOCKS,
-    TagPairs,
+    Terms,
     modelled,
     nearby,
     pairs_of,
@@ -25,6 +25,7 @@ from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings, SurveySettings
 from factors import se2
+from factors.least_squares import minimum
 from factors.rfid.model import DetectionModel
 from factors.se2 import Array
 
@@ -241,41 +242,32 @@ def place(
     typical = np.array([TYPICAL[p.name] for p in places])
     within = [nearby(log, settings, survey) for log in logs]
     pairs = pairs_of(logs, settings, survey, within)
-    changes = np.zeros(len(places)) if start is None else start
-
-    def seen(values: Array) -> TagPairs:
-        return pairs_of(logs, *moved(settings, survey, places, values), within)
 
     def logit(values: Array) -> Array:
-        return modelled(models, which, seen(values))
+        return modelled(models, which, pairs_of(logs, *moved(settings, survey, places, values), within))
 
-    def likelihood(z: Array) -> Array:
-        return terms(z, pairs.hits, pairs.count, floor.false_read, floor.miss).nll
+    def scored(values: Array) -> tuple[Terms, Array]:
+        """The terms of the likelihood, and the derivatives (M, P) of the logits."""
+        here = logit(values)
+        jacobian = np.column_stack([(logit(values + e) - here) / STEP for e in STEP * np.eye(len(places))])
+        return terms(here, pairs.hits, pairs.count, floor.false_read, floor.miss), jacobian
 
-    here = logit(changes)
-    cost = float(np.sum(likelihood(here)))
-    for _ in range(ITERATIONS):
-        jacobian = np.column_stack([(logit(changes + e) - here) / STEP for e in STEP * np.eye(len(places))])
-        found = terms(here, pairs.hits, pairs.count, floor.false_read, floor.miss)
+    def at(values: Array) -> tuple[float, Array, Array]:
+        found, jacobian = scored(values)
+        cost = float(np.sum(found.nll) + 0.5 * np.sum((values / typical) ** 2))
         curvature = jacobian.T @ (found.information[:, None] * jacobian) + np.diag(1.0 / typical**2)
-        step = np.linalg.solve(curvature, jacobian.T @ found.gradient + changes / typical**2)
-        size = 1.0
-        while size > 0.05 and float(np.sum(likelihood(logit(changes - size * step)))) > cost:
-            size *= 0.5
-        if size <= 0.05:
-            break
-        changes = changes - size * step
-        here = logit(changes)
-        cost = float(np.sum(likelihood(here)))
-        if np.all(np.abs(size * step) < 0.01 * typical):
-            break
+        return cost, jacobian.T @ found.gradient + values / typical**2, curvature
+
+    begin = np.zeros(len(places)) if start is None else start
+    changes, _, curvature = minimum(at, begin, ITERATIONS, 0.01 * typical)
+    found, jacobian = scored(changes)
     scores = found.gradient[:, None] * jacobian
     of_block = np.zeros((int(pairs.block.max()) + 1, len(places)))
     np.add.at(of_block, pairs.block, scores)
     bread = np.linalg.inv(curvature)
     errors = np.sqrt(np.diag(bread @ (of_block.T @ of_block) @ bread))
     changed, shifted = moved(settings, survey, places, changes)
-    return Placing(changed, shifted, tuple(places), changes, errors, cost / float(np.sum(pairs.count)))
+    return Placing(changed, shifted, tuple(places), changes, errors, float(np.sum(found.nll) / np.sum(pairs.count)))
 
 
 def _added(name: str, value: float, change: float) -> float:

@@ -12,11 +12,12 @@ import numpy as np
 
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor, fit_logistic
 from factorgraph_loc.sensors.rfid.calibration.pairs import TagPairs, terms
+from factors.least_squares import minimum
 from factors.rfid.model import FEATURES, BeamModel, DetectionModel, LogisticModel, logits
 from factors.se2 import Array
 
 ITERATIONS = 30
-CONVERGED = 1e-3  # of a standard error
+CONVERGED = 1e-5  # step of a parameter
 STEP = 1e-4  # of numerical derivatives
 LARGEST = 0.5  # step of a parameter
 LOWEST = (-3.0, np.log(0.3), np.log(0.05), np.log(0.1))  # logit of p0, logarithms of r_max, s_r [m] and sigma_phi [rad]
@@ -38,22 +39,15 @@ def refit_beam(pairs: TagPairs, floor: Floor, start: BeamModel) -> Refit:
     low, high = np.array(LOWEST), np.array(HIGHEST)
     p0 = min(max(start.p0, 1e-3), 1.0 - 1e-3)
     p = np.array((np.log(p0 / (1.0 - p0)), *np.log((start.r_max, start.s_r, start.sigma_phi))))
-    p = np.clip(p, low, high)
-    here, slope, information = _fisher(_beam, p, pairs, floor)
-    for _ in range(ITERATIONS):
-        spread = np.linalg.pinv(information)
-        step = np.clip(-spread @ slope, -LARGEST, LARGEST)
-        if np.all(np.abs(step) < CONVERGED * np.sqrt(np.diag(spread)) + 1e-9):
-            break
-        for _ in range(8):
-            tried = np.clip(p + step, low, high)
-            there = _fisher(_beam, tried, pairs, floor)
-            if there[0] <= here:
-                break
-            step = step / 2.0
-        else:
-            break
-        p, (here, slope, information) = tried, there
+    p, _, _ = minimum(
+        lambda p: _fisher(_beam, p, pairs, floor),
+        np.clip(p, low, high),
+        ITERATIONS,
+        CONVERGED,
+        largest=LARGEST,
+        low=low,
+        high=high,
+    )
     model, errors = _beam(p), _errors(_beam, p, pairs, floor)
     values = np.array((model.p0, model.r_max, model.s_r, model.sigma_phi))
     return Refit(

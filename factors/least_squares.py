@@ -1,0 +1,83 @@
+"""The minima of costs in a few variables, by the damped steps of Levenberg (1944) and Marquardt (1963).
+
+The damping is a share of the diagonal of the curvature, because metres, radians and scales differ. Many problems of one shape are
+solved together. A whole graph is solved elsewhere (:mod:`factorgraph_loc.fusion.graph.least_squares`), without dense matrices.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from factors.se2 import Array, Integers
+
+DAMPING, MAX_DAMPING = 1e-3, 1e8
+LEAST = 1e-9  # curvature of a direction that its problem does not determine
+
+
+class Minima(NamedTuple):
+    """``states`` (N, S) of N problems; their ``costs`` (N,), gradients (N, D) and curvatures (N, D, D) there."""
+
+    states: Array
+    costs: Array
+    gradients: Array
+    curvatures: Array
+
+
+def minima(
+    at: Callable[[Array, Integers], tuple[Array, Array, Array]],
+    start: Array,
+    iterations: int,
+    converged: Array | float,
+    *,
+    moved: Callable[[Array, Array], Array] = np.add,
+    largest: Array | float = np.inf,
+) -> Minima:
+    """The local minima of N costs from ``start`` (N, S).
+
+    ``at(states, which)``: costs (n,), gradients (n, D) and curvatures (n, D, D) of the problems with indices ``which`` (n,). The
+    curvature is the Fisher information or that of Gauss and Newton. ``moved(states, steps)``: the states after steps (n, D). Steps
+    are shortened to the ``largest`` (D,) allowed. A problem is solved when a step is below ``converged`` (D,).
+    """
+    states, which = np.array(start, dtype=float), np.arange(len(start))
+    found = Minima(states, *(np.array(part) for part in at(states, which)))
+    damping = np.full(len(start), DAMPING)
+    for _ in range(iterations):
+        _, _, gradient, curvature = (part[which] for part in found)
+        scale = np.maximum(np.einsum("nii->ni", curvature), LEAST)
+        damped = curvature + (damping[which, None] * scale)[..., None] * np.eye(scale.shape[1])
+        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+        step *= np.minimum(1.0, (largest / np.maximum(np.abs(step), 1e-12)).min(axis=1))[:, None]
+        tried = moved(states[which], step)
+        there = Minima(tried, *at(tried, which))
+        better = there.costs <= found.costs[which]
+        for part, new in zip(found, there, strict=True):
+            part[which[better]] = new[better]
+        damping[which] *= np.where(better, 0.1, 10.0)
+        which = which[np.any(np.abs(step) > converged, axis=1) & (damping[which] < MAX_DAMPING)]
+        if not len(which):
+            break
+    return found
+
+
+def minimum(
+    at: Callable[[Array], tuple[float, Array, Array]],
+    start: Array,
+    iterations: int,
+    converged: Array | float,
+    *,
+    largest: Array | float = np.inf,
+    low: Array | float = -np.inf,
+    high: Array | float = np.inf,
+) -> tuple[Array, float, Array]:
+    """The state (D,), cost and curvature (D, D) at the local minimum of one cost, within bounds: see :func:`minima`."""
+
+    def only(states: Array, _: Integers) -> tuple[Array, Array, Array]:
+        cost, gradient, curvature = at(states[0])
+        return np.array([cost]), gradient[None], curvature[None]
+
+    def moved(states: Array, steps: Array) -> Array:
+        return np.clip(states + steps, low, high)
+
+    found = minima(only, start[None], iterations, converged, moved=moved, largest=largest)
+    return found.states[0], float(found.costs[0]), found.curvatures[0]
