@@ -8,6 +8,7 @@ import pytest
 from factorgraph_loc.calibration.calibrate import check
 from factorgraph_loc.calibration.learn import learn
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.sensors.landmarks.calibration import correlation, sightings_of
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factors import se2
 
@@ -45,6 +46,26 @@ def test_white_errors_have_no_correlation(knowledge):
     """The correlation of 7,000 pairs has a standard error of 0.012: 0.06 are five of them."""
     (correlation,) = knowledge.details["landmarks"]
     np.testing.assert_allclose(correlation.next_one, 0.0, atol=0.06)
+
+
+def test_errors_that_last_for_seconds_have_their_correlation(simulate):
+    """Of a Gauss-Markov process with a time constant of 3 s: exp(-lag / 3 s) within .15, some five standard errors."""
+    log = simulate(seconds=240.0, range_sigma=1e-6)
+    seen, rng = log.streams["bearing_range"], np.random.default_rng(3)
+    errors = np.zeros(len(seen.t))
+    for name in set(seen.landmark):
+        rows = np.flatnonzero(np.array(seen.landmark) == name)
+        value, before = rng.standard_normal(), seen.t[rows[0]]
+        for row in rows.tolist():
+            kept = np.exp((before - seen.t[row]) / 3.0)
+            value, before = kept * value + np.sqrt(1.0 - kept**2) * rng.standard_normal(), seen.t[row]
+            errors[row] = 0.1 * value
+    one = replace(log, streams={**log.streams, "bearing_range": replace(seen, range=seen.range + errors)})
+    found = correlation(sightings_of(one), log.rig.bearing_range.model_copy(update={"range_sigma": 0.1}))
+    known = (found.lags < 6.0) & np.isfinite(found.function[:, 0])
+    assert np.count_nonzero(known) >= 4
+    np.testing.assert_allclose(found.function[known, 0], np.exp(-found.lags[known] / 3.0), atol=0.15)
+    assert found.time[0] == pytest.approx(3.0, rel=0.3)
 
 
 def test_a_constant_that_the_robot_does_not_have_is_not_kept(simulate):

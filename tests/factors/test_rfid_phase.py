@@ -119,6 +119,8 @@ def test_groups_are_of_one_tag_antenna_channel_and_window(likelihood: PhaseLikel
     reads = simulated(np.random.default_rng(5), likelihood.tags, 4)
     same = replace(reads, antennas=np.zeros(4, np.int64), tags=np.zeros(4, np.int64))
     assert len(set(same.groups.tolist())) == 1
+    rounded = replace(same, frequency=FREQUENCY + np.array((0.0, 1.0, 2.0, 3.0)))  # Hz, within one channel
+    assert len(set(rounded.groups.tolist())) == 1
     steps = np.array((0, 0, 1, 1))
     columns: tuple[tuple[str, Any], ...] = (
         ("antennas", steps),
