@@ -3,9 +3,18 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.sensors.rfid.calibration.choice import Kind, choose
-from factorgraph_loc.sensors.rfid.calibration.fit import FACING, Floor, features, fit_beam, fit_logistic
-from factorgraph_loc.sensors.rfid.calibration.grid import Axes, design_of, fit_grid
+from factorgraph_loc.sensors.rfid.calibration.fit import (
+    FACING,
+    Axes,
+    Floor,
+    Kind,
+    choose,
+    design_of,
+    features,
+    fit_beam,
+    fit_grid,
+    fit_logistic,
+)
 from factorgraph_loc.sensors.rfid.calibration.pairs import TagPairs, local, terms
 from factorgraph_loc.sensors.rfid.calibration.rounds import distinct, rounds_of
 from factorgraph_loc.sensors.rfid.settings import SurveySettings

@@ -8,9 +8,8 @@ import pytest
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.native.rig_file import read_rig, write_rig
 from factorgraph_loc.sensors.rfid.calibration import learn as rfid_learn
-from factorgraph_loc.sensors.rfid.calibration.choice import Kind
 from factorgraph_loc.sensors.rfid.calibration.dead import dead_tags
-from factorgraph_loc.sensors.rfid.calibration.fit import Floor, fit_logistic
+from factorgraph_loc.sensors.rfid.calibration.fit import Floor, Kind, fit_logistic
 from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid
 from factorgraph_loc.sensors.rfid.calibration.mounting import (
     SURVEY_PLACES,

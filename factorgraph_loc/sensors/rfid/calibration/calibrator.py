@@ -10,7 +10,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import Calibrator, Settled, State, Told, Unit
-from factorgraph_loc.sensors.rfid.calibration import figures, report
+from factorgraph_loc.sensors.rfid.calibration import report
 from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge, learn_rfid
 from factorgraph_loc.sensors.rfid.calibration.rounds import distinct
 from factorgraph_loc.sensors.rfid.calibration.smoothed import relearn_rfid, with_priors
@@ -199,9 +199,9 @@ class RfidCalibrator(Calibrator):
             report.dead_text(found),
             *self.tables(told),
             "Observed frequency of reads against the probability predicted by a model that was fitted to other logs or segments.",
-            figures.reliability_figure(found),
+            report.reliability_figure(found),
             "Probability of a read around the antenna (triangle): observed on the left, the model on the right.",
-            figures.field_figure(found),
+            report.field_figure(found),
         ]
         return {"RFID": parts}
 

@@ -11,9 +11,8 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import file_name
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.rfid.calibration.choice import Kind, ModelSelection, choose, fit
 from factorgraph_loc.sensors.rfid.calibration.dead import DeadTags, dead_tags
-from factorgraph_loc.sensors.rfid.calibration.fit import Floor
+from factorgraph_loc.sensors.rfid.calibration.fit import Floor, Kind, ModelSelection, choose, fit
 from factorgraph_loc.sensors.rfid.calibration.mounting import Offset, with_focus, with_offsets
 from factorgraph_loc.sensors.rfid.calibration.pairs import TagPairs, pairs_of
 from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit, fit_phase

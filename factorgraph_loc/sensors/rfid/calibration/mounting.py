@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
-from factorgraph_loc.sensors.rfid.calibration.choice import Kind, fit
-from factorgraph_loc.sensors.rfid.calibration.fit import Floor
+from factorgraph_loc.sensors.rfid.calibration.fit import Floor, Kind, fit
 from factorgraph_loc.sensors.rfid.calibration.pairs import (
     BLOCKS,
     Terms,
