@@ -19,6 +19,7 @@ from factorgraph_loc.sensors.calibrating import Calibrator, State, Told
 from factorgraph_loc.sensors.registry import channels, moving
 
 Scores = Mapping[str, Any]
+GUESS = 3.0  # initial noise factor
 STEPS = 6  # steps of which progress is reported
 
 
@@ -187,16 +188,17 @@ class _Search:
             kept = tuple(n for n in self.knowledge.rig.sensors if n == one.channel or n not in senses())
             return rig.model_copy(update={"sensors": kept})
 
-        others = self._learners_of_others() if one.judged_unseen else []
+        others = self._learners_of_others() if one.models else []
         unseen = {log.name: alone(o.knowledge.rig) for log, o in others if o.knowledge is not None}
 
         def held_out(log: Log) -> Scores:
-            return self._evaluate(replace(log, rig=one.as_honest_as(unseen[log.name], log.rig)))
+            return self._evaluate(replace(log, rig=one.honest(unseen[log.name], None, log.rig, unseen[log.name])))
 
         before = self.consistent.get(name)
-        guess, least = one.guess(found), one.least(found)
-        if least is None:
-            guess = before.trial.factor if before is not None and before.trial is not None else guess
+        least = one.least(found)
+        guess = GUESS if least is None else least
+        if least is None and before is not None and before.trial is not None:
+            guess = before.trial.factor
         evaluate = held_out if len(unseen) == len(self.logs) else self._evaluate
         return make_consistent(
             self.logs, alone(rig), evaluate, guess, one.inflated, FACTORS[0] if least is None else least

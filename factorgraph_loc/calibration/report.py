@@ -116,15 +116,12 @@ def _figures(values: Array) -> dict[str, float]:
 
 def page(calibration: Calibration) -> str:
     """The report as one HTML page with embedded plots."""
-    sections: dict[str, Sequence[Part]] = {
-        "Constants": [_how(calibration), _long_constants(calibration)],
-        "Noise": [part for calibrator, told in calibration.told() for part in calibrator.report_noise(told)],
-    }
+    sections: dict[str, list[Part]] = {"Constants": [_how(calibration), _long_constants(calibration)], "Noise": []}
     for calibrator, told in calibration.told():
-        sections |= calibrator.report_section(told)
-    sections |= _judgements(calibration) | _accuracy(calibration)
-    for calibrator, told in reversed(list(calibration.told())):
-        sections |= calibrator.report_residuals(told)
+        for title, parts in calibrator.report(told).items():
+            sections.setdefault(title, []).extend(parts)
+    for title, parts in (_judgements(calibration) | _accuracy(calibration)).items():
+        sections[title] = list(parts)
     lead = f"From {', '.join(calibration.logs)}. {_verdict(calibration)}"
     return sectioned(f"Calibration of {calibration.rig.name}", lead, calibration.doubts, sections)
 

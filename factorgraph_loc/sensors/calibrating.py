@@ -68,7 +68,7 @@ class Calibrator:
     ``uncertain``: the constants that an estimator can learn on each run, with the rig's upper bounds; ``together``: constants
     that are judged together; ``units``: of the constants; ``first``: settings of an unknown sensor. ``estimator``: used for
     judging if the EKF cannot be; ``folds``: number of parts of a single log, and of segments of each. ``is_consistent``: whether
-    the noise is scaled to a consistent estimator. ``judged_unseen``: whether models are judged on held-out logs only.
+    the noise is scaled to a consistent estimator, on held-out logs only if there are ``models``.
     """
 
     section: ClassVar[str]
@@ -83,7 +83,6 @@ class Calibrator:
     estimator: ClassVar[str] = ""
     folds: ClassVar[tuple[int, int]] = (4, 1)
     is_consistent: ClassVar[bool] = False
-    judged_unseen: ClassVar[bool] = False
 
     def recordings(self, logs: Sequence[Log]) -> list[int]:
         """An identifier of the recording of each log; logs with the same measurements cannot validate each other."""
@@ -160,24 +159,17 @@ class Calibrator:
         """Whether a rig has everything that the sensor needs."""
         return self.channel not in rig.sensors or getattr(rig, self.section) is not None
 
-    def guess(self, _found: Any) -> float:
-        """Initial guess of the noise factor."""
-        return 3.0
-
     def least(self, _found: Any) -> float | None:
-        """Lower bound of the noise factor; None for the common bound."""
+        """Lower bound of the noise factor, and its initial guess; None for the common ones."""
         return None
 
     def inflated(self, rig: Rig, _factor: float) -> Rig:
         """The rig with the sensor's standard deviations multiplied by a factor."""
         return rig
 
-    def as_honest_as(self, rig: Rig, _other: Rig) -> Rig:
-        """The rig with the tempering of another one, which accounts for correlated errors."""
-        return rig
-
     def honest(self, rig: Rig, factor: float | None, _other: Rig, _learnt: Rig) -> Rig:
-        """The rig with the final noise: scaled by ``factor``, as in ``_other``; ``_learnt``: the rig learnt from all logs."""
+        """The rig with the final noise: scaled by ``factor``, or with what accounts for correlated errors in the rig ``_other``;
+        ``_learnt``: the rig learnt from all logs."""
         return rig if factor is None or getattr(rig, self.section) is None else self.inflated(rig, factor)
 
     def judged(self, found: Any, _judgements: Mapping[str, Any]) -> Any:
@@ -196,16 +188,8 @@ class Calibrator:
         """Additional tables."""
         return ()
 
-    def report_noise(self, _told: Told) -> Sequence[Part]:
-        """The report on the sensor's noise."""
-        return ()
-
-    def report_section(self, _told: Told) -> dict[str, Sequence[Part]]:
-        """Additional sections of the report, by title."""
-        return {}
-
-    def report_residuals(self, _told: Told) -> dict[str, Sequence[Part]]:
-        """Sections of the report on the residuals, by title."""
+    def report(self, _told: Told) -> Mapping[str, Sequence[Part]]:
+        """Parts of the report by the title of their section, such as ``Noise``."""
         return {}
 
 

@@ -138,11 +138,11 @@ class LandmarkCalibrator(ConstantsCalibrator):
             },
         }
 
-    def report_noise(self, told: Told) -> list[Part]:
-        """The scatter, and the noise in the rig."""
+    def report(self, told: Told) -> dict[str, Sequence[Part]]:
+        """The scatter and the noise in the rig; the residuals of the sightings and their autocorrelation."""
         scatter, settings, trial = told.learnt.bearing_range, told.rig.bearing_range, told.trial
         if told.found is None or scatter is None or settings is None:
-            return []
+            return {}
         out: list[Part] = []
         if SCATTER not in told.accepted:
             out.append("The noise of the sightings is rejected: the rig keeps that of the input.")
@@ -155,17 +155,12 @@ class LandmarkCalibrator(ConstantsCalibrator):
                 f"The scatter was multiplied by {trial.factor:.2f} to make the EKF consistent "
                 f"(ANEES over its ideal value: {trial.causal:.2f} causal, {trial.final:.2f} final)."
             )
-        return out
-
-    def report_residuals(self, told: Told) -> dict[str, Sequence[Part]]:
-        """The residuals of the sightings and their autocorrelation."""
-        if told.found is None:
-            return {}
         explained = (
             "Estimators assume independent errors. If the correlation is far above 0, many sightings contain little more "
             "information than one, and the noise in the rig must be larger than the scatter."
         )
         return {
+            "Noise": out,
             "Correlation of consecutive errors": [explained, _correlations(told)],
             "Residuals of the sightings": [
                 sightings_figure(told.found.seen, told.learnt.bearing_range),

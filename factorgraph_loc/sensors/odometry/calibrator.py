@@ -162,32 +162,27 @@ class OdometryCalibrator(ConstantsCalibrator):
         ]
         return [(("wheels", "in the rig", "with its scales"), rows)] if rows else []
 
-    def report_noise(self, told: Told) -> list[Part]:
-        """The growth of each error."""
+    def report(self, told: Told) -> dict[str, Sequence[Part]]:
+        """The growth of each error, and plots of the residuals of the windows."""
         noise: NoiseFit | None = told.details
-        if noise is None:
-            return []
         out: list[Part] = []
-        if NOISE not in told.accepted:
-            out.append("The noise of the odometry below is rejected: the rig keeps that of the input.")
-        rows = [
-            (error, *(number(v) for v in (g.per_distance, g.per_rotation, g.per_time)))
-            for error, g in noise.growth.items()
-        ]
-        header = ("error of the odometry [m, m, rad]", "per sqrt(m)", "per sqrt(rad)", "per sqrt(s)")
-        out += [(header, rows), *self.tables(told)]
-        out.append(
-            f"{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise was multiplied by "
-            f"{noise.widened:.2f}, so that it is valid for half a minute without landmarks."
-        )
-        return out
-
-    def report_residuals(self, told: Told) -> dict[str, Sequence[Part]]:
-        """Plots of the residuals of the windows."""
+        if noise is not None:
+            if NOISE not in told.accepted:
+                out.append("The noise of the odometry below is rejected: the rig keeps that of the input.")
+            rows = [
+                (error, *(number(v) for v in (g.per_distance, g.per_rotation, g.per_time)))
+                for error, g in noise.growth.items()
+            ]
+            header = ("error of the odometry [m, m, rad]", "per sqrt(m)", "per sqrt(rad)", "per sqrt(s)")
+            out += [(header, rows), *self.tables(told)]
+            out.append(
+                f"{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise was multiplied by "
+                f"{noise.widened:.2f}, so that it is valid for half a minute without landmarks."
+            )
         if told.found is None:
-            return {}
+            return {"Noise": out}
         figure = odometry_figure(told.found.parts, odometry_model(told.learnt))
-        return {"Residuals of the odometry": [figure]}
+        return {"Noise": out, "Residuals of the odometry": [figure]}
 
 
 def _wheels(rig: Rig) -> list[tuple[str, float, float]]:

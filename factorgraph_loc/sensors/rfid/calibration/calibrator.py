@@ -36,14 +36,10 @@ class RfidFound:
 class RfidCalibrator(Calibrator):
     """The calibrator of RFID."""
 
-    section, channel, estimator, folds = (
-        "rfid",
-        "rfid",
-        "smoother",
-        (3, 2),
-    )  # few folds, as detection models are slow to fit
+    section, channel, estimator = "rfid", "rfid", "smoother"
+    folds = (3, 2)  # few, as detection models are slow to fit
     models = (MODEL,)
-    is_consistent = judged_unseen = True
+    is_consistent = True
 
     def recordings(self, logs: Sequence[Log]) -> list[int]:
         """Identifiers by content: logs with the same reads are one recording."""
@@ -129,28 +125,21 @@ class RfidCalibrator(Calibrator):
         """Whether a detection model was learnt or given, because the default model is uninformative."""
         return super().is_complete(rig) and (rig.rfid is None or rig.rfid.models != default_models())
 
-    def guess(self, found: RfidFound) -> float:
-        """The factor of the reads' scatter, which is also the lower bound."""
-        return float(found.like.share**-0.5)
-
     def least(self, found: RfidFound) -> float:
-        """See :meth:`guess`."""
-        return self.guess(found)
+        """The factor of the reads' scatter."""
+        return float(found.like.share**-0.5)
 
     def inflated(self, rig: Rig, factor: float) -> Rig:
         """The rig with its tempering adjusted."""
         return tempered(rig, factor)
-
-    def as_honest_as(self, rig: Rig, other: Rig) -> Rig:
-        """The rig with the other's tempering."""
-        return rig if rig.rfid is None or other.rfid is None else tempered(rig, other.rfid.tempering**-0.5)
 
     def honest(self, rig: Rig, _factor: float | None, other: Rig, learnt: Rig) -> Rig:
         """The rig with the tempering and the share of dead tags from all logs."""
         if rig.rfid is None or learnt.rfid is None:
             return rig
         settings = rig.rfid.model_copy(update={"dead_tags": learnt.rfid.dead_tags})
-        return self.as_honest_as(rig.model_copy(update={"rfid": settings}), other)
+        rig = rig.model_copy(update={"rfid": settings})
+        return rig if other.rfid is None else tempered(rig, other.rfid.tempering**-0.5)
 
     def judged(self, found: RfidFound, judgements: Mapping[str, Any]) -> RfidFound:
         """The result with the estimator's judgement of the positions."""
@@ -189,7 +178,7 @@ class RfidCalibrator(Calibrator):
         tables = [report.offsets_table(found), report.models_table(found, accepted=MODEL in told.accepted)]
         return [*tables, report.tags_table(found)] if found.doubts else tables
 
-    def report_section(self, told: Told) -> dict[str, Sequence[Part]]:
+    def report(self, told: Told) -> dict[str, Sequence[Part]]:
         """The tables, and the accuracy of the models' predictions."""
         if told.found is None:
             return {}
