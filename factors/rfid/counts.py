@@ -71,10 +71,6 @@ class TagReadCounts:
         hits, odds, elsewhere = listing(self.tags, self.hits, self.odds, self.elsewhere, self.others, tags)
         return replace(self, hits=hits, odds=odds, elsewhere=elsewhere, tags=tags)
 
-    def with_odds(self, odds: Array) -> TagReadCounts:
-        """The same with log-odds ``odds`` (T,) of all tags of the map."""
-        return replace(self, odds=odds if self.tags is None else odds[self.tags])
-
 
 def together(parts: list[TagReadCounts]) -> TagReadCounts:
     """Merge counts relative to one pose, in order of time; the odds are those of the first that lists a tag, what they tell of tags

@@ -49,10 +49,6 @@ class RfidFactor:
         """Whether it is a phase likelihood, which has many local optima, centimetres apart."""
         return isinstance(self.likelihood, PhaseLikelihood)
 
-    def with_odds(self, odds: Array) -> RfidFactor:
-        """The factor with other log-odds (T,) that each tag is dead; for read counts only."""
-        return replace(self, seen=self.seen.with_odds(odds)) if isinstance(self.seen, TagReadCounts) else self
-
     def fixed(self, values: Array) -> RfidFactor:
         """The same on the pose alone, with the ``values`` (P,) of what is estimated."""
         if not isinstance(self.likelihood, RfidLikelihood):

@@ -128,20 +128,15 @@ class TagStates:
         self._told = kept
 
     def _changed(self, doubtful: bool) -> None:
-        """Which tags are doubtful has changed, or not."""
+        """Update what depends on the weights; ``doubtful``: whether another set of tags is doubtful."""
         if doubtful:
             self._doubtful = None
-            if self._moved > 0.0:
-                self._expect_moved()
-
-    def _expect_moved(self) -> None:
-        """Take all tags to have moved as often as those that were read."""
-        read, found = self._weights[:, DEAD] == -np.inf, self.were_read(self.doubtful)
-        share = (WORTH * self._moved + np.sum(found)) / (WORTH + np.sum(read))
-        raised = math.log(max(share / self._moved, 1.0))
-        self._weights[:, DEAD + 1 :] += raised - self._raised
-        self._odds, self._raised, self._doubtful = _all_odds(self._weights), raised, None
-        self.prior = float(np.logaddexp(_log(self._dead), _log(self._moved) + raised) - self._surveyed)
+        if self._moved > 0.0:
+            raised = _raised(self._weights, self._odds, self._raised, self._moved)
+            if raised != self._raised:
+                self._weights[:, DEAD + 1 :] += raised - self._raised
+                self._odds, self._raised, self._doubtful = _all_odds(self._weights), raised, None
+                self.prior = float(np.logaddexp(_log(self._dead), _log(self._moved) + raised) - self._surveyed)
 
 
 @compiled
@@ -204,6 +199,28 @@ def _learn(weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32
         odds[tags[u]] = _odds(of_tag)
         changed |= (before > LIMIT) != (odds[tags[u]] > LIMIT)
     return changed
+
+
+@compiled
+def _raised(weights: Array, odds: Array, raised: float, moved: float) -> float:
+    """The logarithm by which the prior of moved tags rises, by the share of moved ones among the tags that were read.
+
+    More tags are believed to have moved with a higher prior. The result is the lowest prior that explains itself, which depends on
+    the evidence only, not on its order. ``odds`` (T,) are those with a prior that has risen by ``raised``.
+    """
+    out, read = 0.0, 0
+    for t in range(len(odds)):
+        read += weights[t, DEAD] == -np.inf
+    while True:
+        found = 0
+        for t in range(len(odds)):
+            # a tag that was read is not dead, so its odds rise as the prior does
+            found += weights[t, DEAD] == -np.inf and odds[t] - raised + out > LIMIT
+        share = (WORTH * moved + found) / (WORTH + read)
+        higher = math.log(max(share / moved, 1.0))
+        if higher <= out:
+            return out
+        out = higher
 
 
 @compiled

@@ -258,9 +258,9 @@ class TagSensor(Sensor):
         return [Term(factor, self._blocks if factor.estimated else (), factor.rows) for factor in factors]
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """The factor with the tag states as known at the end instead of at each scan."""
-        tags = cast(RfidFactor, factor)
-        return None if tags.is_phase and width > 1.0 else tags.with_odds(self.tags.states.odds)
+        """The factor as it is, so that no scan is weighed by tag states that were learnt from it. Phase, which has many local
+        optima, is left out while losses are wide."""
+        return None if width > 1.0 and cast(RfidFactor, factor).is_phase else factor
 
     def rewind(self, t: float) -> None:
         self.tags.forget(math.nextafter(t, math.inf))
