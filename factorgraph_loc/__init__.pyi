@@ -78,10 +78,10 @@ from factorgraph_loc.sensors.odometry.measurement import (
     YawRate as YawRate,
     YawRateStream as YawRateStream,
 )
-from factorgraph_loc.sensors.rfid.grids import read_grid as read_grid, write_grid as write_grid
+from factorgraph_loc.sensors.rfid.settings import read_grid as read_grid, write_grid as write_grid
 from factorgraph_loc.sensors.rfid.map import Tag as Tag
-from factorgraph_loc.sensors.rfid.measurement import RfidScan as RfidScan
-from factorgraph_loc.sensors.rfid.pushed import RfidRead as RfidRead
+from factorgraph_loc.sensors.rfid.stream import RfidScan as RfidScan
+from factorgraph_loc.sensors.rfid.stream import RfidRead as RfidRead
 from factorgraph_loc.sensors.rfid.stream import RfidStream as RfidStream
 from factorgraph_loc.vision.frame import CameraFrame as CameraFrame
 from factorgraph_loc.version import __version__ as __version__

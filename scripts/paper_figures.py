@@ -11,7 +11,7 @@ from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend, style
 from factorgraph_loc.evaluation.figures import Track, way, with_pauses
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,9 +17,8 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry import simulation as simulated_odometry
 from factorgraph_loc.sensors.odometry.simulation import wheel_odometry
 from factorgraph_loc.sensors.rfid.map import TagsFile, read_mapped_tags
-from factorgraph_loc.sensors.rfid.rounds import ends_of, make_rfid_stream, rounds_from_gaps
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.rfid.tables import ROUND_GAP
+from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, ends_of, make_rfid_stream, rounds_from_gaps
 from factors import se2
 
 ANTENNAS = ("first", "second", "third")

@@ -34,8 +34,8 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.interfaces import lacking_section
 from factorgraph_loc.sensors.landmarks.summary import require_mappable
 from factorgraph_loc.sensors.registry import sensors
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.text import quoted
 from factors import se2
 

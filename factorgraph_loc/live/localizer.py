@@ -31,7 +31,7 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.use import MapFrame, frontend_of, uses_images
 from factorgraph_loc.sensors.pushed import checked
 from factorgraph_loc.sensors.registry import channels
-from factorgraph_loc.sensors.rfid.pushed import RfidRead, scan_of
+from factorgraph_loc.sensors.rfid.stream import RfidRead, scan_of
 
 if TYPE_CHECKING:
     from factorgraph_loc.sensors.camera.frontend import LiveFrontend

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.known_tags import tag_map, whole_scans
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
-from factorgraph_loc.sensors.rfid.whole import whole_scans
+from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.text import listed
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.model import RfidModel

@@ -4,7 +4,7 @@ from factorgraph_loc.sensors.camera.measurement import PixelSightings
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factorgraph_loc.sensors.loops.measurement import Loops
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.vision.frame import CameraFrame
 
 Odometry = VelocityOdometry | IncrementOdometry | YawRate

@@ -81,8 +81,7 @@ def test_priors_come_from_the_scatter_between_logs(found):
 
 def test_a_grid_learns_its_range_and_rate(blind, tmp_path):
     """A grid that was made of a beam whose range is 10 % too long."""
-    from factorgraph_loc.sensors.rfid.grids import write_grid  # noqa: PLC0415
-    from factorgraph_loc.sensors.rfid.settings import GridSettings  # noqa: PLC0415
+    from factorgraph_loc.sensors.rfid.settings import GridSettings, write_grid  # noqa: PLC0415
     from factors.rfid.model import BeamModel, bake  # noqa: PLC0415
 
     beam = BeamModel(r_max=4.95)

@@ -14,7 +14,7 @@ from factorgraph_loc.model.belief import PoseEstimate, gaussian_belief
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import named_settings
 from factorgraph_loc.simulation import simulate as simulated
 

@@ -19,8 +19,7 @@ from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, IncrementStream
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.rfid.stream import RfidScan, RfidStream
 from factorgraph_loc.simulation import preset, simulate
 from factors import se2
 

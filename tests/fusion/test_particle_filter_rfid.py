@@ -14,8 +14,8 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
 from factorgraph_loc.sensors.rfid.map import Tag
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, BeamSettings, PriorSettings, RfidSettings
+from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate
 from factors import se2

@@ -11,7 +11,7 @@ from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.sensors.odometry.measurement import YawRate
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation import simulate as simulate_office
 from factors import se2

@@ -18,7 +18,7 @@ from factorgraph_loc.sensors.camera.tables import SIGHTINGS
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.odometry.tables import IMU, INCREMENTS, VELOCITIES
-from factorgraph_loc.sensors.rfid.columns import INVENTORIES, RFID
+from factorgraph_loc.sensors.rfid.stream import INVENTORIES, RFID
 
 UNIX = 1_700_000_000_000_000_000
 ROW = {"landmark": "A", "antenna": "left", "epc": "E1", "file": "a.png", "duration": 1.0}

@@ -17,7 +17,7 @@ from factorgraph_loc import (
     Tick,
     VelocityOdometry,
 )
-from factorgraph_loc.sensors.rfid.pushed import scan_of
+from factorgraph_loc.sensors.rfid.stream import scan_of
 
 
 @pytest.fixture(scope="module")

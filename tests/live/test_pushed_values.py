@@ -30,8 +30,7 @@ from factorgraph_loc.sensors.camera.tables import PAIRS as PIXELS
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
 from factorgraph_loc.sensors.odometry.tables import IMU, INCREMENTS, VELOCITIES
 from factorgraph_loc.sensors.pushed import checked
-from factorgraph_loc.sensors.rfid.columns import READS
-from factorgraph_loc.sensors.rfid.pushed import scan_of
+from factorgraph_loc.sensors.rfid.stream import READS, scan_of
 
 ONE = np.ones(1)
 SOUND = [

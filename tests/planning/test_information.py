@@ -18,9 +18,9 @@ from factorgraph_loc.planning.information import (
 )
 from factorgraph_loc.planning.paths import Path, look_around, primitives
 from factorgraph_loc.planning.sensors import Sensors
-from factorgraph_loc.sensors.rfid.expectation import RfidForecast
+from factorgraph_loc.sensors.rfid.forecast import RfidForecast
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.worlds import make_world
 from factors.odometry.model import Growth, OdometryModel

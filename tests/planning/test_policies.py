@@ -15,7 +15,7 @@ from factorgraph_loc.planning.policies import Situation, make_policy, usable
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
 from factorgraph_loc.sensors.motion import odometry_model
-from factorgraph_loc.sensors.rfid.expectation import RfidForecast
+from factorgraph_loc.sensors.rfid.forecast import RfidForecast
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.simulation.settings import RACKHAM_RIG
 from factors.rfid.detection import RfidLikelihood, TagArray

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.simulation import draw_dead, draw_reads, read_probabilities
-from factorgraph_loc.sensors.rfid.simulation_settings import FaultSettings
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
+from factorgraph_loc.sensors.rfid.simulation import FaultSettings, draw_dead, draw_reads, read_probabilities
+from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import preset
 from factors.rfid.model import BeamModel
 

@@ -7,8 +7,8 @@ import pytest
 from recorded_logs import recorded_log
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.recorded import FAR, SCALES
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.simulation import preset, recorded_looks, simulate
 from factors.rfid.detection import RfidLikelihood
 

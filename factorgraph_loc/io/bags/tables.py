@@ -28,8 +28,7 @@ from factorgraph_loc.model.planar import Axes, Turned
 from factorgraph_loc.sensors.camera.tables import SIGHTINGS
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
 from factorgraph_loc.sensors.rfid import tables as native_rfid
-from factorgraph_loc.sensors.rfid.columns import RFID
-from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.rfid.stream import RFID, RfidStream
 from factorgraph_loc.sensors.tables import stream_of
 from factorgraph_loc.text import listed
 

@@ -26,7 +26,7 @@ from factorgraph_loc.files.column_mapping import (
 from factorgraph_loc.files.columns import PURE, Column
 from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.files.tables import TableRows
-from factorgraph_loc.sensors.rfid.columns import RFID
+from factorgraph_loc.sensors.rfid.stream import RFID
 from factorgraph_loc.sensors.rfid.tables import SIGNALS, check_reads
 from factorgraph_loc.text import listed, quoted
 from factors.se2 import Array

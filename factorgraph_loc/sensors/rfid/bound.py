@@ -13,12 +13,17 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
-from factorgraph_loc.sensors.rfid.consistency import KNOWN, ConsistencyMonitor
-from factorgraph_loc.sensors.rfid.known_tags import KnownTags, TagEvidence
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
-from factorgraph_loc.sensors.rfid.monitor import POSSIBLE, BurstMonitor, ScanMonitor, SettledParameters, SilenceMonitor
-from factorgraph_loc.sensors.rfid.signals import TagSignals
-from factorgraph_loc.sensors.rfid.tag_map import extent
+from factorgraph_loc.sensors.rfid.known_tags import KnownTags, TagEvidence, TagSignals, extent
+from factorgraph_loc.sensors.rfid.monitor import (
+    KNOWN,
+    POSSIBLE,
+    BurstMonitor,
+    ConsistencyMonitor,
+    ScanMonitor,
+    SettledParameters,
+    SilenceMonitor,
+)
+from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factors import positive, se2
 from factors.graph import Factor
 from factors.rfid import update as rfid_update

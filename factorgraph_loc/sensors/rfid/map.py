@@ -10,15 +10,27 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, in_case, read_mapped
-from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, inside, parse_model, write_text
+from factorgraph_loc.files.columns import ANGLE, FULL_TURN, LENGTH, Table, named, number, within
+from factorgraph_loc.files.models import FARTHEST, Coordinate, FileModel, InUnit, inside, parse_model, write_text
 from factorgraph_loc.files.tables import read_cells, rows_by_name
 from factorgraph_loc.model.settings import Covariance, spread_of
-from factorgraph_loc.sensors.rfid.columns import TAGS
 from factors.se2 import Array
 
 TAGS_SUFFIX = ".tags.csv"
 TAG_COLUMNS = ("epc", "x", "y", "z", "facing")
 TAG_COLUMNS_WITH_SIGMA = (*TAG_COLUMNS, "sigma")
+TAGS = Table(
+    "tags",
+    (
+        named("epc", "the EPC of a tag"),
+        within("x", LENGTH, FARTHEST, "position in the frame of the survey"),
+        within("y", LENGTH, FARTHEST, "position in the frame of the survey"),
+        number("z", LENGTH, -FARTHEST, FARTHEST, "height; 0 if empty", may_lack=True),
+        number("facing", ANGLE, -FULL_TURN, FULL_TURN, "direction that its front faces", may_lack=True),
+        number("sigma", LENGTH, 0.0, 100.0, "standard deviation of its survey in x and y", may_lack=True),
+    ),
+    "one each",
+)
 
 
 class Tag(FileModel):

@@ -12,9 +12,8 @@ from scipy.spatial import cKDTree
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.rfid.known_tags import tag_map, whole_scans
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings, SurveySettings
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
-from factorgraph_loc.sensors.rfid.whole import whole_scans
 from factors import se2
 from factors.rfid.detection import TagArray
 from factors.se2 import Array

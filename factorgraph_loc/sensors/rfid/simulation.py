@@ -1,15 +1,110 @@
-"""Simulated tag reads from the detection model of a rig, with faults."""
+"""Simulated reads of tags, on a drive and by an active robot: settings, faults, reads, strength and phase."""
 
+import math
 from collections.abc import Mapping
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
 
-from factorgraph_loc.sensors.rfid.settings import RfidSettings
-from factorgraph_loc.sensors.rfid.simulation_settings import ClockJump, Fading, FaultSettings
-from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.models import FileModel, InUnit
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.settings import Duration, Metres, Share
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.interfaces import Ride, Simulated
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
+from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings, Weight
+from factorgraph_loc.sensors.rfid.stream import RfidScan, RfidStream
+from factorgraph_loc.text import listed, quoted
+from factors import se2
+from factors.rfid import strength as rfid_rssi
 from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.phase import SPEED_OF_LIGHT
+from factors.rfid.strength import RssiReads
 from factors.se2 import Array
+
+
+class SimulatedPhaseSettings(FileModel):
+    """Phase of reads."""
+
+    frequency: Annotated[float, Field(ge=3e8, le=6e9), InUnit("Hz")] = 920.625e6
+    """frequency of the carrier"""
+    sigma: Annotated[float, Field(ge=0.0, le=3.0), InUnit("rad")] = 0.1
+    """noise"""
+    flips: Share = 0.2
+    """share of reads that are off by pi, as with most readers"""
+
+
+class SimulatedRssiSettings(FileModel):
+    """Strength of reads, with Student noise."""
+
+    coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)] = (-50.0, 2.0, -8.0, 0.0, 2.0, 0.0)
+    """weights of the features of the strength, as rfid.rssi.coefficients of a rig"""
+    sigma: Annotated[float, Field(ge=0.0, le=30.0), InUnit("dB")] = 2.0
+    """scale of the noise"""
+    dof: Annotated[float, Field(ge=0.1, le=100.0)] = 4.0
+    """degrees of freedom of the noise"""
+
+
+class Fading(FileModel):
+    """Persistent misses: each antenna misses each tag for a while."""
+
+    duration: Annotated[float, Field(ge=1e-3, le=1000.0), InUnit("s")] = 2.0
+    """mean time for which an antenna misses a tag"""
+    share: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
+    """share of all time for which it does"""
+
+
+class AntennaStop(FileModel):
+    """An antenna that reads nothing any more."""
+
+    model_config = ConfigDict(coerce_numbers_to_str=True)  # antennas are often named by numbers
+
+    antenna: str
+    """name of the antenna"""
+    time: Duration
+    """time from which on it reads nothing"""
+    rounds_go_on: bool = False
+    """whether its rounds go on, without reads, as with a broken cable"""
+
+
+class ClockJump(FileModel):
+    """A jump of the reader's clock."""
+
+    time: Duration
+    """time of the jump"""
+    jump: Annotated[float, Field(ge=-60.0, le=60.0), InUnit("s")]
+    """how much later the reader's timestamps are from then on"""
+
+
+class Silence(FileModel):
+    """A while in which no tag is read."""
+
+    time: Duration
+    """begin of it"""
+    duration: Duration
+    """duration of it"""
+
+
+class FaultSettings(FileModel):
+    """Faults of RFID."""
+
+    fading: Fading = Fading()
+    false_reads: Share = 0.0
+    """share of all reads that are of random tags, in addition to the model's false_read"""
+    dead: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """share of tags that are never read"""
+    misplaced: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """share of tags that are misplaced in the map"""
+    misplaced_by: Metres = 1.0
+    """how far these are off"""
+    antenna_stop: AntennaStop | None = None
+    clock_jump: ClockJump | None = None
+    silence: Silence | None = None
+
 
 Hits = NDArray[np.bool_]
 
@@ -116,3 +211,128 @@ def _false(count: int, share: float, shape: tuple[int, ...], rng: np.random.Gene
     extra = min(rng.poisson(count * share / (1.0 - share)), size)
     out.ravel()[rng.choice(size, extra, replace=False)] = True
     return out
+
+
+def strengths(
+    rfid: RfidSettings,
+    tags: TagArray,
+    poses: Array,
+    hits: Hits,
+    settings: SimulatedRssiSettings,
+    rng: np.random.Generator,
+) -> Array:
+    """RSSI [dBm] (N, A, T) of the reads ``hits`` (N, A, T) at poses (N, 3), NaN elsewhere: :mod:`factors.rfid.strength`."""
+    n, a, tag = np.nonzero(hits)
+    reads = RssiReads(poses[n], a, tag, np.full(len(n), np.nan))
+    features = rfid_rssi.features(rfid.model().antennas, tags, np.zeros(3), reads)
+    out = np.full(hits.shape, np.nan)
+    out[hits] = features @ np.array(settings.coefficients) + settings.sigma * rng.standard_t(settings.dof, len(n))
+    return out
+
+
+def phases(
+    rfid: RfidSettings, tags: TagArray, poses: Array, settings: SimulatedPhaseSettings, rng: np.random.Generator
+) -> Array:
+    """Phase (N, A, T) in [0, 2 pi) of a read of each tag by each antenna at poses (N, 3).
+
+    ``offset - 4 pi f d / c`` (Nikitin et al., IEEE RFID 2010, eq. 4) with a random offset for each antenna and tag, noise, and an
+    additional pi for a share of the reads.
+    """
+    at = np.array([(antenna.x, antenna.y, antenna.z) for antenna in rfid.all_antennas().values()])
+    planar = se2.transform_from(poses[:, None], at[None, :, :2])[:, :, None] - tags.points[:, :2]
+    height = at[:, None, 2] - tags.points[:, 2]
+    distance = np.sqrt((planar**2).sum(axis=-1) + height**2)
+    offset = rng.uniform(0.0, 2.0 * np.pi, distance.shape[1:])
+    phase = offset - 4.0 * np.pi * settings.frequency / SPEED_OF_LIGHT * distance
+    phase += settings.sigma * rng.standard_normal(phase.shape)
+    phase += np.pi * (rng.random(phase.shape) < settings.flips)
+    return np.asarray(np.mod(phase, 2.0 * np.pi))
+
+
+SPARSE = 20  # every n-th pose is used to check the donors
+MOST_UNMATCHED = 0.1  # maximum share of rounds in range without a similar recorded one
+
+
+def simulate(ride: Ride) -> Simulated:
+    """The reads of a simulated drive, with all faults."""
+    settings, rfid, recorded, rng = ride.settings, ride.rig.of(RfidSettings), ride.recorded, ride.rng("reads")
+    tags = tag_map(ride.world, ride.rig.of(SurveySettings))
+    times = ride.times(settings.rounds_per_second)
+    poses = ride.truth.at(times)
+    # recorded outcomes are probabilities of zero and one
+    p = read_probabilities(rfid, tags.tags, poses) if recorded is None else recorded.outcomes(tags.tags, poses, rng)
+    names, epcs = list(rfid.all_antennas()), list(tags.names)
+    dead = draw_dead(settings.faults, len(epcs), rng)
+    hits = draw_reads(rfid, p, times, settings.faults, dead, rng)
+    signals: dict[str, Array] = {}
+    if settings.rssi is not None:
+        signals["rssi"] = strengths(rfid, tags.tags, poses, hits, settings.rssi, ride.rng("strengths"))
+    if settings.phase is not None:
+        signals["phase"] = phases(rfid, tags.tags, poses, settings.phase, ride.rng("phases"))
+        signals["frequency"] = np.full(hits.shape, settings.phase.frequency)
+    stream = rfid_stream(names, epcs, times, hits, settings.faults, signals)
+    surveyed, misplaced = _surveyed(ride.world.tags, settings.faults, ride.rng_of_world("survey"))
+    metadata, warnings = {}, []
+    if recorded is not None:
+        metadata["reads"] = "resampled from recorded rounds at similar range, bearing, height and facing"
+        share = recorded.unmatched(tags.tags, ride.truth.poses[::SPARSE])
+        if share > MOST_UNMATCHED:
+            warnings.append(f"rfid: {share:.0%} of the rounds in range have no similar recorded one")
+    if len(dead):
+        metadata["dead"] = ", ".join(epcs[i] for i in sorted(dead.tolist()))
+    if misplaced:
+        metadata["misplaced"] = ", ".join(misplaced)
+    return Simulated({"rfid": stream}, {"tags": surveyed}, metadata, tuple(warnings))
+
+
+def looks(settings: Any) -> dict[str, float]:
+    """Rate [Hz] of the simulated rounds; ValueError if rig and faults are inconsistent."""
+    if settings.rig.find(RfidSettings) is None:
+        raise ValueError("the rig has no rfid, expected antennas")
+    stop, names = settings.faults.antenna_stop, list(settings.rig.of(RfidSettings).all_antennas())
+    if stop is not None and stop.antenna not in names:
+        raise ValueError(f"antenna {quoted(stop.antenna)} stops, expected one of {listed(names)}")
+    return {"tags": settings.rounds_per_second * len(names) * settings.world.tag_count()}
+
+
+def _surveyed(
+    tags: Mapping[str, Tag], faults: FaultSettings, rng: np.random.Generator
+) -> tuple[dict[str, Tag], list[str]]:
+    """The tags of the surveyed map, and the names of misplaced ones."""
+    names = list(tags)
+    chosen = sorted(rng.permutation(len(names))[: round(faults.misplaced * len(names))].tolist())
+    surveyed = dict(tags)
+    for i in chosen:
+        tag, direction = surveyed[names[i]], rng.uniform(-math.pi, math.pi)
+        x, y = tag.x + faults.misplaced_by * math.cos(direction), tag.y + faults.misplaced_by * math.sin(direction)
+        surveyed[names[i]] = tag.model_copy(update={"x": x, "y": y})
+    return surveyed, [names[i] for i in chosen]
+
+
+class SimulatedReader:
+    """A :class:`~factorgraph_loc.sensors.interfaces.LiveSensor`: all antennas measure one round at a time."""
+
+    channel, decides = "rfid", True
+
+    def __init__(self, world: World, rig: Rig, rate: float, rng: np.random.Generator) -> None:
+        self.rate, self._rng = rate, rng
+        self._antennas = tuple(rig.of(RfidSettings).all_antennas())
+        self._map = tag_map(world, rig.of(SurveySettings))
+        self._likelihood = RfidLikelihood(rig.of(RfidSettings).model(), self._map.tags)
+
+    def measure(self, t: float, pose: Array) -> RfidScan:
+        """A round that ends at ``t``."""
+        chance = np.stack([self._likelihood.probabilities(pose[None], a)[0] for a in range(len(self._antennas))])
+        antenna, tag = np.nonzero(self._rng.random(chance.shape) < chance)
+        unknown = np.full(len(tag), np.nan)
+        names = tuple(self._map.names[i] for i in tag.tolist())
+        return RfidScan(
+            t, self._antennas, antenna.astype(np.int64), names, np.zeros(len(tag)), unknown, unknown, unknown
+        )
+
+
+def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedReader:
+    """The antennas of a rig; InputError if the settings have faults."""
+    if settings.faults != FaultSettings():
+        raise InputError(f"{settings.name}: has faults, which active runs do not support")
+    return SimulatedReader(world, rig, settings.rounds_per_second, rng)

@@ -1,14 +1,94 @@
-"""The stream of an RFID reader."""
+"""Scans of an RFID reader: their tables, stream and validation."""
 
-from collections.abc import Iterator, Sequence
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_loc.errors import bad_field
+from factorgraph_loc.files import values
+from factorgraph_loc.files.columns import (
+    ANGLE,
+    DURATION,
+    FREQUENCY,
+    FULL_TURN,
+    POWER,
+    PURE,
+    STAMP,
+    Column,
+    Table,
+    named,
+    number,
+)
 from factorgraph_loc.model.measurement import Measurement, Stream
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.text import listed, plain
 from factors.se2 import Array
+
+ANTENNA = named("antenna", "the name of an antenna")
+RFID = Table(
+    "rfid",
+    (
+        STAMP,
+        ANTENNA,
+        named("epc", "the EPC of a tag"),
+        number("rssi", POWER, -200.0, 200.0, "strength of the response, by the reader's own zero", may_lack=True),
+        number("phase", ANGLE, -FULL_TURN, FULL_TURN, "phase as the reader reports it", may_lack=True),
+        number("frequency", FREQUENCY, 1e8, 1e10, "of the carrier", may_lack=True),
+        Column("inventory", "whole", PURE, 1.0, 2.0**53, False, "the row of the round in inventories"),
+    ),
+    "one measurement",
+    optional=((("rssi", "phase", "frequency"), ("rssi",), ()), (("inventory",), ())),
+)
+INVENTORIES = Table(
+    "inventories",
+    (STAMP, ANTENNA, number("duration", DURATION, 0.0, 3600.0, "duration of the round, which ends at the timestamp")),
+    "one measurement",
+)
+# the place of an antenna in a scan
+PLACE = Column("antenna", "whole", PURE, -(2.0**53), 2.0**53, False, "index in antennas")
+# the reads of a stream or scan, grouped in rounds
+READS = Table(
+    "reads",
+    (
+        number("age", DURATION, 0.0, 3600.0, "time from the read to the end of its round"),
+        *(RFID[name] for name in ("rssi", "phase", "frequency")),
+    ),
+    "one measurement",
+    stream="factorgraph_loc.sensors.rfid.stream:RfidStream",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RfidScan:
+    """Inventory rounds of one or several antennas that ended at one time, with R tag reads.
+
+    ``antennas``: A names of the active antennas; a name may occur twice, for two rounds. A tag of the map without a read was missed
+    by all active antennas. ``antenna`` (R,): index in ``antennas``; ``tags``: R EPCs; ``age`` (R,) [s]: time from the read to
+    ``t``; ``rssi`` (R,) [dBm], ``phase`` (R,) [rad] as the reader reports it, and ``frequency`` (R,) [Hz] of the carrier: NaN if
+    unknown.
+    """
+
+    sensor: ClassVar[str] = "rfid"
+    modality: ClassVar[str] = "rfid"
+    is_motion: ClassVar[bool] = False
+    t: float
+    antennas: tuple[str, ...]
+    antenna: NDArray[np.int64]
+    tags: tuple[str, ...]
+    age: Array
+    rssi: Array
+    phase: Array
+    frequency: Array
+
+    @property
+    def count(self) -> int:
+        """Number of rounds."""
+        return len(self.antennas)
 
 
 @dataclass(frozen=True)
@@ -32,9 +112,9 @@ class RfidStream(Stream):
         for i, j in self.scans():
             rounds: dict[int, int] = {}
             names: list[str] = []
-            for number, antenna in zip(self.round[i:j].tolist(), self.antenna[i:j], strict=True):
-                if number not in rounds:
-                    rounds[number] = len(names)
+            for index, antenna in zip(self.round[i:j].tolist(), self.antenna[i:j], strict=True):
+                if index not in rounds:
+                    rounds[index] = len(names)
                     names.append(antenna)
             rows = [k for k in range(i, j) if self.epc[k]]
             yield RfidScan(
@@ -47,3 +127,81 @@ class RfidStream(Stream):
                 self.phase[rows],
                 self.frequency[rows],
             )
+
+
+@dataclass(frozen=True)
+class RfidRead:
+    """A read of a tag: name of the antenna and EPC; ``t`` [s]: time of the read, None for the end of the round. ``rssi`` [dBm],
+    ``phase`` [rad] as the reader reports it, ``frequency`` [Hz] of the carrier: NaN if unknown. ``round``: index of the round in
+    the list of antennas that are pushed together, or None. In that case the first read of a tag by an antenna belongs to the
+    antenna's first round, the next one to its next round, as a tag responds once per round."""
+
+    antenna: str
+    epc: str
+    t: float | None = None
+    rssi: float = math.nan
+    phase: float = math.nan
+    frequency: float = math.nan
+    round: int | None = None
+
+
+def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> RfidScan:
+    """The scan of rounds of ``antennas`` that ended at ``t``; InputError if a read is invalid, or names another antenna or a round
+    of another antenna."""
+    t = values.seconds_of("RfidScan", t)
+    where = f"RfidScan at {t:.3f} s"
+    antenna_names = values.names(where, "antennas", values.items_of(where, "antennas", antennas))
+    rows = values.items_of(where, "reads", reads)
+    for read in rows:
+        if not isinstance(read, RfidRead):
+            raise bad_field(where, "read", read, "an RfidRead")
+    return RfidScan(
+        t,
+        antenna_names,
+        _rounds(where, t, antenna_names, rows),
+        tuple(read.epc for read in rows),
+        np.array([0.0 if read.t is None else t - values.seconds_of(where, read.t, "time of a read") for read in rows]),
+        *(
+            values.numbers(where, name, [getattr(read, name) for read in rows])
+            for name in ("rssi", "phase", "frequency")
+        ),
+    )
+
+
+def _rounds(where: str, t: float, names: tuple[str, ...], reads: Sequence[RfidRead]) -> NDArray[np.int64]:
+    """The round of each read (R,). If a read does not name it: the first round of its antenna in which the tag was not read yet, in
+    order of time, or the last round."""
+    out = np.full(len(reads), -1, dtype=np.int64)
+    for i, read in enumerate(reads):
+        if not isinstance(read.antenna, str) or read.antenna not in names:
+            raise bad_field(where, "antenna", read.antenna, f"one of the active antennas: {listed(names)}")
+        if not isinstance(read.epc, str):
+            raise bad_field(where, "epc", read.epc, RFID["epc"].doc)
+        if read.round is None:
+            continue
+        own = [k for k, name in enumerate(names) if name == read.antenna]
+        if not isinstance(read.round, (int, np.integer)) or read.round not in own:
+            expected = f"one of antenna {plain(read.antenna)}: {listed(own)}"
+            raise bad_field(where, "round", read.round, expected)
+        out[i] = read.round
+    taken = {(read.epc, int(k)) for read, k in zip(reads, out, strict=True) if k >= 0}
+    untold = [i for i in range(len(reads)) if out[i] < 0]
+    for i in sorted(
+        untold, key=lambda i: t if (at := reads[i].t) is None else values.seconds_of(where, at, "time of a read")
+    ):
+        mine = [k for k, name in enumerate(names) if name == reads[i].antenna]
+        out[i] = next((k for k in mine if (reads[i].epc, k) not in taken), mine[-1])
+        taken.add((reads[i].epc, int(out[i])))
+    return out
+
+
+def check(m: RfidScan, where: str) -> dict[str, Any]:
+    """The fields of a scan; InputError names the first invalid one."""
+    tags, antennas = values.names(where, "tags", m.tags), values.names(where, "antennas", m.antennas)
+    antenna = values.integers(where, PLACE, m.antenna, len(tags))
+    if np.any((antenna < 0) | (antenna >= len(antennas))):
+        raise bad_field(where, "antenna", antenna.tolist(), f"indices of its {len(antennas)} antennas, from 0")
+    told = {
+        column.name: values.within(where, column, getattr(m, column.name), (len(tags),)) for column in READS.columns
+    }
+    return {"tags": tags, "antennas": antennas, "antenna": antenna, **told}

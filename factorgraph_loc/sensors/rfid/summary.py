@@ -1,20 +1,37 @@
-"""Summary of the RFID reads in a log, with warnings."""
+"""Summaries of RFID reads: of a log, of what a run can do with them, and of reads against predicted reads.
 
+The last is a reliability diagram (DeGroot and Fienberg, "The comparison and evaluation of forecasters", The Statistician 32, 1983)
+of a detection model along the final trajectory, by distance and antenna. Reads and misses of one tag by one antenna follow each
+other with the same reflections and the same obstacles. How much more they scatter than independent ones over some seconds gives the
+variance of all counts (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5).
+"""
+
+import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_loc.model.belief import Learnt
+from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.interfaces import Paragraph, Summary
-from factorgraph_loc.sensors.rfid.settings import RfidSettings
+from factorgraph_loc.model.reliability import Reliability
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.interfaces import Ending, Marks, Paragraph, Review, Summary, Use
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
+from factorgraph_loc.sensors.rfid.monitor import BAND, BLOCK, DIFFERENT, FEWEST, POSSIBLE, ReadGroups
+from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.text import listed
+from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, possible_poses
+from factorgraph_loc.text import listed, quoted
+from factors.rfid.adjustment import MOST_CERTAIN, rate_of
+from factors.rfid.detection import ExpectedReads, RfidLikelihood
+from factors.se2 import Array, Integers, transform_from
 
 STOPPED = 10.0  # s; an antenna without rounds for longer before the end has stopped
 CLOCK_STEP = 1.0  # s
-SHOWN = 5  # names in a line
+SHOWN = 5  # names in a line or a warning
 
 
 @dataclass(frozen=True)
@@ -50,10 +67,10 @@ def summarize(log: Log) -> Summary:
     found, in_map = summarize_rfid(log), {"tags": len(log.world.tags)}
     if found is None:
         return Summary({"rfid": None}, in_map)
-    return Summary({"rfid": found}, in_map, rfid_problems(log, found), (_told(found),))
+    return Summary({"rfid": found}, in_map, rfid_problems(log, found), (_paragraph(found),))
 
 
-def _told(found: RfidSummary) -> Paragraph:
+def _paragraph(found: RfidSummary) -> Paragraph:
     unknown = f"{len(found.unknown)} others" if found.unknown else "no others"
     header = ("antenna", "reads", "rounds", "rounds per s", "without a read", "last [s]")
     rows = [
@@ -152,3 +169,206 @@ def _clock_trouble(log: Log, found: RfidSummary) -> list[str]:
         if excess > CLOCK_STEP:
             out.append(f"the reads reach {excess:.1f} s {side} the odometry: do their clocks agree?")
     return out
+
+
+CLEARLY = 3.0  # standard deviations
+CHANGED = 0.1  # of a range or of a probability: less is nothing to warn of
+
+
+def review(use: Use, ending: Ending) -> Review:
+    """The warnings of a run, and the reliability of the detection models along its final trajectory."""
+    reliable = reliability(use, ending.final_diagnostics, ending.learnt, ending.final)
+    return Review(tuple(doubts(use, ending.diagnostics, ending.learnt)), reliable)
+
+
+def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
+    """That an estimator takes no tags, that no tag of a map is read, which are believed dead or moved at the end, the surest first,
+    and how the antennas differ from the rig's models."""
+    log, rounds = use.log, diagnostics.ignored.get("rfid", 0)
+    if rounds and use.estimator != "dead_reckoning":  # obvious from its name
+        yield f"{log.name}: {use.estimator} does not use RFID: all {rounds} inventory rounds are ignored"
+    if "rfid" not in use.sensors:
+        return
+    stream, tags = log.streams.get("rfid"), log.world.tags
+    if isinstance(stream, RfidStream) and not any(epc in tags for epc in stream.epc):
+        what = f"none of the {len(tags)} tags of the map is read" if tags else "reads are of no use without a map"
+        yield f"{log.name}: {what}"
+        return
+    for suspects, why in (
+        (diagnostics.dead_tags, "are believed dead, as they were not read from where they should have been"),
+        (
+            diagnostics.moved_tags,
+            "are believed to have moved, as they were read from elsewhere than they should have been",
+        ),
+    ):
+        if suspects:
+            yield f"{log.name}: {len(suspects)} of {len(tags)} tags of the map {why}: {suspected(suspects)}"
+    settings = log.rig.find(RfidSettings)
+    if settings is not None:
+        yield from (f"{log.name}: {line}" for line in _differences(settings, learnt))
+
+
+def suspected(tags: Mapping[str, float]) -> str:
+    """Tags with their probabilities, the surest first."""
+    found = sorted(tags.items(), key=lambda row: -row[1])
+    names = ", ".join(f"{name} ({_percent(probability)})" for name, probability in found[:SHOWN])
+    return names + (f" and {len(found) - SHOWN} more" if len(found) > SHOWN else "")
+
+
+def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
+    """What was learnt of the antennas' models and is clearly not what the rig says."""
+    names = settings.parameter_names()
+    for name, parameters in names.items():
+        peak = min(settings.models[name].model().peak, MOST_CERTAIN)
+        of = "the antennas" if len(names) == 1 else f"the antennas of model {quoted(name)}"
+        ranges, rate = (learnt.values.get(f"rfid.{parameter}", (0.0, 0.0)) for parameter in parameters)
+        factor = math.exp(ranges[0])
+        if abs(ranges[0]) > CLEARLY * ranges[1] and abs(factor - 1.0) > CHANGED:
+            more = f"{100.0 * abs(factor - 1.0):.0f} % {'farther' if factor > 1.0 else 'less far'}"
+            yield f"{of} reach {more} than the rig says"
+        found = peak * rate_of(peak, rate[0])
+        if abs(rate[0]) > CLEARLY * rate[1] and abs(found - peak) > CHANGED:
+            yield f"{of} read {100.0 * found:.0f} % of the tags next to them, where the rig says {100.0 * peak:.0f} %"
+
+
+def _percent(probability: float) -> str:
+    return "> 99 %" if probability > 0.99 else f"{100.0 * probability:.0f} %"
+
+
+MOST_ROUNDS = 6000  # of a long log so many are looked at, evenly spread
+OFF = 4.0  # standard deviations above which a group that is off is doubted
+TOGETHER = 2.0  # rounds that count as one: more is told, as estimators take `1 / tempering` for it
+
+
+@dataclass(frozen=True, eq=False)
+class _Looks:
+    """M rounds of an antenna at a tag that it may have read: probability ``p`` and ``hit`` (M,); ``antenna``, ``tag``, ``block``
+    (M,) of time; ``distance`` (M,) [m]."""
+
+    p: Array
+    hit: Array
+    antenna: Integers
+    tag: Integers
+    block: Integers
+    distance: Array
+
+
+def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Trajectory) -> Reliability | None:
+    """The reliability of the detection models with what was learnt of them; None without reads, antennas or covariances.
+
+    Tags that are believed dead or moved are left out, and times in which nothing was read.
+    """
+    log, settings = use.log, use.log.rig.find(RfidSettings)
+    stream = log.streams.get("rfid")
+    if settings is None or "rfid" not in use.sensors or not isinstance(stream, RfidStream) or not len(stream.t):
+        return None
+    if not log.world.tags or len(final) < 2 or final.covariances is None or "rfid" not in use.modalities:
+        return None
+    doubted = diagnostics.dead_tags.keys() | diagnostics.moved_tags.keys()
+    kept = [name for name in log.world.tags if name not in doubted]
+    looks = _looks(use, stream, settings, learnt, final, kept)
+    if looks is None:
+        return None
+    names = list(settings.all_antennas())
+    return _told(log.name, looks, names, settings.tempering)
+
+
+def _looks(
+    use: Use, stream: RfidStream, settings: RfidSettings, learnt: Learnt, final: Trajectory, kept: list[str]
+) -> _Looks | None:
+    log, tags = use.log, tag_map(use.log.world, use.log.rig.of(SurveySettings), kept)
+    likelihood = RfidLikelihood(settings.model(), tags.tags)
+    estimated = settings.estimated()
+    found = np.array([learnt.values.get(f"rfid.{name}", (0.0, 0.0))[0] for name in estimated.names])
+    likelihood = likelihood.adjusted(estimated.full(found, len(likelihood.parameters)))
+    first, inverse = np.unique(np.rec.fromarrays((stream.t, stream.round)), return_index=True, return_inverse=True)[1:]
+    t = stream.t[first] + log.rig.time_offset("rfid")
+    block = ((t - t.min()) // BLOCK).astype(np.int64)
+    read = np.array([epc in tags.index for epc in stream.epc], dtype=bool)
+    heard = np.zeros(int(block.max()) + 1, dtype=bool)
+    heard[block[inverse[read]]] = True
+    numbers = {name: i for i, name in enumerate(settings.all_antennas())}
+    antenna = np.array([numbers.get(stream.antenna[i], -1) for i in first.tolist()], dtype=np.int64)
+    poses = possible_poses(final, t, REFERENCE_GAP)
+    used = np.isfinite(poses[:, 0]) & (antenna >= 0) & heard[block]
+    used[np.flatnonzero(used)[_left_out(int(used.sum()))]] = False
+    rows = np.flatnonzero(read)
+    place = np.array([tags.index[stream.epc[i]] for i in rows.tolist()], dtype=np.int64)
+    parts = []
+    for a, mounted in enumerate(settings.all_antennas().values()):
+        mine = np.flatnonzero(used & (antenna == a))
+        if not len(mine):
+            continue
+        p = likelihood.probabilities(poses[mine], a)
+        row_of = np.full(len(first), -1, dtype=np.int64)
+        row_of[mine] = np.arange(len(mine))
+        hits = np.zeros(p.shape, dtype=bool)
+        ours = row_of[inverse[rows]] >= 0
+        hits[row_of[inverse[rows[ours]]], place[ours]] = True
+        n, tag = np.nonzero(p > POSSIBLE)
+        at = np.array([transform_from(pose, np.array((mounted.x, mounted.y))) for pose in poses[mine]])
+        distance = np.hypot(*(tags.tags.points[tag, :2] - at[n]).T)
+        parts.append((p[n, tag], hits[n, tag].astype(float), np.full(len(n), a), tag, block[mine][n], distance))
+    if not parts:
+        return None
+    return _Looks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _left_out(count: int) -> Integers:
+    """Of so many rounds, those that are more than :data:`MOST_ROUNDS` are."""
+    kept = np.unique(np.linspace(0, count - 1, min(count, MOST_ROUNDS)).astype(np.int64)) if count else np.empty(0, int)
+    return np.setdiff1d(np.arange(count), kept)
+
+
+def _told(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Reliability | None:
+    """The counts by bands of distance and by antennas, None if there are too few."""
+    if looks.p.sum() < FEWEST:
+        return None
+    groups = ReadGroups(antennas)
+    one = np.ones(len(looks.p), dtype=np.int64)
+    reads = ExpectedReads(looks.tag, looks.hit.astype(np.int64)[:, None], looks.p[:, None], looks.distance[:, None])
+    groups.add(looks.antenna, one, reads, one[:, None] > 0)
+    together, told = _together(looks, (looks.distance // BAND).astype(np.int64)), groups.told()
+    if not len(told):
+        return None
+    observed, predicted, variance = groups.sums[:, told]
+    # what the estimators take successive rounds for is no reason to doubt the model either
+    spread = np.sqrt(max(together, 1.0 / tempering) * variance)
+    off = (np.abs(observed - predicted) > OFF * spread) & (np.abs(observed / predicted - 1.0) > DIFFERENT)
+    doubts = []
+    if np.any(off):
+        shares = groups.shares(told[off])
+        doubts.append(f"{log}: reads over those that the detection models predict, by distance and antenna: {shares}")
+    if together * tempering > TOGETHER:
+        doubts.append(
+            f"{log}: reads and misses come in bursts, {together:.0f} rounds tell as much as one; the tempering in the rig is "
+            f"{tempering:g}"
+        )
+    return Reliability("reads", groups.names(told), observed, predicted, spread, together, tuple(doubts))
+
+
+def _together(looks: _Looks, band: Integers) -> float:
+    """How many rounds are worth an independent one, at least 1: by the scatter of each tag's reads by each antenna in blocks of
+    time, about the share of the predicted reads that the band has."""
+    share = np.ones(int(band.max(initial=0)) + 1)
+    predicted, observed = np.bincount(band, looks.p), np.bincount(band, looks.hit)
+    np.divide(observed, predicted, out=share, where=predicted > 0.0)
+    p = np.clip(looks.p * share[band], 0.0, 1.0 - 1e-3)
+    key = (looks.block * (looks.tag.max(initial=0) + 1) + looks.tag) * (
+        looks.antenna.max(initial=0) + 1
+    ) + looks.antenna
+    cell = np.unique(key, return_inverse=True)[1]
+    excess, variance = np.bincount(cell, looks.hit - p), np.bincount(cell, p * (1.0 - p))
+    return max(1.0, float(np.sum(excess**2)) / max(float(np.sum(variance)), 1e-9))
+
+
+def draw(log: Log) -> Marks:
+    """The tags of the map, corrected by the rig's survey transform, and the times of their reads."""
+    known = tag_map(log.world, log.rig.of(SurveySettings))
+    stream = log.streams.get("rfid")
+    t, seen = np.empty(0), tuple[str, ...]()
+    if isinstance(stream, RfidStream):
+        rows = [i for i, epc in enumerate(stream.epc) if epc]
+        t = (stream.t - stream.age + log.rig.time_offset("rfid"))[rows]
+        seen = tuple(stream.epc[i] for i in rows)
+    return Marks("tags", known.names, known.tags.points, t, seen, marker="s", size=5.0, order=2.0)

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from factorgraph_loc.evaluation.pairing import CONFIDENCE
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factors import se2
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood

@@ -17,10 +17,9 @@ from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factorgraph_loc.sensors.odometry.simulation import ALONG, HEADING, LATERAL, RATE
-from factorgraph_loc.sensors.rfid.known_tags import KnownTags
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
+from factorgraph_loc.sensors.rfid.known_tags import KnownTags, extent
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings
-from factorgraph_loc.sensors.rfid.tag_map import extent
+from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factors import se2
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood

@@ -8,7 +8,7 @@ import pytest
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.rfid.consistency import ConsistencyMonitor
+from factorgraph_loc.sensors.rfid.monitor import ConsistencyMonitor
 from factorgraph_loc.sensors.rfid.settings import BeamSettings, PriorSettings, RfidSettings
 from factorgraph_loc.simulation import preset, simulate
 from factors.rfid.counts import TagReadCounts

@@ -16,8 +16,8 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
 from factorgraph_loc.sensors.rfid.map import Tag
-from factorgraph_loc.sensors.rfid.measurement import RfidScan
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
+from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import preset, simulate
 
 SENSORS = ("odometry", "rfid")

@@ -15,6 +15,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.rfid.calibration.phase import fit_phase
 from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi, rssi_nll
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import (
     AntennaSettings,
@@ -24,7 +25,6 @@ from factorgraph_loc.sensors.rfid.settings import (
     SurveySettings,
 )
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factors import se2
 from factors.rfid.phase import SPEED_OF_LIGHT
 from factors.rfid.strength import RssiReads, features

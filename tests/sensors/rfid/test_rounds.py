@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorgraph_loc.sensors.rfid.rounds import OUTSIDE, ends_of, rounds_from_gaps, rounds_from_inventories
+from factorgraph_loc.sensors.rfid.tables import OUTSIDE, ends_of, rounds_from_gaps, rounds_from_inventories
 
 
 def ns(*values):

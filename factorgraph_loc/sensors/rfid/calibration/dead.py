@@ -12,8 +12,8 @@ import numpy as np
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factors.rfid.detection import RfidLikelihood
 from factors.rfid.tag_states import BELIEVED
 

@@ -20,7 +20,6 @@ from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, distinct, ro
 from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi
 from factorgraph_loc.sensors.rfid.calibration.tags import TagDoubt, misplaced
 from factorgraph_loc.sensors.rfid.calibration.tempering import independent_share, tempered
-from factorgraph_loc.sensors.rfid.grids import write_grid
 from factorgraph_loc.sensors.rfid.settings import (
     BeamSettings,
     GridSettings,
@@ -29,6 +28,7 @@ from factorgraph_loc.sensors.rfid.settings import (
     PriorSettings,
     RfidSettings,
     SurveySettings,
+    write_grid,
 )
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factors.rfid.model import BeamModel, DetectionModel, GridModel, LogisticModel

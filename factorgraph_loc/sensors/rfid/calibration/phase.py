@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.text import listed
 from factors import se2
 from factors.rfid.detection import TagArray

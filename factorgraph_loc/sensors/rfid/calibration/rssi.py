@@ -11,8 +11,8 @@ from scipy.special import gammaln
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.calibration.phase import along_reference
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, RssiSettings, SurveySettings
-from factorgraph_loc.sensors.rfid.tag_map import tag_map
 from factorgraph_loc.text import listed
 from factors.rfid.strength import FEATURES, RssiReads, features
 from factors.se2 import Array
