@@ -1,7 +1,7 @@
 """Joint estimation of tag positions and robot trajectory from odometry and reads.
 
 The trajectory grows in stretches, to bound the drift of the odometry: all poses so far are optimised with the mapped tags
-(:class:`factors.rfid.tag_factor.RfidTagFactor`), then the remaining tags are searched
+(:class:`factors.rfid.factor.RfidTagFactor`), then the remaining tags are searched
 (:mod:`factorgraph_loc.mapping.tag_search`) and added to the map once a single position explains their reads. At the end all
 tags are searched again along the whole trajectory, and the problem is solved again if one has moved.
 """
@@ -32,8 +32,7 @@ from factors.motion import Increment
 from factors.odometry.model import PARAMETERS, OdometryFactor, recalibrated
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood, TagArray
-from factors.rfid.factor import RfidFactor
-from factors.rfid.tag_factor import RfidTagFactor
+from factors.rfid.factor import RfidFactor, RfidTagFactor
 from factors.se2 import Array
 
 INTERVAL = 1.0  # s between keyframes

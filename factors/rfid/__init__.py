@@ -7,7 +7,6 @@ __all__ = [
     "DetectionModel",
     "GridModel",
     "LogisticModel",
-    "adjustment",
     "counts",
     "detection",
     "factor",
@@ -16,7 +15,6 @@ __all__ = [
     "model",
     "phase",
     "strength",
-    "tag_factor",
     "tag_states",
     "update",
 ]

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid import kernels as rfid_kernels
 from factors.se2 import Array, Integers
+from factors.se2_kernels import wrapped
+
+# offsets, antennas, rounds, hits, odds and elsewhere; the places in the map that are listed, and the odds of the others
+Seen = tuple[Array, Integers, Integers, Integers, Array, Array, Integers, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,17 +44,13 @@ class TagReadCounts:
         if not len(self.elsewhere):
             object.__setattr__(self, "elsewhere", np.where(self.hits.any(axis=0), -np.inf, 0.0))
 
-    @property
-    def arrays(self) -> tuple[Array, Integers, Integers, Integers, Array, Array]:
-        """Offsets, antennas, rounds, hits, odds and elsewhere."""
-        return self.offsets, self.antennas, self.rounds, self.hits, self.odds, self.elsewhere
+    @cached_property
+    def seen(self) -> Seen:
+        """The counts for compiled code."""
+        counts = self.offsets, self.antennas, self.rounds, self.hits
+        return (*counts, self.odds, self.elsewhere, self.listed, self.others)
 
-    @property
-    def seen(self) -> tuple[Array, Integers, Integers, Integers, Array, Array, Integers, float]:
-        """The arrays, the places in the map that are listed, and the odds of the others."""
-        return (*self.arrays, self.listed, self.others)
-
-    @property
+    @cached_property
     def listed(self) -> Integers:
         """Places (C,) in the map of the tags that are listed."""
         return np.arange(self.hits.shape[1]) if self.tags is None else self.tags
@@ -62,7 +62,7 @@ class TagReadCounts:
 
     def moved(self, offset: Array) -> TagReadCounts:
         """The counts relative to the pose that lies ``offset`` (3,) before theirs."""
-        return replace(self, offsets=rfid_kernels.moved(offset, self.offsets))
+        return replace(self, offsets=moved(offset, self.offsets))
 
     def listing(self, tags: Integers) -> TagReadCounts:
         """The same with ``tags`` listed, ascending, which are among them all that are listed now."""
@@ -96,6 +96,17 @@ def together(parts: list[TagReadCounts]) -> TagReadCounts:
         tags,
         parts[0].others,
     )
+
+
+@compiled
+def moved(offset: Array, offsets: Array) -> Array:
+    """The poses (K, 3) ``offset`` (3,) composed with ``offsets`` (K, 3)."""
+    c, s, out = math.cos(offset[2]), math.sin(offset[2]), np.empty_like(offsets)
+    for k in range(len(offsets)):
+        out[k, 0] = offset[0] + c * offsets[k, 0] - s * offsets[k, 1]
+        out[k, 1] = offset[1] + s * offsets[k, 0] + c * offsets[k, 1]
+        out[k, 2] = wrapped(offset[2] + offsets[k, 2])
+    return out
 
 
 @compiled

@@ -1,10 +1,8 @@
-"""The likelihood of RFID reads and misses for many poses, with gradient and Fisher information.
+"""The likelihood of RFID reads and misses with a map of tags.
 
-An antenna reads a tag in k of n inventory rounds with probability q each (:mod:`factors.rfid.model`), so the negative
-log-likelihood is ``-tempering * sum(k log q + (n - k) log(1 - q))``. Its Hessian is replaced by the Fisher information, which is
-positive semi-definite. A tag that may be dead or moved has a mixture likelihood (:mod:`factors.rfid.tag_states`): gradient and
-information are those of a tag as surveyed times the probability that it is so given what was seen, which neglects the information
-lost by the unknown state (Louis, JRSS B 44(2), 1982, eq. 3.2').
+It is exact with derivatives for Gaussian states and graphs (:mod:`factors.rfid.kernels`), and from tables without derivatives for
+particles. The log-likelihood is tempered: multiplied by an exponent below 1 for correlated reads. A tag that may be dead or moved
+has a mixture likelihood (:mod:`factors.rfid.tag_states`).
 """
 
 from __future__ import annotations
@@ -18,12 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.rfid import adjustment, anywhere, near, weighing
-from factors.rfid import kernels as rfid_kernels
+from factors.rfid import kernels, weighing
 from factors.rfid.counts import TagReadCounts
-from factors.rfid.index import tag_index
+from factors.rfid.index import MapTags, tag_index
 from factors.rfid.model import Packed, RfidModel
-from factors.rfid.near import MapTags
 from factors.rfid.places import Places, in_reach, is_wide, reach_of
 from factors.rfid.tables import Tables, make_tables
 from factors.se2 import Array, Integers
@@ -73,7 +69,7 @@ class ExpectedReads(NamedTuple):
 class RfidLikelihood:
     """The likelihood of an antenna model of M detection models with a map of tags.
 
-    ``parameters`` (2 M,): how the models are adjusted (:mod:`factors.rfid.adjustment`); ``packed``: what compiled code takes.
+    ``parameters`` (2 M,): of the detection models (:mod:`factors.rfid.kernels`); ``packed``: the models for compiled code.
     """
 
     model: RfidModel
@@ -91,7 +87,7 @@ class RfidLikelihood:
     def adjusted(self, parameters: Array) -> RfidLikelihood:
         """The same with other parameters (2 M,) of the detection models."""
         out = copy.copy(self)
-        object.__setattr__(out, "packed", adjustment.adjusted(self._unadjusted.packed, parameters))
+        object.__setattr__(out, "packed", kernels.adjusted(self._unadjusted.packed, parameters))
         object.__setattr__(out, "parameters", np.asarray(parameters, dtype=float))
         return out
 
@@ -118,14 +114,15 @@ class RfidLikelihood:
         those of the ``parameters`` (2 M,) of the detection models that are ``estimated`` (P,), by default all."""
         places = np.array(range(len(parameters)) if estimated is None else estimated, dtype=np.int64)
         pose, alpha = np.ascontiguousarray(pose, dtype=float), float(self.model.tempering)
-        nll, gradient, information, *told = near.score(*self.arrays, looks.seen, alpha, pose, parameters, places)
-        expected, variance = (np.array([value]) for value in told)
-        return Score(np.array([nll]), gradient[None], information[None], expected, variance)
+        found = kernels.score(*self.arrays, looks.seen, alpha, pose, parameters, places)
+        return Score(*(np.asarray(part)[None] for part in found))
 
     def score(self, poses: Array, looks: TagReadCounts) -> Score:
         """Likelihood, gradient and information at poses (N, 3)."""
         poses = np.ascontiguousarray(np.atleast_2d(poses), dtype=float)
-        return Score(*near.scores(self.packed, self.arrays[1], looks.seen, float(self.model.tempering), poses))
+        no_columns = np.full(len(self.parameters), -1, dtype=np.int64)
+        alpha = float(self.model.tempering)
+        return Score(*kernels.scores(self.packed, self.arrays[1], looks.seen, alpha, poses, no_columns))
 
     def displaced(
         self, poses: Array, looks: TagReadCounts, shifts: Array, margin: float, parameters: Array, odds: Array
@@ -138,7 +135,7 @@ class RfidLikelihood:
         return weighing.displaced(*self._tabled, looks.seen, poses, margin, odds, shifts, alpha, parameters)
 
     def log_likelihood(self, poses: Array, looks: TagReadCounts, parameters: Array | None = None) -> Array:
-        """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.weighing`, :mod:`factors.rfid.anywhere`):
+        """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.weighing`, :mod:`factors.rfid.places`):
         for particles.
 
         ``parameters`` (N, 2 M): of the detection models at each pose, by default its own.
@@ -171,10 +168,6 @@ class RfidLikelihood:
         """How many tags are in reach of a pose among them, on average."""
         return in_reach(self.tags.points[:, :2], reach_of(self._unadjusted.packed))
 
-    @cached_property
-    def _heights(self) -> anywhere.Heights:
-        return anywhere.heights_of(self._tables)
-
     @property
     def _places(self) -> Places:
         """Those of the parameters, which are rounded."""
@@ -184,30 +177,25 @@ class RfidLikelihood:
         if key not in kept:
             if len(kept) >= KEPT:
                 del kept[next(k for k in kept if any(k))]
-            packed = adjustment.adjusted(self._unadjusted.packed, steps * rounded)
+            packed = kernels.adjusted(self._unadjusted.packed, steps * rounded)
             first = self._unadjusted
-            kept[key] = Places.of(self.model, packed, first._tables, first._map, first._heights)
+            kept[key] = Places.of(self.model, packed, first._tables, first._map)
         return kept[key]
 
     def by_tag(self, pose: Array, looks: TagReadCounts) -> tuple[Array, Array, Array]:
         """The contribution of each tag, all of the map being listed, at one pose (3,): tempered negative log-likelihood (T,),
         its gradient (T, 2) by the tag's position in the world, and information (T, 2, 2)."""
-        count = len(self.tags.points)
-        nll, gradient, information = np.zeros(count), np.zeros((count, 2)), np.zeros((count, 2, 2))
-        arrays = (looks.offsets, looks.antennas, looks.rounds, looks.hits)
+        arrays, alpha = looks.seen[:4], self.model.tempering
         pose = np.asarray(pose, dtype=float)
-        rfid_kernels.by_tag(self.packed, pose, self.tags.points, self.tags.normals, *arrays, nll, gradient, information)
-        alpha = self.model.tempering
-        return alpha * nll, alpha * gradient, alpha * information
+        nll, slope, curve = kernels.by_tag(self.packed, pose, self.tags.points, self.tags.normals, *arrays)
+        return alpha * nll, alpha * slope[:, 3:], alpha * curve[:, 3:, 3:]
 
     def expected(self, pose: Array, looks: TagReadCounts, parameters: Array) -> ExpectedReads:
         """What was seen from a pose (3,) of the tags that are in reach of it or listed, and what is expected with ``parameters``
         (2 M,) of the detection models."""
-        return ExpectedReads(*near.predicted(*self.arrays, looks.seen, pose, parameters))
+        return ExpectedReads(*kernels.predicted(*self.arrays, looks.seen, pose, parameters))
 
     def probabilities(self, poses: Array, antenna: int) -> Array:
         """Probability (N, T), floor included, that a round of an antenna reads each tag from poses (N, 3)."""
-        out = np.empty((len(poses), len(self.tags.points)))
-        poses = np.ascontiguousarray(poses, dtype=float)
-        rfid_kernels.probabilities(self.packed, antenna, poses, self.tags.points, self.tags.normals, out)
-        return out
+        poses, antennas = np.ascontiguousarray(poses, dtype=float), np.full(len(poses), antenna)
+        return kernels.probabilities(self.packed, antennas, poses, self.tags.points, self.tags.normals)[0]

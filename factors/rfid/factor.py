@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factors.compressed import compressed
+from factors.rfid import kernels
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood, Score
 from factors.rfid.phase import PhaseLikelihood, PhaseReads, PhaseScore
@@ -24,7 +25,7 @@ class RfidFactor:
     whatever their number there are four residuals, whose squares have the value, the gradient and the expected curvature of the
     likelihood. ``seen``: looks for a :class:`RfidLikelihood`, reads for the other two.
 
-    ``estimated`` (P,): places, among the parameters of the detection models (:mod:`factors.rfid.adjustment`), of those that are a
+    ``estimated`` (P,): places, among the parameters of the detection models (:mod:`factors.rfid.kernels`), of those that are a
     second variable (P,) of looks; there are P residuals more then.
     """
 
@@ -101,3 +102,37 @@ class RfidFactor:
     def cost(self, values: Sequence[Array]) -> float:
         """The tempered negative log-likelihood."""
         return float((self.fixed(values[1]) if self.estimated else self).score(values[0]).nll[0])
+
+
+@dataclass(frozen=True, eq=False)
+class RfidTagFactor:
+    """The likelihood of read counts of tag number ``tag`` of ``likelihood``, as a factor on the pose (3,) and the tag's position
+    (2,) in the world, in compressed Fisher form (:mod:`factors.compressed`): whatever the number of reads there are six
+    residuals.
+
+    Height and facing of the tag are those in ``likelihood``; its position there is not used.
+    """
+
+    likelihood: RfidLikelihood
+    tag: int
+    looks: TagReadCounts
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Residual (6,) and its Jacobians (6, 3) by the pose and (6, 2) by the position."""
+        nll, gradient, information = self.score(values)
+        residual, jacobian = compressed(nll, gradient, information)
+        return residual, [jacobian[:, :3], jacobian[:, 3:]]
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """The tempered negative log-likelihood."""
+        return self.score(values)[0]
+
+    def score(self, values: Sequence[Array]) -> tuple[float, Array, Array]:
+        """Tempered negative log-likelihood, its gradient (5,) and Fisher information (5, 5) by the body-frame perturbation of the
+        pose and the position in the world."""
+        tags, looks, alpha = self.likelihood.tags, self.looks, self.likelihood.model.tempering
+        point = np.array([(values[1][0], values[1][1], tags.points[self.tag, 2])])
+        hits = np.ascontiguousarray(looks.hits[:, self.tag : self.tag + 1])
+        arrays = point, tags.normals[self.tag : self.tag + 1], looks.offsets, looks.antennas, looks.rounds, hits
+        nll, slope, curve = kernels.by_tag(self.likelihood.packed, np.asarray(values[0], dtype=float), *arrays)
+        return float(alpha * nll[0]), alpha * slope[0], alpha * curve[0]

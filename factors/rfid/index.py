@@ -1,16 +1,19 @@
-"""An index of tags by place: which tags are in reach of a pose is asked of a few cells instead of the whole map."""
+"""An index of tags by position, which finds the tags in reach of a pose in a few cells instead of the whole map."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
+from factors.rfid.counts import Seen, listing, union
 from factors.se2 import Array, Integers
 
 CELL = 2.0  # m
+SPARE = 0.5  # m: tags are found in a box on a grid of this size, which neighbouring poses share
 Corner = tuple[float, float]
 MOST_CELLS = 1 << 20  # a map that is wider has larger cells
 
@@ -69,3 +72,51 @@ def within(index: TagIndex, low: Array | Corner, high: Array | Corner) -> NDArra
                 count += 1
     out.sort()
     return out
+
+
+class MapTags(NamedTuple):
+    """The tags of a map: ``points`` (T, 3) [m] and ``normals`` (T, 2), with their index."""
+
+    cells: TagIndex
+    points: Array
+    normals: Array
+
+
+class NearTags(NamedTuple):
+    """C tags that matter to some poses: places in the map, ascending, and what is known and seen of them."""
+
+    tags: Integers
+    points: Array
+    normals: Array
+    hits: Integers
+    odds: Array
+    elsewhere: Array
+
+
+@compiled
+def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
+    """The corners of the box that holds what is within ``reach`` [m] of poses (N, 3), on a grid, so that the same tags count
+    whatever was looked at before: to the last bit, sums depend on them."""
+    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+    for n in range(len(poses)):
+        low_x, high_x = min(low_x, poses[n, 0]), max(high_x, poses[n, 0])
+        low_y, high_y = min(low_y, poses[n, 1]), max(high_y, poses[n, 1])
+    low = SPARE * math.floor((low_x - reach) / SPARE), SPARE * math.floor((low_y - reach) / SPARE)
+    return low, (SPARE * math.ceil((high_x + reach) / SPARE), SPARE * math.ceil((high_y + reach) / SPARE))
+
+
+@compiled
+def near_tags(of_map: MapTags, seen: Seen, poses: Array, reach: float) -> NearTags:
+    """The tags within ``reach`` [m] of poses (N, 3), or in the same cells, and those that are listed in what was ``seen``
+    (:attr:`factors.rfid.counts.TagReadCounts.seen`)."""
+    _, _, _, hits, odds, elsewhere, listed, others = seen
+    low, high = _box(poses, reach)
+    tags = union(within(of_map.cells, low, high), listed)
+    hits, odds, elsewhere = listing(listed, hits, odds, elsewhere, others, tags)
+    points, normals = np.empty((len(tags), 3)), np.empty((len(tags), 2))
+    for u in range(len(tags)):
+        for i in range(3):
+            points[u, i] = of_map.points[tags[u], i]
+        for i in range(2):
+            normals[u, i] = of_map.normals[tags[u], i]
+    return NearTags(tags, points, normals, hits, odds, elsewhere)

@@ -3,7 +3,7 @@
 A model gives the logit of that probability as a function of the tag's position in the antenna's frame (x along the boresight, y to
 the left, z up) and its facing. The final probability is ``q = false_read + (1 - false_read - miss) * sigmoid(logit)``: the floor
 allows a read from anywhere, as by misplaced tags and reflections, which makes the likelihood robust. The likelihood is in
-:mod:`factors.rfid.detection`.
+:mod:`factors.rfid.kernels`.
 """
 
 import math
@@ -143,7 +143,7 @@ class Packed(NamedTuple):
     """A :class:`RfidModel` as compiled code takes it. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw and pitch;
     ``which`` (A,): their models; ``kinds`` (M,); ``parameters`` (M, 12); ``shapes`` (M, 5): H, F, NX, NY and the first place in
     ``knots``; ``reach`` (M,); ``span``: what the floor leaves to the model. ``scale`` and ``rate`` (M,): factors of each model's
-    ranges and probabilities (:mod:`factors.rfid.adjustment`); ``peak`` (M,): its largest probability."""
+    ranges and probabilities (:mod:`factors.rfid.kernels`); ``peak`` (M,): its largest probability."""
 
     antennas: Array
     which: NDArray[np.int64]

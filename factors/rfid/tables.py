@@ -31,7 +31,6 @@ COARSE = 8  # cells along each side of a block
 FACINGS = 9  # knots of the facing's cosine
 NEGLIGIBLE = 15.0  # log of the ratio of two likelihoods of which the smaller one does not count
 STEP, LEVEL = 0.01, 0.04  # of the logit, in the tables; m of height within which tags share a table
-MOST_KEPT, LARGEST_KEPT = 3, 1 << 22  # tables of antenna models, and cells in them
 _LOGITS = np.arange(round(-2.0 * NEGLIGIBLE_LOGIT / STEP) + 1) * STEP + NEGLIGIBLE_LOGIT
 
 
@@ -53,9 +52,6 @@ class Tables(NamedTuple):
     first: NDArray[np.int64]
 
 
-_last: dict[tuple[bytes, ...], Tables] = {}
-
-
 def logs_of(packed: Packed) -> Array32:
     """Log q and log(1 - q), (M, Z, 2), of a model as it is adjusted, for the logits of :class:`Tables`."""
     q = packed.false_read + packed.span * packed.rate[:, None] / (1.0 + np.exp(-_LOGITS))
@@ -64,18 +60,7 @@ def logs_of(packed: Packed) -> Array32:
 
 
 def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
-    """One table for each model, pitch and height difference, for tags at ``heights`` (T,) [m]. Those of the last few antenna
-    models are kept, for other estimators and logs of the same robot, unless they are large."""
-    key = tuple(np.asarray(part).tobytes() for part in (*packed, heights))
-    found = _last.pop(key, None) or _made(model, packed, heights)
-    if found.rows.size <= LARGEST_KEPT:
-        _last[key] = found
-    for old in list(_last)[:-MOST_KEPT]:
-        del _last[old]
-    return found
-
-
-def _made(model: RfidModel, packed: Packed, heights: Array) -> Tables:
+    """One table for each model, pitch and height difference, for tags at ``heights`` (T,) [m]."""
     sigmoids = 1.0 / (1.0 + np.exp(-_LOGITS))
     numbers: dict[tuple[int, float, int], int] = {}
     level = np.zeros((len(model.antennas), len(heights)), dtype=np.int64)

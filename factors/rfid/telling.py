@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from factors import se2_kernels
 from factors.compiled import compiled
-from factors.rfid.adjustment import MOST_CERTAIN
-from factors.rfid.kernels import placed
+from factors.rfid.kernels import MOST_CERTAIN, placed
 from factors.rfid.model import LOGISTIC, Packed
 from factors.rfid.tables import CELL, COARSE, Tables
 from factors.se2 import Array, Integers

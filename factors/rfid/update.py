@@ -10,11 +10,12 @@ import numpy as np
 from factors import positive, se2, se2_kernels
 from factors.compiled import compiled
 from factors.odometry.kernels import FAR, ROUNDING
-from factors.rfid.counts import TagReadCounts
+from factors.rfid.counts import Seen, TagReadCounts
 from factors.rfid.detection import RfidLikelihood, Score
 from factors.rfid.factor import RfidFactor
+from factors.rfid.index import MapTags
+from factors.rfid.kernels import score
 from factors.rfid.model import Packed
-from factors.rfid.near import MapTags, Seen, score
 from factors.se2 import Array, Integers
 from factors.small_kernels import inverse, product, solved
 

@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid.adjustment import MOST_CERTAIN, adjusted
-from factors.rfid.anywhere import mixed as of_states
-from factors.rfid.kernels import FAST
+from factors.rfid.counts import Seen
+from factors.rfid.index import MapTags, NearTags, near_tags
+from factors.rfid.kernels import FAST, MOST_CERTAIN, adjusted, reach_of
 from factors.rfid.model import LOGISTIC, NEGLIGIBLE_LOGIT, Packed
-from factors.rfid.near import MapTags, NearTags, Seen, near_tags, reach_of
-from factors.rfid.tables import CELL, Tables, row_of
+from factors.rfid.tables import CELL, NEGLIGIBLE, Tables, row_of
 from factors.rfid.telling import Looks, Tags, telling
 from factors.se2 import Array, Integers
 
@@ -54,11 +53,11 @@ def log_likelihood(
     for t in range(len(odds)):
         hits = near.hits[:, t].sum()
         if hits > 0 and not near_enough[t]:  # all poses are as likely
-            base += of_states(tempering * hits * (math.log(none) - math.log1p(-none)), odds[t], elsewhere[t])
+            base += mixed(tempering * hits * (math.log(none) - math.log1p(-none)), odds[t], elsewhere[t])
     out = np.full(len(poses), base)
     size = min(BLOCK, len(poses))
     at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
-    own, product, room, mixed = np.empty(size), np.empty(size), np.empty(size), np.ones(size)
+    own, product, room, ratios = np.empty(size), np.empty(size), np.empty(size), np.ones(size)
     for first in range(0, len(poses), size):
         count = min(size, len(poses) - first)
         found = out[first : first + count]
@@ -78,12 +77,12 @@ def log_likelihood(
             for n in range(count):
                 surveyed = tempering * own[n]
                 found[n] += max(surveyed, other) - both
-                mixed[n] *= 1.0 + _exp(-min(abs(surveyed - other), FARTHEST))
+                ratios[n] *= 1.0 + _exp(-min(abs(surveyed - other), FARTHEST))
             factors += 1
             if factors == MIXED:
-                _add_logs(mixed, count, found)
+                _add_logs(ratios, count, found)
                 factors = 0
-        _add_logs(mixed, count, found)
+        _add_logs(ratios, count, found)
     return out
 
 
@@ -142,6 +141,18 @@ def displaced(
                 mean += own[n] / each
             out[u, i] += math.log(mean)
     return near.tags[found], out, heard[found]
+
+
+@compiled
+def mixed(own: float, odds: float, elsewhere: float) -> float:
+    """Log-likelihood of a tag that may be dead or moved; ``own``: that of the tag as surveyed."""
+    if odds == -np.inf or elsewhere == -np.inf:
+        return own
+    other = odds + elsewhere
+    both = max(odds, 0.0) + math.log1p(math.exp(-abs(odds)))
+    if abs(own - other) > NEGLIGIBLE:
+        return max(own, other) - both
+    return own + math.log1p(math.exp(other - own)) - both
 
 
 @compiled

@@ -13,7 +13,6 @@ from factors.rfid.counts import TagReadCounts, together
 from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, DetectionModel, LogisticModel, RfidModel, bake, probability
-from factors.rfid.tables import MOST_KEPT
 
 COEFFICIENTS = (3.0, -1.2, 0.02, -1.5, 0.2, -0.06, -0.6, 0.4, 0.9, 0.1, -0.16)
 MODELS: dict[str, DetectionModel] = {
@@ -88,18 +87,6 @@ def test_tables_of_grids_are_the_same_from_their_planes_as_cell_by_cell() -> Non
     assert len(np.unique(cells.rows)) > 500
     assert off.max() <= 1
     assert (off > 0).mean() < 1e-4
-
-
-def test_tables_of_the_last_few_models_are_made_once() -> None:
-    models = [BeamModel(r_max=3.0 + 0.1 * k) for k in range(MOST_KEPT + 1)]
-    first = scene(models[0])[0]._tables
-    assert scene(replace(models[0]), tempering=0.5)[0]._tables is first
-    for other in models[1:]:
-        assert len(scene(other)[0]._tables.rows) > len(first.rows)
-    assert scene(models[-1])[0]._tables is scene(models[-1])[0]._tables
-    again = scene(models[0])[0]._tables
-    assert again is not first
-    np.testing.assert_array_equal(again.rows, first.rows)
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -10,8 +10,10 @@ import pytest
 from factors import se2
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.factor import RfidTagFactor
 from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel, bake
-from factors.rfid.tag_factor import ROWS, RfidTagFactor
+
+ROWS = 6
 
 LOGISTIC = LogisticModel((3.0, -0.8, -0.1, -1.5, 0.2, -0.1, -0.4, 0.8, 0.1, -0.05, 0.1))
 GRID = bake(LOGISTIC, 5.0, 0.25, heights=(-1.0, 0.0, 1.0), facings=9)

@@ -13,9 +13,8 @@ from factors.camera.model import CameraModel, camera_pose, predict
 from factors.landmarks.factor import BearingRangeFactor, landmark_update
 from factors.landmarks.model import BearingRangeModel
 from factors.landmarks.model import predict as predict_landmarks
-from factors.rfid import kernels as rfid_kernels
 from factors.rfid import update as rfid_update
-from factors.rfid.counts import TagReadCounts
+from factors.rfid.counts import TagReadCounts, moved
 from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, RfidModel
@@ -140,7 +139,7 @@ def test_by_what_antennas_read_and_did_not_read(rng, iterations):
 
 def test_offsets_of_looks_are_moved_as_poses_are(rng):
     offset, offsets = rng.standard_normal(3), rng.standard_normal((4, 3))
-    np.testing.assert_allclose(rfid_kernels.moved(offset, offsets), se2.compose(offset, offsets), atol=1e-12)
+    np.testing.assert_allclose(moved(offset, offsets), se2.compose(offset, offsets), atol=1e-12)
 
 
 def seen(covariance, sigma, iterations=3):

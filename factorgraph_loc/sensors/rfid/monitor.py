@@ -1,6 +1,5 @@
 """Monitors of a run: a lost track, a failed reader, reads in bursts, and reads that are not as predicted."""
 
-import itertools
 import math
 from collections import deque
 from collections.abc import Sequence
@@ -82,8 +81,8 @@ class ScanMonitor:
 
     def accept(self) -> None:
         """Accept the track: the model or the map is wrong instead, and scans will remain as unlikely as the last ones."""
-        last = self._last()
-        self._usual = sum(s[1] for s in last) / max(len(last), 1)
+        surprise, _, count = self._sums()
+        self._usual = surprise / max(count, 1)
         self._since = None
 
     def clear(self) -> None:
@@ -93,14 +92,17 @@ class ScanMonitor:
 
     def _z(self) -> float:
         """The total excess of the last scans, in standard deviations."""
-        last = self._last()
-        if len(last) < SCANS:
-            return 0.0
-        return sum(s[1] - self._usual for s in last) / math.sqrt(sum(s[2] for s in last) + 1e-9)
+        surprise, variance, count = self._sums()
+        return (surprise - count * self._usual) / math.sqrt(variance + 1e-9) if count >= SCANS else 0.0
 
-    def _last(self) -> list[tuple[float, float, float]]:
-        since = self._scans[-1][0] - DURATION if self._scans else 0.0
-        return list(itertools.takewhile(lambda scan: scan[0] > since, reversed(self._scans)))
+    def _sums(self) -> tuple[float, float, int]:
+        """Sums of the excesses and of the variances of the last scans, and their number."""
+        excess, variance, count = 0.0, 0.0, 0
+        for t, surprise, own in reversed(self._scans):
+            if t <= self._scans[-1][0] - DURATION:
+                break
+            excess, variance, count = excess + surprise, variance + own, count + 1
+        return excess, variance, count
 
     def _beginning(self) -> float:
         """The change point, which maximises the total excess after it."""

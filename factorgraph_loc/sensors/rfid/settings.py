@@ -17,7 +17,7 @@ from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, inside, 
 from factorgraph_loc.model.settings import Estimated, SensorSettings
 from factorgraph_loc.text import listed, quoted
 from factors import se2
-from factors.rfid.adjustment import PARAMETERS
+from factors.rfid.kernels import PARAMETERS
 from factors.rfid.model import Antenna, BeamModel, DetectionModel, GridModel, LogisticModel, RfidModel
 from factors.rfid.phase import PhaseModel
 from factors.rfid.strength import RssiModel
@@ -30,7 +30,7 @@ Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 
 
 class PriorSettings(FileModel):
-    """How well a detection model is known, as standard deviations (:mod:`factors.rfid.adjustment`); what is above 0 is learnt on
+    """How well a detection model is known, as standard deviations (:mod:`factors.rfid.kernels`); what is above 0 is learnt on
     the way by every estimator that uses tags."""
 
     range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1

@@ -25,8 +25,8 @@ from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, possible_poses
 from factorgraph_loc.text import listed, quoted
-from factors.rfid.adjustment import MOST_CERTAIN, rate_of
 from factors.rfid.detection import ExpectedReads, RfidLikelihood
+from factors.rfid.kernels import MOST_CERTAIN, rate_of
 from factors.se2 import Array, Integers, transform_from
 
 STOPPED = 10.0  # s; an antenna without rounds for longer before the end has stopped

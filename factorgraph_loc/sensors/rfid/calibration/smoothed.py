@@ -3,7 +3,7 @@
 The likelihood of the reads is averaged over the poses that the smoother thinks possible
 (:func:`~factorgraph_loc.sensors.smoothed.possible_poses`). Tags that are probably not where the map has them are left out. A beam
 is fitted in all its parameters, and a logistic model in all its coefficients; a grid keeps its shape, and changes as estimators
-change it on the way (:mod:`factors.rfid.adjustment`).
+change it on the way (:mod:`factors.rfid.kernels`).
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from factorgraph_loc.sensors.rfid.calibration.tempering import bursts
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, Corrections, Smoothed, pooled, possible_poses
 from factorgraph_loc.text import quoted
-from factors.rfid.adjustment import MOST_CERTAIN, PARAMETERS, rate_of
+from factors.rfid.kernels import MOST_CERTAIN, PARAMETERS, rate_of
 from factors.rfid.model import FEATURES, BeamModel, DetectionModel, GridModel, LogisticModel
 
 MIN_READS = 100.0  # weighted reads that a model is learnt from
