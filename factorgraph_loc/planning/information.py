@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.fusion.cloud import pose_moments, systematic
 from factorgraph_loc.maps.free_space import FreeSpace
+from factorgraph_loc.planning import particle_kernels
 from factorgraph_loc.planning.paths import Path, free_steps
 from factorgraph_loc.planning.sensors import SPEED, Sensors
 from factorgraph_loc.sensors.interfaces import Array32, Places
-from factorgraph_loc.sensors.rfid import forecast as expected_scans
 from factorgraph_loc.text import quoted
 from factors import se2
 from factors.motion import ChainState, propagate
@@ -65,7 +65,7 @@ def particle_entropy(poses: Array, weights: Array, dims: Sequence[str] = DIMS, c
     flat = np.atleast_2d(weights).reshape(-1, len(poses)).astype(np.float32)
     out = np.empty(len(flat))
     at = np.ascontiguousarray(poses, dtype=float)[None]
-    expected_scans.cell_entropies(at, np.zeros(len(flat), dtype=np.int64), flat, cell, chosen, out)
+    particle_kernels.cell_entropies(at, np.zeros(len(flat), dtype=np.int64), flat, cell, chosen, out)
     return out.reshape(np.shape(weights)[:-1])
 
 
@@ -126,7 +126,7 @@ def expected_gain(
     for c, (path, steps) in enumerate(zip(paths, stations, strict=True)):
         at = np.empty((len(steps), count, 3))
         sigmas = np.zeros((len(steps), 3)) if noise is None else _sigmas(path, steps, noise)
-        expected_scans.look_poses(poses, path.poses, steps, last[c], sigmas, normals, at)
+        particle_kernels.look_poses(poses, path.poses, steps, last[c], sigmas, normals, at)
         stops = np.searchsorted(steps[1:-1], last[c], side="right")
         log_weights: Array32 = np.zeros((scans, count), dtype=np.float32)
         for forecast in sensors.forecasts:
@@ -163,10 +163,10 @@ def _entropies(poses: Array, index: Places, weights: Array32, dims: int, several
     """Entropies (J,) of particles at stations ``index`` (J,) of ``poses`` (S, M, 3), with weights (J, M)."""
     if several:
         out = np.empty(len(index))
-        expected_scans.cell_entropies(poses, index, weights, CELL, dims, out)
+        particle_kernels.cell_entropies(poses, index, weights, CELL, dims, out)
         return out
     covariances = np.empty((len(index), 3, 3))
-    expected_scans.covariances(poses, index, weights, covariances)
+    particle_kernels.covariances(poses, index, weights, covariances)
     return gaussian_entropy(covariances + np.diag(FINEST**2), DIMS[:dims])
 
 

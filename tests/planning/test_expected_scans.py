@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from factorgraph_loc.planning import particle_kernels
 from factorgraph_loc.sensors.rfid import forecast as expected_scans
 from factors import se2
 from factors.rfid.detection import RfidLikelihood, TagArray
@@ -107,7 +108,7 @@ def test_particles_follow_the_path_until_they_are_stopped():
     along, steps, particles, sigmas, normals = stations()
     last = np.arange(4000) % 25
     out = np.empty((5, 4000, 3))
-    expected_scans.look_poses(particles, along, steps, last, sigmas, normals, out)
+    particle_kernels.look_poses(particles, along, steps, last, sigmas, normals, out)
     for k, step in enumerate(steps.tolist()):
         expected = se2.compose(particles, along[np.minimum(step, last)])
         np.testing.assert_allclose(out[k, :, :2], expected[:, :2], atol=1e-9)
@@ -118,7 +119,7 @@ def test_noise_on_the_way_adds_up_as_small_motions_do():
     """Against exact composition, draw by draw, and the standard deviations of 4000 draws to 6 % (5 of their own)."""
     along, steps, particles, sigmas, normals = stations(noise=1.0)
     out = np.empty((5, 4000, 3))
-    expected_scans.look_poses(particles, along, steps, np.full(4000, 99), sigmas, normals, out)
+    particle_kernels.look_poses(particles, along, steps, np.full(4000, 99), sigmas, normals, out)
     exact = particles
     for k in range(1, 5):
         exact = se2.compose(exact, se2.between(along[steps[k - 1]], along[steps[k]]))
@@ -138,7 +139,7 @@ def test_covariances_are_those_of_weighted_particles():
     weights = rng.random((4, 300)).astype(np.float32)
     index = np.array((0, 1, 1, 0))
     out = np.empty((4, 3, 3))
-    expected_scans.covariances(wrapped, index, weights, out)
+    particle_kernels.covariances(wrapped, index, weights, out)
     for n, k in enumerate(index):
         np.testing.assert_allclose(out[n], np.cov(poses[k].T, aweights=weights[n], ddof=0), rtol=1e-4, atol=1e-5)
 
@@ -150,7 +151,7 @@ def test_histograms_count_particles_in_cells():
     index, cell = np.array((1, 0, 1)), np.array((0.5, 0.8, 2.0 * math.pi / 6.0))
     for dims in (1, 2, 3):
         out = np.empty(3)
-        expected_scans.cell_entropies(poses, index, weights, cell, dims, out)
+        particle_kernels.cell_entropies(poses, index, weights, cell, dims, out)
         for n, k in enumerate(index):
             at = poses[k].copy()
             at[:, 2] %= 2.0 * math.pi

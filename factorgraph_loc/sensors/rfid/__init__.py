@@ -6,7 +6,6 @@ from factorgraph_loc.sensors.registry import Channel, SensorType
 __all__ = [
     "SENSOR",
     "calibration",
-    "forecast",
     "known_tags",
     "map",
     "recorded",

@@ -20,10 +20,11 @@ from factorgraph_loc.sensors.interfaces import Array32, Places
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factors.compiled import compiled
+from factors.rfid import kernels
 from factors.rfid.counts import TagReadCounts
 from factors.rfid.detection import RfidLikelihood
-from factors.rfid.kernels import FAST, detection, of_tag, placed
-from factors.rfid.model import Packed
+from factors.rfid.kernels import FAST
+from factors.rfid.model import RfidModel
 from factors.se2 import Array
 
 CELL = 0.15  # m, of the tables
@@ -62,8 +63,7 @@ def make_tables(likelihood: RfidLikelihood) -> ScanTables:
     half = math.ceil(reach / CELL)
     levels, level = np.unique(np.rint(tags.points[:, 2] / LEVEL).astype(np.int64), return_inverse=True)
     layers = FACINGS + 1 if any(m.uses_facing for m in model.models) else 1
-    q: Array = np.empty((len(levels), layers, 2 * half + 1, 2 * half + 1, len(model.antennas)))
-    _fill(model.packed(), np.asarray(levels * LEVEL, dtype=float), half, q)
+    q = _probabilities(model, levels * LEVEL, layers, half)
     floor = max(model.false_read, ALMOST_NEVER)
     q = np.clip(q, floor, 1.0 - ALMOST_NEVER)
     told = np.argwhere((q > floor + NOTHING).any(axis=(0, 1, 4)))
@@ -89,26 +89,16 @@ def make_tables(likelihood: RfidLikelihood) -> ScanTables:
     )
 
 
-@compiled
-def _fill(packed: Packed, heights: Array, half: int, out: Array) -> None:
-    levels, layers, size, _, antennas = out.shape
-    none = np.zeros(3)
-    point, normal = np.zeros(3), np.zeros(2)
-    for a in range(antennas):
-        x, y, c, s, _, _ = placed(packed, a, none, none)
-        for k in range(levels):
-            point[2] = heights[k]
-            for f in range(layers):
-                normal[:] = 0.0
-                if f < layers - 1:
-                    angle = 2.0 * math.pi * f / (layers - 1)
-                    normal[0], normal[1] = math.cos(angle), math.sin(angle)
-                for i in range(size):
-                    point[0] = (i - half) * CELL
-                    for j in range(size):
-                        point[1] = (j - half) * CELL
-                        z = of_tag(packed, a, x, y, c, s, point, normal)[0]
-                        out[k, f, i, j, a] = detection(packed, z, packed.rate[packed.which[a]])[0]
+def _probabilities(model: RfidModel, heights: Array, layers: int, half: int) -> Array:
+    """Probability (L, F, N, N, A) that a round of each antenna reads a tag in a cell of the robot frame."""
+    angles = 2.0 * math.pi * np.arange(layers - 1) / max(layers - 1, 1)
+    normals = np.vstack((np.column_stack((np.cos(angles), np.sin(angles))), np.zeros(2)))
+    axis, antennas = (np.arange(2 * half + 1) - half) * CELL, np.arange(len(model.antennas))
+    h, f, x, y = np.meshgrid(heights, np.arange(layers), axis, axis, indexing="ij")
+    points = np.stack((x, y, h), axis=-1).reshape(-1, 3)
+    origin = np.zeros((len(antennas), 3))
+    found, _ = kernels.probabilities(model.packed(), antennas, origin, points, normals[f.ravel()])
+    return np.moveaxis(found.reshape(-1, *h.shape), 0, -1)
 
 
 @compiled
@@ -119,44 +109,6 @@ def _uniform(seed: np.uint64, number: int) -> float:
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     z = z ^ (z >> np.uint64(31))
     return (z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
-
-
-@compiled
-def look_poses(
-    particles: Array, along: Array, steps: Places, last: Places, sigmas: Array, normals: Array, out: Array
-) -> None:
-    """Poses of M particles at S stations of a path, (S, M, 3): the start, the measurement poses and the end.
-
-    ``particles`` (M, 3); ``along`` (P, 3): poses of the path; ``steps`` (S,): indices of the stations; ``last`` (M,): index of the
-    last pose that each particle reaches, where it stays; ``sigmas`` (S, 3): motion noise between stations in the robot frame, with
-    standard normal draws ``normals`` (S, M, 3).
-    """
-    count = len(particles)
-    errors = np.zeros((count, 3))
-    for k in range(len(steps)):
-        end = along[steps[k]]
-        begin = along[steps[k - 1]] if k else end
-        # adjoint of the inverse motion: the earlier error seen from the end
-        ce, se = math.cos(end[2]), math.sin(end[2])
-        c, s = math.cos(end[2] - begin[2]), math.sin(end[2] - begin[2])
-        back_x, back_y = (
-            ce * (begin[0] - end[0]) + se * (begin[1] - end[1]),
-            ce * (begin[1] - end[1]) - se * (begin[0] - end[0]),
-        )
-        for i in range(count):
-            if k == 0 or steps[k - 1] < last[i]:
-                ex, ey, eh = errors[i]
-                errors[i, 0] = c * ex + s * ey + back_y * eh + sigmas[k, 0] * normals[k, i, 0]
-                errors[i, 1] = c * ey - s * ex - back_x * eh + sigmas[k, 1] * normals[k, i, 1]
-                errors[i, 2] = eh + sigmas[k, 2] * normals[k, i, 2]
-            at = along[min(steps[k], last[i])]
-            ch, sh = math.cos(particles[i, 2]), math.sin(particles[i, 2])
-            heading = particles[i, 2] + at[2]
-            cn, sn = math.cos(heading), math.sin(heading)
-            ex, ey, eh = errors[i]
-            out[k, i, 0] = particles[i, 0] + ch * at[0] - sh * at[1] + cn * ex - sn * ey
-            out[k, i, 1] = particles[i, 1] + sh * at[0] + ch * at[1] + sn * ex + cn * ey
-            out[k, i, 2] = heading + eh
 
 
 @compiled(error_model="numpy", fastmath=FAST)
@@ -267,87 +219,6 @@ def _binomial(count: int, q: float, uniform: float) -> tuple[int, float]:
         p *= (count - k) / (k + 1.0) * q / (1.0 - q)
         k += 1
     return k, min(uniform / p, 1.0)
-
-
-@compiled
-def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> None:
-    """Weighted covariances (J, 3, 3) of M particles at stations ``index`` (J,) of ``poses`` (S, M, 3), with ``weights`` (J, M).
-    Headings are relative to the first particle's."""
-    count = poses.shape[1]
-    d = np.empty(3)
-    first, second = np.empty(3), np.empty((3, 3))
-    for n in range(len(index)):
-        first[:], second[:] = 0.0, 0.0
-        at = poses[index[n]]
-        total = 0.0
-        for i in range(count):
-            w = weights[n, i]
-            if w < 1e-9:
-                continue
-            d[0], d[1] = at[i, 0] - at[0, 0], at[i, 1] - at[0, 1]
-            turn = at[i, 2] - at[0, 2]
-            d[2] = turn - 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)
-            total += w
-            for a in range(3):
-                first[a] += w * d[a]
-                for b in range(a + 1):
-                    second[a, b] += w * d[a] * d[b]
-        for a in range(3):
-            for b in range(a + 1):
-                out[n, a, b] = out[n, b, a] = second[a, b] / total - first[a] * first[b] / (total * total)
-
-
-@compiled
-def cell_entropies(poses: Array, index: Places, weights: Array32, cell: Array, dims: int, out: Array) -> None:
-    """Entropies (J,) [nats] of histograms of the first ``dims`` coordinates with cells of size ``cell`` (3,); otherwise as
-    :func:`covariances`."""
-    stations, count, _ = poses.shape
-    volume = 0.0
-    for a in range(dims):
-        volume += math.log(cell[a])
-    numbers = np.full((stations, count), -1, np.int64)
-    mass = np.zeros(count)
-    for n in range(len(index)):
-        number = numbers[index[n]]
-        if number[0] < 0:
-            _number_cells(poses[index[n]], cell, dims, number)
-        total = 0.0
-        for i in range(count):
-            mass[number[i]] += weights[n, i]
-            total += weights[n, i]
-        entropy = 0.0
-        for i in range(count):
-            p = mass[i] / total
-            if p > 0.0:
-                entropy -= p * math.log(p)
-            mass[i] = 0.0
-        out[n] = entropy + volume
-
-
-@compiled
-def _number_cells(poses: Array, cell: Array, dims: int, out: Places) -> None:
-    """Cell indices (M,) below M, equal for particles in one cell: a hash table with open addressing."""
-    count = len(poses)
-    size = 1
-    while size < 4 * count:
-        size *= 2
-    owner = np.full(size, -1, np.int64)
-    keys = np.zeros((count, 3), np.int64)
-    for i in range(count):
-        for a in range(dims):
-            value = poses[i, a]
-            if a == 2:
-                value -= 2.0 * math.pi * math.floor(value / (2.0 * math.pi))
-            keys[i, a] = math.floor(value / cell[a])
-        slot = (keys[i, 0] * 73856093 ^ keys[i, 1] * 19349663 ^ keys[i, 2] * 83492791) & (size - 1)
-        while owner[slot] >= 0:
-            other = keys[owner[slot]]
-            if other[0] == keys[i, 0] and other[1] == keys[i, 1] and other[2] == keys[i, 2]:
-                break
-            slot = (slot + 1) & (size - 1)
-        if owner[slot] < 0:
-            owner[slot] = i
-        out[i] = owner[slot]
 
 
 ROUNDS_PER_SECOND = 2.0  # default rate
