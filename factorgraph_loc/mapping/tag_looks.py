@@ -11,7 +11,7 @@ from factorgraph_loc.sensors.rfid.known_tags import tag_map, whole_scans
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.text import listed
-from factors.rfid.counts import TagReadCounts
+from factors.rfid.detection import TagReadCounts
 from factors.rfid.model import RfidModel
 from factors.se2 import Array
 

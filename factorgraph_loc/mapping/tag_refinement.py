@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.least_squares import minima
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.model import RfidModel, probability
 from factors.se2 import Array
 

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.mapping.tag_refinement import TagCandidates, reach, refine
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.model import RfidModel
 from factors.se2 import Array, wrap, wrap_scalar
 

@@ -30,8 +30,7 @@ from factors import se2
 from factors.graph import Factor, PriorFactor, VectorPriorFactor
 from factors.motion import Increment
 from factors.odometry.model import PARAMETERS, OdometryFactor, recalibrated
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor, RfidTagFactor
 from factors.se2 import Array
 

@@ -7,7 +7,6 @@ __all__ = [
     "DetectionModel",
     "GridModel",
     "LogisticModel",
-    "counts",
     "detection",
     "factor",
     "kernels",

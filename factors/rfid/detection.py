@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.rfid import kernels, weighing
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.index import MapTags, tag_index
+from factors.rfid.index import MapTags, Seen, listing, moved, tag_index
 from factors.rfid.model import Packed, RfidModel
 from factors.rfid.places import Places, in_reach, is_wide, reach_of
 from factors.rfid.tables import Tables, make_tables
@@ -41,6 +40,89 @@ class TagArray:
         known = np.isfinite(self.facing)
         angle = np.where(known, self.facing, 0.0)
         return np.where(known[:, None], np.column_stack((np.cos(angle), np.sin(angle))), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class TagReadCounts:
+    """Read counts of tags by K antennas, each at its own pose.
+
+    ``offsets`` (K, 3): the robot's pose at the measurement, in the frame of the likelihood's pose; ``antennas`` (K,): indices in
+    the model; ``rounds`` (K,): inventory rounds. ``tags`` (C,): places in the map, ascending, of the tags that are listed; None,
+    the default, if all of the map are. ``hits`` (K, C): number of rounds that read each of them; the others were not read.
+    ``odds`` (C,): prior log-odds that each is dead or moved (:class:`~factors.rfid.tag_states.TagStates`), ``-inf`` for as
+    surveyed, the default; ``others``: those of the tags that are not listed. ``elsewhere`` (C,): tempered log-likelihood of what
+    was seen of the tag if so, relative to a silence out of reach; by default that of a dead tag: 0, or ``-inf`` if it was read.
+    """
+
+    offsets: Array
+    antennas: NDArray[np.int64]
+    rounds: NDArray[np.int64]
+    hits: NDArray[np.int64]
+    odds: Array = field(default_factory=lambda: np.empty(0))
+    elsewhere: Array = field(default_factory=lambda: np.empty(0))
+    tags: Integers | None = None
+    others: float = -np.inf
+
+    def __post_init__(self) -> None:
+        if not len(self.odds):
+            object.__setattr__(self, "odds", np.full(self.hits.shape[1], -np.inf))
+        if not len(self.elsewhere):
+            object.__setattr__(self, "elsewhere", np.where(self.hits.any(axis=0), -np.inf, 0.0))
+
+    @cached_property
+    def seen(self) -> Seen:
+        """The counts for compiled code."""
+        counts = self.offsets, self.antennas, self.rounds, self.hits
+        return (*counts, self.odds, self.elsewhere, self.listed, self.others)
+
+    @cached_property
+    def listed(self) -> Integers:
+        """Places (C,) in the map of the tags that are listed."""
+        return np.arange(self.hits.shape[1]) if self.tags is None else self.tags
+
+    @property
+    def heard(self) -> Integers:
+        """Places in the map of the tags that were read, ascending."""
+        return np.asarray(self.listed[self.hits.any(axis=0)])
+
+    def with_states(self, tags: Integers, odds: Array, elsewhere: Array) -> TagReadCounts:
+        """The counts with ``tags`` (U,) listed too, which have these ``odds`` (U,) and ``elsewhere`` (U,)."""
+        both = np.union1d(self.listed, tags)
+        hits, all_odds, all_elsewhere = listing(self.listed, self.hits, self.odds, self.elsewhere, self.others, both)
+        at = np.searchsorted(both, tags)
+        all_odds[at], all_elsewhere[at] = odds, elsewhere
+        return replace(self, hits=hits, odds=all_odds, elsewhere=all_elsewhere, tags=both)
+
+    def moved(self, offset: Array) -> TagReadCounts:
+        """The counts relative to the pose that lies ``offset`` (3,) before theirs."""
+        return replace(self, offsets=moved(offset, self.offsets))
+
+
+def together(parts: list[TagReadCounts]) -> TagReadCounts:
+    """Merge counts relative to one pose, in order of time. The odds are those of the first that lists a tag; ``elsewhere`` is the
+    sum of all."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    tags = first.listed if first.tags is None else np.unique(np.concatenate([p.listed for p in parts]))
+    odds, elsewhere, hits = np.full(len(tags), first.others), np.zeros(len(tags)), []
+    for part in reversed(parts):
+        at, own = np.searchsorted(tags, part.listed), np.zeros((len(part.hits), len(tags)), dtype=np.int64)
+        own[:, at] = part.hits
+        odds[at] = part.odds
+        elsewhere[at] += part.elsewhere
+        hits.append(own)
+    offsets, antennas, rounds = zip(*[(p.offsets, p.antennas, p.rounds) for p in parts], strict=True)
+    return TagReadCounts(
+        np.concatenate(offsets),
+        np.concatenate(antennas),
+        np.concatenate(rounds),
+        np.concatenate(hits[::-1]),
+        odds,
+        elsewhere,
+        None if first.tags is None else tags,
+        first.others,
+    )
 
 
 class Score(NamedTuple):
@@ -102,7 +184,7 @@ class RfidLikelihood:
         for name in ("_tables", "_places"):
             getattr(self._unadjusted, name)
 
-    @property
+    @cached_property
     def arrays(self) -> tuple[Packed, MapTags]:
         """The models without adjustment and the map, for compiled code."""
         return self._unadjusted.packed, self._unadjusted._map
@@ -114,8 +196,9 @@ class RfidLikelihood:
         those of the ``parameters`` (2 M,) of the detection models that are ``estimated`` (P,), by default all."""
         places = np.array(range(len(parameters)) if estimated is None else estimated, dtype=np.int64)
         pose, alpha = np.ascontiguousarray(pose, dtype=float), float(self.model.tempering)
-        found = kernels.score(*self.arrays, looks.seen, alpha, pose, parameters, places)
-        return Score(*(np.asarray(part)[None] for part in found))
+        nll, gradient, information, *moments = kernels.score(*self.arrays, looks.seen, alpha, pose, parameters, places)
+        expected, variance = np.array(moments)[:, None]
+        return Score(np.array((nll,)), gradient[None], information[None], expected, variance)
 
     def score(self, poses: Array, looks: TagReadCounts) -> Score:
         """Likelihood, gradient and information at poses (N, 3)."""
@@ -142,11 +225,11 @@ class RfidLikelihood:
         """
         poses = np.ascontiguousarray(poses, dtype=float)
         if parameters is None and not looks.offsets.any() and is_wide(poses, reach_of(self.packed)):
-            return self._places.log_likelihood(poses, looks, self.model.tempering)
+            return self._places.log_likelihood(poses, looks.seen, self.model.tempering)
         parameters = self.parameters[None] if parameters is None else np.ascontiguousarray(parameters)
         return weighing.log_likelihood(*self._tabled, looks.seen, poses, float(self.model.tempering), parameters)
 
-    @property
+    @cached_property
     def _tabled(self) -> tuple[Packed, Tables, MapTags]:
         return self._unadjusted.packed, self._unadjusted._tables, self._unadjusted._map
 
@@ -161,7 +244,7 @@ class RfidLikelihood:
 
     def work(self, looks: TagReadCounts) -> int:
         """How many tags are looked at, by all antennas, to tell the likelihood of one pose among poses that are far apart."""
-        return self._unadjusted._places.work(looks)
+        return self._unadjusted._places.work(looks.seen)
 
     @cached_property
     def reached(self) -> float:

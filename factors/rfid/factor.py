@@ -9,8 +9,7 @@ import numpy as np
 
 from factors.compressed import compressed
 from factors.rfid import kernels
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood, Score
+from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts
 from factors.rfid.phase import PhaseLikelihood, PhaseReads, PhaseScore
 from factors.rfid.strength import RssiLikelihood, RssiReads, RssiScore
 from factors.se2 import Array

@@ -1,4 +1,7 @@
-"""An index of tags by position, which finds the tags in reach of a pose in a few cells instead of the whole map."""
+"""Tags of a map by position, and read counts of tags: which tags count for a pose, in compiled code.
+
+An index finds the tags in reach of a pose in a few cells instead of the whole map.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid.counts import Seen, listing, union
 from factors.se2 import Array, Integers
+from factors.se2_kernels import wrapped
 
 CELL = 2.0  # m
 SPARE = 0.5  # m: tags are found in a box on a grid of this size, which neighbouring poses share
 Corner = tuple[float, float]
 MOST_CELLS = 1 << 20  # a map that is wider has larger cells
+# offsets, antennas, rounds, hits, odds and elsewhere; the places in the map that are listed, and the odds of the others
+Seen = tuple[Array, Integers, Integers, Integers, Array, Array, Integers, float]
 
 
 class TagIndex(NamedTuple):
@@ -108,7 +113,7 @@ def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
 @compiled
 def near_tags(of_map: MapTags, seen: Seen, poses: Array, reach: float) -> NearTags:
     """The tags within ``reach`` [m] of poses (N, 3), or in the same cells, and those that are listed in what was ``seen``
-    (:attr:`factors.rfid.counts.TagReadCounts.seen`)."""
+    (:attr:`factors.rfid.detection.TagReadCounts.seen`)."""
     _, _, _, hits, odds, elsewhere, listed, others = seen
     low, high = _box(poses, reach)
     tags = union(within(of_map.cells, low, high), listed)
@@ -120,3 +125,49 @@ def near_tags(of_map: MapTags, seen: Seen, poses: Array, reach: float) -> NearTa
         for i in range(2):
             normals[u, i] = of_map.normals[tags[u], i]
     return NearTags(tags, points, normals, hits, odds, elsewhere)
+
+
+@compiled
+def moved(offset: Array, offsets: Array) -> Array:
+    """The poses (K, 3) ``offset`` (3,) composed with ``offsets`` (K, 3)."""
+    c, s, out = math.cos(offset[2]), math.sin(offset[2]), np.empty_like(offsets)
+    for k in range(len(offsets)):
+        out[k, 0] = offset[0] + c * offsets[k, 0] - s * offsets[k, 1]
+        out[k, 1] = offset[1] + s * offsets[k, 0] + c * offsets[k, 1]
+        out[k, 2] = wrapped(offset[2] + offsets[k, 2])
+    return out
+
+
+@compiled
+def union(some: Integers, others: Integers) -> Integers:
+    """All numbers of either, which are ascending both."""
+    out = np.empty(len(some) + len(others), np.int64)
+    i = j = count = 0
+    while i < len(some) or j < len(others):
+        if j == len(others) or (i < len(some) and some[i] <= others[j]):
+            out[count] = some[i]
+            j += j < len(others) and some[i] == others[j]
+            i += 1
+        else:
+            out[count] = others[j]
+            j += 1
+        count += 1
+    return out[:count]
+
+
+@compiled
+def listing(
+    listed: Integers, hits: Integers, odds: Array, elsewhere: Array, others: float, tags: Integers
+) -> tuple[Integers, Array, Array]:
+    """Hits, odds and elsewhere of ``tags``, both ascending; those of tags that are not listed are no hits, ``others`` and 0."""
+    new_hits = np.zeros((len(hits), len(tags)), np.int64)
+    new_odds, new_elsewhere = np.full(len(tags), others), np.zeros(len(tags))
+    i = 0
+    for u in range(len(tags)):
+        while i < len(listed) and listed[i] < tags[u]:
+            i += 1
+        if i < len(listed) and listed[i] == tags[u]:
+            for k in range(len(hits)):
+                new_hits[k, u] = hits[k, i]
+            new_odds[u], new_elsewhere[u] = odds[i], elsewhere[i]
+    return new_hits, new_odds, new_elsewhere

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid.counts import Seen, moved
-from factors.rfid.index import MapTags, near_tags
+from factors.rfid.index import MapTags, Seen, moved, near_tags
 from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed, logit
 from factors.se2 import Array, Integers
 

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.index import MapTags, TagIndex, cells
+from factors.rfid.index import MapTags, Seen, TagIndex, cells
 from factors.rfid.kernels import FAST
 from factors.rfid.model import LOGISTIC, Packed, RfidModel
 from factors.rfid.tables import CELL, Array32, Tables, logs_of, row_of
@@ -118,16 +117,17 @@ class Places:
         made = place_tables(model, antennas, order)
         return cls(antennas, made, of_map.cells, *of_tags, np.ascontiguousarray(tables.level[:, order]))
 
-    def work(self, looks: TagReadCounts) -> int:
+    def work(self, seen: Seen) -> int:
         """How many tags count for one pose, on average; one that was read counts as four."""
         near = in_reach(self.points[:, :2], self.antennas.reach)
+        _, antennas, _, hits, *_ = seen
         if not self.tables.gain.size:
-            return PLACED + round(BY_ANTENNA * len(looks.antennas) * near)
-        return PLACED + round(near) + 4 * int(np.count_nonzero(looks.hits.any(axis=0)))
+            return PLACED + round(BY_ANTENNA * len(antennas) * near)
+        return PLACED + round(near) + 4 * int(np.count_nonzero(hits.any(axis=0)))
 
-    def log_likelihood(self, poses: Array, looks: TagReadCounts, tempering: float) -> Array:
+    def log_likelihood(self, poses: Array, seen: Seen, tempering: float) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3)."""
-        scan = self._scan(looks)
+        scan = self._scan(seen)
         missed = float(scan.rounds @ self.tables.none[scan.antennas, 1])
         out = np.full(len(poses), tempering * len(self.points) * missed)
         of_tags = self.points, self.normals, self.levels
@@ -143,17 +143,17 @@ class Places:
             self._last[key] = miss_table(self.tables, scan, tempering, self.antennas.reach)
         return self._last[key]
 
-    def _scan(self, looks: TagReadCounts) -> Scan:
+    def _scan(self, seen: Seen) -> Scan:
         """The reads, with the tags listed that are not as most are."""
-        odds, rows = looks.others, np.arange(len(looks.odds))
-        if looks.tags is None:
-            odds = float(np.sort(looks.odds)[len(looks.odds) // 2])
-            rows = np.flatnonzero(looks.hits.any(axis=0) | (looks.odds != odds) | (looks.elsewhere != 0.0))
+        _, antennas, rounds, hits, odds, elsewhere, listed, others = seen
+        rows = np.arange(len(odds))
+        if len(odds) == len(self.points):
+            others = float(np.sort(odds)[len(odds) // 2])
+            rows = np.flatnonzero(hits.any(axis=0) | (odds != others) | (elsewhere != 0.0))
         number = np.full(len(self.points), -1, dtype=np.int32)
-        number[looks.listed[rows]] = np.arange(len(rows))
-        hits = np.ascontiguousarray(looks.hits[:, rows])
-        listed = number[self.index.order], looks.odds[rows], looks.elsewhere[rows]
-        return Scan(looks.antennas, looks.rounds, hits, *listed, odds)
+        number[listed[rows]] = np.arange(len(rows))
+        of_rows = number[self.index.order], odds[rows], elsewhere[rows]
+        return Scan(antennas, rounds, np.ascontiguousarray(hits[:, rows]), *of_rows, others)
 
 
 def place_tables(model: RfidModel, antennas: Antennas, order: Integers) -> PlaceTables:

@@ -60,16 +60,11 @@ class TagStates:
         self._weights = np.tile(prior, (count, 1))  # logarithms, not normalised
         self._dead, self._moved, self._surveyed, self._raised = dead, moved, prior[0], 0.0
         self.prior = float(_log(dead + moved) - prior[0])
-        self._odds = np.full(count, self.prior)
+        self.odds: Array = np.full(count, self.prior)  # log-odds (T,) of dead or moved against as surveyed
         self._doubtful: Integers | None = None  # not known
         # time, tags, and what they told of each state
         self._told: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
         self._heard = -math.inf
-
-    @property
-    def odds(self) -> Array:
-        """Log-odds (T,) of dead or moved against as surveyed, which change with what is learnt."""
-        return self._odds
 
     @property
     def heard(self) -> float:
@@ -80,14 +75,14 @@ class TagStates:
     def doubtful(self) -> Integers:
         """The tags that are dead or moved with a probability above :data:`BELIEVED`, ascending."""
         if self._doubtful is None:
-            self._doubtful = np.flatnonzero(self._odds > LIMIT)
+            self._doubtful = np.flatnonzero(self.odds > LIMIT)
         return self._doubtful
 
     @property
     def suspects(self) -> dict[int, float]:
         """The probability of each of these, which is told."""
         tags = self.doubtful
-        return dict(zip(tags.tolist(), (1.0 / (1.0 + np.exp(-self._odds[tags]))).tolist(), strict=True))
+        return dict(zip(tags.tolist(), (1.0 / (1.0 + np.exp(-self.odds[tags]))).tolist(), strict=True))
 
     def were_read(self, tags: Integers) -> NDArray[np.bool_]:
         """Which of ``tags`` (U,) were read, which are not dead then."""
@@ -100,7 +95,7 @@ class TagStates:
     def hear(self, t: float, tags: Integers) -> None:
         """Tags (R,) were read at ``t``: they are not dead."""
         if len(tags):
-            self._changed(_hear(self._weights, self._odds, tags))
+            self._changed(*_hear(self._weights, self.odds, tags, self._raised, self._moved))
             self._heard = max(self._heard, t)
 
     def expect(self, tags: Integers, told: Array) -> Array:
@@ -112,7 +107,7 @@ class TagStates:
         """Take what was ``told`` (U, 1 + K) of U ``tags`` at ``t``, see :meth:`expect`."""
         if len(tags):
             self._told.append((t, tags, told.astype(np.float32)))
-            self._changed(_learn(self._weights, self._odds, tags, self._told[-1][2], 1.0))
+            self._changed(*_learn(self._weights, self.odds, tags, self._told[-1][2], 1.0, self._raised, self._moved))
         while self._told and self._told[0][0] < t - KEPT:
             self._told.popleft()
 
@@ -124,19 +119,18 @@ class TagStates:
             if row[0] < since:
                 kept.append(row)
             else:
-                self._changed(_learn(self._weights, self._odds, row[1], row[2], -1.0))
+                self._changed(*_learn(self._weights, self.odds, row[1], row[2], -1.0, self._raised, self._moved))
         self._told = kept
 
-    def _changed(self, doubtful: bool) -> None:
-        """Update what depends on the weights; ``doubtful``: whether another set of tags is doubtful."""
+    def _changed(self, doubtful: bool, raised: float) -> None:
+        """Update what depends on the weights; ``doubtful``: whether another set of tags is doubtful; ``raised``: the logarithm by
+        which the prior of moved tags rises."""
         if doubtful:
             self._doubtful = None
-        if self._moved > 0.0:
-            raised = _raised(self._weights, self._odds, self._raised, self._moved)
-            if raised != self._raised:
-                self._weights[:, DEAD + 1 :] += raised - self._raised
-                self._odds, self._raised, self._doubtful = _all_odds(self._weights), raised, None
-                self.prior = float(np.logaddexp(_log(self._dead), _log(self._moved) + raised) - self._surveyed)
+        if raised != self._raised:
+            self._weights[:, DEAD + 1 :] += raised - self._raised
+            self.odds, self._raised, self._doubtful = _all_odds(self._weights), raised, None
+            self.prior = float(np.logaddexp(_log(self._dead), _log(self._moved) + raised) - self._surveyed)
 
 
 @compiled
@@ -176,20 +170,22 @@ def _expected(weights: Array, tags: Integers, told: Array) -> Array:
 
 
 @compiled
-def _hear(weights: Array, odds: Array, tags: Integers) -> bool:
-    """That ``tags`` are not dead; whether others are doubtful now."""
+def _hear(weights: Array, odds: Array, tags: Integers, raised: float, moved: float) -> tuple[bool, float]:
+    """Take ``tags`` to be not dead. Returns whether another set of tags is doubtful, and the rise of the prior of moved tags."""
     changed = False
     for t in tags:
         if weights[t, DEAD] > -np.inf:
             weights[t, DEAD] = -np.inf
             before, odds[t] = odds[t], _odds(weights[t])
             changed |= (before > LIMIT) != (odds[t] > LIMIT)
-    return changed
+    return changed, _raised(weights, odds, raised, moved)
 
 
 @compiled
-def _learn(weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32], sign: float) -> bool:
-    """Add what was ``told``; whether others are doubtful now."""
+def _learn(
+    weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32], sign: float, raised: float, moved: float
+) -> tuple[bool, float]:
+    """Add log-likelihoods. Returns whether another set of tags is doubtful, and the rise of the prior of moved tags."""
     changed = False
     for u in range(len(tags)):
         of_tag, before = weights[tags[u]], odds[tags[u]]
@@ -198,7 +194,7 @@ def _learn(weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32
             of_tag[DEAD + k] += sign * told[u, k]
         odds[tags[u]] = _odds(of_tag)
         changed |= (before > LIMIT) != (odds[tags[u]] > LIMIT)
-    return changed
+    return changed, _raised(weights, odds, raised, moved)
 
 
 @compiled
@@ -208,6 +204,8 @@ def _raised(weights: Array, odds: Array, raised: float, moved: float) -> float:
     More tags are believed to have moved with a higher prior. The result is the lowest prior that explains itself, which depends on
     the evidence only, not on its order. ``odds`` (T,) are those with a prior that has risen by ``raised``.
     """
+    if moved == 0.0:
+        return 0.0
     out, read = 0.0, 0
     for t in range(len(odds)):
         read += weights[t, DEAD] == -np.inf

@@ -10,10 +10,9 @@ import numpy as np
 from factors import positive, se2, se2_kernels
 from factors.compiled import compiled
 from factors.odometry.kernels import FAR, ROUNDING
-from factors.rfid.counts import Seen, TagReadCounts
-from factors.rfid.detection import RfidLikelihood, Score
+from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts
 from factors.rfid.factor import RfidFactor
-from factors.rfid.index import MapTags
+from factors.rfid.index import MapTags, Seen
 from factors.rfid.kernels import score
 from factors.rfid.model import Packed
 from factors.se2 import Array, Integers

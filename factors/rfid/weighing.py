@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid.counts import Seen
-from factors.rfid.index import MapTags, NearTags, near_tags
+from factors.rfid.index import MapTags, NearTags, Seen, near_tags
 from factors.rfid.kernels import FAST, MOST_CERTAIN, adjusted, reach_of
 from factors.rfid.model import LOGISTIC, NEGLIGIBLE_LOGIT, Packed
 from factors.rfid.tables import CELL, NEGLIGIBLE, Tables, row_of

@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factors import se2
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel, bake, probability
 from factors.rfid.update import updated

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.index import tag_index, within
 from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel, bake
 from factors.rfid.places import is_wide

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factors.rfid.counts import TagReadCounts, together
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts, together
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, RfidModel
 from factors.rfid.update import updated

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factors import se2
-from factors.rfid.counts import TagReadCounts, together
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts, together
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, DetectionModel, LogisticModel, RfidModel, bake, probability
 

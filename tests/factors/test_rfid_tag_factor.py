@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from factors import se2
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidTagFactor
 from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel, bake
 

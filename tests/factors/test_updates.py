@@ -14,9 +14,9 @@ from factors.landmarks.factor import BearingRangeFactor, landmark_update
 from factors.landmarks.model import BearingRangeModel
 from factors.landmarks.model import predict as predict_landmarks
 from factors.rfid import update as rfid_update
-from factors.rfid.counts import TagReadCounts, moved
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
+from factors.rfid.index import moved
 from factors.rfid.model import Antenna, BeamModel, RfidModel
 from factors.update import update_state
 

@@ -19,8 +19,7 @@ from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate
 from factors import se2
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 
 SENSORS = ("odometry", "rfid")
 KNOWN = RunConfig("particle_filter", {"particles": 1500, "smooth": False}, SENSORS)

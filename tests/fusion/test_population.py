@@ -16,8 +16,7 @@ from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNo
 from factorgraph_loc.sensors.rfid.bound import TagObservation
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factors import se2
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
 from factors.update import Correction
 

@@ -20,8 +20,7 @@ from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate
 from factors import se2
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel
 
 SMALL = {"world": {"width": 7.0, "depth": 6.5, "tags": 8}, "drive": {"duration": 60.0}}

@@ -27,8 +27,7 @@ from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factors import positive, se2
 from factors.graph import Factor
 from factors.rfid import update as rfid_update
-from factors.rfid.counts import TagReadCounts, together
-from factors.rfid.detection import RfidLikelihood
+from factors.rfid.detection import RfidLikelihood, TagReadCounts, together
 from factors.rfid.factor import RfidFactor
 from factors.se2 import Array
 from factors.update import Correction
@@ -90,8 +89,9 @@ class TagObservation:
         iterations: int = 1,
     ) -> Correction:
         """The most likely pose and parameters, by Fisher scoring; what else is in the state follows by correlation."""
-        at = [0, 1, 2, *(i for name in self.blocks for i in range(columns[name].start, columns[name].stop))]
-        before = np.concatenate([rfid_update.NOTHING, *(values[name] for name in self.blocks)])
+        at, before = [0, 1, 2], rfid_update.NOTHING
+        for name in self.blocks:  # at most one
+            at, before = [*at, *range(columns[name].start, columns[name].stop)], np.array(values[name])
         own = np.ascontiguousarray(covariance[np.ix_(at, at)])
         found = rfid_update.updated(self.factor, pose, before, own, iterations)
         delta = np.concatenate((se2.log(se2.between(pose, found.pose)), found.values - before))
@@ -239,8 +239,10 @@ class TagSensor(Sensor):
 
     @property
     def suspicious_since(self) -> float | None:
-        since = self._monitor.suspicious_since, self._consistency.suspicious_since
-        return min((t for t in since if t is not None), default=None)
+        scans, counts = self._monitor.suspicious_since, self._consistency.suspicious_since
+        if scans is None or counts is None:
+            return counts if scans is None else scans
+        return min(scans, counts)
 
     @property
     def silent(self) -> bool:
@@ -256,11 +258,18 @@ class TagSensor(Sensor):
 
     def gathered(self, observations: Sequence[TagObservation]) -> list[Term]:
         """Merge all reads and misses into one factor."""
-        looks = [seen for o in observations if isinstance(seen := o.factor.seen, TagReadCounts)]
-        factors = [o.factor for o in observations if not isinstance(o.factor.seen, TagReadCounts)]
-        if looks and self.tags.likelihood is not None:
-            factors.append(RfidFactor(self.tags.likelihood, together(looks), self.constants.indices))
-        return [Term(factor, self._blocks if factor.estimated else (), factor.rows) for factor in factors]
+        counts: list[TagReadCounts] = []
+        terms: list[Term] = []
+        for observation in observations:
+            factor = observation.factor
+            if isinstance(factor.seen, TagReadCounts):
+                counts.append(factor.seen)
+            else:
+                terms.append(Term(factor, (), factor.rows))
+        if counts and self.tags.likelihood is not None:
+            factor = RfidFactor(self.tags.likelihood, together(counts), self.constants.indices)
+            terms.append(Term(factor, self._blocks, factor.rows))
+        return terms
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
         """The factor as it is, so that no scan is weighed by tag states that were learnt from it. Phase, which has many local

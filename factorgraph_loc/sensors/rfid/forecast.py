@@ -21,8 +21,7 @@ from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factors.compiled import compiled
 from factors.rfid import kernels
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood
+from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.rfid.kernels import FAST
 from factors.rfid.model import RfidModel
 from factors.se2 import Array

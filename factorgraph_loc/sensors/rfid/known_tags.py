@@ -18,8 +18,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factors import positive, se2
-from factors.rfid.counts import TagReadCounts, union
-from factors.rfid.detection import RfidLikelihood, TagArray
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
 from factors.rfid.phase import PhaseLikelihood, PhaseModel, PhaseReads
 from factors.rfid.strength import RssiLikelihood, RssiModel, RssiReads
@@ -154,13 +153,12 @@ class KnownTags:
                 reads.append((rows[number], place))
         if unknown:
             diagnostics.ignore("tag not in the map", unknown)
-        self.states.hear(m.t, np.array(sorted({place for _, place in reads}), dtype=np.int64))
+        at, places = np.array(reads, dtype=np.int64).reshape(-1, 2).T
+        self.states.hear(m.t, np.unique(places))
         self._tell()
-        tags = np.array(sorted({*(place for _, place in reads), *self.states.doubtful.tolist()}), dtype=np.int64)
-        number = {place: i for i, place in enumerate(tags.tolist())}
+        tags = np.unique(np.concatenate((places, self.states.doubtful)))
         hits = np.zeros((len(used), len(tags)), dtype=np.int64)
-        for row, place in reads:
-            hits[row, number[place]] += 1
+        np.add.at(hits, (at, np.searchsorted(tags, places)), 1)
         odds = self.states.odds[tags]
         # what is read of a tag that is believed to have moved tells nothing of an unknown pose
         elsewhere = np.where(hits.any(axis=0) & (odds <= 0.0), -np.inf, 0.0)
@@ -177,12 +175,8 @@ class KnownTags:
 
     def with_states(self, looks: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
         """The looks at tags that may be dead or moved, of which they tell ``evidence``."""
-        looks = looks.listing(union(looks.listed, evidence.tags))
-        at = np.searchsorted(looks.listed, evidence.tags)
-        odds, elsewhere = looks.odds.copy(), looks.elsewhere.copy()
-        odds[at] = self.states.odds[evidence.tags]
-        elsewhere[at] = self.states.expect(evidence.tags, evidence.told)
-        return replace(looks, odds=odds, elsewhere=elsewhere)
+        elsewhere = self.states.expect(evidence.tags, evidence.told)
+        return looks.with_states(evidence.tags, self.states.odds[evidence.tags], elsewhere)
 
     def learn(self, t: float, evidence: TagEvidence) -> None:
         """Learn of the tags that were not read at ``t``, and of those that were read :data:`CONFIRMED` ago."""

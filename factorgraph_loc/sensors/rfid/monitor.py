@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from factors import chi_squared
 from factors.compiled import compiled
-from factors.rfid.counts import TagReadCounts, union
-from factors.rfid.detection import ExpectedReads
+from factors.rfid.detection import ExpectedReads, TagReadCounts
 from factors.se2 import Array, Integers
 
 DURATION = 5.0  # s of scans that are tested jointly
@@ -36,15 +35,12 @@ class SilenceMonitor:
 
     def __init__(self) -> None:
         self._evidence = 0.0
-
-    @property
-    def lasts(self) -> bool:
-        """Whether the last scan was part of such a silence."""
-        return self._evidence < -SILENT
+        self.lasts = False  # whether the last scan was part of such a silence
 
     def add(self, reads: int, evidence: float) -> bool:
         """Add a scan with its number of reads and its log-probability at the predicted pose; True in a silence."""
         self._evidence = 0.0 if reads else self._evidence + evidence
+        self.lasts = self._evidence < -SILENT
         return self.lasts
 
 
@@ -57,13 +53,8 @@ class ScanMonitor:
 
     def __init__(self) -> None:
         self._scans: deque[tuple[float, float, float]] = deque()
-        self._since: float | None = None
+        self.suspicious_since: float | None = None  # the time [s] since which scans are unlikely
         self._usual = 0.0  # mean excess of the negative log-likelihood that was accepted
-
-    @property
-    def suspicious_since(self) -> float | None:
-        """The time [s] since which scans are unlikely, or None."""
-        return self._since
 
     def add(self, t: float, surprise: float, variance: float) -> None:
         """Add a scan: excess of its negative log-likelihood over the expected value, and the variance of that, at the predicted
@@ -73,27 +64,23 @@ class ScanMonitor:
         self._scans.append((t, surprise, variance))
         while self._scans[0][0] < t - KEPT:
             self._scans.popleft()
-        z = self._z()
-        if z > SUSPICIOUS or (self._since is not None and z > CALM):
-            self._since = self._beginning()
+        excess, spread, count = self._sums()
+        z = (excess - count * self._usual) / math.sqrt(spread + 1e-9) if count >= SCANS else 0.0
+        if z > SUSPICIOUS or (self.suspicious_since is not None and z > CALM):
+            self.suspicious_since = self._beginning()
         else:
-            self._since = None
+            self.suspicious_since = None
 
     def accept(self) -> None:
         """Accept the track: the model or the map is wrong instead, and scans will remain as unlikely as the last ones."""
-        surprise, _, count = self._sums()
-        self._usual = surprise / max(count, 1)
-        self._since = None
+        excess, _, count = self._sums()
+        self._usual = excess / max(count, 1)
+        self.suspicious_since = None
 
     def clear(self) -> None:
         """Forget the scans: a new track starts."""
         self._scans.clear()
-        self._since = None
-
-    def _z(self) -> float:
-        """The total excess of the last scans, in standard deviations."""
-        surprise, variance, count = self._sums()
-        return (surprise - count * self._usual) / math.sqrt(variance + 1e-9) if count >= SCANS else 0.0
+        self.suspicious_since = None
 
     def _sums(self) -> tuple[float, float, int]:
         """Sums of the excesses and of the variances of the last scans, and their number."""
@@ -144,7 +131,7 @@ class BurstMonitor:
             self._sums = REMEMBERED * self._sums + (squares, variances)
             self._tags, self._begun = NO_TAGS, t
         _count(self._cells, looks.antennas, looks.rounds, reads.tags, reads.hits, reads.p, counts)
-        self._tags = union(self._tags, reads.tags)
+        self._tags = np.union1d(self._tags, reads.tags)
 
     def clear(self) -> None:
         """Forget this block: the track was wrong."""
@@ -279,8 +266,9 @@ class ConsistencyMonitor:
         self._last = t
         self._groups.sums[:2] *= forgotten
         self._groups.sums[2] *= forgotten**2
-        self._groups.add(looks.antennas, looks.rounds, reads, counts)
-        chance = min((self._chance(one, together) for one in (slice(0, BANDS), slice(BANDS, None))), default=1.0)
+        _add(self._groups.sums, looks.antennas, looks.rounds, reads.hits, reads.p, reads.distance, counts)
+        by_distance, by_antenna = self._chance(slice(0, BANDS), together), self._chance(slice(BANDS, None), together)
+        chance = min(by_distance, by_antenna)
         if chance >= TRUSTED:
             self._odd_since = None
         elif self._odd_since is None:

@@ -13,8 +13,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factors import se2
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood
+from factors.rfid.detection import RfidLikelihood, TagReadCounts
 
 
 @dataclass(frozen=True)

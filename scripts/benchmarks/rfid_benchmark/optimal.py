@@ -21,8 +21,7 @@ from factorgraph_loc.sensors.rfid.known_tags import KnownTags, extent
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factors import se2
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import RfidLikelihood
+from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.se2 import Array
 from rfid_benchmark.grid_filter import GridFilter
 

@@ -7,8 +7,7 @@ from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.sensors.rfid.monitor import BurstMonitor
 from factorgraph_loc.simulation import preset, simulate
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import ExpectedReads
+from factors.rfid.detection import ExpectedReads, TagReadCounts
 
 ANTENNAS, TAGS, STEP = 4, 60, 0.5
 ALL = np.ones(TAGS, dtype=bool)

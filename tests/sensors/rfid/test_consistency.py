@@ -11,8 +11,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.monitor import ConsistencyMonitor
 from factorgraph_loc.sensors.rfid.settings import BeamSettings, PriorSettings, RfidSettings
 from factorgraph_loc.simulation import preset, simulate
-from factors.rfid.counts import TagReadCounts
-from factors.rfid.detection import ExpectedReads
+from factors.rfid.detection import ExpectedReads, TagReadCounts
 
 ANTENNAS, TAGS, STEP = 4, 30, 0.5
 DISTANCE = np.tile(np.linspace(0.2, 5.8, TAGS), (ANTENNAS, 1))
