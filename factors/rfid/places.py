@@ -20,12 +20,11 @@ from factors.compiled import compiled
 from factors.rfid.index import MapTags, Seen, TagIndex, cells
 from factors.rfid.kernels import FAST
 from factors.rfid.model import LOGISTIC, Packed, RfidModel
-from factors.rfid.tables import CELL, Array32, Tables, logs_of, row_of
+from factors.rfid.tables import CELL, NO_MATTER, Array32, Tables, logs_of, row_of
 from factors.rfid.weighing import mixed
 from factors.se2 import Array, Integers
 
 MOST = 1 << 25  # numbers in the tables; more have none
-NO_MATTER = 1e-3  # of a log-likelihood: a smaller difference from a miss out of reach is neglected
 WIDE = 2.0  # times the square that an antenna reaches: poses that touch more are evaluated one by one
 PLACED = 25  # work of a pose, besides that of its tags
 BY_ANTENNA = 7  # work of a tag for one antenna, where there are no tables of places
@@ -147,7 +146,7 @@ class Places:
         """The reads, with the tags listed that are not as most are."""
         _, antennas, rounds, hits, odds, elsewhere, listed, others = seen
         rows = np.arange(len(odds))
-        if len(odds) == len(self.points):
+        if len(odds) == len(self.points) > 0:
             others = float(np.sort(odds)[len(odds) // 2])
             rows = np.flatnonzero(hits.any(axis=0) | (odds != others) | (elsewhere != 0.0))
         number = np.full(len(self.points), -1, dtype=np.int32)
@@ -235,7 +234,7 @@ def _log_likelihood(
                     total += missed.folded[h, i, j]
                 elif tabled:
                     h, i, j = _cell(tables, missed, t, c * ex + s * ey, c * ey - s * ex)
-                    own = np.float64(missed.surveyed[h, i, j])
+                    own = float(missed.surveyed[h, i, j])
                     for k in range(len(scan.antennas)):
                         if scan.hits[k, w] > 0:
                             own += scan.hits[k, w] * tables.gain[scan.antennas[k], h, i, j]

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import se2_kernels
 from factors.compiled import compiled
 from factors.rfid import knots
-from factors.rfid.kernels import seen
+from factors.rfid.kernels import MOST_CERTAIN, placed, seen
 from factors.rfid.model import (
     GRID,
     LOGISTIC,
@@ -22,14 +23,18 @@ from factors.rfid.model import (
     RfidModel,
     logistic_value,
 )
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 Array32 = NDArray[np.float32]
+Measured = tuple[Array, Integers, Integers]  # offsets, antennas and rounds of read counts
+Tags = tuple[Array, Array, Integers, Integers]  # points, normals, tables (A, T) and hits (K, T)
 
 CELL = 0.05  # m
 COARSE = 8  # cells along each side of a block
 FACINGS = 9  # knots of the facing's cosine
 NEGLIGIBLE = 15.0  # log of the ratio of two likelihoods of which the smaller one does not count
+NO_MATTER = 1e-3  # of a log-likelihood: a smaller difference from a miss out of reach is neglected
+SCATTERED = 2.0  # m: tags that may be anywhere in so wide a circle are evaluated pose by pose
 STEP, LEVEL = 0.01, 0.04  # of the logit, in the tables; m of height within which tags share a table
 _LOGITS = np.arange(round(-2.0 * NEGLIGIBLE_LOGIT / STEP) + 1) * STEP + NEGLIGIBLE_LOGIT
 
@@ -179,3 +184,64 @@ def row_of(
     low = np.float64(tables.rows[place + below * size * size])
     high = np.float64(tables.rows[place + (below + 1) * size * size])
     return int(low + (f - below) * (high - low) + 0.5)
+
+
+@compiled
+def relevant(
+    packed: Packed,
+    tables: Tables,
+    poses: Array,
+    looks: Measured,
+    parameters: Array,
+    tags: Tags,
+    near: NDArray[np.bool_],
+    tempering: float,
+) -> NDArray[np.bool_]:
+    """Which measurements of which tags (K, T) matter to some of the poses (N, 3) with ``parameters`` (N or 1, 2 M).
+
+    These are measurements of tags that are ``near`` (T,), and were read or, by the blocks of the tables, could have been. In a
+    dense map most others do not matter.
+    """
+    offsets, antennas, rounds = looks
+    points, _, levels, hits = tags
+    out = np.zeros(hits.shape, np.bool_)
+    low_x, high_x, low_y, high_y = poses[:, 0].min(), poses[:, 0].max(), poses[:, 1].min(), poses[:, 1].max()
+    middle, turned = np.array((0.5 * (low_x + high_x), 0.5 * (low_y + high_y), poses[0, 2])), 0.0
+    for n in range(len(poses)):
+        turned = max(turned, abs(se2_kernels.wrapped(poses[n, 2] - middle[2])))
+    apart = 0.5 * math.hypot(high_x - low_x, high_y - low_y)
+    for k in range(len(antennas)):
+        m, antenna = packed.which[antennas[k]], packed.antennas[antennas[k]]
+        x, y, c, s, _, _ = placed(packed, antennas[k], middle, offsets[k])
+        lever = math.hypot(antenna[0], antenna[1]) + math.hypot(offsets[k, 0], offsets[k, 1])
+        small, large = math.exp(-parameters[:, 2 * m].max()), math.exp(-parameters[:, 2 * m].min())
+        unit = 0.5 * (small + large)
+        least = NO_MATTER * min(packed.peak[m], MOST_CERTAIN) / (tempering * rounds[k] * packed.span)
+        for t in range(len(near)):
+            if hits[k, t] > 0 or packed.kinds[m] == LOGISTIC:
+                out[k, t] = near[t]
+            elif near[t]:
+                ex, ey = points[t, 0] - x, points[t, 1] - y
+                distance = math.hypot(ex, ey)
+                radius = large * (apart + (lever + distance) * turned) + (large - unit) * distance
+                along, across = unit * (c * ex + s * ey), unit * (c * ey - s * ex)
+                level = levels[antennas[k], t]
+                out[k, t] = radius > SCATTERED or _largest(tables, level, along, across, radius) > least
+    return out
+
+
+@compiled
+def _largest(tables: Tables, level: int, along: float, across: float, radius: float) -> float:
+    """An upper bound of the chances of a table in a circle; beyond the edge they are those at the edge."""
+    half, largest = tables.half[level], 0.0
+    last, reach = 2 * half, radius / CELL + 1.0
+    i, j, count = along / CELL + half, across / CELL + half, 2 * half // COARSE + 1
+    for a in range(_block(i - reach, last), _block(i + reach, last) + 1):
+        for b in range(_block(j - reach, last), _block(j + reach, last) + 1):
+            largest = max(largest, tables.most[tables.first[level] + a * count + b])
+    return float(largest)
+
+
+@compiled(inline="always")
+def _block(place: float, last: int) -> int:
+    return int(min(max(place, 0.0), last)) // COARSE

@@ -14,8 +14,7 @@ from factors.compiled import compiled
 from factors.rfid.index import MapTags, NearTags, Seen, near_tags
 from factors.rfid.kernels import FAST, MOST_CERTAIN, adjusted, reach_of
 from factors.rfid.model import LOGISTIC, NEGLIGIBLE_LOGIT, Packed
-from factors.rfid.tables import CELL, NEGLIGIBLE, Tables, row_of
-from factors.rfid.telling import Looks, Tags, telling
+from factors.rfid.tables import CELL, NEGLIGIBLE, Measured, Tables, Tags, relevant, row_of
 from factors.se2 import Array, Integers
 
 BLOCK = 512  # poses at a time, so that what is needed of them stays in the cache
@@ -46,7 +45,7 @@ def log_likelihood(
     tags, odds, elsewhere = _tabled(tables, near), near.odds, near.elsewhere
     near_enough = np.empty(len(odds), np.bool_)
     _near(poses, tags, reach, near_enough)
-    matters = telling(packed, tables, poses, looks, parameters, tags, near_enough, tempering)
+    matters = relevant(packed, tables, poses, looks, parameters, tags, near_enough, tempering)
     base = tempering * len(of_map.points) * _silence(packed, looks[2])
     none = packed.false_read + packed.span / (1.0 + math.exp(-NEGLIGIBLE_LOGIT))
     for t in range(len(odds)):
@@ -165,7 +164,7 @@ def _tabled(tables: Tables, near: NearTags) -> Tags:
 
 
 @compiled
-def _reach(packed: Packed, looks: Looks, parameters: Array) -> float:
+def _reach(packed: Packed, looks: Measured, parameters: Array) -> float:
     """How far [m] the antennas of ``looks`` reach at most, with any of the ``parameters`` (N or 1, 2 M), from the pose."""
     offsets, antennas, _ = looks
     reach = 0.0
@@ -193,7 +192,7 @@ def _near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) -> Non
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def _place(packed: Packed, poses: Array, looks: Looks, parameters: Array, at: Array, models: Array) -> None:
+def _place(packed: Packed, poses: Array, looks: Measured, parameters: Array, at: Array, models: Array) -> None:
     """For each look ``at`` (K, 4, N): place of the antenna, cosine and sine of its heading; and for each of ``models`` (M, 2, N):
     one over the scale of the range, and rate of the probabilities, at poses (N, 3) with ``parameters`` (N or 1, 2 M)."""
     offsets, antennas, _ = looks
@@ -233,7 +232,7 @@ def _of_tag(
     at: Array,
     models: Array,
     count: int,
-    looks: Looks,
+    looks: Measured,
     tags: Tags,
     t: int,
     matters: NDArray[np.bool_],

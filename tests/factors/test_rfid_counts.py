@@ -108,5 +108,3 @@ def test_merged_counts_list_what_any_of_them_lists():
     assert np.array_equal(of_two.hits, whole_of_two.hits[:, of_two.listed])
     assert of_two.elsewhere == pytest.approx(whole_of_two.elsewhere[of_two.listed])
     assert set(of_two.heard) == set(np.flatnonzero(whole_of_two.hits.any(axis=0)))
-    final = of_two.with_odds(np.arange(400.0))
-    assert np.array_equal(final.odds, of_two.listed)

@@ -112,3 +112,20 @@ def test_the_more_tags_have_moved_the_likelier_it_is_of_others() -> None:
     states.forget(2.0)
     assert states.odds == pytest.approx(after)
     assert states.prior == pytest.approx(before)
+
+
+def test_the_order_of_evidence_does_not_matter() -> None:
+    rng = np.random.default_rng(3)
+    tags, moved = np.arange(12), told(-9.0, 1.0)
+    events = [(tag, moved if tag < 4 else rng.normal(0.0, 0.3, (1, 1 + PLACES))) for tag in tags.tolist()]
+    odds = []
+    for order in (events, events[::-1], [events[i] for i in rng.permutation(12)]):
+        states = TagStates(14, 0.03, 0.03)
+        for tag, evidence in order:
+            states.hear(1.0, np.array((tag,)))
+            states.learn(1.0, np.array((tag,)), evidence)
+        odds.append((states.odds, states.prior))
+    assert odds[0][1] > TagStates(14, 0.03, 0.03).prior + 0.5
+    for other, prior in odds[1:]:
+        assert other == pytest.approx(odds[0][0], abs=1e-4)
+        assert prior == pytest.approx(odds[0][1])
