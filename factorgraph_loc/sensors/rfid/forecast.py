@@ -62,7 +62,7 @@ def make_tables(likelihood: RfidLikelihood) -> ScanTables:
     half = math.ceil(reach / CELL)
     levels, level = np.unique(np.rint(tags.points[:, 2] / LEVEL).astype(np.int64), return_inverse=True)
     layers = FACINGS + 1 if any(m.uses_facing for m in model.models) else 1
-    q = _probabilities(model, levels * LEVEL, layers, half)
+    q = _probabilities(model, np.asarray(levels * LEVEL, dtype=float), layers, half)
     floor = max(model.false_read, ALMOST_NEVER)
     q = np.clip(q, floor, 1.0 - ALMOST_NEVER)
     told = np.argwhere((q > floor + NOTHING).any(axis=(0, 1, 4)))
