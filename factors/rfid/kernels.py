@@ -40,7 +40,7 @@ def rate_of(peak: float, shift: float) -> float:
 
 @compiled
 def adjusted(packed: Packed, parameters: Array) -> Packed:
-    """A model (as it was packed first) with these parameters (2 M,)."""
+    """The models with these parameters (2 M,); ``packed``: the models without adjustment."""
     models = len(packed.reach)
     scale, reach, rate = np.empty(models), np.empty(models), np.empty(models)
     for m in range(models):
@@ -139,8 +139,10 @@ def reach_of(packed: Packed, offsets: Array, antennas: Integers) -> float:
 
 @compiled(inline="always")
 def _place_antennas(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[np.int64], out: Array) -> float:
-    """Fill ``out`` (K, 8): position and boresight of each antenna in the world, then boresight and position in the frame of the
-    pose. Returns how far from the pose [m] the antennas reach."""
+    """Fill ``out`` (K, 8): position and boresight of each antenna in the world, then both in the frame of the pose.
+
+    Returns how far from the pose [m] the antennas reach.
+    """
     farthest = 0.0
     for k in range(len(antennas)):
         a = packed.antennas[antennas[k]]
