@@ -1,10 +1,11 @@
-"""A cloud of weighted particles: its moments, its modes, the density that it stands for, and drawing from it."""
+"""A cloud of weighted particles: its moments, its modes, its density, resampling, and the correction by a likelihood."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,9 @@ REACH = np.array((1.0, 1.0, 0.6))  # m, m, rad: from the middle of a mode to its
 BISECTIONS, SMALLEST = 8, 0.01  # of what is left of a likelihood: to find the share that is taken, and the least of it
 LEAST = 1e-3  # of the whole likelihood, that is taken at least: there is an end to what no particle explains
 CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad, in which the heaviest place is looked for
+
+T = TypeVar("T")
+Steps = Generator[float, None, T]  # a computation in steps: it yields the work of each step and returns the result
 
 
 @dataclass(frozen=True)
@@ -148,6 +152,64 @@ class Cloud:
             found.append(Mode(float(weights[near].sum()), middle, covariance))
             free &= ~near
         return tuple(sorted(found, key=lambda m: -m.weight))
+
+
+class Corrected(NamedTuple):
+    """Particles after a share of a likelihood, the log of its mean over them, and the share that is ``left``."""
+
+    cloud: Cloud
+    evidence: float
+    left: float
+
+
+def corrected(
+    cloud: Cloud,
+    likelihood: Callable[[Cloud], Steps[Array]],
+    resampled: Callable[[Cloud], Steps[Cloud]],
+    enough: Callable[[Cloud], float],
+    t: float,
+    *,
+    below: float = 0.0,
+    left: float = 1.0,
+    to_end: bool = True,
+) -> Steps[Corrected]:
+    """Progressive correction (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4).
+
+    The log-likelihood (N,) of a measurement at ``t`` is applied in shares, each as large as leaves ``enough`` effective
+    particles, with resampling after each; after the last one only below the effective size ``below``, relative to N.
+    ``left``: the share to apply. Without ``to_end`` it stops before the last share. RunFailedError if no particle is possible.
+    """
+    evidence = 0.0
+    while left > 0.0:
+        values = weighable((yield from likelihood(cloud)), cloud.log_weights, t)
+        share = largest_share(cloud.log_weights, values, left, enough(cloud))
+        if share >= left and not to_end:
+            break
+        cloud, mean = cloud.weighed(values, share)
+        evidence, left = evidence + mean, left - share
+        if left > 0.0 or effective_size(cloud.log_weights) < below * len(cloud.poses):
+            cloud = yield from resampled(cloud)
+    return Corrected(cloud, evidence, left)
+
+
+def in_one_step(function: Callable[[Cloud], T]) -> Callable[[Cloud], Steps[T]]:
+    """A function of particles as a computation of one step, whose work is not counted."""
+
+    def steps(cloud: Cloud) -> Steps[T]:
+        yield 0.0
+        return function(cloud)
+
+    return steps
+
+
+def finished(steps: Steps[T]) -> T:
+    """The result of a computation in steps."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            result: T = end.value
+            return result
 
 
 def systematic(weights: Array, rng: np.random.Generator, count: int | None = None) -> NDArray[np.int64]:

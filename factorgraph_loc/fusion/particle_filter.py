@@ -26,7 +26,15 @@ from pydantic import Field
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.changes import Change, is_known
-from factorgraph_loc.fusion.cloud import Cloud, largest_share, systematic, vector_moments, weighable
+from factorgraph_loc.fusion.cloud import (
+    Cloud,
+    Corrected,
+    corrected,
+    finished,
+    in_one_step,
+    systematic,
+    vector_moments,
+)
 from factorgraph_loc.fusion.cloud_view import CloudView
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
@@ -304,31 +312,34 @@ class ParticleFilter(Filter):
         return se2.compose(pose, CloudView(self).poses_at(np.array([t]))[0])
 
     def _weigh(self, observation: Observation) -> float:
-        """Weigh the particles by an observation, by a share of it at a time if it leaves too few effective ones: they are resampled
-        in between (progressive correction: Musso, Oudjane, Le Gland, 2001, section 12.4). Where that is much work, a few of them
-        are, until they can take all that is left; by that all are weighed, which are drawn from them. Returns the log of the mean
-        of the likelihood. RunFailedError if that is not finite for any of them."""
-        evidence, left, enough, whole = 0.0, 1.0, self._settings.resample_below, self._state
-        count = self._settings.particles
-        few = count > FEW and observation.work * count > HEAVY
-        if few:
-            self._state = whole.thinned(FEW)
-            count = FEW if self._search.doubts else count  # a track in doubt is not worth more
-        while True:
-            cloud = self._state
+        """Weigh the particles by an observation (:func:`~factorgraph_loc.fusion.cloud.corrected`); returns the log of the mean of
+        the likelihood. Where that is much work, a few of them are corrected first, down to the last share, and all are drawn
+        from these."""
+        cloud, count, enough = self._state, self._settings.particles, self._settings.resample_below
+
+        @in_one_step
+        def likelihood(cloud: Cloud) -> Array:
             values = {name: cloud.constants[:, cloud.parts[name]] for name in observation.blocks}
-            likelihood = weighable(observation.log_likelihood(cloud.poses, values), cloud.log_weights, self._t)
-            share = largest_share(cloud.log_weights, likelihood, left, enough * len(cloud.poses))
-            if few and share >= left and count > FEW:
-                few, enough = False, 0.5 * enough
-                self._state = self._resampled(cloud, count) if left < 1.0 else whole
-                continue
-            self._state, mean = cloud.weighed(likelihood, share)
-            evidence += mean
-            left -= share
-            if left <= 0.0:
+            return observation.log_likelihood(cloud.poses, values)
+
+        def correct(cloud: Cloud, count: int, enough: float, left: float, *, to_end: bool = True) -> Corrected:
+            resampled = in_one_step(lambda cloud: self._resampled(cloud, count))
+            steps = corrected(
+                cloud, likelihood, resampled, lambda c: enough * len(c.poses), self._t, left=left, to_end=to_end
+            )
+            return finished(steps)
+
+        evidence, left = 0.0, 1.0
+        if count > FEW and observation.work * count > HEAVY:
+            doubted = self._search.doubts  # a track in doubt is not worth more than the few
+            few, evidence, left = correct(cloud.thinned(FEW), FEW, enough, left, to_end=doubted)
+            if doubted:
+                self._state = few
                 return evidence
-            self._state = self._resampled(self._state, FEW if few else count)
+            cloud = self._resampled(few, count) if left < 1.0 else cloud
+            enough *= 0.5
+        self._state, more, _ = correct(cloud, count, enough, left)
+        return evidence + more
 
     def _resampled(self, cloud: Cloud, count: int) -> Cloud:
         chosen = systematic(cloud.weights, self._drawn_by, count)

@@ -15,14 +15,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Generator, Hashable
+from collections.abc import Hashable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from factorgraph_loc.fusion import kld
-from factorgraph_loc.fusion.cloud import Cloud, effective_size, largest_share, systematic, weighable
+from factorgraph_loc.fusion.cloud import Cloud, Steps, corrected, effective_size, systematic
 from factorgraph_loc.model.belief import Mode, PosePrior
 from factorgraph_loc.sensors.base import Observation
 from factorgraph_loc.sensors.known_position import KnownPosition
@@ -85,7 +86,7 @@ class Population:
         self._things: set[Hashable] = set()
         self._since = [math.inf for _ in CLEAR]  # when the place had these probabilities first
         self._waiting: deque[_Waiting] = deque()
-        self._running: Generator[float, None, None] | None = None
+        self._running: Steps[None] | None = None
         self._rival = 0.0
 
     @property
@@ -147,7 +148,7 @@ class Population:
                 work -= cost
         return done
 
-    def _taken(self, new: _Waiting) -> Generator[float, None, None]:
+    def _taken(self, new: _Waiting) -> Steps[None]:
         """Take an observation, telling the work of each part of it."""
         odometry, observation = new.odometry, new.observation
         if self._cloud is None or self._odometry is None:
@@ -159,7 +160,14 @@ class Population:
             cloud = self._cloud
             if odometry.t > self._odometry.t:
                 cloud = self._predicted(cloud, self._odometry, odometry)
-        cloud, evidence = yield from self._weighed(cloud, new)
+        cloud, evidence, _ = yield from corrected(
+            cloud,
+            partial(_likelihood, observation),
+            partial(self._resampled, odometry),
+            lambda cloud: ENOUGH * effective_size(cloud.log_weights),
+            odometry.t,
+            below=RESAMPLE_BELOW,
+        )
         self._cloud, self._odometry = cloud, odometry
         self._log_evidence += evidence
         self._rival += new.rival
@@ -213,21 +221,7 @@ class Population:
         noise = self._rng.standard_normal(cloud.poses.shape) @ root.T
         return replace(cloud, poses=se2.compose(se2.compose(cloud.poses, increment.delta), se2.exp(noise)))
 
-    def _weighed(self, cloud: Cloud, new: _Waiting) -> Generator[float, None, tuple[Cloud, float]]:
-        """The cloud after an observation, and the log of the mean of its likelihood."""
-        left, evidence = 1.0, 0.0
-        while left > 0.0:
-            likelihood = yield from _likelihood(cloud, new.observation)
-            likelihood = weighable(likelihood, cloud.log_weights, new.odometry.t)
-            share = largest_share(cloud.log_weights, likelihood, left, ENOUGH * effective_size(cloud.log_weights))
-            cloud, mean = cloud.weighed(likelihood, share)
-            evidence += mean
-            left -= share
-            if effective_size(cloud.log_weights) < RESAMPLE_BELOW * len(cloud.poses):
-                cloud = yield from self._resampled(cloud, new.odometry)
-        return cloud, evidence
-
-    def _resampled(self, cloud: Cloud, now: ChainState) -> Generator[float, None, Cloud]:
+    def _resampled(self, now: ChainState, cloud: Cloud) -> Steps[Cloud]:
         rows = systematic(cloud.weights, self._rng, min(MOST, GROWTH * len(cloud.poses)))
         rows = rows[kld.prefix(cloud.poses[rows], self._rng, FEWEST)]
         yield RESAMPLED * len(cloud.poses)
@@ -265,7 +259,7 @@ def _cloud(poses: Array, log_weights: Array) -> Cloud:
     return Cloud(poses, np.zeros((len(poses), 0)), log_weights, localized=False)
 
 
-def _likelihood(cloud: Cloud, observation: Observation) -> Generator[float, None, Array]:
+def _likelihood(observation: Observation, cloud: Cloud) -> Steps[Array]:
     """The log-likelihood (N,) of the particles, some of them at a time."""
     each = PARTICLE + observation.work
     count = max(1, CHUNK // each)
