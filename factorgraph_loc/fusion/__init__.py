@@ -3,15 +3,14 @@
 __all__ = [
     "base",
     "cloud",
-    "cloud_view",
     "dead_reckoning",
     "ekf",
+    "filter",
     "graph",
     "guarded",
-    "kld",
     "mapping",
     "particle_filter",
     "registry",
+    "search",
     "switching",
-    "timeline",
 ]

@@ -131,12 +131,6 @@ class Cloud:
             log_weights=np.full(len(rows), -np.log(len(rows))),
         )
 
-    def around(self, middle: Array) -> NDArray[np.bool_]:
-        """Which particles (N,) are of a mode with this ``middle`` (3,)."""
-        difference = np.abs(self.poses - middle)
-        difference[:, 2] = np.abs(se2.wrap(difference[:, 2]))
-        return np.asarray(np.all(difference < REACH, axis=1))
-
     def modes(self) -> tuple[Mode, ...]:
         """The places where the weight is, the heaviest first: each with the moments of the particles around it."""
         weights = self.weights
@@ -147,7 +141,7 @@ class Cloud:
             heaviest = free & (which == np.argmax(np.bincount(which, weights * free)))
             middle, _ = _normalised_moments(self.poses[heaviest], weights[heaviest])
             for _ in range(2):
-                near = free & self.around(middle)
+                near = free & around(self.poses, middle)
                 middle, covariance = _normalised_moments(self.poses[near], weights[near])
             found.append(Mode(float(weights[near].sum()), middle, covariance))
             free &= ~near
@@ -218,6 +212,13 @@ def systematic(weights: Array, rng: np.random.Generator, count: int | None = Non
     positions = (rng.random() + np.arange(count)) / count
     cumulative = np.cumsum(weights)
     return np.asarray(np.minimum(np.searchsorted(cumulative / cumulative[-1], positions), len(weights) - 1))
+
+
+def around(poses: Array, middle: Array) -> NDArray[np.bool_]:
+    """Which of the poses (N, 3) belong to a mode with this ``middle`` (3,)."""
+    difference = np.abs(poses - middle)
+    difference[:, 2] = np.abs(se2.wrap(difference[:, 2]))
+    return np.asarray(np.all(difference < REACH, axis=1))
 
 
 def cell_numbers(poses: Array, cell: Array) -> NDArray[np.int64]:

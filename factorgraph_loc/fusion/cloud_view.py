@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.fusion.cloud import vector_moments
+from factorgraph_loc.fusion.filter import Filter
 from factorgraph_loc.fusion.layout import MOTION
-from factorgraph_loc.fusion.timeline import Filter
 from factorgraph_loc.sensors.base import EarlierPose
 from factors import se2
 from factors.se2 import Array

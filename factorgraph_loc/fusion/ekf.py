@@ -15,22 +15,26 @@ import numpy as np
 from pydantic import Field
 from scipy.linalg.lapack import dpotrf
 
-from factorgraph_loc.fusion.heading_search import HeadingSearch
+from factorgraph_loc.fusion.filter import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.search import Search, Tracked
-from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks, world_estimate
-from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
+from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable
 from factorgraph_loc.sensors.binding import bound_sensors
+from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import gaussian_kernels, positive, se2, se2_kernels
+from factors.motion import Increment
 from factors.se2 import Array
 
 NOWHERE = slice(POSE, POSE)  # the columns of a block that there is not
 MOST = 150  # components of the error state from which on positions of the map with a sigma are no part of it, but add to the noise
+# A filter begins with a heading of this many times the standard deviation with which it was found: as the same measurements are
+# processed again, a 16th of their information counts twice. Without any heading it would be linearised far from the truth.
+HEADING_WIDENED = 4.0
 SKEW = 1e-7  # of two standard deviations: more asymmetry is not one of a few roundings
 
 
@@ -147,32 +151,25 @@ class Ekf(Filter):
         self._headings = Search(finders, self._motion, setup.rng)
         self.supports_unknown_start = self._search.possible
         self.supports_unknown_heading = self._headings.possible
-        self._heading: HeadingSearch | None = None
         self._step: _Step | None = None
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian; without a heading, once what is seen tells it."""
-        self._heading = None
+        """Start from a Gaussian; without a heading, once the search has found it."""
         if prior.has_heading:
             super().initialize(prior)
             return
         self._wait(prior.t)
-        self._heading = HeadingSearch(self._headings, self._motion, prior)
+        self._seek_heading(prior, self._headings)
 
-    def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The pose at the time of the newest measurement or tick, or at ``t`` if that is later; ``ambiguous`` while its heading is
-        sought, and while a sensor is silent where it should not be, or not as its model says."""
-        if self._heading is not None:
-            at = self._t if t is None else max(t, self._t)
-            likeliest = self._heading.belief(at).modes[0]
-            return PoseEstimate(at, likeliest.pose, likeliest.covariance, "ambiguous")
-        return super().estimate(t)
-
-    def belief(self, t: float | None = None) -> Belief:
-        """The belief behind :meth:`estimate`; of all headings while that is sought."""
-        if self._heading is None:
-            return super().belief(t)
-        return self._heading.belief(self._t if t is None else max(t, self._t))
+    def _prior(self, t: float, best: PosePrior, moved: Increment, start: KnownPosition | None) -> PosePrior:
+        pose: Array = se2.compose(best.pose, se2.inverse(moved.delta))
+        covariance = HEADING_WIDENED**2 * best.covariance
+        covariance[2, 2] += HEADING_WIDENED**2 * moved.covariance[2, 2]
+        if start is not None:
+            known = np.diag((0.0, 0.0, covariance[2, 2]))
+            known[:2, :2] = start.prior.covariance[:2, :2]
+            pose, covariance = np.append(start.prior.pose[:2], pose[2]), known
+        return PosePrior(t, pose, covariance)
 
     def learnt(self) -> Learnt:
         """The constants and landmarks that are estimated."""
@@ -270,24 +267,6 @@ class Ekf(Filter):
     def _poses_at(self, times: Array) -> Array:
         constants = self._state.layout.values(self._state.rest).get(MOTION, np.zeros(0))
         return self._motion.poses_at(self._odometry, times, constants)
-
-    def _begin(self, m: Measurement) -> None:
-        if self._heading is None:
-            super()._begin(m)
-            return
-        self._heading.start.settle()
-        if m.t < max(self._heading.start.t, self._t - self._max_delay):
-            self._drop_late(m)
-            return
-        self._t = max(self._t, m.t)
-        found = self._heading.take(m)
-        if found is None:
-            return
-        again = self._heading.kept()
-        self.diagnostics.events.append((m.t, "localized"))
-        self.initialize(found)
-        for one in again:
-            self._take(one)
 
     def _seek(self, m: Measurement) -> _State | None:
         found = self._search.best if self._search.look(m, self._odometry) else None

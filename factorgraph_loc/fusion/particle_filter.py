@@ -36,10 +36,11 @@ from factorgraph_loc.fusion.cloud import (
     vector_moments,
 )
 from factorgraph_loc.fusion.cloud_view import CloudView
+from factorgraph_loc.fusion.filter import Filter, FilterSettings, twin
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.search import Search, Tracked
-from factorgraph_loc.fusion.timeline import Filter, FilterSettings, Taken, twin
+from factorgraph_loc.fusion.timeline import Taken
 from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -173,7 +174,7 @@ class ParticleFilter(Filter):
             self._t, self._odometry, self._moves = m.t, self._motion.state(m.t), True
             found = self._found(m.t)
             if found is not None:
-                self._state = found
+                self._state, self._begun = found, m.t
                 self._records.append(self._record())
 
     def _seek(self, m: Measurement) -> Cloud | None:

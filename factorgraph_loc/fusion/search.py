@@ -1,26 +1,28 @@
-"""Where the robot is when no track tells it: an unknown start, a heading that is not known, a robot that was carried elsewhere.
+"""The search for the robot's pose where no track gives it: unknown start, unknown heading, lost track, active localization.
 
-Sensors that tell a place by themselves have finders. Where one only says how likely a place is, as RFID does, particles that begin
-anywhere are weighed by what all sensors see (:mod:`.population`), so that their evidence adds up. On the way what was seen is kept
-with the track's own evidence; when the track comes under suspicion the same search begins among what was seen since then, and
-refutes the track if "somewhere else" has become so much likelier than it. The particles are weighed in slices
-(:meth:`Search.advance`), beside the track, so that no measurement has to wait for the search.
+Sensors that find a pose from their own measurements propose it (:class:`~factorgraph_loc.sensors.base.Finder`). Others, such as
+RFID, only weigh poses: then particles anywhere in the map (:mod:`.population`) are weighed by all sensors, so that their evidence
+adds up. While a track lasts, recent observations are kept with their log-probabilities under the track. Once a sensor doubts the
+track, the particles begin with these observations; the track is rejected when the log-odds of another pose exceed
+:data:`REFUTING`. Particles are weighed in slices of fixed work (:meth:`Search.advance`), so that no measurement waits for them.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from factorgraph_loc.fusion.changes import Change
-from factorgraph_loc.fusion.population import Population
+from factorgraph_loc.fusion.population import FEWEST, Population
+from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.model.belief import Mode, PosePrior
 from factorgraph_loc.model.measurement import Tick
-from factorgraph_loc.sensors.base import Observation, Sensor, View
+from factorgraph_loc.sensors.base import Finder, Observation, Sensor, View
 from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
@@ -29,17 +31,17 @@ from factors.se2 import Array
 from factors.update import Correction
 
 DURATION = 60.0  # s of observations that are kept
-REFUTING = 8.0  # log of the odds that a track must lose by: kidnappings are rare
-BEFORE = 2.0  # s before a suspicion, or before what speaks for a change, in which it may lie
-UNSURE = 5.0  # a change may be at a time for which the log of its likelihood is so much below the highest
-SLICE = 2_500_000  # of work (:mod:`.population`) that is done at a measurement or a tick
+REFUTING = 8.0  # log-odds by which a track must lose: kidnappings are rare
+BEFORE = 2.0  # s before a suspicion, or before the evidence of a change, in which the change may be
+UNSURE = 5.0  # largest difference of a possible change's log-likelihood from the highest
+SLICE = 2_500_000  # work (:mod:`.population`) of one slice
 PAUSE = 0.05  # s between two slices, at least: a measurement and a tick often come at once
-NEAR, SURE = 0.5, 0.9  # m: a place that was found is known once it is so near with so much probability
-APART = 16.0  # squared Mahalanobis distance to the track, beyond which it is another place
+NEAR, SURE = 0.5, 0.9  # m: a pose is known once it is so near with so much probability
+APART = 16.0  # squared Mahalanobis distance from the track, beyond which a pose is another one
 
 
 class WeighedObservation(NamedTuple):
-    """An observation on the way, and the log of its probability under the track."""
+    """An observation on the way, and its log-probability under the track."""
 
     odometry: ChainState
     observation: Observation
@@ -47,7 +49,7 @@ class WeighedObservation(NamedTuple):
 
 
 class Tracked(NamedTuple):
-    """Where a track has come to: the odometry, and the ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
+    """The newest pose of a track: the odometry there, and ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
 
     odometry: ChainState
     pose: Array
@@ -55,7 +57,7 @@ class Tracked(NamedTuple):
 
 
 class Refuted(NamedTuple):
-    """Why a track is given up, and since when it was wrong; ``change``: between which times the robot left it."""
+    """Why a track is rejected, and since when it is wrong; ``change``: between which times the robot left it."""
 
     why: str
     since: float
@@ -63,77 +65,90 @@ class Refuted(NamedTuple):
 
 
 class Search:
-    """The search; see the module. ``sensors``: by the modality of their measurements."""
+    """The search; see the module. ``sensors``: by the modality of their measurements. ``space``: where the robot may be, by default
+    within the bounds of the sensors; ``fewest``: least number of particles; ``work``: of one slice."""
 
-    def __init__(self, sensors: Mapping[str, Sensor], motion: Motion, rng: np.random.Generator) -> None:
-        self._sensors, self._motion, self._rng = sensors, motion, rng
+    def __init__(
+        self,
+        sensors: Mapping[str, Sensor],
+        motion: Motion,
+        rng: np.random.Generator,
+        space: FreeSpace | None = None,
+        fewest: int = FEWEST,
+        work: float = SLICE,
+    ) -> None:
+        self._sensors, self._motion, self._work = sensors, motion, work
         self._finders = {name: sensor.finder for name, sensor in sensors.items() if sensor.finder is not None}
         bounds = [s.bounds for s in sensors.values() if s.bounds is not None]
-        self._bounds = None if not bounds else np.array((np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]))
-        self._population = self._new_population(None)
+        if space is not None:
+            bounds = [np.array((space.centres.min(axis=0), space.centres.max(axis=0)))]
+        self._weighs = bool(bounds)  # whether particles are weighed
+        within = np.array((np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1])) if bounds else np.zeros((2, 2))
+        self._new_population = partial(Population, motion, within, rng, space=space, fewest=fewest)
+        self._population = self._new_population() if self._weighs else None
         self._kept: deque[WeighedObservation] = deque()
-        self._looked: deque[float] = deque()  # when finders' sensors told something on the way
-        self._last: dict[str, float] = {}  # when a sensor last told something new of a place
-        self._newest: ChainState | None = None
+        self._looked: deque[float] = deque()  # times of observations of sensors with a finder
+        self._last: dict[str, float] = {}  # time of each sensor's last evidence
         self._since = -math.inf
-        self._advanced = -math.inf  # when a slice of work was done last
+        self._advanced = -math.inf  # time of the last slice
         self._horizon = motion.horizon
-        self._unsure = False  # whether a track that particles found has not yet been known to half a metre
+        self._unsure = False  # whether a track found by particles has not yet been known to half a metre
+        self.newest: ChainState | None = None  # the odometry at the last informative measurement
         self.start: KnownPosition | None = None
 
     @property
     def possible(self) -> bool:
-        """Whether anything that may be seen tells a place."""
-        return bool(self._finders) or self._bounds is not None
+        """Whether any measurement could give a pose."""
+        return bool(self._finders) or self._weighs
 
     def remember(self) -> None:
-        """Keep the odometry that a search on the way needs."""
+        """Keep the odometry for a search on the way."""
         self._motion.keep(2.0 * DURATION)
         self._horizon = 2.0 * DURATION
 
     def begin(self, start: KnownPosition | None) -> None:
-        """Seek the heading of a start whose position is known; None: that is over."""
+        """Search the heading at a known position; None ends that."""
         self.start = start
         for finder in self._finders.values():
             finder.start = start
         self._motion.keep(self._horizon if start is None else START_KEPT)
-        if start is not None:
+        if start is not None and self._weighs:
             self._population = self._new_population(start)
 
     def look(self, m: Any, odometry: ChainState) -> bool:
-        """Take a measurement while no place is known; False where it tells nothing."""
+        """Process a measurement while the pose is unknown; False if it is uninformative."""
         sensor, finder = self._sensors.get(m.modality), self._finders.get(m.modality)
         if sensor is None:
             return False
         told = finder is not None and finder.look(m, odometry)
         if told:
-            self._newest = odometry
+            self.newest = odometry
         if self._population is not None and self._is_due(sensor, odometry.t):
             seen = sensor.evidence(m)
             if seen is not None:
                 self._population.add(odometry, seen)
         return self.advance(odometry.t) or told
 
+    def weigh(self, observation: Observation, odometry: ChainState) -> None:
+        """Weigh the particles by an observation that is not a sensor's, once they have begun."""
+        if self._population is not None and self._population.newest is not None:
+            self._population.add(odometry, observation)
+
     def advance(self, t: float) -> bool:
-        """Go on at ``t`` with what waits, for one slice of work; whether that told something of a place."""
-        if self._population is None or t < self._advanced + PAUSE:
+        """Weigh the particles for one slice of work at ``t``; whether an observation was completed."""
+        if self._population is None or (t < self._advanced + PAUSE and self._work < math.inf):
             return False
         self._advanced = t
-        if not self._population.advance(SLICE):
+        if not self._population.advance(self._work):
             return False
-        reached = self._population.odometry
-        if reached is not None and (self._newest is None or reached.t > self._newest.t):
-            self._newest = reached
+        reached = self._population.newest
+        if reached is not None and (self.newest is None or reached.t > self.newest.t):
+            self.newest = reached
         return True
 
     @property
-    def newest(self) -> ChainState | None:
-        """The odometry at the last measurement that told something."""
-        return self._newest
-
-    @property
     def best(self) -> PosePrior | None:
-        """The one place that is clear, at its time; None where there is none."""
+        """The pose, at its time, if one is clear; else None."""
         for finder in self._finders.values():
             found = finder.best
             if found is not None and not self._denied(found):
@@ -142,49 +157,42 @@ class Search:
 
     @property
     def waits(self) -> bool:
-        """Whether there is something that was seen and not weighed yet."""
+        """Whether an observation is not yet weighed."""
         return self._population is not None and self._population.waits
 
     def _denied(self, place: PosePrior) -> bool:
-        """Whether the particles tell against a place, or have not yet seen what told it."""
+        """Whether the particles reject this pose, or have not processed the measurement it came from."""
         return self._population is not None and (self._population.waits or self._population.denies(place))
 
     def modes(self, t: float) -> list[Mode]:
-        """Where the robot may be at ``t``, the likeliest place first; none where what was seen tells none. Of a start whose
-        position is known there is always one."""
-        now = self._motion.state(t)
-        at, found = self._hypotheses()
-        if at is None or not found:
+        """Hypotheses of the pose at ``t``, most likely first; at least one for a known start position."""
+        now, leading = self._motion.state(t), self._leading
+        if leading is None or leading.newest is None or not leading.hypotheses:
             return [] if self.start is None else [self.start.mode(now)]
-        since = self._motion.relative(at, now)
+        since = self._motion.relative(leading.newest, now)
         return [
             Mode(h.weight, se2.compose(h.pose, since.delta), h.covariance + se2.body_to_world(h.pose, since.covariance))
-            for h in found
+            for h in leading.hypotheses
         ]
 
     def particles(self, t: float) -> tuple[Array, Array] | None:
-        """Poses (N, 3) at ``t`` and weights (N,) of the particles that are anywhere, if these lead the search."""
-        reached = None if self._population is None else self._population.odometry
-        if self._population is None or reached is None or self._at_once() is not None:
+        """Poses (N, 3) at ``t`` and weights (N,) of the particles, if these lead the search."""
+        leading = self._leading
+        if not isinstance(leading, Population) or leading.newest is None:
             return None
-        poses, weights = self._population.particles
-        return se2.compose(poses, self._motion.relative(reached, self._motion.state(t)).delta), weights
+        poses, weights = leading.particles
+        return se2.compose(poses, self._motion.relative(leading.newest, self._motion.state(t)).delta), weights
 
     def sample(self, rng: np.random.Generator, count: int, now: ChainState) -> tuple[Array, ChainState] | None:
-        """Poses (N, 3) drawn from what is known, and the odometry there, not later than ``now``; None where nothing was seen."""
-        leading = self._at_once()
-        if leading is None and self._population is not None and self._population.odometry is not None:
-            poses, reached = self._population.sample(rng, count), self._population.odometry
-        else:
-            if leading is None:
-                leading = next((f for f in self._finders.values() if f.newest is not None), None)
-            if leading is None:
-                return None
-            poses, reached = leading.sample(rng, count), leading.newest
+        """Random poses (N, 3), and the odometry there, not later than ``now``; None before any informative measurement."""
+        leading = self._leading
+        if leading is None:
+            return None
+        poses, reached = leading.sample(rng, count), leading.newest
         return poses, now if reached is None or reached.t >= now.t else reached
 
     def is_unsure(self, covariance: Array) -> bool:
-        """Whether a track that particles found has not yet been known to :data:`NEAR` with probability :data:`SURE`, nor is by its
+        """Whether a track that particles found has never been known to :data:`NEAR` with probability :data:`SURE`, nor is by its
         ``covariance`` (3, 3) now."""
         return self._unsure and beyond(covariance, NEAR) > 1.0 - SURE
 
@@ -194,7 +202,7 @@ class Search:
         return any(s.suspicious_since is not None or s.silent or s.inconsistent for s in self._sensors.values())
 
     def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
-        """An observation is about to be applied to a track."""
+        """Record an observation that is about to be applied to a track."""
         if sensor.finder is not None:
             sensor.finder.follow(observation, odometry, view)
             self._looked.append(odometry.t)
@@ -204,8 +212,8 @@ class Search:
     def keep(
         self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: Callable[[], float]
     ) -> None:
-        """An observation was applied to a track, under which ``evidence`` tells the log of its probability."""
-        seen = observation.at_its_time() if self._bounds is not None else None
+        """Keep an observation that was applied to a track; ``evidence()``: its log-probability under the track."""
+        seen = observation.at_its_time() if self._weighs else None
         if seen is None or not self._is_due(sensor, odometry.t):
             return
         self._kept.append(WeighedObservation(odometry, seen, evidence()))
@@ -235,12 +243,11 @@ class Search:
         self, odometry: ChainState, pose: Array, covariance: Array, pose_at: Callable[[float, Array], Array]
     ) -> Refuted | None:
         doubting = {s: since for s in self._sensors.values() if (since := s.suspicious_since) is not None}
-        if not doubting or self._bounds is None:
+        if not doubting or not self._weighs:
             self._population = None
             return None
         if self._population is None:
-            self._population, self._since = self._new_population(None), min(doubting.values())
-            assert self._population is not None
+            self._population, self._since = self._new_population(), min(doubting.values())
             for row in self._kept:
                 if row.odometry.t >= self._since:
                     self._population.add(*row)
@@ -258,14 +265,14 @@ class Search:
         return Refuted(next(iter(doubting)).lost, *self._change(best, pose_at))
 
     def _brought(self, best: PosePrior, now: ChainState) -> PosePrior:
-        """A place where the odometry is at ``now``."""
+        """A pose moved to where the odometry is ``now``."""
         since = self._motion.relative(self._motion.state(best.t), now)
         pose = se2.compose(best.pose, since.delta)
         return PosePrior(now.t, pose, best.covariance + se2.body_to_world(pose, since.covariance))
 
     def _change(self, best: PosePrior, pose_at: Callable[[float, Array], Array]) -> tuple[float, Change]:
-        """When the robot must have come to the other place: from then on what was seen is likelier there, before on the track. And
-        between which observations that may have been."""
+        """The most likely time of the change: from then on the observations are more likely at the other pose, before on the
+        track. And the observations between which it may have been."""
         times: list[float] = []
         likelihoods: list[float] = []  # logarithms, of a change just before each time
         total, highest, earliest = 0.0, -math.inf, self._since
@@ -284,9 +291,9 @@ class Search:
         return times[int(np.argmax(likelihoods))], (before, times[possible[0]])
 
     def begin_track(self, *, found: bool) -> None:
-        """A track begins: where the search ``found`` it, with what was seen again that led there, or where it was said to."""
+        """A track begins: where the search ``found`` it, with the observations that led there again, or at a given prior."""
         self.begin(None)
-        self._unsure = found and self._bounds is not None  # what tells a place by itself has said how near it is
+        self._unsure = found and self._weighs  # a finder states the covariance of its pose
         if found:
             self._kept.clear()
             self._last.clear()
@@ -294,28 +301,24 @@ class Search:
             finder.clear()
         self._population = None
 
-    def _hypotheses(self) -> tuple[ChainState | None, Sequence[Mode]]:
-        leading = self._at_once()
-        if leading is None and self._population is not None and self._population.odometry is not None:
-            return self._population.odometry, self._population.hypotheses
-        if leading is None:
-            leading = next((f for f in self._finders.values() if f.newest is not None), None)
-        return (None, ()) if leading is None else (leading.newest, leading.hypotheses)
-
-    def _at_once(self) -> Any:
-        """A finder that one measurement has told a place."""
-        told = (f for f in self._finders.values() if f.at_once and f.newest is not None)
-        return next((f for f in told if self._population is None or f.best is not None), None)
+    @property
+    def _leading(self) -> Finder | Population | None:
+        """Which source leads: a finder that one measurement is enough for, else the particles, else any finder."""
+        told = [finder for finder in self._finders.values() if finder.newest is not None]
+        for finder in told:
+            if finder.at_once and (self._population is None or finder.best is not None):
+                return finder
+        if self._population is not None and self._population.newest is not None:
+            return self._population
+        return next(iter(told), None)
 
     def _is_due(self, sensor: Sensor, t: float) -> bool:
+        """Whether a sensor's last evidence is long enough ago."""
         last = self._last.get(sensor.modality, -math.inf)
         if t <= last or t < last + sensor.evidence_every:
             return False
         self._last[sensor.modality] = t
         return True
-
-    def _new_population(self, start: KnownPosition | None) -> Population | None:
-        return None if self._bounds is None else Population(self._motion, self._bounds, self._rng, start)
 
 
 def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:

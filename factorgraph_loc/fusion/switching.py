@@ -14,8 +14,8 @@ from pydantic import Field
 
 from factorgraph_loc.fusion.base import EVERY
 from factorgraph_loc.fusion.ekf import Ekf, EkfSettings
+from factorgraph_loc.fusion.filter import Filter, FilterSettings, at_ticks
 from factorgraph_loc.fusion.particle_filter import ParticleFilter, ParticleFilterSettings
-from factorgraph_loc.fusion.timeline import Filter, FilterSettings, at_ticks
 from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick

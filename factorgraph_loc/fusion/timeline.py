@@ -1,284 +1,174 @@
-"""What the filters have in common: time, odometry, late measurements, the record of the run."""
+"""The order of time in all estimators: measurements before the start, late ones, and replay.
+
+A measurement that is late by more than ``max_delay`` is counted and dropped. For another late one a filter goes back to its state
+before then and processes the later measurements again; a graph adds a factor at its time. Before a start that is not known the
+measurements are kept until the search has found one pose, and then processed from the first on.
+"""
 
 from __future__ import annotations
 
-import bisect
 import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Container, Sequence
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
-from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.fusion.base import EVERY
-from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, gaussian_belief
+from factorgraph_loc.fusion.search import DURATION, Search
+from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, gaussian_belief
 from factorgraph_loc.model.diagnostics import Addition, Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
-from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import Sensor
+from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
 from factorgraph_loc.sensors.motion import Motion
-from factors import se2, se2_kernels
-from factors.motion import ChainState, Increment
-from factors.se2 import Array
-
-
-class FilterSettings(FileModel):
-    """Settings of every filter."""
-
-    max_delay: Annotated[float, Field(ge=0.0, le=5.0), InUnit("s")] = 0.5
-    """how late a measurement may come; later ones are counted and dropped"""
-    smooth: bool = True
-    """whether the final trajectory uses all measurements, else it repeats the causal one"""
+from factors.motion import Increment
 
 
 class Taken(NamedTuple):
-    """A measurement with what there was before it: the filter's state, time and odometry, and how many records and ticks; and what
-    the diagnostics say of it."""
+    """A processed measurement, the estimator's state ``before`` it, and what it added to the diagnostics."""
 
     measurement: Measurement
-    state: Any
-    t: float
-    odometry: ChainState
-    records: int
-    ticks: int
-    written: list[Addition]
+    before: Any = None
+    added: Sequence[Addition] = ()
 
 
-class Filter(ABC):
-    """A recursive estimator: predicts along the odometry to each measurement's time, then updates.
-
-    The state is replaced, never changed in place, so that a checkpoint costs nothing: a late measurement goes back to the
-    checkpoint before its time and takes those since then once more.
-    """
+class Timeline(ABC):
+    """The order of time in an estimator; see the module."""
 
     deterministic = True
-    supports_unknown_start = False
     takes_rows = True  # of odometry, as one measurement
     modalities: Container[str] = EVERY  # of measurements that may update it; others are counted as ignored
 
-    def __init__(self, setup: Setup, settings: FilterSettings, diagnostics: Diagnostics | None = None) -> None:
-        self.diagnostics = Diagnostics() if diagnostics is None else diagnostics
-        self._max_delay = settings.max_delay
-        self._smooth = settings.smooth
-        calibrates = getattr(settings, "self_calibration", False)
-        self._motion = Motion(setup.rig, setup.sensors, self.diagnostics, self_calibration=calibrates)
+    def __init__(self, motion: Motion, diagnostics: Diagnostics, max_delay: float) -> None:
+        self.diagnostics, self._motion, self._max_delay = diagnostics, motion, max_delay
         self._sensors: dict[str, Sensor] = {}  # by the modality of their measurements
-        self._rng: np.random.Generator | None = None  # of a filter whose predictions draw
-        self._state: Any = None
-        # the last one that was ahead of this one, and the state that it began with: the next tick need not go there once more
-        self._ahead: tuple[Any, Filter] | None = None
-        self._t = -math.inf
-        self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        # whether the odometry at the state's time counts: at a start rows of before it may still come
-        self._moves = False
-        self._ticks: list[float] = []
-        self._records: list[Any] = []
-        self._taken: deque[Taken] = deque()  # the last ones, as far back as one may be late
-
-    def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian."""
-        self._t, self._odometry, self._moves = prior.t, self._motion.state(prior.t), False
-        self._state = self._start(prior)
-        self._taken.clear()
-
-    def _wait(self, t: float) -> None:
-        """Begin at ``t`` without a state: measurements go to :meth:`_begin`."""
-        self._t, self._state = t, None
-        self._taken.clear()
+        self._t = -math.inf  # the newest time
+        self._begun = math.inf  # when the estimator started; infinite before
+        self._taken: deque[Taken] = deque()  # the last measurements, in the order in which they were processed
+        self._seeking: Search | None = None  # finds the start with the measurements that are kept
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
+        self._renew(measurement)
         if measurement.is_motion:
-            self._ahead = None
             self._motion.add(measurement)
-            return
-        if not isinstance(measurement, Tick):
-            self._ahead = None
-            if not self._uses(measurement.modality):
-                self.diagnostics.ignore(measurement.modality, measurement.count)
-                return
-        if self._state is None:
+        elif not (isinstance(measurement, Tick) or self._uses(measurement.modality)):
+            self.diagnostics.ignore(measurement.modality, measurement.count)
+        elif self._begun == math.inf:
             self._begin(measurement)
-        elif measurement.t >= self._t:
-            self._take(measurement)
-        elif measurement.t < self._t - self._max_delay or not self._taken:
+        elif measurement.t < max(self._t - self._max_delay, self._begun):
             self._drop_late(measurement)
         else:
-            self._take_late(measurement)
-
-    def _uses(self, modality: str) -> bool:
-        """Whether measurements of a modality may update it."""
-        return modality in self._sensors
+            self._process(measurement)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The pose at the time of the newest measurement or tick, or at ``t`` if that is later; not a number before the start."""
-        if self._state is None:
-            return PoseEstimate(self._t, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
-        return self._at(t)._estimate()
+        """The pose at the time of the newest measurement or tick, or at ``t`` if that is later.
+
+        Before the start: the most likely hypothesis of the search, ``ambiguous``, or NaN if there is none. Later it is
+        ``ambiguous`` while a search is going on, and while the measurements are not as expected.
+        """
+        if self._begun < math.inf:
+            return self._estimate_at(t)
+        at = self._t if t is None else max(t, self._t)
+        modes = [] if self._seeking is None else self._seeking.modes(at)
+        if not modes:
+            return PoseEstimate(at, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
+        return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
 
     def belief(self, t: float | None = None) -> Belief:
-        """The belief behind :meth:`estimate`."""
-        return gaussian_belief(self.estimate(t))
-
-    def learnt(self) -> Learnt:
-        """Nothing, unless the filter says otherwise."""
-        return Learnt()
-
-    def forget(self, before: float) -> None:
-        """Forget the trajectory before then, but not what late measurements may still change."""
-        self._ahead = None
-        t = min(before, self._t - self._max_delay)
-        records = max(0, bisect.bisect_left(self._records, t, key=lambda record: record.t) - 1)
-        ticks = bisect.bisect_left(self._ticks, self._records[records].t) if records else 0
-        del self._records[:records], self._ticks[:ticks]
-        self._taken = deque(
-            taken._replace(records=taken.records - records, ticks=taken.ticks - ticks) for taken in self._taken
-        )
+        """The belief behind :meth:`estimate`; before the start all hypotheses of the search, and its particles."""
+        if self._begun < math.inf or self._seeking is None:
+            return gaussian_belief(self.estimate(t))
+        at = self._t if t is None else max(t, self._t)
+        particles = self._seeking.particles(at)
+        return Belief(tuple(self._seeking.modes(at)), *(() if particles is None else particles))
 
     @abstractmethod
-    def trajectory(self) -> Trajectory:
-        """The best estimate of the whole past at the stamps of the ticks."""
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a Gaussian."""
 
     @abstractmethod
-    def _start(self, prior: PosePrior) -> Any:
-        """The state that stands for the prior."""
+    def _estimate_at(self, t: float | None) -> PoseEstimate:
+        """:meth:`estimate` after the start."""
 
     @abstractmethod
-    def _predict(self, t: float) -> None:
-        """Move the state along to ``t``, and the odometry."""
+    def _process(self, m: Measurement) -> None:
+        """Process a measurement that is not too late."""
 
-    @abstractmethod
-    def _see(self, m: Any) -> None:
-        """Take what a sensor saw at the state's time."""
-
-    def _pass(self, tick: Tick) -> None:
-        """At a tick, once the state is there: go on with what waits, if anything does."""
+    def _renew(self, m: Measurement) -> None:
+        """A measurement arrives: discard what was computed for questions before it."""
         return
 
-    @abstractmethod
-    def _estimate(self) -> PoseEstimate:
-        """Mean and covariance of the state."""
-
-    @abstractmethod
-    def _record(self) -> Any:
-        """What :meth:`trajectory` needs of this time, with its time as ``t``."""
-
-    def _seek(self, m: Any) -> Any:
-        """The state from a measurement alone, for an unknown start; None where it does not tell one."""
-        return None
-
-    def _at(self, t: float | None) -> Self:
-        """The filter itself, or one that is ahead of it, by what :meth:`_take` would do at ``t``: it is there to be read."""
-        if t is None or t <= self._t or self._state is None:
-            return self
-        self._ahead = None
-        ahead = object.__new__(type(self))  # as copy.copy does, in a third of the time
-        vars(ahead).update(vars(self))
-        ahead._rng = None if self._rng is None else twin(self._rng)
-        ahead._anchor()
-        ahead._move(t)
-        self._ahead = self._state, ahead
-        return ahead
-
-    def _anchor(self) -> None:
-        """At the first measurement after a start: the odometry there is what has come by now."""
-        if not self._moves:
-            self._odometry, self._moves = self._motion.state(self._t), True
-
-    def _move(self, t: float) -> None:
-        """Go on to ``t``, or stay if that is now."""
-        if t <= self._t:
-            return
-        known, self._ahead = self._ahead, None
-        if known is not None and known[0] is self._state and known[1]._t == t:
-            self._catch_up(known[1])
-            return
-        self._predict(t)
-        self._t = t
-
-    def _travelled(self, t: float) -> Increment:
-        """The motion to ``t``, to which the odometry goes on."""
-        self._odometry, increment = self._motion.travelled(self._odometry, t)
-        return increment
-
-    def _catch_up(self, ahead: Filter) -> None:
-        """Take over what the one that is ahead has predicted; the generator stays, as others draw by it too."""
-        rng = self._rng
-        vars(self).update(vars(ahead))
-        self._rng = rng
-        if rng is not None and ahead._rng is not None:
-            rng.bit_generator.state = ahead._rng.bit_generator.state
+    def _uses(self, modality: str) -> bool:
+        """Whether measurements of a modality may update the estimator."""
+        return modality in self._sensors
 
     def _begin(self, m: Measurement) -> None:
-        """Start without a prior, at the first measurement that tells something of the pose."""
-        if isinstance(m, Tick):
-            return
-        self._t, self._odometry, self._moves = m.t, self._motion.state(m.t), True
-        self._state = self._seek(m)
-        if self._state is not None:
-            self._records.append(self._record())
-        elif not self.supports_unknown_start:
-            self.diagnostics.ignore("before the start")
+        """Process a measurement before the start."""
+        if self._seeking is not None:
+            self._seek_start(m, self._seeking)
 
-    def _take(self, m: Measurement) -> None:
-        self._anchor()
-        before = (self._state, self._t, self._odometry, len(self._records), len(self._ticks))
-        written = self.diagnostics.record()
-        self._move(m.t)
-        if isinstance(m, Tick):
-            self._ticks.append(m.t)
-            self._pass(m)
-        else:
-            self._see(m)
-        self.diagnostics.added = None
-        self._records.append(self._record())
-        self._taken.append(Taken(m, *before, written))
-        while self._taken[0].measurement.t < m.t - self._max_delay:
+    def _seek_heading(self, prior: PosePrior, search: Search) -> None:
+        """Search the heading at a known position."""
+        self._t, self._seeking = prior.t, search
+        search.begin(KnownPosition(prior, self._motion))
+
+    def _seek_start(self, m: Measurement, search: Search) -> None:
+        """Search with a measurement; if that gives one pose, start there and process all measurements again."""
+        start = search.start
+        if start is not None:
+            start.settle()
+            if m.t < max(start.t, self._t - self._max_delay):
+                self._drop_late(m)
+                return
+        self._t = max(self._t, m.t)
+        told = search.advance(m.t) if isinstance(m, Tick) else search.look(m, self._motion.state(m.t))
+        if not told and search.newest is None and not search.waits and start is None:
+            return  # the run begins with the first informative measurement
+        self._remember(Taken(m), DURATION if start is None else START_KEPT)
+        best = search.best if told else None
+        if best is None:
+            return
+        again = self._take_back(-math.inf)
+        self.diagnostics.event(m.t, "localized")
+        kept = start if start is not None and self._t <= start.t + START_KEPT else None
+        t = again[0].t if kept is None else kept.t
+        moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))
+        self.initialize(self._prior(t, best, moved, kept))
+        search.begin_track(found=True)
+        self._replay(again)
+
+    def _prior(self, t: float, best: PosePrior, moved: Increment, start: KnownPosition | None) -> PosePrior:
+        """The prior at ``t``, for a search that found the pose ``best`` after the robot ``moved``; ``start``: its known position
+        at ``t``."""
+        raise NotImplementedError
+
+    def _replay(self, measurements: Sequence[Measurement]) -> None:
+        """Process measurements again."""
+        for m in measurements:
+            self._process(m)
+
+    def _remember(self, taken: Taken, span: float) -> None:
+        """Keep a measurement for ``span`` [s]."""
+        self._taken.append(taken)
+        while self._taken[0].measurement.t < taken.measurement.t - span:
             self._taken.popleft()
 
-    def _take_late(self, late: Measurement) -> None:
-        again: list[Measurement] = []
-        while self._taken and self._t > late.t:
-            last = self._taken.pop()
-            again.append(last.measurement)
-            self._go_back(last)
-        if self._t > late.t:
-            self._drop_late(late)
-        else:
-            again.append(late)
-        for m in sorted(again, key=lambda m: m.t):
-            self._take(m)
+    def _take_back(self, t: float) -> list[Measurement]:
+        """Undo the measurements from ``t`` on; returned are these in the order of their times."""
+        undone = [taken for taken in self._taken if taken.measurement.t >= t]
+        self._taken = deque(taken for taken in self._taken if taken.measurement.t < t)
+        for taken in reversed(undone):
+            self.diagnostics.take_back(taken.added)
+            self._go_back(taken)
+        return sorted((taken.measurement for taken in undone), key=lambda m: m.t)
+
+    def _go_back(self, taken: Taken) -> None:
+        """Return to the state before a measurement."""
+        return
 
     def _drop_late(self, m: Measurement) -> None:
         if not isinstance(m, Tick):
             self.diagnostics.drop_late(m.modality, m.count)
-
-    def _go_back(self, taken: Taken) -> None:
-        self._state, self._t, self._odometry = taken.state, taken.t, taken.odometry
-        del self._records[taken.records :], self._ticks[taken.ticks :]
-        self.diagnostics.take_back(taken.written)
-        for sensor in self._sensors.values():
-            sensor.rewind(self._t)
-
-
-def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: Array) -> Trajectory:
-    """The trajectory at the stamps ``ticks``, of records at times ``t`` (N,): the last record of each stamp counts."""
-    rows = np.searchsorted(t, np.unique(np.array(ticks)), side="right") - 1
-    covariances = se2.body_to_world(poses[rows], body_covariances[rows])
-    return Trajectory(np.unique(np.array(ticks)), poses[rows], covariances)
-
-
-def world_estimate(t: float, pose: Array, covariance: Array, status: Status = "localized") -> PoseEstimate:
-    """An estimate from the covariance (S, S) of an error state that begins with the pose's body-frame perturbation."""
-    return PoseEstimate(t, pose, se2_kernels.body_to_world(pose, covariance), status)
-
-
-def twin(rng: np.random.Generator) -> np.random.Generator:
-    """A generator that will draw the same numbers; a deep copy takes four times as long."""
-    bits = type(rng.bit_generator)(0)
-    bits.state = rng.bit_generator.state
-    return np.random.Generator(bits)

@@ -61,6 +61,19 @@ class FreeSpace:
     distance: Array
     clearance: float
 
+    @property
+    def area(self) -> float:
+        """The area [m^2] of the free cells."""
+        return len(self.centres) * CELL**2
+
+    def drawn(self, rng: np.random.Generator, count: int) -> Array:
+        """Random poses (N, 3), evenly over the free cells and all headings."""
+        cells = np.floor((np.arange(count) + rng.random()) * len(self.centres) / count)
+        places = self.centres[cells.astype(np.int64)] + CELL * (rng.random((count, 2)) - 0.5)
+        # a low-discrepancy sequence (golden ratio), so that neighbouring cells get different headings
+        shares = (np.arange(count) * 0.5 * (math.sqrt(5.0) - 1.0)) % 1.0
+        return np.column_stack((places, math.pi * (2.0 * shares - 1.0)))
+
     def cells(self, points: Array) -> NDArray[np.int64]:
         """Return the numbers (N,) of the free cells that contain points (N, 2), -1 where a point is not in one."""
         places = np.floor((points - self.origin) / CELL).astype(np.int64)

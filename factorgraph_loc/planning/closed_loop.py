@@ -20,7 +20,7 @@ from factorgraph_loc.model.belief import Belief, Mode, PoseEstimate
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
+from factorgraph_loc.planning.active_mcl import ActiveMcl
 from factorgraph_loc.planning.paths import Path, look_around, primitives, waypoint_paths, waypoints
 from factorgraph_loc.planning.policies import Choice, Policy, Situation, make_policy, usable
 from factorgraph_loc.planning.robot import SimulatedRobot
@@ -298,7 +298,7 @@ def _rates(simulation: SimulationSettings) -> Iterator[tuple[str, float]]:
 def _estimator(name: str, setup: model_setup.Setup, settings: ActiveSettings) -> Estimator:
     if name == "active_mcl":
         space = free_space(setup.world, max(settings.clearance - SLACK, 0.0))
-        return ActiveMcl(setup, ActiveMclSettings(particles=settings.particles), space)
+        return ActiveMcl(setup, settings.particles, space)
     if name not in ACTIVE_ESTIMATORS:
         raise InputError(
             f"no estimator of active runs is called {quoted(name)}{nearest(name, list(ACTIVE_ESTIMATORS))}"

@@ -46,7 +46,7 @@ class ActiveSettings(FileModel):
 
     policy: PolicySettings = PolicySettings()
     particles: Annotated[int, Field(ge=100, le=100_000)] = 2000
-    """particles of active_mcl once the pose is nearly known, up to ten times as many before"""
+    """least number of particles of active_mcl"""
     speed: Annotated[float, Field(ge=0.01, le=3.0), InUnit("m/s")] = 0.5
     """speed of the robot"""
     turn_rate: Annotated[float, Field(ge=0.01, le=6.0), InUnit("rad/s")] = 1.0

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.files.models import InUnit
-from factorgraph_loc.fusion.timeline import Filter, FilterSettings
+from factorgraph_loc.fusion.filter import Filter, FilterSettings
 from factorgraph_loc.model.belief import Learnt, LearntPoint, PoseEstimate, PosePrior
 from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.model.setup import MapUse, Setup

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from factorgraph_loc.fusion.population import ELSEWHERE, FRESH
 from factorgraph_loc.maps.free_space import free_space
 from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.planning.active_mcl import ActiveMcl, ActiveMclSettings
+from factorgraph_loc.planning.active_mcl import ActiveMcl, LengthsSeen
 from factorgraph_loc.planning.robot import SimulatedRobot
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
@@ -25,19 +26,18 @@ def made(seed: int = 0, name: str = "office"):
     rng = np.random.default_rng((seed, 2))
     start = np.array((*space.centres[rng.integers(len(space.centres))], rng.uniform(-math.pi, math.pi)))
     robot = SimulatedRobot(world, space, simulation, start, ActiveSettings(), rng)
-    return ActiveMcl(setup, ActiveMclSettings(), space), robot, space
+    return ActiveMcl(setup, 2000, space), robot, space
 
 
 def test_particles_begin_evenly_over_free_space_and_headings():
-    estimator, _, space = made()
-    cloud = estimator._everywhere()
-    assert len(cloud.poses) == 20_000
-    assert np.allclose(cloud.weights, 1.0 / 20_000)
-    assert (space.cells(cloud.poses[:, :2]) >= 0).all()
+    _, _, space = made()
+    poses = space.drawn(np.random.default_rng(0), 20_000)
+    assert poses.shape == (20_000, 3)
+    assert (space.cells(poses[:, :2]) >= 0).all()
     # 20,000 in 20 stretches and 8 directions: 1,000 and 2,500 each, were they drawn at random within 92 and 140 (3 sigma)
-    number = np.bincount((space.cells(cloud.poses[:, :2]) * 20) // len(space.centres), minlength=20)
+    number = np.bincount((space.cells(poses[:, :2]) * 20) // len(space.centres), minlength=20)
     assert np.abs(number - 1000).max() <= 6
-    headings = np.bincount(((cloud.poses[:, 2] + math.pi) * 4.0 / math.pi).astype(int) % 8, minlength=8)
+    headings = np.bincount(((poses[:, 2] + math.pi) * 4.0 / math.pi).astype(int) % 8, minlength=8)
     assert np.abs(headings - 2500).max() <= 6
 
 
@@ -46,7 +46,7 @@ def test_fewer_particles_are_enough_once_the_place_is_known():
     for m in (*robot.begin(), *robot.wait(3.0)):
         estimator.process(m)
     assert estimator.estimate().status == "localized"
-    assert 2000 <= len(estimator.belief().particles) < 4000
+    assert 1000 <= len(estimator.belief().particles) < 4000  # besides those anywhere
 
 
 def test_stated_errors_fit_the_real_ones():
@@ -65,17 +65,26 @@ def test_stated_errors_fit_the_real_ones():
     assert np.median(values) < 6.0
 
 
+class Blank:
+    """An observation that says nothing."""
+
+    found, work, things = 0, 1, frozenset()
+
+    def log_likelihood(self, poses, values):
+        return np.zeros(len(poses))
+
+
 def test_particles_that_run_into_walls_lose_their_weight():
     estimator, _, space = made()
-    estimator.process(IncrementOdometry(0.0, 0.0, 0.0, 0.0))
-    estimator._t, estimator._state = 0.0, estimator._everywhere()
-    estimator._odometry = estimator._motion.state(0.0)
-    for k in range(20):
-        estimator.process(IncrementOdometry(0.1 * (k + 1), 0.1, 0.0, 0.0))
-        estimator.process(Tick(0.1 * (k + 1)))
-    inside = space.cells(estimator.belief().particles[:, :2]) >= 0
+    population, motion = estimator._search._population, estimator._motion
+    for k in range(21):
+        motion.add(IncrementOdometry(0.1 * k, 0.1 * min(k, 1), 0.0, 0.0))
+        population.add(motion.state(0.1 * k), Blank())
+        population.advance()
+    poses, weights = population.particles
+    inside = space.cells(poses[:, :2]) >= 0
     assert 0.1 < inside.mean() < 0.9
-    assert estimator.belief().weights[inside].sum() > 0.9
+    assert weights[inside].sum() > 0.9
 
 
 def test_trajectory_is_what_it_said():
@@ -95,10 +104,11 @@ def test_a_corridor_tells_the_heading_and_leaves_both_its_directions():
     by one look after the other, both directions keep a share: a half each within .4, which they miss by luck in few of 100."""
     estimator, robot, _ = made(name="symmetric")
     robot.pose = np.array((1.5, 7.0, math.pi / 2.0))
-    estimator._state = estimator._everywhere()
+    population, now = estimator._search._population, estimator._motion.state(0.0)
     for _ in range(3):
-        estimator.see(robot.proximity, robot.look())
-    poses, weights = estimator._state.poses, estimator._state.weights
+        population.add(now, LengthsSeen(robot.proximity, robot.look()))
+        population.advance()
+    poses, weights = population.particles
     # along some corridor: those across are in the crossbar, where the robot would look along x
     in_arm = (poses[:, 0] < 3.0) | (poses[:, 0] > 27.0)
     aligned = np.abs(np.sin(poses[:, 2] - np.where(in_arm, math.pi / 2.0, 0.0))) < 0.3
@@ -114,14 +124,19 @@ def test_what_is_seen_before_the_first_scan_is_left():
     assert estimator.belief().particles is None
 
 
-def test_particles_that_have_lost_the_robot_begin_anew_where_tags_are_read():
-    """All particles are at the other end of the building."""
+def test_particles_that_have_lost_the_robot_find_it_again_where_tags_are_read():
+    """All particles but those that are drawn anywhere are at the other end of the building."""
     estimator, robot, space = made()
     for m in (*robot.begin(), *robot.wait(2.0)):
         estimator.process(m)
     far = space.centres[np.argmax(np.hypot(*(space.centres - robot.pose[:2]).T))]
-    count = len(estimator._state.poses)
-    estimator._state = replace(estimator._state, poses=np.tile((*far, 0.0), (count, 1)))
+    population = estimator._search._population
+    population.advance()
+    cloud = population._cloud
+    poses = np.concatenate((np.tile((*far, 0.0), (len(cloud.poses) - FRESH, 1)), space.drawn(robot._noise, FRESH)))
+    log_weights = np.full(len(poses), -np.log(len(poses)))
+    log_weights[-FRESH:] = math.log(ELSEWHERE / FRESH)
+    population._cloud, population._hypotheses = replace(cloud, poses=poses, log_weights=log_weights), None
     for m in robot.wait(3.0):
         estimator.process(m)
     assert np.hypot(*(estimator.estimate().pose - robot.pose)[:2]) < 0.5
@@ -135,7 +150,7 @@ def test_landmarks_in_sight_tell_the_place():
     setup = Setup(simulation.rig, world, ("odometry", "rfid", "bearing_range"), np.random.default_rng(1))
     start = np.array((1.5, 18.0, 1.0))
     robot = SimulatedRobot(world, space, simulation, start, ActiveSettings(), np.random.default_rng(2))
-    estimator = ActiveMcl(setup, ActiveMclSettings(), space)
+    estimator = ActiveMcl(setup, 2000, space)
     reports = list(robot.begin())
     assert len(reports[-1].landmarks) >= 2
     for m in (*reports, *robot.wait(1.0)):

@@ -6,21 +6,19 @@ that it left the window with. Where landmarks or points are estimated, which loo
 history. With ``final_only``, as in the batch, the graph is built with a guess and solved at the end only; but where points are
 estimated, such a guess drifts too far to tell which sightings belong together, and iSAM2 solves the graph on the way.
 
-Before the start the last measurements are kept until they tell one place; then they are taken in from their first on. So they are
-where the start is known but for its heading; the graph then begins at that start. On the way, when what is seen refutes the track
-and tells another place, the graph goes back to where that began, and goes on there after a step of unknown length. Replay runs in
-slices of fixed work, so that results do not depend on the machine; until the graph has caught up it does not claim to be localized.
+When the search rejects the track and finds another pose, the graph goes back to the time of the change, and goes on at that pose
+after a step of unknown length. Measurements are replayed in slices of fixed work, so that results do not depend on the machine;
+until the graph has caught up it does not claim to be localized.
 """
 
 from __future__ import annotations
 
-import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.fusion.base import EVERY
 from factorgraph_loc.fusion.graph.batch import AtTheEnd
 from factorgraph_loc.fusion.graph.graph import Graph
 from factorgraph_loc.fusion.graph.isam import Incremental
@@ -29,14 +27,15 @@ from factorgraph_loc.fusion.graph.settings import BatchSettings, SmootherSetting
 from factorgraph_loc.fusion.graph.variables import Keyframe
 from factorgraph_loc.fusion.mapping import Mapper
 from factorgraph_loc.fusion.search import DURATION, Refuted, Search, Tracked
-from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior, Status, gaussian_belief
-from factorgraph_loc.model.diagnostics import Addition, Diagnostics
+from factorgraph_loc.fusion.timeline import Taken, Timeline
+from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
+from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.plugins import MAPPERS
 from factorgraph_loc.sensors.binding import bound_sensors
-from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
+from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2
 from factors.motion import ChainState, Increment
@@ -62,21 +61,18 @@ class _Conclusion:
     covariances: Array
 
 
-class Smoother:
+class Smoother(Timeline):
     """Incremental factor graph (iSAM2): a window and the whole problem at the end, a fixed lag, or the full history. See above."""
 
-    deterministic = True
-    modalities = EVERY
-    takes_rows = True
     estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
 
     def __init__(self, setup: Setup, settings: SmootherSettings, widest: float = WIDEST) -> None:
         self._settings = settings
-        self.diagnostics = Diagnostics()
-        self._max_delay = settings.max_delay
+        diagnostics = Diagnostics()
         calibration: Calibration = "all" if settings.self_calibration else "none"
-        self._motion = Motion(setup.rig, setup.sensors, self.diagnostics, self_calibration=settings.self_calibration)
-        sensors = bound_sensors(
+        motion = Motion(setup.rig, setup.sensors, diagnostics, self_calibration=settings.self_calibration)
+        super().__init__(motion, diagnostics, settings.max_delay)
+        self._sensors = sensors = bound_sensors(
             setup,
             self._motion,
             self.diagnostics,
@@ -90,7 +86,7 @@ class Smoother:
             if found is not None:
                 mappers.append(found)
         self._graph = Graph(self._motion, sensors, mappers, self.diagnostics)
-        self._search = Search(sensors, self._motion, setup.rng)
+        self._search = self._seeking = Search(sensors, self._motion, setup.rng)
         self._search.remember()
         # where landmarks are estimated too, they cannot tell the place
         self.supports_unknown_start = settings.landmarks == "known"
@@ -100,73 +96,42 @@ class Smoother:
         else:
             self._backend = Incremental(self._graph, settings, widest if settings.final_only else 1.0)
         self._builder = Builder(self._graph, self._backend, self._search, settings)
-        # the last measurements, in the order in which they were taken, with what the diagnostics say of them
-        self._recent: deque[tuple[Measurement, list[Addition]]] = deque()
         self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # at the last measurement
-        self._behind: deque[Measurement] = deque()  # what was seen and is still to be taken in, after a track has begun
+        self._behind: deque[Measurement] = deque()  # measurements that are still to be replayed
         self._conclusion: _Conclusion | None = None  # the end, until something is taken
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian; without a heading, once what is seen tells it."""
+        """Start from a Gaussian; without a heading, once the search has found it."""
         if not prior.has_heading:
-            self._graph.t = prior.t
-            self._search.begin(KnownPosition(prior, self._motion))
+            self._seek_heading(prior, self._search)
             return
+        self._t = self._begun = prior.t
         self._search.begin_track(found=False)
         self._backend.begin(self._graph.begin(prior))
 
-    def process(self, measurement: Measurement) -> None:
-        """Take one measurement, in time or late by at most ``max_delay``."""
+    def _renew(self, m: Measurement) -> None:
         self._conclusion = None
-        graph = self._graph
-        if measurement.is_motion:
-            self._motion.add(measurement)
-        elif not (isinstance(measurement, Tick) or measurement.modality in graph.sensors):
-            self.diagnostics.ignore(measurement.modality, measurement.count)
-        elif graph.prior is None:
-            self._seek(measurement)
-        elif measurement.t < max(graph.t - self._max_delay, graph.prior.t):
-            self._drop_late(measurement)
+
+    def _process(self, m: Measurement) -> None:
+        on_time = m.t >= self._t
+        if self._behind:
+            self._behind.append(m)
+            self._t = max(self._t, m.t)
+            self._catch_up()
         else:
-            on_time = measurement.t >= graph.t
-            if self._behind:
-                self._behind.append(measurement)
-                graph.t = max(graph.t, measurement.t)
-                self._catch_up()
-            else:
-                self._take(measurement)
-            if on_time and not self._behind:
-                self._doubt(measurement)
+            self._take(m)
+        if on_time and not self._behind:
+            self._doubt(m)
 
-    def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The newest keyframe, moved along the odometry since, to the newest time or to ``t`` if that is later; before the start
-        the likeliest place, if there is any.
-
-        ``ambiguous`` before one place is clear, and while what is seen is not what is expected. With ``final_only`` it is a guess
-        that is not to be scored, and ``unlocalized``.
-        """
-        graph = self._graph
-        at = graph.t if t is None else max(t, graph.t)
-        if graph.prior is None:
-            modes = self._search.modes(at)
-            if not modes:
-                return PoseEstimate(at, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
-            return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
-        pose, _, covariance = graph.moved(at)
+    def _estimate_at(self, t: float | None) -> PoseEstimate:
+        """The newest keyframe, moved along the odometry since; with ``final_only`` a guess, ``unlocalized``."""
+        at = self._t if t is None else max(t, self._t)
+        pose, _, covariance = self._graph.moved(at)
         doubted = self._behind or self._search.doubts or self._search.is_unsure(covariance)
         status: Status = "ambiguous" if doubted else "localized"
         if self._settings.final_only:
             status = "unlocalized"
         return PoseEstimate(at, pose, covariance, status)
-
-    def belief(self, t: float | None = None) -> Belief:
-        """The belief behind :meth:`estimate`; before the start all places that what was seen allows, and the particles of a search
-        that has them."""
-        if self._graph.prior is not None:
-            return gaussian_belief(self.estimate(t))
-        at = self._graph.t if t is None else max(t, self._graph.t)
-        particles = self._search.particles(at)
-        return Belief(tuple(self._search.modes(at)), *(() if particles is None else particles))
 
     def learnt(self) -> Learnt:
         """The constants and landmarks that are estimated, as the final trajectory has them."""
@@ -199,59 +164,21 @@ class Smoother:
             self._conclusion = _Conclusion(graph, *self._backend.final(graph))
         return self._conclusion
 
-    def _drop_late(self, m: Measurement) -> None:
-        if not isinstance(m, Tick):
-            self.diagnostics.drop_late(m.modality, m.count)
-
     def _take(self, m: Measurement) -> None:
         added = self.diagnostics.record()
         if not self._graph.is_anchored:
             self._graph.anchor()
-        self._odometry = self._motion.state(m.t)
+        self._t, self._odometry = max(self._t, m.t), self._motion.state(m.t)
         if isinstance(m, Tick):
             self._builder.pass_time(self._odometry)
         elif not self._builder.take(m, self._odometry):
             self._drop_late(m)
         self.diagnostics.added = None
-        self._remember(m, added)
+        self._remember(Taken(m, added=added), DURATION)
 
-    def _remember(self, m: Measurement, added: list[Addition]) -> None:
-        self._recent.append((m, added))
-        while self._recent[0][0].t < m.t - (DURATION if self._search.start is None else START_KEPT):
-            self._recent.popleft()
-
-    def _take_back(self, t: float) -> list[Measurement]:
-        """The last measurements from ``t`` on, by their times: forgotten, as they are taken once more."""
-        again = [(m, written) for m, written in self._recent if m.t >= t]
-        self._recent = deque((m, written) for m, written in self._recent if m.t < t)
-        for _, written in reversed(again):
-            self.diagnostics.take_back(written)
-        return sorted((m for m, _ in again), key=lambda m: m.t)
-
-    def _seek(self, m: Measurement) -> None:
-        """Before the start: see whether what was seen tells one place by now, and start there."""
-        graph, start = self._graph, self._search.start
-        if start is not None:
-            start.settle()
-            if m.t < max(start.t, graph.t - self._max_delay):
-                self._drop_late(m)
-                return
-        graph.t = max(graph.t, m.t)
-        told = self._search.advance(m.t) if isinstance(m, Tick) else self._search.look(m, self._motion.state(m.t))
-        if not told and self._search.newest is None and not self._search.waits and start is None:
-            return  # the run begins with the first measurement that tells something
-        self._remember(m, [])
-        best = self._search.best if told else None
-        if best is None:
-            return
-        replay = self._take_back(-math.inf)
-        self.diagnostics.events.append((m.t, "localized"))
-        t = replay[0].t
-        prior = PosePrior(t, self._placed(t, best), FOUND)
-        if start is not None and graph.t <= start.t + START_KEPT:
-            prior = start.facing(float(self._placed(start.t, best)[2]))
-        self.initialize(prior)
-        self._replay(replay)
+    def _prior(self, t: float, best: PosePrior, moved: Increment, start: KnownPosition | None) -> PosePrior:
+        pose = self._placed(t, best)
+        return PosePrior(t, pose, FOUND) if start is None else start.facing(float(pose[2]))
 
     def _doubt(self, m: Measurement) -> None:
         """See whether the measurement refutes the track, and go on at the place that the search finds instead."""
@@ -269,7 +196,7 @@ class Smoother:
         best = None if refuted is None else self._search.best
         if refuted is not None and best is not None:
             what = f"lost: {refuted.why} since {refuted.since:.1f} s; goes on at another place"
-            self.diagnostics.events.append((self._graph.t, what))
+            self.diagnostics.events.append((self._t, what))
             self._go_on(refuted, best)
 
     def _go_on(self, refuted: Refuted, best: PosePrior) -> None:
@@ -294,6 +221,7 @@ class Smoother:
             sensor.restart(t)
         graph.forget_points()
         self._backend.begin(keyframe)
+        self._search.begin_track(found=True)
         self._replay(replay)
 
     def _placed(self, t: float, best: PosePrior) -> Array:
@@ -301,16 +229,15 @@ class Smoother:
         moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))
         return se2.compose(best.pose, se2.inverse(self._graph.recalibrated(moved).delta))
 
-    def _replay(self, measurements: list[Measurement]) -> None:
-        self._search.begin_track(found=True)
+    def _replay(self, measurements: Sequence[Measurement]) -> None:
         self._behind.extend(measurements)
-        self._graph.t = max(m.t for m in measurements)
+        self._t = max(m.t for m in measurements)
         self._catch_up()
 
     @property
     def _taken_until(self) -> float:
         """The time until which all that came has been taken in."""
-        return min((m.t for m in self._behind), default=self._graph.t)
+        return min((m.t for m in self._behind), default=self._t)
 
     def _catch_up(self) -> None:
         """Go on with what is taken in once more, for one slice of work."""

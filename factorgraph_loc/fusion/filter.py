@@ -1,0 +1,238 @@
+"""What filters have in common: prediction along the odometry, checkpoints for late measurements, and the record of the run."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from typing import Annotated, Any, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.files.models import FileModel, InUnit
+from factorgraph_loc.fusion.timeline import Taken, Timeline
+from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.measurement import Measurement, Tick
+from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.motion import Motion
+from factors import se2, se2_kernels
+from factors.motion import ChainState, Increment
+from factors.se2 import Array
+
+
+class FilterSettings(FileModel):
+    """Settings of every filter."""
+
+    max_delay: Annotated[float, Field(ge=0.0, le=5.0), InUnit("s")] = 0.5
+    """how late a measurement may come; later ones are counted and dropped"""
+    smooth: bool = True
+    """whether the final trajectory uses all measurements, else it repeats the causal one"""
+
+
+class _Checkpoint(NamedTuple):
+    """The state of a filter: its own, time and odometry, and the numbers of records and ticks."""
+
+    state: Any
+    t: float
+    odometry: ChainState
+    records: int
+    ticks: int
+
+
+class Filter(Timeline):
+    """A recursive estimator: predicts along the odometry to each measurement's time, then updates.
+
+    The state is replaced, never changed in place, so that a checkpoint costs nothing.
+    """
+
+    supports_unknown_start = False
+
+    def __init__(self, setup: Setup, settings: FilterSettings, diagnostics: Diagnostics | None = None) -> None:
+        diagnostics = Diagnostics() if diagnostics is None else diagnostics
+        calibrates = getattr(settings, "self_calibration", False)
+        motion = Motion(setup.rig, setup.sensors, diagnostics, self_calibration=calibrates)
+        super().__init__(motion, diagnostics, settings.max_delay)
+        self._smooth = settings.smooth
+        self._rng: np.random.Generator | None = None  # of a filter whose predictions draw
+        self._state: Any = None
+        # the last prediction that was asked for, and the state that it began with: the next tick need not go there once more
+        self._ahead: tuple[Any, Filter] | None = None
+        self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        # whether the odometry at the state's time is final: at a start earlier rows may still come
+        self._moves = False
+        self._ticks: list[float] = []
+        self._records: list[Any] = []
+
+    def initialize(self, prior: PosePrior) -> None:
+        """Start from a Gaussian."""
+        self._t = self._begun = prior.t
+        self._odometry, self._moves, self._seeking = self._motion.state(prior.t), False, None
+        self._state = self._start(prior)
+        self._taken.clear()
+
+    def _wait(self, t: float) -> None:
+        """Begin at ``t`` without a state: measurements go to :meth:`_begin`."""
+        self._t, self._begun, self._state = t, math.inf, None
+        self._taken.clear()
+
+    def _renew(self, m: Measurement) -> None:
+        if not isinstance(m, Tick):
+            self._ahead = None
+
+    def learnt(self) -> Learnt:
+        """Nothing, unless the filter says otherwise."""
+        return Learnt()
+
+    def forget(self, before: float) -> None:
+        """Forget the trajectory before then, but not what late measurements may still change."""
+        self._ahead = None
+        t = min(before, self._t - self._max_delay)
+        records = max(0, bisect.bisect_left(self._records, t, key=lambda record: record.t) - 1)
+        ticks = bisect.bisect_left(self._ticks, self._records[records].t) if records else 0
+        del self._records[:records], self._ticks[:ticks]
+
+        def moved(at: _Checkpoint) -> _Checkpoint:
+            return at._replace(records=at.records - records, ticks=at.ticks - ticks)
+
+        self._taken = deque(taken._replace(before=moved(taken.before)) for taken in self._taken)
+
+    @abstractmethod
+    def trajectory(self) -> Trajectory:
+        """The best estimate of the whole past at the stamps of the ticks."""
+
+    @abstractmethod
+    def _start(self, prior: PosePrior) -> Any:
+        """The state that stands for the prior."""
+
+    @abstractmethod
+    def _predict(self, t: float) -> None:
+        """Move the state along to ``t``, and the odometry."""
+
+    @abstractmethod
+    def _see(self, m: Any) -> None:
+        """Update the state by a measurement at its time."""
+
+    def _pass(self, tick: Tick) -> None:
+        """At a tick, once the state is there: go on with a search, if there is one."""
+        return
+
+    @abstractmethod
+    def _estimate(self) -> PoseEstimate:
+        """Mean and covariance of the state."""
+
+    @abstractmethod
+    def _record(self) -> Any:
+        """What :meth:`trajectory` needs of this time, with its time as ``t``."""
+
+    def _seek(self, m: Any) -> Any:
+        """The state from a measurement alone, for an unknown start; None if it gives none."""
+        return None
+
+    def _estimate_at(self, t: float | None) -> PoseEstimate:
+        return self._at(t)._estimate()
+
+    def _at(self, t: float | None) -> Self:
+        """The filter itself, or one that was predicted to ``t``, which is there to be read."""
+        if t is None or t <= self._t or self._state is None:
+            return self
+        self._ahead = None
+        ahead = object.__new__(type(self))  # as copy.copy does, in a third of the time
+        vars(ahead).update(vars(self))
+        ahead._rng = None if self._rng is None else twin(self._rng)
+        ahead._anchor()
+        ahead._move(t)
+        self._ahead = self._state, ahead
+        return ahead
+
+    def _anchor(self) -> None:
+        """At the first measurement after a start: the odometry there is what has come by now."""
+        if not self._moves:
+            self._odometry, self._moves = self._motion.state(self._t), True
+
+    def _move(self, t: float) -> None:
+        """Go on to ``t``, or stay if that is now."""
+        if t <= self._t:
+            return
+        known, self._ahead = self._ahead, None
+        if known is not None and known[0] is self._state and known[1]._t == t:
+            self._catch_up(known[1])
+            return
+        self._predict(t)
+        self._t = t
+
+    def _travelled(self, t: float) -> Increment:
+        """The motion to ``t``, to which the odometry goes on."""
+        self._odometry, increment = self._motion.travelled(self._odometry, t)
+        return increment
+
+    def _catch_up(self, ahead: Filter) -> None:
+        """Take over a prediction; the generator stays, as others draw by it too."""
+        rng = self._rng
+        vars(self).update(vars(ahead))
+        self._rng = rng
+        if rng is not None and ahead._rng is not None:
+            rng.bit_generator.state = ahead._rng.bit_generator.state
+
+    def _begin(self, m: Measurement) -> None:
+        """Start without a prior, at the first measurement that gives a pose, or as the search finds it."""
+        if self._seeking is not None:
+            super()._begin(m)
+        elif not isinstance(m, Tick):
+            self._t, self._odometry, self._moves = m.t, self._motion.state(m.t), True
+            self._state = self._seek(m)
+            if self._state is not None:
+                self._begun = m.t
+                self._records.append(self._record())
+            elif not self.supports_unknown_start:
+                self.diagnostics.ignore("before the start")
+
+    def _process(self, m: Measurement) -> None:
+        again = self._take_back(math.nextafter(m.t, math.inf)) if m.t < self._t else []
+        for one in (m, *again):
+            self._take(one)
+
+    def _take(self, m: Measurement) -> None:
+        self._anchor()
+        before = _Checkpoint(self._state, self._t, self._odometry, len(self._records), len(self._ticks))
+        added = self.diagnostics.record()
+        self._move(m.t)
+        if isinstance(m, Tick):
+            self._ticks.append(m.t)
+            self._pass(m)
+        else:
+            self._see(m)
+        self.diagnostics.added = None
+        self._records.append(self._record())
+        self._remember(Taken(m, before, added), self._max_delay)
+
+    def _go_back(self, taken: Taken) -> None:
+        if taken.before is None:
+            return
+        self._state, self._t, self._odometry, records, ticks = taken.before
+        del self._records[records:], self._ticks[ticks:]
+        for sensor in self._sensors.values():
+            sensor.rewind(self._t)
+
+
+def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: Array) -> Trajectory:
+    """The trajectory at the stamps ``ticks``, of records at times ``t`` (N,): the last record of each stamp counts."""
+    rows = np.searchsorted(t, np.unique(np.array(ticks)), side="right") - 1
+    covariances = se2.body_to_world(poses[rows], body_covariances[rows])
+    return Trajectory(np.unique(np.array(ticks)), poses[rows], covariances)
+
+
+def world_estimate(t: float, pose: Array, covariance: Array, status: Status = "localized") -> PoseEstimate:
+    """An estimate from the covariance (S, S) of an error state that begins with the pose's body-frame perturbation."""
+    return PoseEstimate(t, pose, se2_kernels.body_to_world(pose, covariance), status)
+
+
+def twin(rng: np.random.Generator) -> np.random.Generator:
+    """A generator that will draw the same numbers; a deep copy takes four times as long."""
+    bits = type(rng.bit_generator)(0)
+    bits.state = rng.bit_generator.state
+    return np.random.Generator(bits)
