@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.cloud import Cloud, Steps, around, corrected, effective_size, systematic
 from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.model.belief import Mode, PosePrior
-from factorgraph_loc.sensors.base import Observation
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
@@ -58,11 +57,23 @@ RESAMPLED = 60  # of a particle in each half of a resampling
 BEGUN = 80  # of a particle at first, with what the sensors make for the search
 
 
+class Evidence(Protocol):
+    """An observation as far as particles need it; see :class:`~factorgraph_loc.sensors.base.Observation`."""
+
+    @property
+    def found(self) -> int: ...
+    @property
+    def work(self) -> int: ...
+    @property
+    def things(self) -> frozenset[Hashable]: ...
+    def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array: ...
+
+
 class _Waiting(NamedTuple):
     """An observation in the queue, and its log-probability under the track that the population competes with."""
 
     odometry: ChainState
-    observation: Observation
+    observation: Evidence
     rival: float
 
 
@@ -125,7 +136,7 @@ class Population:
         """Poses (N, 3) at the last observation and weights (N,); none before the first observation."""
         return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
 
-    def add(self, odometry: ChainState, observation: Observation, rival: float = 0.0) -> bool:
+    def add(self, odometry: ChainState, observation: Evidence, rival: float = 0.0) -> bool:
         """Queue an observation made at ``odometry``; False if it is older than the last one and is left out. ``rival``: its
         log-probability under the track."""
         newest = self._waiting[-1].odometry if self._waiting else self._begun
@@ -257,7 +268,7 @@ def _cloud(poses: Array, log_weights: Array) -> Cloud:
     return Cloud(poses, np.zeros((len(poses), 0)), log_weights, localized=False)
 
 
-def _likelihood(observation: Observation, cloud: Cloud) -> Steps[Array]:
+def _likelihood(observation: Evidence, cloud: Cloud) -> Steps[Array]:
     """The log-likelihood (N,) of the particles, in chunks."""
     each = PARTICLE + observation.work
     count = max(1, CHUNK // each)

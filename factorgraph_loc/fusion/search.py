@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from factorgraph_loc.fusion.changes import Change
-from factorgraph_loc.fusion.population import FEWEST, Population
+from factorgraph_loc.fusion.population import FEWEST, Evidence, Population
 from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.model.belief import Mode, PosePrior
 from factorgraph_loc.model.measurement import Tick
@@ -129,7 +129,7 @@ class Search:
                 self._population.add(odometry, seen)
         return self.advance(odometry.t) or told
 
-    def weigh(self, observation: Observation, odometry: ChainState) -> None:
+    def weigh(self, observation: Evidence, odometry: ChainState) -> None:
         """Weigh the particles by an observation that is not a sensor's, once they have begun."""
         if self._population is not None and self._population.newest is not None:
             self._population.add(odometry, observation)
