@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.rfid import kernels, weighing
-from factors.rfid.index import MapTags, Seen, listing, moved, tag_index
+from factors.rfid.index import MapTags, Seen, moved, tag_index
 from factors.rfid.model import Packed, RfidModel
 from factors.rfid.places import Places, in_reach, is_wide, reach_of
 from factors.rfid.tables import Tables, make_tables
@@ -88,9 +88,13 @@ class TagReadCounts:
     def with_states(self, tags: Integers, odds: Array, elsewhere: Array) -> TagReadCounts:
         """The counts with ``tags`` (U,) listed too, which have these ``odds`` (U,) and ``elsewhere`` (U,)."""
         both = np.union1d(self.listed, tags)
-        hits, all_odds, all_elsewhere = listing(self.listed, self.hits, self.odds, self.elsewhere, self.others, both)
-        at = np.searchsorted(both, tags)
-        all_odds[at], all_elsewhere[at] = odds, elsewhere
+        hits = np.zeros((len(self.hits), len(both)), dtype=np.int64)
+        all_odds, all_elsewhere = np.full(len(both), self.others), np.zeros(len(both))
+        rows = (self.listed, self.odds, self.elsewhere), (tags, odds, elsewhere)
+        hits[:, np.searchsorted(both, self.listed)] = self.hits
+        for chosen, own_odds, own_elsewhere in rows:
+            at = np.searchsorted(both, chosen)
+            all_odds[at], all_elsewhere[at] = own_odds, own_elsewhere
         return replace(self, hits=hits, odds=all_odds, elsewhere=all_elsewhere, tags=both)
 
     def moved(self, offset: Array) -> TagReadCounts:

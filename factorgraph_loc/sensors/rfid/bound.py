@@ -24,7 +24,7 @@ from factorgraph_loc.sensors.rfid.monitor import (
     SilenceMonitor,
 )
 from factorgraph_loc.sensors.rfid.stream import RfidScan
-from factors import positive, se2
+from factors import positive, se2_kernels
 from factors.graph import Factor
 from factors.rfid import update as rfid_update
 from factors.rfid.detection import RfidLikelihood, TagReadCounts, together
@@ -94,7 +94,7 @@ class TagObservation:
             at, before = [*at, *range(columns[name].start, columns[name].stop)], np.array(values[name])
         own = np.ascontiguousarray(covariance[np.ix_(at, at)])
         found = rfid_update.updated(self.factor, pose, before, own, iterations)
-        delta = np.concatenate((se2.log(se2.between(pose, found.pose)), found.values - before))
+        delta = np.concatenate((se2_kernels.twist_to(pose, found.pose), found.values - before))
         after = found.covariance
         if len(covariance) > len(at):
             gain = positive.solve(own, covariance[at]).T
@@ -218,7 +218,11 @@ class TagSensor(Sensor):
         assert self.tags.likelihood is not None
         nominal = self.tags.likelihood.parameters
         value = view.value(self.modality) if self._blocks else None
-        return nominal if value is None else self.constants.full(value, len(nominal))
+        if value is None:
+            return nominal
+        out = nominal.copy()
+        out[list(self.constants.indices)] = value
+        return out
 
     def _is_evidence(self, observation: TagObservation, evidence: float) -> bool:
         # a scan without reads that is repeated after going back in time counts once
