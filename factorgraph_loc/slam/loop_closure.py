@@ -16,7 +16,7 @@ import numpy as np
 
 from factorgraph_loc.fusion.graph.variables import Guess, Keyframe
 from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.sensors.camera.sensor import lifted
+from factorgraph_loc.sensors.camera.known_points import lifted
 from factorgraph_loc.vision.association import TURNED as VIEWED
 from factorgraph_loc.vision.association import ZOOMED, Associations, Associator
 from factorgraph_loc.vision.consensus import CameraPose, Truths

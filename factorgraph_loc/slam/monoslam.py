@@ -23,7 +23,7 @@ from factorgraph_loc.model.belief import Learnt, LearntPoint, PoseEstimate, Pose
 from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera.sensor import CAMERAS, Pixels
+from factorgraph_loc.sensors.camera.known_points import CAMERAS, Pixels
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.turn_check import TurnCheck
 from factorgraph_loc.sensors.registry import moving

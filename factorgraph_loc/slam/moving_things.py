@@ -15,7 +15,7 @@ import numpy as np
 
 from factorgraph_loc.fusion.graph.variables import Keyframe
 from factorgraph_loc.fusion.mapping import GraphView
-from factorgraph_loc.sensors.camera.sensor import lifted
+from factorgraph_loc.sensors.camera.known_points import lifted
 from factorgraph_loc.vision.consensus import GATE, Truths
 from factors import positive
 from factors.camera.model import CameraModel, linearize_in_space

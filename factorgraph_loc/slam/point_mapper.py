@@ -11,8 +11,8 @@ from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.base import Sensor
-from factorgraph_loc.sensors.camera.bound import CameraSensor
-from factorgraph_loc.sensors.camera.sensor import Pixels
+from factorgraph_loc.sensors.camera.known_points import Pixels
+from factorgraph_loc.sensors.camera.sensor import CameraSensor
 from factorgraph_loc.slam.frame_pairs import FramePairs
 from factorgraph_loc.slam.moving_things import MovingThings
 from factorgraph_loc.slam.new_points import FEWEST

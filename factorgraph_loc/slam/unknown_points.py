@@ -17,7 +17,7 @@ from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING, Estimated
-from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, Pixels, lifted
+from factorgraph_loc.sensors.camera.known_points import ITERATIONS, SETTLED, Pixels, lifted
 from factorgraph_loc.slam.image_times import ImageTimes
 from factorgraph_loc.slam.local_bundle import bundled
 from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints

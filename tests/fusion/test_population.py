@@ -13,7 +13,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
-from factorgraph_loc.sensors.rfid.bound import TagObservation
+from factorgraph_loc.sensors.rfid.sensor import TagObservation
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factors import se2
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts

@@ -8,7 +8,7 @@ from factorgraph_loc.maps.free_space import distance_to_walls
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import PixelSettings
-from factorgraph_loc.sensors.camera.simulate import pixel_stream, surface_normals
+from factorgraph_loc.sensors.camera.simulation import pixel_stream, surface_normals
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.worlds import STANDOFF
 from factors.camera import model as reprojection

@@ -9,7 +9,7 @@ from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.settings import Landmark, SightingSettings
-from factorgraph_loc.sensors.landmarks.simulate import sighting_stream
+from factorgraph_loc.sensors.landmarks.simulation import sighting_stream
 from factorgraph_loc.simulation import PRESETS, read_settings, simulate
 from factors import se2
 from factors.landmarks import model as bearing_range

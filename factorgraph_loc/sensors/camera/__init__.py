@@ -5,8 +5,8 @@ from factorgraph_loc.sensors.registry import Channel, SensorType
 
 __all__ = [
     "SENSOR",
-    "bound",
     "frontend",
+    "known_points",
     "measurement",
     "sensor",
     "settings",
@@ -46,7 +46,7 @@ SENSOR = SensorType(
     settings={"camera": Section("factorgraph_loc.sensors.camera.settings:CameraSettings")},
     detects="points",
     undetected="no point of the map was found in an image",
-    bind="factorgraph_loc.sensors.camera.bound:bind",
+    bind="factorgraph_loc.sensors.camera.sensor:bind",
     summarize="factorgraph_loc.sensors.camera.summary:summarize",
     check="factorgraph_loc.sensors.camera.use:check",
     review="factorgraph_loc.sensors.camera.use:review",
@@ -54,7 +54,7 @@ SENSOR = SensorType(
     simulation={
         "pixels": Section("factorgraph_loc.sensors.camera.settings:PixelSettings", always=True),
     },
-    simulate="factorgraph_loc.sensors.camera.simulate:simulate",
-    looks="factorgraph_loc.sensors.camera.simulate:looks",
-    forecast="factorgraph_loc.sensors.camera.simulate:forecast",
+    simulate="factorgraph_loc.sensors.camera.simulation:simulate",
+    looks="factorgraph_loc.sensors.camera.simulation:looks",
+    forecast="factorgraph_loc.sensors.camera.simulation:forecast",
 )

@@ -1,324 +1,347 @@
-"""Points of the map seen by a camera, identified by name or by matching features."""
+"""The camera sensor of a run: points of the map, by name or matched by appearance; and localization from images alone.
+
+For an unknown or wrong start, and for a kidnapped robot, an image with enough inliers gives the pose by itself; otherwise
+several images must agree along the odometry. A track is suspicious if points of the map are persistently not found where they
+are predicted. If the start position is known, an image must agree with it.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from types import MappingProxyType
+from collections import defaultdict, deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
 
 import numpy as np
 
-from factorgraph_loc.maps.common_error import without_common
-from factorgraph_loc.maps.markers import marker_of
-from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.settings import Estimated
-from factorgraph_loc.model.setup import MapUse, Setup
-from factorgraph_loc.sensors.camera.measurement import PixelSightings
-from factorgraph_loc.vision.association import Associator
-from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
-from factorgraph_loc.vision.frame import CameraFrame
-from factorgraph_loc.vision.relocalization import FoundOnFloor, found_on_floor, on_floor
-from factorgraph_loc.vision.spread import spread_out
-from factors import se2
+from factorgraph_loc.model.belief import Mode, PosePrior
+from factorgraph_loc.model.measurement import GOING_BACK
+from factorgraph_loc.model.settings import NOTHING, Estimated
+from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
+from factorgraph_loc.sensors.camera.known_points import (
+    CAMERAS,
+    ITERATIONS,
+    SETTLED,
+    KnownPoints,
+    Pixels,
+    Predicted,
+)
+from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.turn_check import TurnCheck
+from factorgraph_loc.sensors.known_position import KnownPosition
+from factorgraph_loc.sensors.motion import Motion
+from factorgraph_loc.vision.relocalization import FoundOnFloor
+from factors import positive, se2
 from factors.camera import model as reprojection
-from factors.camera import update_kernels as pixel_kernels
-from factors.camera.factor import ReprojectionFactor
+from factors.camera.factor import ReprojectionFactor, image_update
 from factors.camera.floor import TiltScale
-from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel
-from factors.motion import Increment, propagate
+from factors.camera.model import TIME_OFFSET
+from factors.motion import ChainState, propagate
 from factors.se2 import Array
 from factors.update import Correction
 
-DISAGREES = "camera: does not agree with the others"  # reason of a rejection
-CAMERAS = ("camera", "sightings")  # channels that use the rig's camera: features, and named points
-FEW_SHARE = 0.3  # of named points: with fewer inliers, points are missing
-FEW, MANY = 6, 20  # of matched points: fewer than FEW inliers where MANY are expected means that points are missing
-UNSURE = 1.0  # m: a prediction with a larger standard deviation may miss the map
-MOST = 100  # points used per image; more add little, as errors of neighbouring points are correlated
-STEEPEST = 0.06  # rad: what tilts by more is no robot on a floor, or its camera is not mounted as the rig says
-NEAR = 3.0  # m: from where `exact_survey` compares the survey of a point with a pixel
-EXACT = 0.1  # a map is treated as exact if its errors are below this share of a pixel's, seen from 1 m
-# Pixels are so precise that one step from a poor prediction does not reach the optimum
-ITERATIONS, SETTLED = 8, 1e-3  # m, rad: convergence limit of a step
-
-NOT_DISPLACED: Mapping[str, tuple[Array, Array]] = MappingProxyType({})
-Pixels = PixelSightings | CameraFrame  # measurements of a camera
+PASS = 10.0  # s: looks within it have the error of a point's survey in common, where that is not estimated
+SOLVE_EVERY = 0.45  # s between solver updates; in between, images only update the newest pose, as in a filter
 
 
 @dataclass(frozen=True)
-class Predicted:
-    """The prediction for an image: ``pose`` (3,) of the factor's variable with body-frame ``covariance`` (3, 3), and the
-    corrections (P,) of the camera's constants that are estimated with their ``spread`` (P, P)."""
+class PixelObservation(ResidualObservation):
+    """Points seen in one image.
 
-    pose: Array
-    covariance: Array
-    constants: Array | None = None
-    spread: Array | None = None
-
-
-class KnownPoints:
-    """Turns camera measurements into factors. Points that map or rig lack are counted as ignored, outliers as rejected.
-
-    ``estimated``: the camera's constants that are estimated. ``use``: see
-    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`.
+    ``seen``: as a factor on the pose, and perhaps on the camera's constants and on displacements of points. ``expected`` (3,): the
+    predicted pose used to match them. ``held``: the camera's constants (P,) with their covariance (P, P), if the observation
+    depends on the pose only.
     """
 
-    def __init__(
+    iterations: ClassVar[int] = ITERATIONS
+    settled: ClassVar[float] = SETTLED
+    seen: ReprojectionFactor
+    expected: Array = field(default_factory=lambda: np.zeros(3))
+    held: tuple[Array, Array] | None = None
+
+    @classmethod
+    def of(cls, t: float, seen: ReprojectionFactor, blocks: tuple[str, ...], expected: Array) -> Self:
+        """The observation of ``seen``, whose values but for the pose are these ``blocks``."""
+        return cls(t, (Term(seen, blocks, seen.dof()),), seen, expected)
+
+    def correct(
         self,
-        setup: Setup,
-        diagnostics: Diagnostics,
-        estimated: Estimated,
-        use: MapUse = "known",
-    ) -> None:
-        used = any(sensor in setup.sensors for sensor in CAMERAS)
-        settings = setup.rig.camera if used else None
-        self.model: CameraModel | None = None if settings is None else replace(settings.model(), tempering=1.0)
-        self.floor = None if self.model is None else TiltScale.guessed(self.model.tilt)
-        self._tempering = 1.0 if settings is None else settings.tempering  # for matched points
-        self.map = PointMap.of((), np.empty((0, 3)))
-        if setup.world.points is not None and use != "unknown":
-            self.map = without_common(setup.world.points)
-        self._others_matter = use != "known"
-        self.used = np.empty(0, dtype=np.int64)  # features of the last image that match points of the map
-        self.names: tuple[str, ...] = ()  # of the points of the last factor, where they are named
-        self._estimated = estimated
-        self._diagnostics = diagnostics
-        self.associator: Associator | None = None
-        if self.model is not None and "camera" in setup.sensors and len(self.map.owners):
-            self.associator = Associator(self.map, self.model)
-        self.missed = False  # whether points of the map were missing in the last image
-        self._map_matters = False
-        self._inexact = np.zeros(len(self.map), dtype=bool)
-        if settings is not None and len(self.map):
-            variances = np.trace(self.map.covariances, axis1=1, axis2=2)
-            worst = float(variances.max())
-            pixel = settings.pixel_sigma / settings.fx
-            self._map_matters = worst > (EXACT * pixel) ** 2
-            self._inexact = variances > 3.0 * (settings.exact_survey * NEAR * pixel) ** 2
+        pose: Array,
+        covariance: Array,
+        values: Mapping[str, Array],
+        columns: Mapping[str, slice],
+        iterations: int = ITERATIONS,
+    ) -> Correction:
+        if self.held is not None:
+            size = 3 + len(self.held[0])
+            both = np.zeros((size, size))
+            both[:3, :3], both[3:, 3:] = covariance, self.held[1]
+            found = image_update(self.seen, pose, both, iterations, self.settled, self.held[:1], (slice(3, size),))
+            return replace(found, delta=found.delta[:3], covariance=found.covariance[:3, :3])
+        at, places = [values[name] for name in self.blocks], [columns[name] for name in self.blocks]
+        return image_update(self.seen, pose, covariance, iterations, self.settled, at, places)
+
+    def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
+        factor, spreads = self.seen, None
+        _, by_pose, by_point, by_constants = reprojection.linearize(factor.model, self.expected, factor.points)
+        tilts = reprojection.by_tilt(factor.model, by_constants)
+        if factor.point_covariances is not None or self.held is not None:
+            spreads = np.broadcast_to(factor.model.sigma**2 * np.eye(2), (len(by_point), 2, 2))
+            if factor.point_covariances is not None:
+                spreads = spreads + by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
+            if self.held is not None:
+                if factor.twist is not None:
+                    by_constants[..., TIME_OFFSET] = by_pose @ factor.twist
+                by_constants = by_constants[..., list(factor.estimated)]
+                # the error of the constants is common to all pixels, so it must not average out
+                common = by_constants @ self.held[1] @ by_constants.transpose(0, 2, 1)
+                spreads = spreads + len(common) * common
+        return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, tilts, spreads)
+
+    def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
+        """The observation on the pose only; the uncertainty of the camera's constants and of points is added to the noise."""
+        if not self.blocks:
+            return self
+        seen, held, blocks = self.seen, None, self.blocks
+        if seen.estimated:
+            held, blocks = (values[blocks[0]], spreads[blocks[0]]), blocks[1:]
+        if seen.moved_by:
+            assert seen.point_covariances is not None
+            points, noise = seen.points.copy(), seen.point_covariances.copy()
+            for row, which in enumerate(seen.moved_by):
+                if which >= 0:  # several points with one displacement tell no more of it than one
+                    points[row] += values[blocks[which]]
+                    noise[row] = seen.moved_by.count(which) * spreads[blocks[which]]
+            seen = replace(seen, points=points, point_covariances=noise, moved_by=())
+        return replace(self, terms=(Term(seen, (), seen.dof()),), seen=seen, held=held)
+
+
+class CameraSensor(Sensor):
+    """A camera that sees points of the map. ``points``: matching and outlier rejection."""
+
+    modality = "camera"
+    lost = "points in images were not where they were expected"
+    follows_constants = True  # matching depends on them
+
+    def __init__(self, binding: Binding, constants: Estimated) -> None:
+        setup, motion, diagnostics, use = binding.setup, binding.motion, binding.diagnostics, binding.points
+        self._uncertain, self._motion = constants, motion
+        self.constants = constants if binding.calibration == "all" else NOTHING
+        self._carries = binding.calibration != "particles"  # too many for particles
+        self.points = KnownPoints(setup, diagnostics, constants, use)
+        self._check = TurnCheck(self.points.model, motion, diagnostics, constants)
+        # times [s] of recent looks at what was surveyed with an error and is not estimated
+        self._looks: dict[str, list[float]] = defaultdict(list)
+        self._before: deque[tuple[float, TiltScale | None]] = deque()  # what was known of the floor before an image
+        self._shared = (self.modality,) if constants.names else ()
+        if self.points.known:
+            self.finder = PixelFinder(self.points, motion)
+            # pixels of known points determine the pose so well that the graph need not be solved for each image, unless the
+            # camera's mounting is estimated
+            self.solve_every = 0.0 if constants.names else SOLVE_EVERY
 
     @property
-    def known(self) -> bool:
-        """Whether the camera is used and the map has points."""
-        return self.model is not None and len(self.map) > 0
+    def inconsistent(self) -> bool:
+        return self._check.told
 
-    @property
-    def needs_twist(self) -> bool:
-        """Whether the camera's time offset is estimated."""
-        return TIME_OFFSET in self._estimated.indices
-
-    def inexact(self, m: Pixels) -> dict[str, tuple[list[str], Array]]:
-        """What is seen that was surveyed with an error. By name, of a point or of a marker, that of each of its points and the
-        covariance (3, 3) of their common displacement."""
-        found: dict[str, tuple[list[str], Array]] = {}
-        if self.model is None or not isinstance(m, PixelSightings) or not self._inexact.any():
-            return found
-        for name in dict.fromkeys(m.points):
-            place = self.map.index.get(name, -1)
-            if place >= 0 and self._inexact[place]:
-                names, _ = found.setdefault(marker_of(name) or name, ([], self.map.covariances[place]))
-                names.append(name)
-        return found
-
-    def named(self, m: PixelSightings) -> ReprojectionFactor | None:
-        """All named points of the map without outlier rejection, on the pose at their time."""
-        if self.model is None:
-            self._diagnostics.ignore("camera", len(m.pixels))
-            return None
-        places = [self.map.index.get(name, -1) for name in m.points]
-        pixels = m.pixels
-        if -1 in places:
-            rows = [i for i, place in enumerate(places) if place >= 0]
-            if not self._others_matter:
-                self._diagnostics.ignore("point not in the map", len(places) - len(rows))
-            places, pixels = [places[i] for i in rows], pixels[rows]
-        self.names = tuple(self.map.names[place] for place in places)
-        return self._factor(self.model, places, pixels) if places else None
-
-    def factor(
-        self,
-        m: Pixels,
-        predicted: Predicted,
-        offset: Increment | None = None,
-        twist: Array | None = None,
-        displaced: Mapping[str, tuple[Array, Array]] = NOT_DISPLACED,
-    ) -> ReprojectionFactor | None:
-        """The factor of the known points, on the pose at the image's time or on one that lies ``offset`` before it.
-
-        ``twist`` (3,): the robot's velocity at that time, needed if the camera's time offset is estimated. ``displaced``: by name
-        how far (3,) points are from where the map has them, with its covariance, which becomes theirs.
-        """
-        self.used = np.empty(0, dtype=np.int64)
-        factor = self.named(m) if isinstance(m, PixelSightings) else self._nothing(m)
+    def observe(self, m: Pixels, view: View) -> Iterator[PixelObservation | NewVariable]:
+        self._check.add(m)
+        twist = self._motion.twist(m.t) if self.points.needs_twist else None
+        predicted, values, spreads = Predicted(view.pose, view.covariance), {}, {}
+        for name in self._shared:
+            value = view.value(name)
+            values[name] = np.zeros(len(self._uncertain.names)) if value is None else value
+            spreads[name] = np.diag(self._uncertain.sigmas**2) if value is None else view.spread(name)
+            predicted = replace(predicted, constants=values[name], spread=spreads[name])
+        displaced, blocks = {}, {}
+        for name, (points, survey) in self.points.inexact(m).items():
+            block = f"{self.modality}/{name}"
+            if self._carries and view.value(block) is None:
+                yield NewVariable(block, np.zeros(3), np.zeros((3, 3)), {}, survey, ())
+            by, spread = view.value(block), survey
+            if by is None:
+                by, spread = np.zeros(3), self._looks_now(name, m.t) * survey
+            else:
+                spread = view.spread(block)
+                blocks.update(dict.fromkeys(points, block))
+            displaced.update(dict.fromkeys(points, (by, len(points) * spread)))
+        self._before.append((m.t, self.points.floor))
+        while self._before[0][0] < m.t - GOING_BACK:
+            self._before.popleft()
+        factor = self.points.factor(m, predicted, view.offset, twist, displaced)
         if factor is None:
+            return
+        names = [blocks.get(name, "") for name in self.points.names]
+        moving = tuple(dict.fromkeys(filter(None, names)))
+        if moving:
+            factor = displaced_by(factor, [moving.index(name) if name else -1 for name in names])
+        seen = PixelObservation.of(m.t, factor, (*self._shared, *moving), view.pose)
+        yield seen if self.constants.names or moving else seen.on_pose(values, spreads)
+
+    def _looks_now(self, name: str, t: float) -> int:
+        """Add a look at a point or marker; how many there were within :data:`PASS`, with the error of its survey in common."""
+        looks = [*(one for one in self._looks[name] if one > t - PASS), t]
+        self._looks[name] = looks
+        return len(looks)
+
+    def rewind(self, t: float) -> None:
+        for name, looks in self._looks.items():
+            self._looks[name] = [one for one in looks if one <= t]
+        while self._before and self._before[-1][0] > t:
+            _, self.points.floor = self._before.pop()
+
+    def restart(self, t: float) -> None:
+        self._looks.clear()
+
+    def judge(self, observation: PixelObservation, correction: Correction, view: View) -> bool:
+        self.points.report(observation.t, observation.seen, correction)
+        return True
+
+
+def displaced_by(factor: ReprojectionFactor, which: list[int]) -> ReprojectionFactor:
+    """The factor on displacements too: the number of that of each point, or -1, ``which`` has its covariance in the state."""
+    spreads = factor.point_covariances
+    if spreads is not None:
+        spreads = np.where(np.array(which)[:, None, None] < 0, spreads, 0.0)
+    return replace(factor, point_covariances=spreads, moved_by=tuple(which))
+
+
+def bind(binding: Binding) -> CameraSensor | None:
+    """The sensor of a run, or None if it is not used. With particles, its constants are not estimated but widen the noise."""
+    setup = binding.setup
+    if setup.rig.find(CameraSettings) is None or not any(sensor in setup.sensors for sensor in CAMERAS):
+        return None
+    return CameraSensor(binding, NOTHING if binding.calibration == "none" else setup.rig.estimated("camera"))
+
+
+CLEAR, CLEAR_SHARE = 8, 0.5  # minimum number and share of inliers for a single image to be accepted
+AGREEING = 3  # images that must agree otherwise
+KEPT = 5.0  # s
+APART = 25.0  # squared Mahalanobis distance above which two poses disagree
+LEAST = np.diag((0.05, 0.05, 0.03)) ** 2  # m, m, rad: lower bound of the covariance
+POOR_FRAMES, POOR_TIME = 3, 0.3  # images, and s, with missing points before a track is suspicious
+SEARCH_INTERVAL = 1.0  # s between unsuccessful searches
+
+
+@dataclass(frozen=True)
+class _Fix:
+    """A pose (3,) with body-frame ``covariance`` (3, 3) from one image."""
+
+    odometry: ChainState
+    pose: Array
+    covariance: Array
+    clear: bool
+
+
+class PixelFinder:
+    """Finds poses from images; see the module."""
+
+    at_once = True
+
+    def __init__(self, points: KnownPoints, motion: Motion) -> None:
+        self._points, self._motion = points, motion
+        self.start: KnownPosition | None = None  # known start position while the heading is sought
+        self._fixes: list[_Fix] = []
+        self._stamps: list[tuple[float, bool]] = []
+        self._fruitless = -np.inf
+
+    @property
+    def newest(self) -> ChainState | None:
+        """The odometry state at the last image that gave a pose, or None."""
+        return self._fixes[-1].odometry if self._fixes else None
+
+    @property
+    def hypotheses(self) -> tuple[Mode, ...]:
+        """The poses of the last image."""
+        if not self._fixes:
+            return ()
+        last = self._fixes[-1]
+        return (Mode(1.0, last.pose, se2.body_to_world(last.pose, last.covariance)),)
+
+    @property
+    def best(self) -> PosePrior | None:
+        """The pose at the last image, if it is unambiguous or other images agree."""
+        if not self._fixes or not (self._fixes[-1].clear or self._agree()):
             return None
-        moved = np.zeros_like(factor.points)
-        if displaced:
-            assert factor.point_covariances is not None
-            spreads = factor.point_covariances.copy()
-            for row, name in enumerate(self.names):
-                moved[row], spreads[row] = displaced.get(name, (moved[row], spreads[row]))
-            factor = replace(factor, point_covariances=spreads)
-        if offset is not None:
-            factor = replace(factor, offset=offset.delta, offset_covariance=offset.covariance)
-        if self._estimated.indices:
-            factor = replace(factor, estimated=self._estimated.indices, twist=twist)
-        here = factor.fixed([] if predicted.constants is None else [predicted.constants], moved)
-        camera = self._camera(here, predicted)
-        focal = 0.0
-        if predicted.spread is not None and FOCAL in self._estimated.indices:
-            place = self._estimated.indices.index(FOCAL)
-            focal = math.sqrt(predicted.spread[place, place])
-        if isinstance(m, CameraFrame):
-            found = self._found(m, factor, here.model, camera, focal)
-            return None if found is None else self._levelled(found, found, predicted)
-        right = _agreeing(here, camera, focal)
-        agreed = int(np.count_nonzero(right))
-        seen = self._levelled(rows_of(factor, right), rows_of(here, right), predicted) if agreed else None
-        if seen is None:
-            right, agreed = np.zeros_like(right), 0
-        self.missed = agreed < FEW_SHARE * len(right)
-        if agreed < len(right):
-            self._diagnostics.reject(DISAGREES, len(right) - agreed)
-            self.names = tuple(self.names[row] for row in np.flatnonzero(right).tolist())
-        return seen
+        last = self._fixes[-1]
+        return PosePrior(last.odometry.t, last.pose, se2.body_to_world(last.pose, last.covariance))
 
-    def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
-        """The pose of an image without a prediction, or None, and the number of points that it seemed to show."""
-        model = self.model
-        if model is None or not self.known:
-            return None, 0
-        if isinstance(m, PixelSightings):
-            rows = [i for i, name in enumerate(m.points) if name in self.map.index]
-            points = np.array([self.map.index[m.points[i]] for i in rows], dtype=np.int64)
-            spreads = self.map.covariances[points] if self._map_matters else None
-            return found_on_floor(model, self.map.positions[points], m.pixels[rows], spreads), len(rows)
-        found = None if self.associator is None else self.associator.relocalized(m)
-        if found is None:
-            return None, 0
-        position, rotation, covariance, seen = found
-        spreads = self.map.covariances[seen.points] if self._map_matters else None
-        pixels = np.asarray(m.pixels[seen.features], dtype=float)
-        camera = CameraPose(position, rotation, covariance)
-        return on_floor(model, camera, self.map.positions[seen.points], pixels, spreads), seen.expected
+    def _suspicious_since(self) -> float | None:
+        """The time since which points are not where they are predicted, or None."""
+        poor: list[float] = []
+        for t, missed in reversed(self._stamps):
+            if not missed:
+                break
+            poor.append(t)
+        enough = len(poor) >= POOR_FRAMES and poor[0] - poor[-1] >= POOR_TIME
+        return poor[-1] if enough else None
 
-    def report(self, t: float, factor: ReprojectionFactor, update: Correction) -> None:
-        """Record the innovation of an update at time ``t``."""
-        self._diagnostics.innovation("camera", t, update.nis, update.dof)
-        u, v = (-factor.model.sigma * update.residual.T).tolist()
-        self._diagnostics.add_residuals("camera.u", u)
-        self._diagnostics.add_residuals("camera.v", v)
+    def follow(self, observation: object, odometry: ChainState, view: object) -> None:
+        """Nothing to record: missing points tell whether the track is lost."""
 
-    def _factor(self, model: CameraModel, points: list[int], pixels: Array) -> ReprojectionFactor:
-        spreads = self.map.covariances[points] if self._map_matters else None
-        return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=spreads)
+    def refuted_since(self, m: Pixels, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
+        """The time since which the track must have been wrong, after an image was processed at its ``pose`` (3,): points have
+        been missing since then, and the last images agree on another pose. None if they do not.
 
-    def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
-        """A factor without points yet; None if features cannot be matched with the map."""
-        self.names = ()
-        if self.model is None or self.associator is None:
-            if self.model is None or not self._others_matter:
-                self._diagnostics.ignore("camera", len(m.pixels))
-            return None
-        if m.feature != self.map.feature:
-            self._diagnostics.ignore("camera: features of another kind than the map's", len(m.pixels))
-            return None
-        return self._factor(replace(self.model, tempering=self._tempering), [], np.empty((0, 2)))
-
-    def _found(
-        self, m: CameraFrame, factor: ReprojectionFactor, model: CameraModel, camera: CameraPose, focal: float
-    ) -> ReprojectionFactor | None:
-        """The factor of the points matched in a frame."""
-        assert self.associator is not None
-        seen = self.associator.guided(m, camera.position, camera.rotation, camera.covariance, model, focal)
-        self.used = seen.features
-        unsure = float(np.trace(camera.covariance[3:, 3:])) > UNSURE**2
-        self.missed = len(seen) < FEW and (unsure or min(seen.expected, len(m.pixels)) >= MANY)
-        if seen.rejected:
-            self._diagnostics.reject(DISAGREES, seen.rejected)
-        if len(seen) == 0:
-            return None
-        pixels = np.asarray(m.pixels[seen.features], dtype=float)
-        chosen = spread_out(pixels, MOST)
-        points = seen.points[chosen]
-        spreads = self.map.covariances[points] if self._map_matters else None
-        return replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=spreads)
-
-    def _levelled(
-        self, factor: ReprojectionFactor, here: ReprojectionFactor, predicted: Predicted
-    ) -> ReprojectionFactor | None:
-        """The factor with what is known of the tilt of the robot; ``here``: with the constants that are expected.
-
-        None if only a robot that tilts by more than :data:`STEEPEST` sees the points where they are, which is not believed.
+        The track's covariance is not used, because an uncertain track misses points by searching in the wrong place. Earlier
+        results from after that time are discarded.
         """
-        if here.estimated:  # constants that nothing is known of would explain it
-            return factor
-        pose, covariance = (np.ascontiguousarray(part, dtype=float) for part in (predicted.pose, predicted.covariance))
-        tilt, spread = pixel_kernels.leaning(here.packed(), pose, covariance)
-        if math.hypot(*tilt) > STEEPEST:
+        self._stamps = [s for s in self._stamps if s[0] < m.t]
+        self._stamps.append((m.t, self._points.missed))
+        if not self._points.missed:
+            self._stamps = self._stamps[-1:]
+        since = self._suspicious_since()
+        if since is None or not self.look(m, odometry):
             return None
-        assert self.floor is not None
-        self.floor, sigma = self.floor.learnt(tilt, spread, float(here.model.tilt))
-        return replace(factor, model=replace(factor.model, tilt=sigma))
+        if _distance(pose, np.zeros((3, 3)), self._fixes[-1]) <= APART:
+            self.clear()
+            return None
+        return since if self._agree() else None
 
-    def _camera(self, here: ReprojectionFactor, predicted: Predicted) -> CameraPose:
-        """The pose of the camera for an image, including the uncertainty of its constants."""
-        pose, covariance = predicted.pose, predicted.covariance
-        if here.offset is not None:
-            noise = np.zeros((3, 3)) if here.offset_covariance is None else here.offset_covariance
-            since = Increment(here.offset, noise, 0.0)
-            pose, covariance = se2.compose(pose, here.offset), propagate(covariance, since)
-        camera = lifted(here.model, pose, covariance)
-        if predicted.spread is None:
-            return camera
-        model = here.model
-        full = np.zeros((6, len(predicted.spread)))
-        for column, place in enumerate(self._estimated.indices):
-            if place < 3:
-                full[3:, column] = model.rotation[place]
-            elif place < FOCAL:
-                full[:3, column] = model.rotation[place - 3]
-            elif place == TIME_OFFSET and here.twist is not None:
-                full[:, column] = _lift(model) @ here.twist
-        return replace(camera, covariance=camera.covariance + full @ predicted.spread @ full.T)
+    def look(self, m: Pixels, odometry: ChainState) -> bool:
+        """Find the pose from an image alone; False if that fails."""
+        if not self._fixes and m.t < self._fruitless + SEARCH_INTERVAL and m.t >= self._fruitless:
+            return False
+        self._fixes = [f for f in self._fixes if m.t - KEPT <= f.odometry.t < m.t]
+        found, seen = self._points.find(m)
+        if found is None:
+            self._fruitless = m.t
+            return False
+        if self.start is not None and self._is_not_from(self.start, found, odometry):
+            self._fruitless = m.t
+            return False
+        count = int(np.count_nonzero(found.inliers))
+        clear = count >= CLEAR and count >= CLEAR_SHARE * seen
+        self._fixes.append(_Fix(odometry, found.pose, found.covariance, clear))
+        return True
 
+    def sample(self, rng: np.random.Generator, count: int) -> Array:
+        """Poses (N, 3) sampled from the last image's result."""
+        last = self._fixes[-1]
+        body = last.covariance + LEAST
+        return np.asarray(se2.compose(last.pose, se2.exp(rng.multivariate_normal(np.zeros(3), body, count))))
 
-def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
-    """The pose of the camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3), which may tilt."""
-    arrays = (np.ascontiguousarray(part, dtype=float) for part in (pose, covariance))
-    return CameraPose(*pixel_kernels.placed(model.position, model.rotation, float(model.tilt), *arrays))
+    def clear(self) -> None:
+        """Forget the images: a new track starts, or the current one is trusted."""
+        self._fixes, self._stamps = [], []
 
+    @staticmethod
+    def _is_not_from(start: KnownPosition, found: FoundOnFloor, now: ChainState) -> bool:
+        return bool(2.0 * start.loss(found.pose[None], now, found.covariance + LEAST)[0] > APART)
 
-def _lift(model: CameraModel) -> Array:
-    """Jacobian (6, 3) of the camera's perturbation in its own frame (rotation first) by that of the robot's planar pose."""
-    x, y, _ = model.position
-    lift = np.zeros((6, 3))
-    lift[:3, 2] = model.rotation[2]
-    lift[3:, 0], lift[3:, 1] = model.rotation[0], model.rotation[1]
-    lift[3:, 2] = -y * model.rotation[0] + x * model.rotation[1]
-    return lift
-
-
-def _agreeing(here: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
-    """Inliers near the prediction; all points if too few are seen to tell. ``focal``: standard deviation of the logarithm of the
-    focal length."""
-    model, count = here.model, len(here.pixels)
-    if count < FEWEST:
-        return np.ones(count, dtype=bool)
-    if here.point_covariances is None:
-        spreads = np.zeros((count, 2, 2))
-        spreads[:, (0, 1), (0, 1)] = model.sigma**2
-    else:
-        _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, here.points)
-        spreads = pixel_kernels.spread(by_point, here.point_covariances, float(model.sigma))
-    if focal > 0.0:
-        away = focal * (here.pixels - (model.cx, model.cy))
-        spreads = spreads + away[:, :, None] * away[:, None, :]
-    return agreeing(model, camera, here.points, here.pixels, spreads)
+    def _agree(self) -> bool:
+        """Whether the last images agree along the odometry."""
+        if len(self._fixes) < AGREEING:
+            return False
+        *others, last = self._fixes[-AGREEING:]
+        for fix in others:
+            moved = self._motion.relative(fix.odometry, last.odometry)
+            if _distance(se2.compose(fix.pose, moved.delta), propagate(fix.covariance, moved), last) > APART:
+                return False
+        return True
 
 
-def rows_of(factor: ReprojectionFactor, rows: Truths) -> ReprojectionFactor:
-    """The factor of some of its points."""
-    spreads = None if factor.point_covariances is None else factor.point_covariances[rows]
-    return replace(factor, points=factor.points[rows], pixels=factor.pixels[rows], point_covariances=spreads)
+def _distance(pose: Array, covariance: Array, fix: _Fix) -> float:
+    """Squared Mahalanobis distance of a pose from an image to a pose (3,) with body-frame covariance (3, 3)."""
+    error = se2.log(se2.between(pose, fix.pose))
+    return float(error @ positive.solve(covariance + fix.covariance + LEAST, error[:, None])[:, 0])

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import Estimated
-from factorgraph_loc.sensors.camera.sensor import Pixels
+from factorgraph_loc.sensors.camera.known_points import Pixels
 from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.vision.frame_motion import turned
 from factors import se2

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from factorgraph_loc.model.belief import Mode, PosePrior, Status
 from factorgraph_loc.sensors.base import View
 from factorgraph_loc.sensors.known_position import KnownPosition
+from factorgraph_loc.sensors.landmarks.known_landmarks import KnownLandmarks
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks
 from factorgraph_loc.sensors.landmarks.window import Sighting, SightingWindow
 from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2

@@ -1,175 +1,234 @@
-"""Factors of identified landmarks."""
+"""The landmark sensor of a run."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections import deque
+from collections.abc import Hashable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Self, cast
 
 import numpy as np
 
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.setup import MapUse, Setup
+from factorgraph_loc.model.measurement import GOING_BACK
+from factorgraph_loc.model.settings import Estimated
+from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
+from factorgraph_loc.sensors.landmarks.finder import LandmarkFinder
+from factorgraph_loc.sensors.landmarks.known_landmarks import KnownLandmarks, together
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factors.landmarks.factor import BearingRangeFactor
-from factors.landmarks.model import BearingRangeModel, packed
-from factors.landmarks.update_kernels import innovations
-from factors.motion import Increment
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factors import positive
+from factors.graph import Factor
+from factors.landmarks.factor import BearingRangeFactor, landmark_update
+from factors.landmarks.model import PARAMETERS, TIME_OFFSET
 from factors.se2 import Array
-from factors.update import Correction
+from factors.update import GATE, Correction
+
+SURVEYED_ITERATIONS = 4
+WORK = 8  # of a landmark, for one of many poses that are weighed by a compiled call
+SMALL = 40  # size of error states whose matrices are inverted by compiled code
+MAX_PENDING = 5  # sightings per landmark that wait for another to agree
 
 
-class KnownLandmarks:
-    """Turns measurements into factors. Landmarks that map or rig lack are counted as ignored.
+@dataclass(frozen=True)
+class LandmarkObservation(ResidualObservation):
+    """Landmarks seen at one time: one term for those of the map, and one term for each other landmark. ``surveyed``: some have a
+    survey prior, which requires several linearisations if the first sighting is from afar."""
 
-    ``use`` of the map: ``known`` uses its landmarks and ignores others, ``extended`` also estimates the others, ``unknown``
-    estimates all landmarks without the map. ``estimated``: indices of the sensor's constants that are estimated. ``carries``:
-    whether the estimator estimates landmarks with an inexact survey; otherwise the survey's covariance is added to the noise.
-    """
-
-    def __init__(
-        self,
-        setup: Setup,
-        diagnostics: Diagnostics,
-        use: MapUse = "known",
-        estimated: tuple[int, ...] = (),
-        *,
-        carries: bool = False,
-    ) -> None:
-        settings = setup.rig.bearing_range if "bearing_range" in setup.sensors else None
-        self._model = None if settings is None else settings.model()
-        landmarks = {} if use == "unknown" else setup.world.landmarks
-        self._positions = {name: np.array((m.x, m.y)) for name, m in landmarks.items()}
-        limit = math.inf if settings is None else 2.0 * (settings.exact_survey * settings.range_sigma) ** 2
-        spreads = {name: m.spread() for name, m in landmarks.items()}
-        self._surveys = {name: spread for name, spread in spreads.items() if np.trace(spread) > limit}
-        self._carries = carries
-        self._maps_others = use != "known"
-        self._estimated = estimated
-        self._diagnostics = diagnostics
+    surveyed: bool = False
 
     @property
-    def known(self) -> bool:
-        """Whether there is a landmark sensor and the map has landmarks."""
-        return self._model is not None and bool(self._positions)
+    def work(self) -> int:
+        return WORK * self.found
 
-    def factor(
-        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
-    ) -> BearingRangeFactor | None:
-        """The factor of the known landmarks, on the pose at the measurement's time or on one that lies ``offset`` before it.
+    @property
+    def iterations(self) -> int | None:  # type: ignore[override]
+        return SURVEYED_ITERATIONS if self.surveyed else None
 
-        ``twist`` (3,): the robot's velocity at that time, needed if the sensor's time offset is estimated.
-        """
-        if self._model is None:
-            self._diagnostics.ignore("bearing_range", len(m.landmarks))
-            return None
-        known = [i for i, name in enumerate(m.landmarks) if name in self._positions]
-        told = _told(m)
-        rows = [i for i in known if told[i]]
-        if len(known) < len(m.landmarks) and not self._maps_others:
-            self._diagnostics.ignore("landmark not in the map", len(m.landmarks) - len(known))
-        if len(rows) < len(known):
-            self._diagnostics.ignore("neither range nor bearing", len(known) - len(rows))
-        if self._carries and self._surveys:
-            rows = [i for i in rows if m.landmarks[i] not in self._surveys]
-        if not rows:
-            return None
-        points = np.array([self._positions[m.landmarks[i]] for i in rows])
-        factor = self._factor(self._model, m, rows, points, offset, twist)
-        if self._surveys and any(m.landmarks[i] in self._surveys for i in rows):
-            spreads = np.array([self._surveys.get(m.landmarks[i], np.zeros((2, 2))) for i in rows])
-            factor = replace(factor, point_covariances=spreads)
-        return factor
+    @property
+    def measured(self) -> BearingRangeFactor:
+        """All landmarks as one factor."""
+        return together([cast(BearingRangeFactor, term.factor) for term in self.terms])
 
-    def surveyed(
-        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
-    ) -> list[tuple[str, BearingRangeFactor]]:
-        """The landmarks with an inexact survey by name, each with a factor on the pose and its position."""
-        if self._model is None or not self._carries or not self._surveys:
-            return []
-        told = _told(m)
-        rows = [i for i, name in enumerate(m.landmarks) if name in self._surveys and told[i]]
-        free = [self._factor(self._model, m, [i], np.zeros((1, 2)), offset, twist) for i in rows]
-        return [(m.landmarks[i], replace(factor, free=True)) for i, factor in zip(rows, free, strict=True)]
-
-    def survey(self, name: str) -> tuple[Array, Array]:
-        """Position (2,) and covariance (2, 2) of a landmark in the map."""
-        return self._positions[name], self._surveys[name]
-
-    def others(
-        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
-    ) -> list[tuple[str, BearingRangeFactor]]:
-        """The landmarks to be estimated by name, each with a factor on the pose and its position (the last value)."""
-        if self._model is None or not self._maps_others:
-            return []
-        found = []
-        for i, name in enumerate(m.landmarks):
-            if name in self._positions:
-                continue
-            if np.isnan(m.range[i]) or np.isnan(m.bearing[i]):
-                self._diagnostics.ignore("unknown landmark without range and bearing")
-            else:
-                factor = self._factor(self._model, m, [i], np.zeros((1, 2)), offset, twist)
-                found.append((name, replace(factor, free=True)))
-        return found
-
-    def _factor(
+    def correct(
         self,
-        model: BearingRangeModel,
-        m: BearingRange,
-        rows: list[int],
-        points: Array,
-        offset: Increment | None,
-        twist: Array | None,
-    ) -> BearingRangeFactor:
-        everything = len(rows) == len(m.landmarks)
-        return BearingRangeFactor(
-            model,
-            points,
-            m.range if everything else m.range[rows],
-            m.bearing if everything else m.bearing[rows],
-            None if offset is None else offset.delta,
-            None if offset is None else offset.covariance,
-            estimated=self._estimated,
-            twist=twist,
-            in_look=None if offset is None else self._count(m),
+        pose: Array,
+        covariance: Array,
+        values: Mapping[str, Array],
+        columns: Mapping[str, slice],
+        iterations: int = 1,
+    ) -> Correction:
+        term = self.terms[0]
+        if len(self.terms) == 1 and len(covariance) <= SMALL:
+            held, first = (values[term.blocks[0]], columns[term.blocks[0]].start) if term.blocks else (np.zeros(0), 3)
+            factor = cast(BearingRangeFactor, term.factor)
+            found = landmark_update(factor, pose, covariance, held, first, iterations, self.settled)
+            if found is not None:
+                return found
+        return super().correct(pose, covariance, values, columns, iterations)
+
+    def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
+        total = np.zeros(len(poses))
+        for term in self.terms:
+            factor, at, parameters = cast(BearingRangeFactor, term.factor), poses, None
+            if factor.estimated and term.blocks[0] in values:
+                parameters = np.zeros((len(poses), len(PARAMETERS)))
+                parameters[:, list(factor.estimated)] = values[term.blocks[0]]
+            if factor.free:  # an error of the landmark's position is equivalent to one of the robot's
+                places = values[term.blocks[-1]]
+                factor, at = replace(factor, points=places[:1]), poses.copy()
+                at[:, :2] -= places - places[0]
+            total += factor.log_likelihood(at, parameters)
+        return total
+
+    @property
+    def things(self) -> frozenset[Hashable]:
+        return frozenset(map(tuple, self.measured.points.tolist()))
+
+    def at_its_time(self) -> Self | None:
+        """The landmarks of the map, on the pose at the time of the measurement."""
+        if self.blocks:
+            return None
+        factor = self.measured
+        return replace(
+            self, terms=(replace(self.terms[0], factor=replace(factor, offset=None, offset_covariance=None)),)
         )
 
-    def _count(self, m: BearingRange) -> int:
-        """Number of usable landmarks: those of the map with either value, others with both."""
-        lacks = zip(m.landmarks, np.isnan(m.range).tolist(), np.isnan(m.bearing).tolist(), strict=True)
-        return sum(
-            not (no_range and no_bearing)
-            if name in self._positions
-            else self._maps_others and not (no_range or no_bearing)
-            for name, no_range, no_bearing in lacks
-        )
-
-    def report(self, t: float, factor: BearingRangeFactor, update: Correction) -> None:
-        """Record the innovation of an update at time ``t``."""
-        self._diagnostics.innovation("bearing_range", t, update.nis, update.dof)
-        ranges, bearings = innovations(packed(factor.model), update.residual, factor.ranges, factor.bearings)
-        self._diagnostics.add_residuals("bearing_range.range", ranges.tolist())
-        self._diagnostics.add_residuals("bearing_range.bearing", bearings.tolist())
+    def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
+        """The observation on the pose only: constants are fixed, other landmarks have covariances ``spreads``."""
+        if len(self.terms) == 1 and not self.terms[0].blocks:
+            return self
+        fixed = []
+        for term in self.terms:
+            factor = cast(BearingRangeFactor, term.factor)
+            shared = [values[name] for name in term.blocks[: len(term.blocks) - factor.free]]
+            own = term.blocks[-1] if factor.free else None
+            here = factor.fixed(shared, None if own is None else values[own])
+            fixed.append(here if own is None else replace(here, point_covariances=spreads[own][None]))
+        factor = together(fixed)
+        return type(self)(self.t, (Term(factor, (), 2 * len(factor.points)),), self.surveyed)
 
 
-def _told(m: BearingRange) -> list[bool]:
-    """Of each landmark whether its range or its bearing was measured."""
-    return [r == r or b == b for r, b in zip(m.range.tolist(), m.bearing.tolist(), strict=True)]  # noqa: PLR0124 - not NaN
+Sighted = tuple[float, LandmarkObservation]  # with the time [s] of the pose that saw it
 
 
-def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
-    """Merge the factors of one measurement on one pose."""
-    first, *others = factors
-    if not others:
-        return first
-    covariances = [
-        np.zeros((len(f.points), 2, 2)) if f.point_covariances is None else f.point_covariances for f in factors
-    ]
-    return replace(
-        first,
-        points=np.concatenate([f.points for f in factors]),
-        ranges=np.concatenate([f.ranges for f in factors]),
-        bearings=np.concatenate([f.bearings for f in factors]),
-        point_covariances=np.concatenate(covariances),
-    )
+@dataclass(frozen=True)
+class NewLandmarks:
+    """Sightings of landmarks that are not initialized yet: two must agree on the position, because one may be an outlier.
+
+    Immutable, because filters go back to an earlier state when a measurement is late.
+    """
+
+    pending: Mapping[str, tuple[tuple[Array, Array, Sighted], ...]] = field(default_factory=dict)
+
+    def propose(
+        self, name: str, point: Array, covariance: Array, sighting: Sighted
+    ) -> tuple[NewLandmarks, Sighted | None]:
+        """Add a sighting that puts the landmark at ``point`` (2,) with ``covariance`` (2, 2). Returns the new pending sightings,
+        and an earlier sighting that agrees, or None."""
+        waiting = self.pending.get(name, ())
+        for earlier, spread, candidate in reversed(waiting):
+            apart = point - earlier
+            if positive.squared(apart, spread + covariance) < GATE:
+                return NewLandmarks({other: rows for other, rows in self.pending.items() if other != name}), candidate
+        return NewLandmarks({**self.pending, name: (*waiting, (point, covariance, sighting))[-MAX_PENDING:]}), None
+
+
+class LandmarkSensor(Sensor):
+    """Identified landmarks. For ``use`` of the map see :class:`KnownLandmarks`. A landmark that is not in the map becomes a block
+    ``bearing_range/NAME`` once two sightings agree on its position."""
+
+    modality = "bearing_range"
+    lost = "landmarks were not where they were expected"
+
+    def __init__(self, binding: Binding, constants: Estimated) -> None:
+        setup, motion, diagnostics, use = binding.setup, binding.motion, binding.diagnostics, binding.use
+        self.constants, self._motion = constants, motion
+        self._landmarks = KnownLandmarks(setup, diagnostics, use, constants.indices, carries=True)
+        # sightings before the start are counted when they are used there
+        self._sought = KnownLandmarks(setup, Diagnostics())
+        self._shared = (self.modality,) if constants.names else ()
+        self._new: NewLandmarks = NewLandmarks()
+        self._before: deque[tuple[float, NewLandmarks]] = deque()
+        self._finder: LandmarkFinder | None = None
+        if use == "known" and self._landmarks.known:
+            self.finder = self._finder = LandmarkFinder(self._sought, motion, setup.world.positions())
+
+    def observe(self, m: BearingRange, view: View) -> Iterator[LandmarkObservation | NewVariable]:
+        twist = self._motion.twist(m.t) if TIME_OFFSET in self.constants.indices else None
+        known = self._landmarks.factor(m, view.offset, twist)
+        terms = [] if known is None else [Term(known, self._shared, 2 * len(known.points))]
+        for name, factor in self._landmarks.surveyed(m, view.offset, twist):
+            block, (position, spread) = f"{self.modality}/{name}", self._landmarks.survey(name)
+            if view.value(block) is None:
+                yield NewVariable(block, position, np.zeros((2, 3)), {}, spread, ())
+            if view.value(block) is None:  # the estimator does not estimate it
+                here = replace(factor, points=position[None], point_covariances=spread[None], free=False)
+                terms.append(Term(here, self._shared, 2))
+            else:
+                terms.append(Term(factor, (*self._shared, block), 2))
+        surveyed = any(term.blocks != self._shared for term in terms)
+        met: list[tuple[str, Term]] = []
+        for name, factor in self._landmarks.others(m, view.offset, twist):
+            block = f"{self.modality}/{name}"
+            term = Term(factor, (*self._shared, block), 2)
+            if view.value(block) is None:
+                met.append((block, term))
+            else:
+                terms.append(term)
+        if terms:
+            yield LandmarkObservation(m.t, tuple(terms), surveyed)
+        for block, term in met if view.newest else ():
+            new = self._proposed(m.t, block, term, view)
+            if new is not None:
+                yield new
+
+    def _proposed(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
+        """A new landmark if an earlier sighting agrees with this one, with its position from this sighting."""
+        shared = [value for name in self._shared if (value := view.value(name)) is not None]
+        point, (by_pose, *others), noise = cast(BearingRangeFactor, term.factor).locate([view.pose, *shared])
+        here = (view.t, LandmarkObservation(t, (term,)))
+        new = NewVariable(block, point, by_pose, dict(zip(self._shared, others, strict=True)), noise, (here,))
+        _, spread = new.joint(*view.joint())
+        self._before.append((t, self._new))
+        while self._before[0][0] < t - GOING_BACK:
+            self._before.popleft()
+        self._new, earlier = self._new.propose(block, point, spread, here)
+        return None if earlier is None else replace(new, sightings=(earlier, here))
+
+    def judge(self, observation: LandmarkObservation, correction: Correction, view: View) -> bool:
+        self._landmarks.report(observation.t, observation.measured, correction)
+        return True
+
+    @property
+    def suspicious_since(self) -> float | None:
+        return None if self._finder is None else self._finder.suspicious_since
+
+    def accept(self) -> None:
+        if self._finder is not None:
+            self._finder.clear()
+
+    def evidence(self, m: BearingRange) -> LandmarkObservation | None:
+        seen = self._sought.factor(m)
+        return None if seen is None else LandmarkObservation(m.t, (Term(seen, (), 2 * len(seen.points)),))
+
+    def at_end(self, factor: Factor, width: float) -> Factor:
+        return cast(BearingRangeFactor, factor).widened(width)
+
+    def rewind(self, t: float) -> None:
+        while self._before and self._before[-1][0] > t:
+            _, self._new = self._before.pop()
+
+    def restart(self, t: float) -> None:
+        self._new = NewLandmarks()
+        self._before.clear()
+
+
+def bind(binding: Binding) -> LandmarkSensor | None:
+    """The sensor of a run, or None if it is not used. With particles its time offset is not estimated."""
+    settings = binding.setup.rig.find(BearingRangeSettings)
+    if settings is None or LandmarkSensor.modality not in binding.setup.sensors:
+        return None
+    names = PARAMETERS[:TIME_OFFSET] if binding.calibration == "particles" else PARAMETERS
+    uncertainty = None if binding.calibration == "none" else settings.uncertainty
+    return LandmarkSensor(binding, Estimated.of(names, uncertainty))

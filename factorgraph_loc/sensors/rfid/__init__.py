@@ -49,7 +49,7 @@ SENSOR = SensorType(
     },
     detects="tags",
     undetected="no tag of the map was read",
-    bind="factorgraph_loc.sensors.rfid.bound:bind",
+    bind="factorgraph_loc.sensors.rfid.sensor:bind",
     summarize="factorgraph_loc.sensors.rfid.summary:summarize",
     review="factorgraph_loc.sensors.rfid.summary:review",
     draw="factorgraph_loc.sensors.rfid.summary:draw",

@@ -18,8 +18,8 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.camera.known_points import ITERATIONS, SETTLED, KnownPoints, Predicted, lifted
 from factorgraph_loc.sensors.camera.measurement import PixelSightings, SightingStream
-from factorgraph_loc.sensors.camera.sensor import ITERATIONS, SETTLED, KnownPoints, Predicted, lifted
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings

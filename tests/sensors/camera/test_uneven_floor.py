@@ -13,7 +13,7 @@ from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.camera.sensor import lifted
+from factorgraph_loc.sensors.camera.known_points import lifted
 from factors.camera import model as reprojection
 from factors.camera.factor import ReprojectionFactor
 

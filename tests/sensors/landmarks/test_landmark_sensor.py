@@ -8,8 +8,8 @@ from factorgraph_loc import BearingRange, Log, Rig, World
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding
-from factorgraph_loc.sensors.landmarks.bound import bind
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.sensor import bind
 from factorgraph_loc.sensors.landmarks.summary import located_landmarks
 from factorgraph_loc.sensors.motion import Motion
 

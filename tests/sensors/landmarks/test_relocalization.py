@@ -10,8 +10,8 @@ from recorded_logs import recorded_log
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.landmarks.finder import Relocalizer, TrackMonitor, _apart, _insert, _thinned
+from factorgraph_loc.sensors.landmarks.known_landmarks import KnownLandmarks
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks
 from factorgraph_loc.sensors.landmarks.window import Sighting
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2

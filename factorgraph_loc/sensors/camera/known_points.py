@@ -1,0 +1,324 @@
+"""Points of the map seen by a camera, identified by name or by matching features."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from factorgraph_loc.maps.common_error import without_common
+from factorgraph_loc.maps.markers import marker_of
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.settings import Estimated
+from factorgraph_loc.model.setup import MapUse, Setup
+from factorgraph_loc.sensors.camera.measurement import PixelSightings
+from factorgraph_loc.vision.association import Associator
+from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
+from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.relocalization import FoundOnFloor, found_on_floor, on_floor
+from factorgraph_loc.vision.spread import spread_out
+from factors import se2
+from factors.camera import model as reprojection
+from factors.camera import update_kernels as pixel_kernels
+from factors.camera.factor import ReprojectionFactor
+from factors.camera.floor import TiltScale
+from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel
+from factors.motion import Increment, propagate
+from factors.se2 import Array
+from factors.update import Correction
+
+DISAGREES = "camera: does not agree with the others"  # reason of a rejection
+CAMERAS = ("camera", "sightings")  # channels that use the rig's camera: features, and named points
+FEW_SHARE = 0.3  # of named points: with fewer inliers, points are missing
+FEW, MANY = 6, 20  # of matched points: fewer than FEW inliers where MANY are expected means that points are missing
+UNSURE = 1.0  # m: a prediction with a larger standard deviation may miss the map
+MOST = 100  # points used per image; more add little, as errors of neighbouring points are correlated
+STEEPEST = 0.06  # rad: what tilts by more is no robot on a floor, or its camera is not mounted as the rig says
+NEAR = 3.0  # m: from where `exact_survey` compares the survey of a point with a pixel
+EXACT = 0.1  # a map is treated as exact if its errors are below this share of a pixel's, seen from 1 m
+# Pixels are so precise that one step from a poor prediction does not reach the optimum
+ITERATIONS, SETTLED = 8, 1e-3  # m, rad: convergence limit of a step
+
+NOT_DISPLACED: Mapping[str, tuple[Array, Array]] = MappingProxyType({})
+Pixels = PixelSightings | CameraFrame  # measurements of a camera
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """The prediction for an image: ``pose`` (3,) of the factor's variable with body-frame ``covariance`` (3, 3), and the
+    corrections (P,) of the camera's constants that are estimated with their ``spread`` (P, P)."""
+
+    pose: Array
+    covariance: Array
+    constants: Array | None = None
+    spread: Array | None = None
+
+
+class KnownPoints:
+    """Turns camera measurements into factors. Points that map or rig lack are counted as ignored, outliers as rejected.
+
+    ``estimated``: the camera's constants that are estimated. ``use``: see
+    :class:`~factorgraph_loc.sensors.landmarks.known_landmarks.KnownLandmarks`.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        diagnostics: Diagnostics,
+        estimated: Estimated,
+        use: MapUse = "known",
+    ) -> None:
+        used = any(sensor in setup.sensors for sensor in CAMERAS)
+        settings = setup.rig.camera if used else None
+        self.model: CameraModel | None = None if settings is None else replace(settings.model(), tempering=1.0)
+        self.floor = None if self.model is None else TiltScale.guessed(self.model.tilt)
+        self._tempering = 1.0 if settings is None else settings.tempering  # for matched points
+        self.map = PointMap.of((), np.empty((0, 3)))
+        if setup.world.points is not None and use != "unknown":
+            self.map = without_common(setup.world.points)
+        self._others_matter = use != "known"
+        self.used = np.empty(0, dtype=np.int64)  # features of the last image that match points of the map
+        self.names: tuple[str, ...] = ()  # of the points of the last factor, where they are named
+        self._estimated = estimated
+        self._diagnostics = diagnostics
+        self.associator: Associator | None = None
+        if self.model is not None and "camera" in setup.sensors and len(self.map.owners):
+            self.associator = Associator(self.map, self.model)
+        self.missed = False  # whether points of the map were missing in the last image
+        self._map_matters = False
+        self._inexact = np.zeros(len(self.map), dtype=bool)
+        if settings is not None and len(self.map):
+            variances = np.trace(self.map.covariances, axis1=1, axis2=2)
+            worst = float(variances.max())
+            pixel = settings.pixel_sigma / settings.fx
+            self._map_matters = worst > (EXACT * pixel) ** 2
+            self._inexact = variances > 3.0 * (settings.exact_survey * NEAR * pixel) ** 2
+
+    @property
+    def known(self) -> bool:
+        """Whether the camera is used and the map has points."""
+        return self.model is not None and len(self.map) > 0
+
+    @property
+    def needs_twist(self) -> bool:
+        """Whether the camera's time offset is estimated."""
+        return TIME_OFFSET in self._estimated.indices
+
+    def inexact(self, m: Pixels) -> dict[str, tuple[list[str], Array]]:
+        """What is seen that was surveyed with an error. By name, of a point or of a marker, that of each of its points and the
+        covariance (3, 3) of their common displacement."""
+        found: dict[str, tuple[list[str], Array]] = {}
+        if self.model is None or not isinstance(m, PixelSightings) or not self._inexact.any():
+            return found
+        for name in dict.fromkeys(m.points):
+            place = self.map.index.get(name, -1)
+            if place >= 0 and self._inexact[place]:
+                names, _ = found.setdefault(marker_of(name) or name, ([], self.map.covariances[place]))
+                names.append(name)
+        return found
+
+    def named(self, m: PixelSightings) -> ReprojectionFactor | None:
+        """All named points of the map without outlier rejection, on the pose at their time."""
+        if self.model is None:
+            self._diagnostics.ignore("camera", len(m.pixels))
+            return None
+        places = [self.map.index.get(name, -1) for name in m.points]
+        pixels = m.pixels
+        if -1 in places:
+            rows = [i for i, place in enumerate(places) if place >= 0]
+            if not self._others_matter:
+                self._diagnostics.ignore("point not in the map", len(places) - len(rows))
+            places, pixels = [places[i] for i in rows], pixels[rows]
+        self.names = tuple(self.map.names[place] for place in places)
+        return self._factor(self.model, places, pixels) if places else None
+
+    def factor(
+        self,
+        m: Pixels,
+        predicted: Predicted,
+        offset: Increment | None = None,
+        twist: Array | None = None,
+        displaced: Mapping[str, tuple[Array, Array]] = NOT_DISPLACED,
+    ) -> ReprojectionFactor | None:
+        """The factor of the known points, on the pose at the image's time or on one that lies ``offset`` before it.
+
+        ``twist`` (3,): the robot's velocity at that time, needed if the camera's time offset is estimated. ``displaced``: by name
+        how far (3,) points are from where the map has them, with its covariance, which becomes theirs.
+        """
+        self.used = np.empty(0, dtype=np.int64)
+        factor = self.named(m) if isinstance(m, PixelSightings) else self._nothing(m)
+        if factor is None:
+            return None
+        moved = np.zeros_like(factor.points)
+        if displaced:
+            assert factor.point_covariances is not None
+            spreads = factor.point_covariances.copy()
+            for row, name in enumerate(self.names):
+                moved[row], spreads[row] = displaced.get(name, (moved[row], spreads[row]))
+            factor = replace(factor, point_covariances=spreads)
+        if offset is not None:
+            factor = replace(factor, offset=offset.delta, offset_covariance=offset.covariance)
+        if self._estimated.indices:
+            factor = replace(factor, estimated=self._estimated.indices, twist=twist)
+        here = factor.fixed([] if predicted.constants is None else [predicted.constants], moved)
+        camera = self._camera(here, predicted)
+        focal = 0.0
+        if predicted.spread is not None and FOCAL in self._estimated.indices:
+            place = self._estimated.indices.index(FOCAL)
+            focal = math.sqrt(predicted.spread[place, place])
+        if isinstance(m, CameraFrame):
+            found = self._found(m, factor, here.model, camera, focal)
+            return None if found is None else self._levelled(found, found, predicted)
+        right = _agreeing(here, camera, focal)
+        agreed = int(np.count_nonzero(right))
+        seen = self._levelled(rows_of(factor, right), rows_of(here, right), predicted) if agreed else None
+        if seen is None:
+            right, agreed = np.zeros_like(right), 0
+        self.missed = agreed < FEW_SHARE * len(right)
+        if agreed < len(right):
+            self._diagnostics.reject(DISAGREES, len(right) - agreed)
+            self.names = tuple(self.names[row] for row in np.flatnonzero(right).tolist())
+        return seen
+
+    def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
+        """The pose of an image without a prediction, or None, and the number of points that it seemed to show."""
+        model = self.model
+        if model is None or not self.known:
+            return None, 0
+        if isinstance(m, PixelSightings):
+            rows = [i for i, name in enumerate(m.points) if name in self.map.index]
+            points = np.array([self.map.index[m.points[i]] for i in rows], dtype=np.int64)
+            spreads = self.map.covariances[points] if self._map_matters else None
+            return found_on_floor(model, self.map.positions[points], m.pixels[rows], spreads), len(rows)
+        found = None if self.associator is None else self.associator.relocalized(m)
+        if found is None:
+            return None, 0
+        position, rotation, covariance, seen = found
+        spreads = self.map.covariances[seen.points] if self._map_matters else None
+        pixels = np.asarray(m.pixels[seen.features], dtype=float)
+        camera = CameraPose(position, rotation, covariance)
+        return on_floor(model, camera, self.map.positions[seen.points], pixels, spreads), seen.expected
+
+    def report(self, t: float, factor: ReprojectionFactor, update: Correction) -> None:
+        """Record the innovation of an update at time ``t``."""
+        self._diagnostics.innovation("camera", t, update.nis, update.dof)
+        u, v = (-factor.model.sigma * update.residual.T).tolist()
+        self._diagnostics.add_residuals("camera.u", u)
+        self._diagnostics.add_residuals("camera.v", v)
+
+    def _factor(self, model: CameraModel, points: list[int], pixels: Array) -> ReprojectionFactor:
+        spreads = self.map.covariances[points] if self._map_matters else None
+        return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=spreads)
+
+    def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
+        """A factor without points yet; None if features cannot be matched with the map."""
+        self.names = ()
+        if self.model is None or self.associator is None:
+            if self.model is None or not self._others_matter:
+                self._diagnostics.ignore("camera", len(m.pixels))
+            return None
+        if m.feature != self.map.feature:
+            self._diagnostics.ignore("camera: features of another kind than the map's", len(m.pixels))
+            return None
+        return self._factor(replace(self.model, tempering=self._tempering), [], np.empty((0, 2)))
+
+    def _found(
+        self, m: CameraFrame, factor: ReprojectionFactor, model: CameraModel, camera: CameraPose, focal: float
+    ) -> ReprojectionFactor | None:
+        """The factor of the points matched in a frame."""
+        assert self.associator is not None
+        seen = self.associator.guided(m, camera.position, camera.rotation, camera.covariance, model, focal)
+        self.used = seen.features
+        unsure = float(np.trace(camera.covariance[3:, 3:])) > UNSURE**2
+        self.missed = len(seen) < FEW and (unsure or min(seen.expected, len(m.pixels)) >= MANY)
+        if seen.rejected:
+            self._diagnostics.reject(DISAGREES, seen.rejected)
+        if len(seen) == 0:
+            return None
+        pixels = np.asarray(m.pixels[seen.features], dtype=float)
+        chosen = spread_out(pixels, MOST)
+        points = seen.points[chosen]
+        spreads = self.map.covariances[points] if self._map_matters else None
+        return replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=spreads)
+
+    def _levelled(
+        self, factor: ReprojectionFactor, here: ReprojectionFactor, predicted: Predicted
+    ) -> ReprojectionFactor | None:
+        """The factor with what is known of the tilt of the robot; ``here``: with the constants that are expected.
+
+        None if only a robot that tilts by more than :data:`STEEPEST` sees the points where they are, which is not believed.
+        """
+        if here.estimated:  # constants that nothing is known of would explain it
+            return factor
+        pose, covariance = (np.ascontiguousarray(part, dtype=float) for part in (predicted.pose, predicted.covariance))
+        tilt, spread = pixel_kernels.leaning(here.packed(), pose, covariance)
+        if math.hypot(*tilt) > STEEPEST:
+            return None
+        assert self.floor is not None
+        self.floor, sigma = self.floor.learnt(tilt, spread, float(here.model.tilt))
+        return replace(factor, model=replace(factor.model, tilt=sigma))
+
+    def _camera(self, here: ReprojectionFactor, predicted: Predicted) -> CameraPose:
+        """The pose of the camera for an image, including the uncertainty of its constants."""
+        pose, covariance = predicted.pose, predicted.covariance
+        if here.offset is not None:
+            noise = np.zeros((3, 3)) if here.offset_covariance is None else here.offset_covariance
+            since = Increment(here.offset, noise, 0.0)
+            pose, covariance = se2.compose(pose, here.offset), propagate(covariance, since)
+        camera = lifted(here.model, pose, covariance)
+        if predicted.spread is None:
+            return camera
+        model = here.model
+        full = np.zeros((6, len(predicted.spread)))
+        for column, place in enumerate(self._estimated.indices):
+            if place < 3:
+                full[3:, column] = model.rotation[place]
+            elif place < FOCAL:
+                full[:3, column] = model.rotation[place - 3]
+            elif place == TIME_OFFSET and here.twist is not None:
+                full[:, column] = _lift(model) @ here.twist
+        return replace(camera, covariance=camera.covariance + full @ predicted.spread @ full.T)
+
+
+def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
+    """The pose of the camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3), which may tilt."""
+    arrays = (np.ascontiguousarray(part, dtype=float) for part in (pose, covariance))
+    return CameraPose(*pixel_kernels.placed(model.position, model.rotation, float(model.tilt), *arrays))
+
+
+def _lift(model: CameraModel) -> Array:
+    """Jacobian (6, 3) of the camera's perturbation in its own frame (rotation first) by that of the robot's planar pose."""
+    x, y, _ = model.position
+    lift = np.zeros((6, 3))
+    lift[:3, 2] = model.rotation[2]
+    lift[3:, 0], lift[3:, 1] = model.rotation[0], model.rotation[1]
+    lift[3:, 2] = -y * model.rotation[0] + x * model.rotation[1]
+    return lift
+
+
+def _agreeing(here: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
+    """Inliers near the prediction; all points if too few are seen to tell. ``focal``: standard deviation of the logarithm of the
+    focal length."""
+    model, count = here.model, len(here.pixels)
+    if count < FEWEST:
+        return np.ones(count, dtype=bool)
+    if here.point_covariances is None:
+        spreads = np.zeros((count, 2, 2))
+        spreads[:, (0, 1), (0, 1)] = model.sigma**2
+    else:
+        _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, here.points)
+        spreads = pixel_kernels.spread(by_point, here.point_covariances, float(model.sigma))
+    if focal > 0.0:
+        away = focal * (here.pixels - (model.cx, model.cy))
+        spreads = spreads + away[:, :, None] * away[:, None, :]
+    return agreeing(model, camera, here.points, here.pixels, spreads)
+
+
+def rows_of(factor: ReprojectionFactor, rows: Truths) -> ReprojectionFactor:
+    """The factor of some of its points."""
+    spreads = None if factor.point_covariances is None else factor.point_covariances[rows]
+    return replace(factor, points=factor.points[rows], pixels=factor.pixels[rows], point_covariances=spreads)
