@@ -20,11 +20,6 @@ def require_finite(source: object, rows: Integers, names: Sequence[str], table: 
         require(np.isfinite(values), source, rows, name, values, "a finite number")
 
 
-def require_above_zero(source: object, rows: Integers, field: str, values: Array) -> None:
-    """InputError at the first of ``values`` (N,) that is not positive; NaN (not measured) is valid."""
-    require(~(values <= 0.0), source, rows, field, values, "more than 0")
-
-
 def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:
     """Indices (M,) of the rows to keep of a stream with non-decreasing timestamps (N,): the last one of equal timestamps."""
     _require_order(source, rows, t_ns)
@@ -70,29 +65,18 @@ def arrivals(
         warnings.append(f"{source}: {count} rows are late, by at most {late.max() * 1e-9:.3f} s")
 
 
-def images_in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:
-    """Indices (M,) of the images to keep, in order of arrival: the last one of equal timestamps (N,)."""
-    return _last_in_order(
-        source, rows, t_ns, t_ns.tolist(), "have the timestamp of a later row and are skipped", warnings
-    )
-
-
-def sightings_in_order(
-    source: object, rows: Integers, t_ns: Integers, landmarks: Sequence[str], warnings: list[str]
+def last_in_order(
+    source: object, rows: Integers, t_ns: Integers, warnings: list[str], names: Sequence[str] | None = None
 ) -> Integers:
-    """Indices (M,) of the sightings to keep, in order of arrival: the last one of a landmark at a timestamp."""
-    seen = zip(t_ns.tolist(), landmarks, strict=True)
-    what = "see a landmark that a later row sees at the same timestamp: skipped"
-    return _last_in_order(source, rows, t_ns, seen, what, warnings)
-
-
-def _last_in_order(
-    source: object, rows: Integers, t_ns: Integers, keys: Iterable[Hashable], what: str, warnings: list[str]
-) -> Integers:
-    """Indices (M,) of the last row of each of the ``keys`` (N,), in order; ``what``: what the others do."""
+    """Indices (M,) of the rows to keep, in order of arrival: the last one of equal timestamps (N,), or of each of the ``names`` of
+    landmarks at a timestamp."""
     arrivals(source, rows, t_ns, warnings)
+    keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)
     last = {key: i for i, key in enumerate(keys)}
     if dropped := len(t_ns) - len(last):
+        what = "have the timestamp of a later row and are skipped"
+        if names is not None:
+            what = "see a landmark that a later row sees at the same timestamp: skipped"
         warnings.append(f"{source}: {dropped} rows {what}")
     return np.array(sorted(last.values()), dtype=np.int64)
 

@@ -4,9 +4,8 @@ CSV with any separator, with or without header, or JSON lines. The cells are rea
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -23,7 +22,6 @@ COMMENT = ("#", "//")
 EpcCase = Literal["as written", "upper", "lower"]
 Alternatives = tuple[str, ...]  # columns of which one must be there
 Value = bool | int | str
-T = TypeVar("T")
 
 
 class ReadNames(FileModel):
@@ -188,27 +186,24 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
     comments, content = _split_comments(numbered)
     if not content:
         raise InputError(f"{path}: contains no rows")
-    parsed = _parsed(path, content, mapping.separator)
-    body: Iterable[tuple[int, list[str]]]
+    body = list(_parsed(path, content, mapping.separator))
+    where = mapping.chosen()
     if mapping.header:
-        first_row, first = next(parsed)
+        first_row, first = body[0]
         named = next(_parsed(path, comments[-1:], mapping.separator), (0, []))[1]
         # a comment with as many names as there are columns is the header, unless the first row contains the names
         in_comment = _has(named, needed) or (len(named) == len(first) and not _has(first, needed))
         header = named if in_comment else first
-        body = chain([(first_row, first)], parsed) if in_comment else parsed
+        body = body if in_comment else body[1:]
     else:
-        body = list(parsed)
         # rows of other kinds may have other numbers of columns
-        chosen = _places(_numbers(max(len(parts) for _, parts in body)), mapping.chosen())
-        first_row, first = next((one for one in body if _is_chosen(one[1], chosen)), body[0])
+        chosen = (one for one in body if _is_chosen(one[1], _numbers(len(one[1])), where))
+        first_row, first = next(chosen, body[0])
         header = _numbers(len(first))
     _require_columns(path, mapping, needed, header, first_row)
-    chosen = _places(header, mapping.chosen())
-    every = list(body)
-    kept = [one for one in every if _is_chosen(one[1], chosen)]
+    kept = [(row, parts) for row, parts in body if _is_chosen(parts, header, where)]
     rows, columns = rows_of_length(path, header, kept)
-    return _mapped(path, rows, columns, mapping, header, unwanted=len(every) - len(kept))
+    return _mapped(path, rows, columns, mapping, header, unwanted=len(body) - len(kept))
 
 
 def _numbers(count: int) -> list[str]:
@@ -216,14 +211,10 @@ def _numbers(count: int) -> list[str]:
     return [str(i) for i in range(1, count + 1)]
 
 
-def _places(header: Sequence[str], columns: Mapping[str, T]) -> dict[int, T]:
-    """The values of ``columns``, by the index of the column in the header; others are left out."""
-    at = {column: i for i, column in enumerate(header)}
-    return {at[column]: value for column, value in columns.items() if column in at}
-
-
-def _is_chosen(parts: Sequence[str], chosen: Mapping[int, set[str]]) -> bool:
-    return all(i < len(parts) and parts[i] in values for i, values in chosen.items())
+def _is_chosen(parts: Sequence[str], header: Sequence[str], where: Mapping[str, set[str]]) -> bool:
+    """Whether a row has one of the values of ``where`` in each of its columns."""
+    cells = dict(zip(header, parts, strict=False)) if where else {}
+    return all(cells.get(name) in values for name, values in where.items())
 
 
 def _split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
@@ -261,36 +252,26 @@ def _require_columns(
 def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
     """The mapped cells of the chosen objects of JSON lines (one object or a list of them per line) that have all ``needed``
     columns."""
-    rows: list[int] = []
-    columns: dict[str, list[str]] = {column: [] for column in mapping.columns.values()}
-    chosen = mapping.chosen()
-    passed, unwanted = 0, 0
-    seen: set[str] = set()
-    keys: list[str] = []
-    there: dict[str, None] = {}
-    for row, entry in _objects(path):
-        if any(_text(_at(entry, column)) not in values for column, values in chosen.items()):
-            unwanted += 1
-            continue
-        found = {column: _at(entry, column) for column in columns}
-        known = {column for column, value in found.items() if value is not None}
-        keys = keys or sorted(_paths(entry))
-        seen |= known
-        if not _has(known, needed):
-            passed += 1
-            continue
-        rows.append(row)
-        there |= dict.fromkeys(_paths(entry))
-        for column, value in found.items():
-            if isinstance(value, (dict, list)):
-                raise bad_field(path, column, value, "a number or a text", row=row)
-            columns[column].append(_text(value))
+    objects = list(_objects(path))
+    where = mapping.chosen()
+    chosen = [(row, o) for row, o in objects if all(_text(o.get(name)) in values for name, values in where.items())]
+    known = [{name for name, value in o.items() if value is not None} for _, o in chosen]
+    whole = [one for one, names in zip(chosen, known, strict=True) if _has(names, needed)]
+    seen = set[str]().union(*known)
     for alternatives in needed:
-        if passed and not seen.intersection(alternatives):
-            raise InputError(f"{path}: no object has {quoted(alternatives[0])}, the first has {listed(keys)}")
-    found_columns = {column: values for column, values in columns.items() if column in seen}
-    numbers = np.array(rows, dtype=np.int64)
-    return _mapped(path, numbers, found_columns, mapping, there, unwanted=unwanted, passed=passed)
+        if len(whole) < len(chosen) and not seen.intersection(alternatives):
+            first = listed(sorted(chosen[0][1]))
+            raise InputError(f"{path}: no object has {quoted(alternatives[0])}, the first has {first}")
+    columns: dict[str, list[str]] = {}
+    for name in seen.intersection(mapping.columns.values()):
+        for row, one in whole:
+            if isinstance(one.get(name), list):
+                raise bad_field(path, name, one[name], "a number or a text", row=row)
+        columns[name] = [_text(one.get(name)) for _, one in whole]
+    there = dict.fromkeys(name for _, one in whole for name in one)
+    rows = np.array([row for row, _ in whole], dtype=np.int64)
+    unwanted, passed = len(objects) - len(chosen), len(chosen) - len(whole)
+    return _mapped(path, rows, columns, mapping, there, unwanted=unwanted, passed=passed)
 
 
 def _text(value: Any) -> str:
@@ -301,7 +282,7 @@ def _text(value: Any) -> str:
 
 
 def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    """The objects of JSON lines with their line numbers."""
+    """The line numbers and the objects of JSON lines, with the values of nested objects by paths of keys, joined by dots."""
     for row, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
@@ -309,22 +290,12 @@ def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
         entries = content if isinstance(content, list) else [content]
         if not all(isinstance(entry, dict) for entry in entries):
             raise bad_field(path, "line", line.strip()[:80], "an object, or a list of objects", row=row)
-        yield from ((row, entry) for entry in entries)
+        yield from ((row, dict(_values(entry))) for entry in entries)
 
 
-def _at(entry: Mapping[str, Any], keys: str) -> Any:
-    """The value at a path of keys joined by dots, or None."""
-    value: Any = entry
-    for key in keys.split("."):
-        if not isinstance(value, Mapping) or key not in value:
-            return None
-        value = value[key]
-    return value
-
-
-def _paths(entry: Mapping[str, Any], before: str = "") -> Iterator[str]:
+def _values(entry: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in entry.items():
         if isinstance(value, Mapping):
-            yield from _paths(value, f"{before}{key}.")
+            yield from _values(value, f"{before}{key}.")
         else:
-            yield before + key
+            yield before + key, value

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import checks
 from factorgraph_loc.io.bags import rosbag
 from factorgraph_loc.io.bags.file import is_bag, require_rosbags
 from factorgraph_loc.io.bags.poses import checked_rotations, seven
@@ -83,10 +84,11 @@ def from_evo(trajectory: Any) -> PosePath:
         turns = np.roll(np.asarray(trajectory.orientations_quat_wxyz, dtype=float), -1, axis=1)
         table = np.column_stack((trajectory.positions_xyz, turns))
         seconds = getattr(trajectory, "timestamps", None)
-        t_ns = None if seconds is None else _nanoseconds(np.asarray(seconds, dtype=float))
+        times = None if seconds is None else np.asarray(seconds, dtype=float)
     except (AttributeError, TypeError, ValueError) as error:
         raise InputError(f"the trajectory is {quoted(trajectory)}, expected one of evo") from error
-    return _path("the trajectory of evo", table, t_ns)
+    name = "the trajectory of evo"
+    return _path(name, table, None if times is None else checks.stamps(name, np.arange(1, len(times) + 1), times))
 
 
 def to_ros(trajectory: Trajectory | Trajectory3, frame_id: str = "map", t0_ns: int = 0) -> Any:
@@ -165,9 +167,3 @@ def _path(name: str, table: Array, t_ns: Any) -> PosePath:
     found = PosePath(name, table[:, :3], checked_rotations(name, rows, table), t_ns)
     require_poses(found)
     return found
-
-
-def _nanoseconds(seconds: Array) -> Any:
-    if not np.all(np.abs(seconds) < 2**63 / 1e9):
-        raise ValueError("a time is beyond 64 bits of nanoseconds")
-    return np.rint(seconds * 1e9).astype(np.int64)

@@ -106,7 +106,7 @@ def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[str]) ->
         keep = checks.in_order(rows.path, rows.rows, rows.t_ns, warnings)
     else:
         names = next(iter(rows.names.values()), None) or [str(row) for row in rows.rows]
-        keep = checks.sightings_in_order(rows.path, rows.rows, rows.t_ns, names, warnings)
+        keep = checks.last_in_order(rows.path, rows.rows, rows.t_ns, warnings, names)
         if measured:
             keep = keep[~_all_empty([values[column.name][keep] for column in measured])]
     kept = {

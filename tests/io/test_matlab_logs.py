@@ -64,7 +64,7 @@ def test_plaza_odometry_of_one_stamp_is_one_motion(read_plaza):
 PLAZA_BAD = {
     "field missing": ({"DR": None}, "DR is missing"),
     "shape": ({"TL": np.zeros((2, 2))}, "TL has shape (2, 2)"),
-    "nan": ({"DR": np.array([[10.1, 0, 0], [10.2, np.nan, 0]])}, "DR:2: distance is nan"),
+    "nan": ({"DR": np.array([[10.1, 0, 0], [10.2, np.nan, 0]])}, "DR:2: dx is nan"),
     "infinite beacon": ({"TL": np.array([[1.0, np.inf, 0]])}, "TL:1: row"),
     "time going back": ({"GT": np.array([[2.0, 0, 0, 0], [1, 0, 0, 0]])}, "GT:2: time"),
     "negative range": ({"TD": np.array([[10.0, 2, 1, -1]])}, "TD:1: range is -1.0"),

@@ -113,7 +113,7 @@ class Images:
                             self._folder.rename(self._written.with_name("damaged"))
                         self._written.rename(self._folder)
         rows, t_ns = np.array([row[0] for row in self._rows], dtype=np.int64), np.array(self._t_ns, dtype=np.int64)
-        keep = checks.images_in_order(self._source, rows, t_ns, warnings)
+        keep = checks.last_in_order(self._source, rows, t_ns, warnings)
         return ImageStream(checks.seconds(t_ns[keep], t0_ns), [self._folder / self._rows[i][-1] for i in keep.tolist()])
 
 

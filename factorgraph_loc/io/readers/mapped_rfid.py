@@ -5,6 +5,7 @@ import base64
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,7 +13,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files import bounded
+from factorgraph_loc.files import bounded, shipped
 from factorgraph_loc.files.cells import Cells
 from factorgraph_loc.files.column_mapping import (
     ColumnMapping,
@@ -24,7 +25,7 @@ from factorgraph_loc.files.column_mapping import (
     read_mapped,
 )
 from factorgraph_loc.files.columns import PURE, Column
-from factorgraph_loc.files.models import FileModel, InUnit
+from factorgraph_loc.files.models import FileModel, InUnit, read_toml
 from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.sensors.rfid.stream import RFID
 from factorgraph_loc.sensors.rfid.tables import SIGNALS, check_reads
@@ -38,57 +39,6 @@ CHANNEL = Column("channel", "whole", PURE, 1.0, 1000.0, True, "the number of a c
 COUNT = Column("count", "number", PURE, 0.0, 1e9, True, "number of reads in the row")
 REQUIRED = tuple(tuple(("t", epc, *antenna) for epc in EPCS) for antenna in (("antenna",), ()))
 STANDARD = str.maketrans("-_", "+/")  # from the alphabet of base64 for addresses
-# Formats of tools. ``impinj_itemtest``: CSV of ItemTest; ``impinj_iot``: event stream of an R700; ``sllurp_log``: output of
-# ``sllurp log``; ``sllurp_reports``: its tag reports as JSON, with timestamps and phases of LLRP.
-PRESETS: dict[str, dict[str, dict[str, str]]] = {
-    "impinj_itemtest": {
-        "columns": {
-            "t": "Timestamp",
-            "epc": "EPC",
-            "antenna": "Antenna",
-            "rssi": "RSSI",
-            "phase": "PhaseAngle",
-            "frequency": "Frequency",
-        },
-        "units": {"t": "iso", "phase": "rad", "frequency": "MHz"},
-    },
-    "impinj_iot": {
-        "columns": {
-            "t": "timestamp",
-            "epc": "tagInventoryEvent.epcHex",
-            "epc_base64": "tagInventoryEvent.epc",
-            "antenna": "tagInventoryEvent.antennaPort",
-            "rssi": "tagInventoryEvent.peakRssiCdbm",
-            "phase": "tagInventoryEvent.phaseAngle",
-            "frequency": "tagInventoryEvent.frequency",
-        },
-        "units": {"t": "iso", "rssi": "cdBm", "phase": "deg", "frequency": "kHz"},
-    },
-    "sllurp_log": {
-        "columns": {
-            "t": "timestamp",
-            "epc": "epc",
-            "antenna": "antenna",
-            "rssi": "rssi",
-            "phase": "phase_angle",
-            "channel": "channel_index",
-        },
-        "units": {"t": "s", "phase": "turn/4096"},
-    },
-    "sllurp_reports": {
-        "columns": {
-            "t": "FirstSeenTimestampUTC",
-            "last": "LastSeenTimestampUTC",
-            "epc": "EPC",
-            "antenna": "AntennaID",
-            "rssi": "PeakRSSI",
-            "phase": "ImpinjRFPhaseAngle",
-            "channel": "ChannelIndex",
-            "count": "TagSeenCount",
-        },
-        "units": {"t": "us", "last": "us", "phase": "turn/4096"},
-    },
-}
 
 
 def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
@@ -132,6 +82,13 @@ class Channels(FileModel):
     """frequency from one channel to the next"""
 
 
+@cache
+def presets() -> dict[str, dict[str, dict[str, str]]]:
+    """The columns and units of the files of known tools, by name."""
+    found: dict[str, dict[str, dict[str, str]]] = read_toml(shipped.readers()["mapped"])
+    return found
+
+
 class RfidFile(TimedMapping, ReadNames):
     """``columns``: t (or the first of several reads), epc or epc_base64, antenna, rssi (with ``*``: a column per tag or antenna),
     phase, frequency or channel, and, if a row summarizes several reads, ``last`` and ``count``."""
@@ -150,7 +107,7 @@ class RfidFile(TimedMapping, ReadNames):
     def _of_preset(cls, content: Any) -> Any:
         """Merge the preset with the given mapping, which has precedence."""
         name = content.get("preset") if isinstance(content, dict) else None
-        preset = PRESETS.get(name) if isinstance(name, str) else None
+        preset = presets().get(name) if isinstance(name, str) else None
         if preset is None or not all(isinstance(content.get(part, {}), dict) for part in preset):
             return content
         columns = preset["columns"] | content.get("columns", {})

@@ -3,25 +3,29 @@
 import io
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.errors import InputError, bad_field, require
 from factorgraph_loc.files import bounded, checks
 from factorgraph_loc.files.models import FileModel, parse_model
+from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.model.log import NOT_READ, Log
+from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
 from factorgraph_loc.sensors.landmarks.settings import Landmark
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
+from factorgraph_loc.sensors.tables import stream_of
 from factorgraph_loc.text import listed
 from factors import se2
-from factors.se2 import Array, Integers
+from factors.se2 import Array
 
 FIELDS = {"DR": 3, "TD": 4, "GT": 4, "TL": 3}  # columns
 
@@ -44,21 +48,24 @@ def read(path: Path | None, options: Options) -> Log:
     file = path or shipped(options.run)
     fields, others = read_matlab(file, FIELDS)
     warnings: list[str] = []
-    for name, columns in (("GT", "t x y heading"), ("DR", "t distance dtheta"), ("TD", "t 2 beacon range")):
-        checks.require_finite(f"{file}:{name}", rows_of(fields[name]), columns.split(), fields[name])
-    truth, truth_ns = kept_in_order(f"{file}:GT", fields["GT"], warnings)
-    t0_ns = int(truth_ns[0])
-    poses = truth[:, 1:].copy()
-    poses[:, 2] = se2.wrap(poses[:, 2] + HEADING_OFFSET[options.run])
+    truth, driven, seen = (
+        _rows(f"{file}:{name}", fields[name], columns)
+        for name, columns in (("GT", "t x y heading"), ("DR", "t dx dtheta"), ("TD", "t unused beacon range"))
+    )
+    keep = checks.in_order(truth.path, truth.rows, truth.t_ns, warnings)
+    truth = truth.rows_at(keep)
+    t0_ns = int(truth.t_ns[0])
+    heading = se2.wrap(truth.numbers["heading"] + HEADING_OFFSET[options.run])
+    poses = np.column_stack((truth.numbers["x"], truth.numbers["y"], heading))
     return Log(
         name=f"plaza{options.run}",
         rig=DEFAULT_RIG,
         world=beacons(f"{file}:TL", fields["TL"]),
         streams={
-            "odometry": increments(f"{file}:DR", fields["DR"], t0_ns, warnings),
-            "bearing_range": ranges(f"{file}:TD", fields["TD"], t0_ns, warnings),
+            "odometry": increments(driven, t0_ns, warnings),
+            "bearing_range": ranges(seen, t0_ns, warnings),
         },
-        reference=Trajectory(checks.seconds(truth_ns, t0_ns), poses, has_heading=HAS_HEADING[options.run]),
+        reference=Trajectory(checks.seconds(truth.t_ns, t0_ns), poses, has_heading=HAS_HEADING[options.run]),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
         metadata={NOT_READ: listed([*others, "TD: column 2"])},
@@ -99,15 +106,13 @@ def shipped(run: int) -> Path:
         raise InputError(f"Plaza{run}_.mat: is not in the installed gtsam, give the path of the file") from error
 
 
-def rows_of(table: Array) -> Integers:
-    return np.arange(1, len(table) + 1, dtype=np.int64)
-
-
-def kept_in_order(source: str, table: Array, warnings: list[str]) -> tuple[Array, Integers]:
-    """The rows of a table to keep, and their timestamps [ns]."""
-    t_ns = checks.stamps(source, rows_of(table), table[:, 0])
-    keep = checks.in_order(source, rows_of(table), t_ns, warnings)
-    return table[keep], t_ns[keep]
+def _rows(source: str, table: Array, columns: str) -> TableRows:
+    """The rows of a table (N, K) of finite numbers, whose first column is the time [s]."""
+    rows = np.arange(1, len(table) + 1, dtype=np.int64)
+    names = columns.split()
+    checks.require_finite(source, rows, names, table)
+    numbers = dict(zip(names[1:], table[:, 1:].T, strict=True))
+    return TableRows(Path(source), rows, checks.stamps(source, rows, table[:, 0]), numbers, {})
 
 
 def beacons(source: str, table: Array) -> World:
@@ -115,36 +120,27 @@ def beacons(source: str, table: Array) -> World:
     for row, (number, x, y) in enumerate(table, start=1):
         if not np.all(np.isfinite((number, x, y))):
             raise bad_field(source, "row", [float(number), float(x), float(y)], "finite numbers", row=row)
-        landmarks[beacon_name(number)] = parse_model(Landmark, {"x": x, "y": y}, f"{source}:{row}")
+        landmarks[f"{number:g}"] = parse_model(Landmark, {"x": x, "y": y}, f"{source}:{row}")
     return World(name="plaza", landmarks=landmarks)
 
 
-def beacon_name(number: float) -> str:
-    return f"{number:g}"
-
-
-def increments(source: str, table: Array, t0_ns: int, warnings: list[str]) -> IncrementStream:
+def increments(driven: TableRows, t0_ns: int, warnings: list[str]) -> IncrementStream:
     """The odometry, preceded by a row without motion at ``t0_ns``, which defines the duration of the first one."""
-    moves = np.column_stack((table[:, 1], np.zeros(len(table)), table[:, 2]))
-    rows = rows_of(table)
-    t_ns, moves = checks.increments_in_order(source, rows, checks.stamps(source, rows, table[:, 0]), moves, warnings)
+    moves = np.column_stack((driven.numbers["dx"], np.zeros(len(driven.rows)), driven.numbers["dtheta"]))
+    t_ns, moves = checks.increments_in_order(driven.path, driven.rows, driven.t_ns, moves, warnings)
     if t_ns[0] > t0_ns:
         moves = np.vstack((np.zeros(3), moves))
         t_ns = np.concatenate(([t0_ns], t_ns))
     return IncrementStream(checks.seconds(t_ns, t0_ns), *np.ascontiguousarray(moves.T))
 
 
-def ranges(source: str, table: Array, t0_ns: int, warnings: list[str]) -> BearingRangeStream:
+def ranges(seen: TableRows, t0_ns: int, warnings: list[str]) -> Stream:
     """The ranges sorted by time: the file joins overlapping recordings, so its order is not that of arrival."""
-    rows = rows_of(table)
-    checks.require_above_zero(source, rows, "range", table[:, 3])
-    t_ns = checks.stamps(source, rows, table[:, 0])
-    if moved := int(np.count_nonzero(t_ns < np.maximum.accumulate(t_ns))):
-        warnings.append(f"{source}: {moved} rows are older than one before them: sorted by time")
-    order = np.argsort(t_ns, kind="stable")
-    table, t_ns, rows = table[order], t_ns[order], rows[order]
-    names = [beacon_name(number) for number in table[:, 2]]
-    keep = checks.sightings_in_order(source, rows, t_ns, names, warnings)
-    return BearingRangeStream(
-        checks.seconds(t_ns[keep], t0_ns), [names[i] for i in keep], table[keep, 3], np.full(len(keep), np.nan)
-    )
+    distance = seen.numbers["range"]
+    require(distance > 0.0, seen.path, seen.rows, "range", distance, "more than 0")
+    if moved := int(np.count_nonzero(seen.t_ns < np.maximum.accumulate(seen.t_ns))):
+        warnings.append(f"{seen.path}: {moved} rows are older than one before them: sorted by time")
+    names = {"landmark": [f"{number:g}" for number in seen.numbers["beacon"]]}
+    numbers = {"range": distance, "bearing": np.full(len(distance), np.nan)}
+    order = np.argsort(seen.t_ns, kind="stable")
+    return stream_of(BEARING_RANGE, replace(seen, numbers=numbers, names=names).rows_at(order), t0_ns, warnings)

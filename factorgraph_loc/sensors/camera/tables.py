@@ -60,7 +60,7 @@ def make_images(table: TableRows, t0_ns: int, warnings: list[str], folder: Path 
 
     InputError if a path leaves the folder or is no regular file, or a timestamp is late by more than 0.5 s.
     """
-    latest = checks.images_in_order(table.path, table.rows, table.t_ns, warnings).tolist()
+    latest = checks.last_in_order(table.path, table.rows, table.t_ns, warnings).tolist()
     within = inside(table.path.parent, FOLDER, table.path) if folder is None else folder
     named = zip(table.rows.tolist(), table.names["file"], strict=True)
     paths = [_image(within, f"{table.path}:{row}", name) for row, name in named]

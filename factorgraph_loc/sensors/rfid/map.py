@@ -1,7 +1,5 @@
 """RFID tags of the map, and their tables."""
 
-import csv
-import io
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,8 +9,8 @@ from pydantic import Field
 
 from factorgraph_loc.files.column_mapping import ColumnMapping, EpcCase, in_case, read_mapped
 from factorgraph_loc.files.columns import ANGLE, FULL_TURN, LENGTH, Table, named, number, within
-from factorgraph_loc.files.models import FARTHEST, Coordinate, FileModel, InUnit, inside, parse_model, write_text
-from factorgraph_loc.files.tables import read_cells, rows_by_name
+from factorgraph_loc.files.models import FARTHEST, Coordinate, FileModel, InUnit, inside, parse_model
+from factorgraph_loc.files.tables import read_cells, rows_by_name, write_table
 from factorgraph_loc.model.settings import Covariance, spread_of
 from factors.se2 import Array
 
@@ -95,9 +93,6 @@ def read_mapped_tags(path: Path, mapping: TagsFile) -> dict[str, Tag]:
 
 
 def write_tags(tags: Mapping[str, Tag], path: Path) -> None:
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(TAG_COLUMNS_WITH_SIGMA)
-    # csv writes all digits of a float, and None as an empty cell
-    rows.writerows((epc, tag.x, tag.y, tag.z, tag.facing, tag.sigma) for epc, tag in tags.items())
-    write_text(path, text.getvalue())
+    names = TAG_COLUMNS_WITH_SIGMA[1:]
+    numbers = {name: [getattr(tag, name) for tag in tags.values()] for name in names}
+    write_table(path, (TAGS,), {"epc": list(tags), **numbers})
