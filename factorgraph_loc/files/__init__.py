@@ -2,7 +2,6 @@
 
 __all__ = [
     "bounded",
-    "cells",
     "checks",
     "column_mapping",
     "columns",

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.cells import Cells, csv_rows, rows_of_length
 from factorgraph_loc.files.models import FileModel, InUnit, inside, nearest, parse_json, read_text
+from factorgraph_loc.files.tables import Cells, csv_rows, rows_of_length
 from factorgraph_loc.text import listed, quoted, well_formed
 from factors.se2 import Integers
 

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.cells import SECONDS, Cells, iso_nanoseconds
 from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
 from factorgraph_loc.files.columns import POSES
+from factorgraph_loc.files.tables import SECONDS, Cells, iso_nanoseconds
 from factorgraph_loc.sensors.rfid.map import TAGS
 
 STAMPS = st.integers(-(2**61), 2**61)

@@ -189,16 +189,11 @@ class FrameReference:
         after ``t0_ns``, by default that of the first transform."""
         if t0_ns is None:
             t0_ns = min((int(edge.t_ns[0]) for edge in self._edges.values()), default=0)
-        moving: list[Trajectory3] = []
-        steps: list[tuple[int, Array]] = []
-        before: Array = np.eye(4)
-        for name in self._chain():
-            if name in self._edges:
-                steps.append((len(moving), before))
-                moving.append(self._edge(name, t0_ns, warnings))
-                before = np.eye(4)
-            else:
-                before = self._static.parents[name][1] @ before
+        edges = [
+            self._edge(name, t0_ns, warnings) if name in self._edges else self._static.parents[name][1]
+            for name in self._chain()
+        ]
+        moving = [edge for edge in edges if isinstance(edge, Trajectory3)]
         if not moving:
             raise InputError(f"{self._source}: {self._child} does not move in {self._parent}, expected frames that do")
         t = max(moving, key=len).t
@@ -208,10 +203,12 @@ class FrameReference:
                 f"{self._source}: the transforms from {self._child} to {self._parent} have no time in common"
             )
         poses = np.broadcast_to(np.eye(4), (len(t), 4, 4))
-        for i, fixed in steps:
-            at = moving[i].at(t)
-            poses = matrices(at.positions, at.rotations) @ fixed @ poses
-        poses = before @ poses
+        for edge in edges:
+            if isinstance(edge, Trajectory3):
+                at = edge.at(t)
+                poses = matrices(at.positions, at.rotations) @ poses
+            else:
+                poses = edge @ poses
         return path_of(Trajectory3(t, poses[:, :3, 3], poses[:, :3, :3]), self._source, t0_ns)
 
     def _chain(self) -> list[str]:

@@ -14,11 +14,10 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.cells import NAMES, NUMBERS
 from factorgraph_loc.files.column_mapping import ReadNames, in_case
 from factorgraph_loc.files.columns import LATEST, POSES, STAMP, Column, Table
 from factorgraph_loc.files.models import InUnit
-from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.poses import StaticFrames
 from factorgraph_loc.io.bags.topics import LIST, Fields, TopicRows, TopicSettings, as_nanoseconds, as_text, leaves

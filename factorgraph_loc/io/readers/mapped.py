@@ -11,12 +11,11 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError, require
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.cells import Cells
 from factorgraph_loc.files.column_mapping import ColumnMapping, TableFolder, TimedMapping, read_mapped
 from factorgraph_loc.files.columns import ANGLE, STAMPS, Table, named
 from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
 from factorgraph_loc.files.models import FileModel, add_fields
-from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.files.tables import Cells, TableRows
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.motions import TURNS, WHEELS, odometry_stream
 from factorgraph_loc.io.native import native

@@ -14,7 +14,6 @@ from pydantic import Field, model_validator
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import bounded, shipped
-from factorgraph_loc.files.cells import Cells
 from factorgraph_loc.files.column_mapping import (
     ColumnMapping,
     EpcCase,
@@ -26,7 +25,7 @@ from factorgraph_loc.files.column_mapping import (
 )
 from factorgraph_loc.files.columns import PURE, Column
 from factorgraph_loc.files.models import FileModel, InUnit, read_toml
-from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.files.tables import Cells, TableRows
 from factorgraph_loc.sensors.rfid.stream import RFID
 from factorgraph_loc.sensors.rfid.tables import SIGNALS, check_reads
 from factorgraph_loc.text import listed, quoted
@@ -206,12 +205,7 @@ def _from_base64(mapped: Cells, i: int, text: str) -> str:
 
 def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -> Array:
     """The frequencies (N,) [Hz] of channels, which are numbered from 1."""
-    number = mapped.numbers("channel", CHANNEL)
-    last = len(channels) if isinstance(channels, tuple) else 1000
-    with np.errstate(invalid="ignore"):
-        bad = np.flatnonzero(~(np.isnan(number) | ((number >= 1) & (number <= last) & (number == np.floor(number)))))
-    if len(bad):
-        raise mapped.invalid("channel", int(bad[0]), f"a channel of 1 to {last}")
+    number = mapped.numbers("channel", replace(CHANNEL, high=len(channels)) if isinstance(channels, tuple) else CHANNEL)
     if isinstance(channels, Channels):
         return np.asarray((channels.first + (number - 1.0) * channels.step) * 1e6)
     table = np.array((*(channels or ()), np.nan)) * 1e6

@@ -12,10 +12,10 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field, require
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.cells import Cells
 from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
 from factorgraph_loc.files.columns import POSES, PURE, within
 from factorgraph_loc.files.models import FARTHEST, read_text
+from factorgraph_loc.files.tables import Cells
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.pose_path import PosePath
 from factors.camera import model as reprojection
