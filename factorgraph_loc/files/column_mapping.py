@@ -197,7 +197,7 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
         body = body if in_comment else body[1:]
     else:
         # rows of other kinds may have other numbers of columns
-        chosen = (one for one in body if _is_chosen(one[1], _numbers(len(one[1])), where))
+        chosen = ((row, parts) for row, parts in body if _is_chosen(parts, _numbers(len(parts)), where))
         first_row, first = next(chosen, body[0])
         header = _numbers(len(first))
     _require_columns(path, mapping, needed, header, first_row)
@@ -255,23 +255,23 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Altern
     objects = list(_objects(path))
     where = mapping.chosen()
     chosen = [(row, o) for row, o in objects if all(_text(o.get(name)) in values for name, values in where.items())]
-    known = [{name for name, value in o.items() if value is not None} for _, o in chosen]
-    whole = [one for one, names in zip(chosen, known, strict=True) if _has(names, needed)]
-    seen = set[str]().union(*known)
+    filled = [{name for name, value in o.items() if value is not None} for _, o in chosen]
+    whole = [entry for entry, names in zip(chosen, filled, strict=True) if _has(names, needed)]
+    known = set[str]().union(*filled)
     for alternatives in needed:
-        if len(whole) < len(chosen) and not seen.intersection(alternatives):
+        if len(whole) < len(chosen) and not known.intersection(alternatives):
             first = listed(sorted(chosen[0][1]))
             raise InputError(f"{path}: no object has {quoted(alternatives[0])}, the first has {first}")
     columns: dict[str, list[str]] = {}
-    for name in seen.intersection(mapping.columns.values()):
-        for row, one in whole:
-            if isinstance(one.get(name), list):
-                raise bad_field(path, name, one[name], "a number or a text", row=row)
-        columns[name] = [_text(one.get(name)) for _, one in whole]
-    there = dict.fromkeys(name for _, one in whole for name in one)
+    for name in known.intersection(mapping.columns.values()):
+        for row, o in whole:
+            if isinstance(o.get(name), list):
+                raise bad_field(path, name, o[name], "a number or a text", row=row)
+        columns[name] = [_text(o.get(name)) for _, o in whole]
+    names = dict.fromkeys(name for _, o in whole for name in o)
     rows = np.array([row for row, _ in whole], dtype=np.int64)
     unwanted, passed = len(objects) - len(chosen), len(chosen) - len(whole)
-    return _mapped(path, rows, columns, mapping, there, unwanted=unwanted, passed=passed)
+    return _mapped(path, rows, columns, mapping, names, unwanted=unwanted, passed=passed)
 
 
 def _text(value: Any) -> str:
@@ -293,9 +293,9 @@ def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
         yield from ((row, dict(_values(entry))) for entry in entries)
 
 
-def _values(entry: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+def _values(entry: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in entry.items():
         if isinstance(value, Mapping):
-            yield from _values(value, f"{before}{key}.")
+            yield from _values(value, f"{prefix}{key}.")
         else:
-            yield before + key, value
+            yield prefix + key, value

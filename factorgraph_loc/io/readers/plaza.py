@@ -48,7 +48,7 @@ def read(path: Path | None, options: Options) -> Log:
     file = path or shipped(options.run)
     fields, others = read_matlab(file, FIELDS)
     warnings: list[str] = []
-    truth, driven, seen = (
+    truth, driven, observed = (
         _rows(f"{file}:{name}", fields[name], columns)
         for name, columns in (("GT", "t x y heading"), ("DR", "t dx dtheta"), ("TD", "t unused beacon range"))
     )
@@ -63,7 +63,7 @@ def read(path: Path | None, options: Options) -> Log:
         world=beacons(f"{file}:TL", fields["TL"]),
         streams={
             "odometry": increments(driven, t0_ns, warnings),
-            "bearing_range": ranges(seen, t0_ns, warnings),
+            "bearing_range": ranges(observed, t0_ns, warnings),
         },
         reference=Trajectory(checks.seconds(truth.t_ns, t0_ns), poses, has_heading=HAS_HEADING[options.run]),
         t0_ns=t0_ns,
@@ -134,13 +134,13 @@ def increments(driven: TableRows, t0_ns: int, warnings: list[str]) -> IncrementS
     return IncrementStream(checks.seconds(t_ns, t0_ns), *np.ascontiguousarray(moves.T))
 
 
-def ranges(seen: TableRows, t0_ns: int, warnings: list[str]) -> Stream:
+def ranges(observed: TableRows, t0_ns: int, warnings: list[str]) -> Stream:
     """The ranges sorted by time: the file joins overlapping recordings, so its order is not that of arrival."""
-    distance = seen.numbers["range"]
-    require(distance > 0.0, seen.path, seen.rows, "range", distance, "more than 0")
-    if moved := int(np.count_nonzero(seen.t_ns < np.maximum.accumulate(seen.t_ns))):
-        warnings.append(f"{seen.path}: {moved} rows are older than one before them: sorted by time")
-    names = {"landmark": [f"{number:g}" for number in seen.numbers["beacon"]]}
+    distance = observed.numbers["range"]
+    require(distance > 0.0, observed.path, observed.rows, "range", distance, "more than 0")
+    if moved := int(np.count_nonzero(observed.t_ns < np.maximum.accumulate(observed.t_ns))):
+        warnings.append(f"{observed.path}: {moved} rows are older than one before them: sorted by time")
+    names = {"landmark": [f"{number:g}" for number in observed.numbers["beacon"]]}
     numbers = {"range": distance, "bearing": np.full(len(distance), np.nan)}
-    order = np.argsort(seen.t_ns, kind="stable")
-    return stream_of(BEARING_RANGE, replace(seen, numbers=numbers, names=names).rows_at(order), t0_ns, warnings)
+    order = np.argsort(observed.t_ns, kind="stable")
+    return stream_of(BEARING_RANGE, replace(observed, numbers=numbers, names=names).rows_at(order), t0_ns, warnings)
