@@ -29,7 +29,7 @@ class Diagnostics:
     events: list[tuple[float, str]] = field(default_factory=list)
     dead_tags: dict[str, float] = field(default_factory=dict)
     moved_tags: dict[str, float] = field(default_factory=dict)
-    # what was added since :meth:`record` was called last; None where nobody asks
+    # all additions since :meth:`record` was called; None if it was not
     added: list[Addition] | None = field(default=None, init=False, repr=False, compare=False)
 
     def ignore(self, reason: str, count: int = 1) -> None:

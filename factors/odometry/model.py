@@ -200,6 +200,7 @@ class OdometryFactor:
     def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
         self._increment = increment
         self._arc = twist(increment.delta)
+        self._moving = increment.duration - increment.still
         self.estimated = tuple(estimated)
         self._indices = np.array(estimated, dtype=np.int64)
         self._whitener = whitener(increment.covariance)
@@ -207,7 +208,7 @@ class OdometryFactor:
     @property
     def packed(self) -> tuple[Array, Array, float, Array]:
         """The increment (3,), its logarithm (3,), how long the robot moved, and what whitens it (3, 3)."""
-        return self._increment.delta, self._arc, self._increment.moving, self._whitener
+        return self._increment.delta, self._arc, self._moving, self._whitener
 
     @property
     def kind(self) -> Hashable:
@@ -222,7 +223,7 @@ class OdometryFactor:
         """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)`` and its Jacobians."""
         start, end, *constants = values
         if constants:
-            changed = self._arc, self._increment.moving, constants[0], self._indices
+            changed = self._arc, self._moving, constants[0], self._indices
             residual, *blocks = linearize_changed(start, end, *changed, self._whitener)
             return residual, blocks
         residual, *blocks = linearize(start, end, self._increment.delta, np.zeros((3, 0)), self._whitener)
@@ -248,6 +249,6 @@ class ScaleFreeOdometryFactor(OdometryFactor):
         start, end, *constants = values
         if not constants:
             return super().linearize(values)
-        changed = self._arc, self._increment.moving, constants[0], self._indices
+        changed = self._arc, self._moving, constants[0], self._indices
         residual, *blocks = linearize_as_reported(start, end, *changed, self._whitener)
         return residual, blocks

@@ -44,7 +44,7 @@ from factors.se2 import Array
 
 # s that a pose may stay longer in a window, so that several are read at a time; less with points, which make it large
 MARGIN, WITH_POINTS = 2.0, 1.0
-FOREVER = 1e300  # s; a lag with which only the variables that are added to leave at once do so
+FOREVER = 1e300  # s; a lag with which only the variables with the stamp minus infinity leave
 
 
 class FullHistory:
@@ -88,8 +88,8 @@ class FullHistory:
         return 0
 
     def summary(self, *, failed: bool) -> MarginalSummary | None:
-        """What is known of all that is no more in the graph, from before the last update if that ``failed``; None where all is
-        there."""
+        """The information of all variables that have left the graph, from before the last update if that ``failed``; None if none
+        has left."""
         return None
 
     def value(self, key: int) -> Array:
@@ -247,8 +247,8 @@ class LinearFactors:
         nodes: Sequence[Node],
         values: Values,
     ) -> tuple[gtsam.NonlinearFactorGraph, list[int]]:
-        """All that the next update is to add, which is to be told by :meth:`place`, and the slots of what it is to remove: factors
-        on variables that it will linearise elsewhere are replaced."""
+        """The factors that the next update adds, and the slots of those that it removes: factors on variables that it will
+        linearise elsewhere are replaced. Call :meth:`place` after the update."""
         self._updates += 1
         self._added = self._moved(solver) if self.at and not self._updates % self._skip else []
         removed = [linear.slot for linear in self._added] if self._added else []
@@ -278,7 +278,7 @@ class LinearFactors:
         """A linearised factor on what the solver holds, with the point that it is linearised at."""
         jacobian, right = linearized.jacobian()
         motions, ends = frame_motions({key: self._held.get(key, self.at[key]) for key in keys})
-        if sum(map(is_place, keys)) > 1:  # else it tells where the place is in the world
+        if sum(map(is_place, keys)) > 1:  # else it contains the position in the world
             jacobian = unaware(jacobian, motions)
         factor = gaussian_factor(keys, -right, np.split(jacobian, ends[:-1], axis=1))
         return gtsam.LinearContainerFactor(factor, to_gtsam({key: self.at[key] for key in keys}))
@@ -301,7 +301,7 @@ class LinearFactors:
 
     @property
     def framed(self) -> Values:
-        """Where a new solver is to linearise the variables, with what is held as far from each other as it was then."""
+        """The linearisation points of a new solver; variables that are held keep their relative positions."""
         return self.at | self._held
 
     @property
@@ -310,7 +310,7 @@ class LinearFactors:
         return frozenset(self._slots)
 
     def _moved(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother) -> list[_Linear]:
-        """Those that are to be linearised anew."""
+        """The factors that the next update linearises at other points."""
         keys, ends = list(self.at), np.cumsum([len(value) for value in self.at.values()])
         change = np.maximum.reduceat(np.abs(solver.getDelta().vector(keys)), np.append(0, ends[:-1]))
         moved = [keys[i] for i in np.flatnonzero(change >= self._threshold).tolist()]
@@ -324,9 +324,9 @@ class LinearFactors:
         return list({number: linear for key in anew for number, linear in self._on.get(key, {}).items()}.values())
 
     def _followed(self, held: Values) -> list[int]:
-        """Of the places that iSAM2 holds, given their estimates, those whose factors are to be linearised anew.
+        """The variables among the ``held`` ones, given with their estimates, whose factors are to be linearised at other points.
 
-        None if they are poses only: in a known map GTSAM's factors of the odometry stay behind."""
+        None if all are poses: in a known map GTSAM's factors of the odometry are not moved."""
         if all(map(is_pose, held)):
             return []
         for key in held:
@@ -352,7 +352,7 @@ _PLACED = attrgetter("node.factor", "node.keys", "node.rows")
 
 
 def unaware(jacobian: Array, motions: Array) -> Array:
-    """The matrix nearest to a ``jacobian`` (m, n) that tells nothing of any of the ``motions`` (n, 3) of its variables (Hesch,
+    """The matrix nearest to a ``jacobian`` (m, n) whose product with the ``motions`` (n, 3) of its variables is zero (Hesch,
     Kottas, Bowman, Roumeliotis, IEEE Transactions on Robotics 30(1), 2014, section V)."""
     basis = np.linalg.qr(motions)[0]
     return np.asarray(jacobian - jacobian @ basis @ basis.T)

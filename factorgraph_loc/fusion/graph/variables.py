@@ -145,7 +145,7 @@ class TickAt(NamedTuple):
 
 @dataclass
 class Addition:
-    """What a measurement adds to the graph: factors, and new variables with their guesses."""
+    """New factors of the graph, and new variables with their guesses."""
 
     nodes: list[Node] = field(default_factory=list)
     values: Values = field(default_factory=dict)
@@ -156,7 +156,7 @@ class Addition:
         self.nodes += nodes
 
 
-# Gauss-Newton steps lead astray where points tell little: squared Mahalanobis distance of a pose from its guess
+# squared Mahalanobis distance of a pose from its guess; Gauss-Newton steps may diverge where points contain little information
 JUMPED = 50.0
 
 
