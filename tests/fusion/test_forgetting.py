@@ -15,6 +15,7 @@ CASES = [
     ("particle_filter", ("odometry", "bearing_range"), {"particles": 300, "smooth": False}),
     ("switching", ("odometry", "rfid", "bearing_range"), {"particles": 300}),
     ("smoother", ("odometry", "bearing_range"), {"lag": 3.0}),
+    ("smoother", ("odometry", "bearing_range"), {"lag": 3.0, "landmarks": "unknown"}),
     ("smoother", ("odometry", "rfid"), {"lag": 3.0, "smooth": False}),
 ]
 

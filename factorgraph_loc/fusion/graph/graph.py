@@ -111,9 +111,9 @@ class Graph:
         self.ticks = [tick for tick in self.ticks if tick.keyframe >= first]
 
     def before(self, t: float) -> Keyframe:
-        """The last keyframe at or before ``t``; KeyError where there is none."""
+        """The last keyframe at or before ``t``; the oldest one that is kept where all are later."""
         keyframe = self.newest
-        while keyframe.t > t:
+        while keyframe.t > t and keyframe.index - 1 in self.keyframes:
             keyframe = self.keyframes[keyframe.index - 1]
         return keyframe
 

@@ -277,5 +277,5 @@ class Builder:
             addition.hang(view.keyframe, Node((key,), VectorPriorFactor(new.mean, new.noise), len(new.mean), native))
         for t, seen in new.sightings:
             keyframe = self._graph.before(t)
-            if self._backend.is_open(keyframe.index):
+            if keyframe.t <= t and self._backend.is_open(keyframe.index):
                 addition.hang(keyframe, *(self._graph.node(keyframe, term, sensor.modality) for term in seen.terms))
