@@ -66,6 +66,10 @@ class Mapper(Protocol):
     def keep_only(self, keys: set[int]) -> None:
         """Give up all points but those with these ``keys``."""
 
+    def forget(self, first: Keyframe) -> Sequence[int]:
+        """Forget the keyframes before the ``first``, and the points that have left the graph and were not seen since.
+        Returns the keys of these points."""
+
     def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
         """All points that ever were in the graph, of which, and of the poses of keyframes, these are the ``values`` with their
         ``spreads``."""

@@ -1,6 +1,11 @@
-"""The views of each point of a graph: the last one, and some before it for a map."""
+"""The views of each point of a graph: the last one, and some before it for a map.
 
-from collections.abc import Mapping, Sequence
+A point whose track was lost is matched by the descriptor of its last view: within the ellipse predicted from pose and point, the
+nearest descriptor is accepted if it is clearly nearer than the second
+(:func:`factorgraph_loc.vision.matching.match_guided`). Wrong matches are rejected later, by consensus with other points.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,12 +15,17 @@ from numpy.typing import NDArray
 from factorgraph_loc.fusion.graph.variables import Guess
 from factorgraph_loc.maps.common_error import carried
 from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.matching import match_guided
 from factors import se2
-from factors.camera.model import CameraModel, camera_pose
+from factors.camera.kernels import NEAREST
+from factors.camera.model import CameraModel, camera_pose, linearize_in_space
 from factors.se2 import Array
 
 APART, VIEWS = 0.5, 4  # m travelled between views that a map keeps, and their number for each point
+NOISE = 3.0  # px: of the predicted pixel of a lost point, in addition to the error of the pose
+FARTHEST = 15.0  # m of its depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +66,32 @@ class PointLooks:
         if before is not None and len(earlier) < VIEWS - 1 and (not earlier or before.way >= earlier[-1].way + APART):
             earlier.append(before)
         self._looks[point] = look
+
+    def refound(
+        self, camera: CameraPose, points: Sequence[int], positions: Array, frame: CameraFrame, rows: Sequence[int]
+    ) -> list[tuple[int, int]]:
+        """Pairs of a point, by its place in ``points`` (N,) with ``positions`` (N, 3), and of its match among the features ``rows``
+        of a frame taken from about ``camera``."""
+        if not len(points) or not rows:
+            return []
+        model = self._model
+        seen, by_camera, _ = linearize_in_space(model, camera.position, camera.rotation, positions)
+        depth = ((positions - camera.position) @ camera.rotation)[:, 2]
+        near = np.flatnonzero(model.contains(seen) & (depth > NEAREST) & (depth < FARTHEST))
+        if not len(near):
+            return []
+        jacobian = by_camera[near]
+        spreads = jacobian @ camera.covariance @ jacobian.transpose(0, 2, 1) + NOISE**2 * np.eye(2)
+        descriptors, chosen = np.array([self._looks[points[i]].descriptor for i in near.tolist()]), list(rows)
+        offered, pixels = frame.descriptors[chosen], frame.pixels[chosen]
+        found = match_guided(descriptors, offered, seen[near], spreads, pixels, binary=offered.dtype == np.uint8)
+        return [(int(near[a]), rows[b]) for a, b in found.indices.tolist()]
+
+    def forget(self, points: Iterable[int]) -> None:
+        """Forget the views of these points, by key."""
+        for point in points:
+            self._looks.pop(point, None)
+            self._earlier.pop(point, None)
 
     def map_of(self, names: Sequence[str], keys: Sequence[int], positions: Array, covariances: Array) -> PointMap:
         """A map of the points, with their last views, in the given order."""

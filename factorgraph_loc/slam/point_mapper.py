@@ -14,9 +14,10 @@ from factorgraph_loc.sensors.base import Sensor
 from factorgraph_loc.sensors.camera.known_points import Pixels
 from factorgraph_loc.sensors.camera.sensor import CameraSensor
 from factorgraph_loc.slam.frame_pairs import FramePairs
+from factorgraph_loc.slam.keyframe_cameras import HORIZON
 from factorgraph_loc.slam.moving_things import MovingThings
 from factorgraph_loc.slam.new_points import FEWEST
-from factorgraph_loc.slam.unknown_points import HORIZON, UnknownPoints
+from factorgraph_loc.slam.unknown_points import UnknownPoints
 from factors.camera.model import CameraModel
 from factors.camera.point import PointFactor
 from factors.se2 import Array
@@ -113,6 +114,9 @@ class PointMapper:
     def keep_only(self, keys: set[int]) -> None:
         if self._unknown is not None:
             self._unknown.keep_only(keys)
+
+    def forget(self, first: Keyframe) -> Sequence[int]:
+        return [] if self._unknown is None else self._unknown.forget(first)
 
     def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
         return None if self._unknown is None else self._unknown.learnt(values, spreads)

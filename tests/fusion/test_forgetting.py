@@ -17,12 +17,13 @@ CASES = [
     ("smoother", ("odometry", "bearing_range"), {"lag": 3.0}),
     ("smoother", ("odometry", "bearing_range"), {"lag": 3.0, "landmarks": "unknown"}),
     ("smoother", ("odometry", "rfid"), {"lag": 3.0, "smooth": False}),
+    ("smoother", ("odometry", "sightings"), {"lag": 3.0, "landmarks": "unknown"}),
 ]
 
 
 @pytest.fixture(scope="module")
 def log():
-    changes = {"drive": {"duration": 60.0}, "world": {"tags": 12, "landmarks": 12}}
+    changes = {"drive": {"duration": 60.0}, "world": {"tags": 12, "landmarks": 12, "points": 200}}
     return simulate(named_settings("office", changes), 4)
 
 
@@ -66,6 +67,22 @@ def test_clouds_are_kept_as_far_as_smoothing_needs_them(log):
     end = log.span()[1]
     assert end - 13.0 < left.t[0] < end - 2.0
     assert np.all(np.isfinite(left.poses))
+
+
+def test_nothing_is_kept_of_points_seen_before(log):
+    settings = {"lag": 3.0, "landmarks": "unknown"}
+    whole, _ = driven(log, "smoother", ("odometry", "sightings"), settings, None)
+    short, _ = driven(log, "smoother", ("odometry", "sightings"), settings, 0.0)
+    oldest, points = next(iter(short._graph.keyframes.values())), short._graph.mappers[0]._unknown
+    assert oldest.index > 0
+    assert min(points._cameras.anchored) >= oldest.index
+    assert all(point.last >= oldest.t for point in points._gone)
+    assert short._graph.departed[0].keys() == short._graph.departed[1].keys() == {point.key for point in points._gone}
+    assert len(short._graph.departed[0]) < len(whole._graph.departed[0])
+    expected, left = whole.learnt().points, short.learnt().points
+    assert 0 < len(left) < len(expected)
+    rows = [expected.index[name] for name in left.names]
+    assert left.positions == pytest.approx(expected.positions[rows], abs=1e-9)
 
 
 def test_a_full_history_forgets_nothing(log):

@@ -30,7 +30,9 @@ def placed(moved, last, step=STEP):
     graph = SimpleNamespace(current=FEW.__getitem__, keyframes=keyframes, slip=lambda _: (np.zeros((3, 3)), np.inf))
     pixels, _ = predict(MODEL, se2.exp(np.asarray(moved)), FEW)
     none = np.zeros(len(FEW), dtype=bool)
-    (pose, _), _, _, right = points._placed(MODEL, known, pixels, keyframes[1], GUESS, graph, none, named=True)
+    named = SimpleNamespace(names=tuple("abcd"))
+    image = SimpleNamespace(m=named, keyframe=keyframes[1], graph=graph, model=MODEL)
+    (pose, _), _, _, right = points._placed(image, known, pixels, GUESS, none)
     return pose, np.count_nonzero(right)
 
 

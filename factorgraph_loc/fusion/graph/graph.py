@@ -105,10 +105,14 @@ class Graph:
         self.ticks = [tick for tick in self.ticks if tick.keyframe < first and tick.t < t]
 
     def forget(self, first: int) -> None:
-        """Forget the keyframes with numbers below ``first``, and the ticks after them."""
+        """Forget the keyframes with numbers below ``first``, the ticks after them, and the points that were not seen since."""
         for index in range(next(iter(self.keyframes)), first):
             del self.keyframes[index]
         self.ticks = [tick for tick in self.ticks if tick.keyframe >= first]
+        for mapper in self.mappers:
+            for key in mapper.forget(next(iter(self.keyframes.values()))):
+                for departed in self.departed:
+                    departed.pop(key, None)
 
     def before(self, t: float) -> Keyframe:
         """The last keyframe at or before ``t``; the oldest one that is kept where all are later."""
