@@ -26,7 +26,7 @@ from factorgraph_loc.experiments.seeds import parse_seeds
 from factorgraph_loc.plugins import ACTIVE_ESTIMATORS, POLICIES
 
 if TYPE_CHECKING:
-    from factorgraph_loc.experiments.experiment import Prepared
+    from factorgraph_loc.experiments.experiment import Done, Prepared
 
 
 MANY = 2000  # runs above which confirmation is required
@@ -46,6 +46,35 @@ Changes = Annotated[
 OutFolder = Annotated[
     Path | None,
     typer.Option("--out", "-o", metavar="OUT", help="Folder for the results; by default the one that FILE states."),
+]
+
+Policies = Annotated[
+    str,
+    typer.Option(
+        metavar="A,B",
+        help=f"{', '.join(POLICIES)}; the others are compared with the first.",
+        autocompletion=completion.policies,
+    ),
+]
+ActiveEstimators = Annotated[
+    str,
+    typer.Option(
+        "--estimator",
+        "-e",
+        metavar="A,B",
+        help=f"{', '.join(ACTIVE_ESTIMATORS)}.",
+        autocompletion=completion.active_estimators,
+    ),
+]
+ActiveSettings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; `fgloc policies` lists those of robot "
+        "and policy, `fgloc presets WORLD` those of the world. May be repeated.",
+        autocompletion=completion.active_setting,
+    ),
 ]
 
 
@@ -97,18 +126,7 @@ def run(
         stop.add_note(f"finished runs are kept in {prepared.folder}; the same command resumes")
         raise
     show.warnings(done.warnings)
-    for failure in done.failures[:SHOWN]:
-        show.note(f"failed: {failure}")
-    if len(done.failures) > SHOWN:
-        show.note(f"failed: {len(done.failures) - SHOWN} more, see `fgloc experiment status {file}`")
-    if json:
-        found = {"runs": done.rows.to_dicts(), "failures": done.failures, "warnings": done.warnings}
-        show.document({"folder": str(prepared.folder), **found})
-    else:
-        header, lines = _summary(done.rows.to_dicts(), prepared.experiment.report.metrics)
-        show.table(header, lines)
-        show.line()
-        show.line(f"results are in {prepared.folder}: results.parquet, store/")
+    _print_done(done, prepared, file, json)
     if done.failures:
         raise typer.Exit(1)
 
@@ -163,6 +181,21 @@ def report(
 
 def _changes(texts: list[str] | None) -> dict[str, Any]:
     return dict(key_and_value(text, "--set") for text in texts or ())
+
+
+def _print_done(done: Done, prepared: Prepared, file: Path, json: bool) -> None:
+    for failure in done.failures[:SHOWN]:
+        show.note(f"failed: {failure}")
+    if len(done.failures) > SHOWN:
+        show.note(f"failed: {len(done.failures) - SHOWN} more, see `fgloc experiment status {file}`")
+    if json:
+        found = {"runs": done.rows.to_dicts(), "failures": done.failures, "warnings": done.warnings}
+        show.document({"folder": str(prepared.folder), **found})
+        return
+    header, lines = _summary(done.rows.to_dicts(), prepared.experiment.report.metrics)
+    show.table(header, lines)
+    show.line()
+    show.line(f"results are in {prepared.folder}: results.parquet, store/")
 
 
 def _print_plan(prepared: Prepared, jobs: int | None, again: bool, json: bool) -> None:
@@ -247,38 +280,13 @@ def active(
         ),
     ],
     out: Out,
-    policy: Annotated[
-        str,
-        typer.Option(
-            metavar="A,B",
-            help=f"{', '.join(POLICIES)}; the others are compared with the first.",
-            autocompletion=completion.policies,
-        ),
-    ] = "information",
-    estimator: Annotated[
-        str,
-        typer.Option(
-            "--estimator",
-            "-e",
-            metavar="A,B",
-            help=f"{', '.join(ACTIVE_ESTIMATORS)}.",
-            autocompletion=completion.active_estimators,
-        ),
-    ] = "active_mcl",
+    policy: Policies = "information",
+    estimator: ActiveEstimators = "active_mcl",
     seeds: Seeds = "0",
     max_metres: Annotated[
         float | None, typer.Option(metavar="M", help="Path length after which a robot gives up [m]; by default 100.")
     ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; `fgloc policies` lists those of robot "
-            "and policy, `fgloc presets WORLD` those of the world. May be repeated.",
-            autocompletion=completion.active_setting,
-        ),
-    ] = None,
+    set_: ActiveSettings = None,
     jobs: Jobs = None,
     overwrite: Overwrite = False,
     json: Json = False,

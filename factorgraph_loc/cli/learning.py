@@ -73,35 +73,40 @@ def calibrate(
     show.line(f"the rig is in {out}, the report in {page}")
 
 
+MapEstimator = Annotated[
+    str,
+    typer.Option(
+        "--estimator",
+        "-e",
+        metavar="NAME",
+        help=f"One of {', '.join(MAP_ESTIMATORS)}.",
+        autocompletion=completion.map_estimator,
+    ),
+]
+Layer = Annotated[
+    str | None,
+    typer.Option(
+        metavar="WHAT",
+        help="landmarks, tags or points; by default points if the log has images, landmarks if it has sightings of them.",
+    ),
+]
+Poses = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SOURCE",
+        help="For tags: reference, or odometry to estimate the poses too; by default the reference if there is one.",
+    ),
+]
+
+
 @takes_options
 def map_(
     log: LogName,
     out: OutWorld,
-    estimator: Annotated[
-        str,
-        typer.Option(
-            "--estimator",
-            "-e",
-            metavar="NAME",
-            help=f"One of {', '.join(MAP_ESTIMATORS)}.",
-            autocompletion=completion.map_estimator,
-        ),
-    ] = MAP_ESTIMATORS[0],
+    estimator: MapEstimator = MAP_ESTIMATORS[0],
     extend: Annotated[bool, typer.Option("--extend", help="Keep the log's map and add what it lacks.")] = False,
-    of: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WHAT",
-            help="landmarks, tags or points; by default points if the log has images, landmarks if it has sightings of them.",
-        ),
-    ] = None,
-    poses: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SOURCE",
-            help="For tags: reference, or odometry to estimate the poses too; by default the reference if there is one.",
-        ),
-    ] = None,
+    of: Layer = None,
+    poses: Poses = None,
     tag_height: Annotated[
         float | None,
         typer.Option(metavar="Z", help="Height [m] of tags that the log's map lacks; by default that of the antennas."),

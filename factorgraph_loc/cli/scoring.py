@@ -11,6 +11,21 @@ from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import Json, MaxGap, Overwrite
 from factorgraph_loc.model.scoring import MAX_DIFF, MAX_GAP, Alignment, Association
 
+Align = Annotated[
+    Alignment,
+    typer.Option(
+        help="How the estimate is moved onto the reference first: not at all, first pose onto first pose, or by least "
+        "squares in the plane, in space, or in space with a scale."
+    ),
+]
+Associate = Annotated[
+    Association,
+    typer.Option(
+        help="Which poses are compared: those with the nearest stamps, or estimates interpolated at the stamps of the "
+        "reference, as runs are scored."
+    ),
+]
+
 
 def score(
     estimate: Annotated[
@@ -22,20 +37,8 @@ def score(
         ),
     ],
     reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="Another one, of any of these kinds.")],
-    align: Annotated[
-        Alignment,
-        typer.Option(
-            help="How the estimate is moved onto the reference first: not at all, first pose onto first pose, or by least "
-            "squares in the plane, in space, or in space with a scale."
-        ),
-    ] = "none",
-    associate: Annotated[
-        Association,
-        typer.Option(
-            help="Which poses are compared: those with the nearest stamps, or estimates interpolated at the stamps of the "
-            "reference, as runs are scored."
-        ),
-    ] = "nearest",
+    align: Align = "none",
+    associate: Associate = "nearest",
     max_diff: Annotated[
         float, typer.Option(metavar="SECONDS", help="Largest difference of the nearest stamps.")
     ] = MAX_DIFF,

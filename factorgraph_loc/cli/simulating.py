@@ -13,16 +13,35 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.seeds import parse_seeds
 from factorgraph_loc.plugins import PRESETS
 
+What = Annotated[
+    str,
+    typer.Argument(
+        metavar="PRESET",
+        help=f"{', '.join(PRESETS)}, or a TOML file.",
+        autocompletion=completion.preset,
+    ),
+]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="A setting, e.g. faults.misplaced=0.1; `fgloc presets NAME` lists them. May be repeated.",
+        autocompletion=completion.simulation_setting,
+    ),
+]
+Recorded = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LOG",
+        help="Resample the reads from this recording, with its antennas (semi-real).",
+        autocompletion=completion.logs,
+    ),
+]
+
 
 def simulate(
-    what: Annotated[
-        str,
-        typer.Argument(
-            metavar="PRESET",
-            help=f"{', '.join(PRESETS)}, or a TOML file.",
-            autocompletion=completion.preset,
-        ),
-    ],
+    what: What,
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write; with --seeds, a folder of folders.")
     ],
@@ -34,23 +53,8 @@ def simulate(
         float | None, typer.Option(metavar="S", help="Duration of the drive [s]; 600 in the presets.")
     ] = None,
     tags: Annotated[int | None, typer.Option(metavar="N", help="Number of tags.")] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="A setting, e.g. faults.misplaced=0.1; `fgloc presets NAME` lists them. May be repeated.",
-            autocompletion=completion.simulation_setting,
-        ),
-    ] = None,
-    recorded: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LOG",
-            help="Resample the reads from this recording, with its antennas (semi-real).",
-            autocompletion=completion.logs,
-        ),
-    ] = None,
+    set_: Changes = None,
+    recorded: Recorded = None,
     images: Annotated[bool, typer.Option("--images", help="Also render camera images.")] = False,
     image_rate: Annotated[float | None, typer.Option(metavar="HZ", help="Images per second; 5 in the presets.")] = None,
     world_seed: Annotated[

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,8 +34,8 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import TURN
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Ticks, check_max_gap, check_tick_gap
-from factorgraph_loc.sensors.camera.use import MapFrame, prepare
-from factorgraph_loc.sensors.interfaces import Ending
+from factorgraph_loc.sensors.camera.use import MapFrame, PreparedLog, prepare
+from factorgraph_loc.sensors.interfaces import Ending, Use
 from factorgraph_loc.sensors.registry import detecting, functions, moving
 from factorgraph_loc.version import __version__
 
@@ -83,101 +83,138 @@ def run(
     not finite or a covariance that is not positive definite, with the time and the measurement; see
     :mod:`factorgraph_loc.fusion.guarded`.
     """
-    check_max_gap(config.max_gap)
-    check_tick_gap(config.tick_gap)
-    require_bounds(log)  # the log may have been made by a program
-    require_one_span(log)
-    sensors = used_sensors(log, config.sensors)
-    settings = registry.settings_of(config.estimator, config.settings)
-    use = checked_use(use_of(log, sensors, config.estimator, settings, config.settings))
-    settings = use.settings
-    prior, prior_source = resolve_prior(log, config.prior)
-    setup = model_setup.Setup(log.rig, log.world, sensors, np.random.default_rng(config.seed))
+    use = _use(log, config)
+    stated = resolve_prior(log, config.prior)
+    setup = model_setup.Setup(log.rig, log.world, use.sensors, np.random.default_rng(config.seed))
     guard = Guard(f"{config.estimator} on {log.name}")
     with guard:
-        estimator = registry.create(config.estimator, setup, settings)
-    unstated: tuple[str, ...] = ()
-    if prior is None and config.prior is None and not detecting(log.world, log.streams):
-        prior, prior_source = at_origin(log), "origin"
-        unstated = (f"{log.name}: has neither a start nor a reference: begins at (0, 0, 0); --prior says where else",)
-    if prior is None and not getattr(estimator, "supports_unknown_start", False):
-        raise InputError(
-            f"{config.estimator} cannot start from an unknown pose on {log.name} with these settings, "
-            f"expected a prior {KNOWN}"
-        )
-    if prior is not None and not prior.has_heading and not (finds_heading(estimator) and detecting(log.world, sensors)):
-        raise InputError(
-            f"{config.estimator} cannot find an unknown heading on {log.name} with these settings and sensors, "
-            f"expected a prior X,Y,HEADING"
-        )
+        estimator = registry.create(config.estimator, setup, use.settings)
+    start = _start(use, config, estimator, *stated)
 
     report = progress or (lambda _: None)
     prepared = prepare(use, lambda share: report(0.5 * share))
     before = 0.5 if prepared.images else 0.0
-    frame = MapFrame.of(setup, use.modalities, getattr(settings, "landmarks", "known"))
-    _rehearse(config, setup, settings, prepared.log, prior)
-    ticks = Ticks(_begin(log, sensors, prior), config.tick_gap)
-    loop = CausalRun(
+    frame = MapFrame.of(setup, use.modalities, getattr(use.settings, "landmarks", "known"))
+    _rehearse(config, setup, use.settings, prepared.log, start.prior)
+    ticks = Ticks(_begin(log, use.sensors, start.prior), config.tick_gap)
+    causal = CausalRun(
         guard,
         estimator,
         prepared.log,
-        sensors,
-        prior,
+        use.sensors,
+        start.prior,
         ticks,
         frame,
         lambda share: report(before + (1.0 - before) * share),
         watch,
     )
     with guard.quiet(), only_new_searched():
-        loop.run()
+        causal.run()
+    return _result(use, config, start, prepared, causal, *_ended(guard, estimator, frame))
+
+
+def _use(log: Log, config: RunConfig) -> Use:
+    """What a run uses of its log; InputError if the log or the configuration is out of bounds."""
+    check_max_gap(config.max_gap)
+    check_tick_gap(config.tick_gap)
+    require_bounds(log)  # the log may have been made by a program
+    require_one_span(log)
+    sensors = used_sensors(log, config.sensors)
+    settings = registry.settings_of(config.estimator, config.settings)
+    return checked_use(use_of(log, sensors, config.estimator, settings, config.settings))
+
+
+class _Start(NamedTuple):
+    """The prior of a run, None if the start is unknown, the name of its source, and warnings."""
+
+    prior: PosePrior | None
+    source: str
+    warnings: tuple[str, ...] = ()
+
+
+def _start(use: Use, config: RunConfig, estimator: Estimator, prior: PosePrior | None, source: str) -> _Start:
+    """The start of a run with the stated ``prior``; InputError if the estimator cannot start there."""
+    log = use.log
+    if prior is None and config.prior is None and not detecting(log.world, log.streams):
+        warning = f"{log.name}: has neither a start nor a reference: begins at (0, 0, 0); --prior says where else"
+        return _Start(at_origin(log), "origin", (warning,))
+    if prior is None and not getattr(estimator, "supports_unknown_start", False):
+        raise InputError(
+            f"{config.estimator} cannot start from an unknown pose on {log.name} with these settings, "
+            f"expected a prior {KNOWN}"
+        )
+    finds = finds_heading(estimator) and detecting(log.world, use.sensors)
+    if prior is not None and not prior.has_heading and not finds:
+        raise InputError(
+            f"{config.estimator} cannot find an unknown heading on {log.name} with these settings and sensors, "
+            f"expected a prior X,Y,HEADING"
+        )
+    return _Start(prior, source)
+
+
+def _ended(guard: Guard, estimator: Estimator, frame: MapFrame) -> tuple[Ending, float]:
+    """The end of a run, and the seconds that the final trajectory took."""
     started = perf_counter()
     with guard.telling("the final trajectory"):
         final = frame.trajectory(sound_trajectory(estimator.trajectory()))
-        final_seconds = perf_counter() - started
+        seconds = perf_counter() - started
         diagnostics, learnt = estimator.diagnostics, estimator.learnt()
         if isinstance(estimator, ConcludingEstimator):
             diagnostics = estimator.final_diagnostics()
-    ending = Ending(estimator.diagnostics, diagnostics, learnt, final)
-    reviews = {name: review(use, ending) for name, review in functions("review")}
+    return Ending(estimator.diagnostics, diagnostics, learnt, final), seconds
+
+
+def _result(
+    use: Use,
+    config: RunConfig,
+    start: _Start,
+    prepared: PreparedLog,
+    causal: CausalRun,
+    end: Ending,
+    final_seconds: float,
+) -> RunResult:
+    log = use.log
+    reviews = {name: review(use, end) for name, review in functions("review")}
     reliability = {name: one.reliability for name, one in reviews.items() if one.reliability is not None}
     versions = _versions()
     effective = {
         "log": log.name,
         "estimator": config.estimator,
-        "settings": settings.model_dump(mode="json", exclude_none=True),
-        "sensors": list(sensors),
-        "prior": prior_source,
+        "settings": use.settings.model_dump(mode="json", exclude_none=True),
+        "sensors": list(use.sensors),
+        "prior": start.source,
         "seed": config.seed,
         "max_gap": config.max_gap,
         "tick_gap": config.tick_gap,
         "rig": log.rig.model_dump(mode="json", exclude_none=True),
         "versions": versions,
     }
+    warnings = (
+        *log.warnings,
+        *start.warnings,
+        *use.warnings,
+        *unused(log, use.sensors),
+        *prepared.warnings,
+        *(line for one in reviews.values() for line in one.warnings),
+        *(line for one in reliability.values() for line in one.doubts),
+        *never_localized(log, use.sensors, causal.told.status, end.final),
+        *partly_scored(log, end.final, config.max_gap),
+        *in_bent_map(log, causal.frame, end.final),
+        *with_pauses(log, causal.ticks.skipped, config.tick_gap),
+    )
     return RunResult(
         log=log.name,
         config=effective,
-        t=np.array(loop.told.t),
-        poses=np.array(loop.told.poses).reshape(-1, 3),
-        covariances=np.array(loop.told.covariances).reshape(-1, 3, 3),
-        status=tuple(loop.told.status),
-        final=final,
-        diagnostics=diagnostics,
-        learnt=learnt,
-        timings=loop.timings(final_seconds, prepared),
+        t=np.array(causal.told.t),
+        poses=np.array(causal.told.poses).reshape(-1, 3),
+        covariances=np.array(causal.told.covariances).reshape(-1, 3, 3),
+        status=tuple(causal.told.status),
+        final=end.final,
+        diagnostics=end.final_diagnostics,
+        learnt=end.learnt,
+        timings=causal.timings(final_seconds, prepared),
         versions=versions,
-        warnings=_once(
-            *log.warnings,
-            *unstated,
-            *use.warnings,
-            *unused(log, sensors),
-            *prepared.warnings,
-            *(line for one in reviews.values() for line in one.warnings),
-            *(line for one in reliability.values() for line in one.doubts),
-            *never_localized(log, sensors, loop.told.status, final),
-            *partly_scored(log, final, config.max_gap),
-            *in_bent_map(log, frame, final),
-            *with_pauses(log, ticks.skipped, config.tick_gap),
-        ),
+        warnings=tuple(dict.fromkeys(warnings)),
         reliability=reliability,
     )
 
@@ -213,11 +250,6 @@ def _begin(log: Log, sensors: tuple[str, ...], prior: PosePrior | None) -> float
     if not begin <= last:
         raise InputError(f"{log.name}: the prior's time {begin:.3f} s lies after the last measurement at {last:.3f} s")
     return begin
-
-
-def _once(*warnings: str) -> tuple[str, ...]:
-    """The warnings without duplicates."""
-    return tuple(dict.fromkeys(warnings))
 
 
 def _versions() -> dict[str, str]:

@@ -148,6 +148,25 @@ def _rays(model: CameraModel, pixels: Array) -> tuple[Array, Array]:
 
 
 @compiled
+def _by_pixel(noise: Array, x: float, y: float, z: float) -> tuple[float, float]:
+    """The derivative by the pixel noise, from that by the ray (x, y, z) and the ray's derivative ``noise`` (3, 2)."""
+    return (
+        noise[0, 0] * x + noise[1, 0] * y + noise[2, 0] * z,
+        noise[0, 1] * x + noise[1, 1] * y + noise[2, 1] * z,
+    )
+
+
+@compiled
+def _shifted(ray: Array, noise: Array, u: float, v: float) -> tuple[float, float, float]:
+    """A ray (3,) without the pixel noise (u, v), by its derivative ``noise`` (3, 2)."""
+    return (
+        ray[0] - (noise[0, 0] * u + noise[0, 1] * v),
+        ray[1] - (noise[1, 0] * u + noise[1, 1] * v),
+        ray[2] - (noise[2, 0] * u + noise[2, 1] * v),
+    )
+
+
+@compiled
 def _sampson(
     first: Array,
     second: Array,
@@ -175,10 +194,8 @@ def _sampson(
         h0, h1, h2 = -a2 * ty, a2 * tx, a0 * ty - a1 * tx
         k0, k1 = c * h0 + s * h1, c * h1 - s * h0
         p, n = first_noise[k], second_noise[k]
-        u0 = p[0, 0] * g0 + p[1, 0] * g1 + p[2, 0] * g2
-        u1 = p[0, 1] * g0 + p[1, 1] * g1 + p[2, 1] * g2
-        v0 = n[0, 0] * k0 + n[1, 0] * k1 + n[2, 0] * h2
-        v1 = n[0, 1] * k0 + n[1, 1] * k1 + n[2, 1] * h2
+        u0, u1 = _by_pixel(p, g0, g1, g2)
+        v0, v1 = _by_pixel(n, k0, k1, h2)
         variance = u0 * u0 + u1 * u1 + v0 * v0 + v1 * v1
         if variance <= 0.0:
             residual[k] = 0.0
@@ -190,16 +207,8 @@ def _sampson(
         residual[k] = value
         # the intersecting rays
         shift = value / sigma
-        m0, m1, m2 = (
-            a0 - shift * (p[0, 0] * u0 + p[0, 1] * u1),
-            a1 - shift * (p[1, 0] * u0 + p[1, 1] * u1),
-            a2 - shift * (p[2, 0] * u0 + p[2, 1] * u1),
-        )
-        w0, w1, w2 = (
-            b0 - shift * (n[0, 0] * v0 + n[0, 1] * v1),
-            b1 - shift * (n[1, 0] * v0 + n[1, 1] * v1),
-            b2 - shift * (n[2, 0] * v0 + n[2, 1] * v1),
-        )
+        m0, m1, m2 = _shifted(first[k], p, shift * u0, shift * u1)
+        w0, w1, w2 = _shifted(second[k], n, shift * v0, shift * v1)
         r0, r1 = c * w0 - s * w1, s * w0 + c * w1
         for j in range(3):
             sx, sy = change_x[j], change_y[j]
@@ -209,10 +218,9 @@ def _sampson(
             if j == 2:
                 dg2 += tx * q0 + ty * q1  # R b rotates too
                 dk0, dk1 = dk0 + k1, dk1 - k0
-            slope = u0 * (p[0, 0] * dg0 + p[1, 0] * dg1 + p[2, 0] * dg2)
-            slope += u1 * (p[0, 1] * dg0 + p[1, 1] * dg1 + p[2, 1] * dg2)
-            slope += v0 * (n[0, 0] * dk0 + n[1, 0] * dk1 + n[2, 0] * dh2)
-            slope += v1 * (n[0, 1] * dk0 + n[1, 1] * dk1 + n[2, 1] * dh2)
+            du0, du1 = _by_pixel(p, dg0, dg1, dg2)
+            dv0, dv1 = _by_pixel(n, dk0, dk1, dh2)
+            slope = u0 * du0 + u1 * du1 + v0 * dv0 + v1 * dv1
             jacobian[k, j] = (a0 * dg0 + a1 * dg1 + a2 * dg2) / sigma - value * slope / variance
             change = m0 * sy * w2 - m1 * sx * w2 + m2 * (sx * r1 - sy * r0)
             if j == 2:

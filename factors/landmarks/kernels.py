@@ -67,24 +67,36 @@ def linearize(
             if widened:
                 a, b, d = _carried(by_pose[k], covariance)
                 uu, uv, vv = uu + count * a, uv + count * b, vv + count * d
-            # of the inverse of the lower root
-            p = 1.0 / math.sqrt(uu)
-            low = uv * p
-            q = 1.0 / math.sqrt(max(vv - low * low, 1e-12 * vv))
-            r = -low * p * q
-            error[k, 1] = r * error[k, 0] + q * error[k, 1]
-            error[k, 0] *= p
-            for j in range(3):
-                by_pose[k, 1, j] = r * by_pose[k, 0, j] + q * by_pose[k, 1, j]
-                by_pose[k, 0, j] *= p
-            for j in range(TIME_OFFSET + 1):
-                by_sensor[k, 1, j] = r * by_sensor[k, 0, j] + q * by_sensor[k, 1, j]
-                by_sensor[k, 0, j] *= p
+            _widen(error[k], by_pose[k], by_sensor[k], uu, uv, vv)
         if displaced:
-            for i in range(2):
-                u, v, w = by_pose[k, i, 0], by_pose[k, i, 1], by_pose[k, i, 2]
-                by_pose[k, i, 0], by_pose[k, i, 1] = u * c - v * s, u * s + v * c
-                by_pose[k, i, 2] = u * lever_x + v * lever_y + w
+            _displace(by_pose[k], c, s, lever_x, lever_y)
+
+
+@compiled
+def _widen(error: Array, by_pose: Array, by_sensor: Array, uu: float, uv: float, vv: float) -> None:
+    """Whiten the ``error`` (2,) of a landmark and its Jacobians (2, 3) and (2, 6) by a covariance [[uu, uv], [uv, vv]]."""
+    # the inverse of its lower root [[p, 0], [r, q]]
+    p = 1.0 / math.sqrt(uu)
+    low = uv * p
+    q = 1.0 / math.sqrt(max(vv - low * low, 1e-12 * vv))
+    r = -low * p * q
+    error[1] = r * error[0] + q * error[1]
+    error[0] *= p
+    for j in range(3):
+        by_pose[1, j] = r * by_pose[0, j] + q * by_pose[1, j]
+        by_pose[0, j] *= p
+    for j in range(TIME_OFFSET + 1):
+        by_sensor[1, j] = r * by_sensor[0, j] + q * by_sensor[1, j]
+        by_sensor[0, j] *= p
+
+
+@compiled
+def _displace(by_pose: Array, c: float, s: float, lever_x: float, lever_y: float) -> None:
+    """Turn a Jacobian (2, 3) by a pose into that by the pose before a motion: see :func:`~factors.displaced.displaced`."""
+    for i in range(2):
+        u, v, w = by_pose[i, 0], by_pose[i, 1], by_pose[i, 2]
+        by_pose[i, 0], by_pose[i, 1] = u * c - v * s, u * s + v * c
+        by_pose[i, 2] = u * lever_x + v * lever_y + w
 
 
 @compiled
