@@ -100,6 +100,11 @@ def squared(errors: Array, covariances: Array) -> Array:
         return np.asarray(np.sum((_whitener(covariances) @ errors[..., None])[..., 0] ** 2, axis=-1))
 
 
+def worst_sigma(covariances: Array) -> Array:
+    """Standard deviations (...,) in the least certain direction of covariances (..., D, D)."""
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[..., -1], 0.0)))
+
+
 def draws(covariance: Array, count: int, rng: np.random.Generator) -> Array:
     """Draws (count, D) from a zero-mean Gaussian whose covariance (D, D) may be singular."""
     values, vectors = np.linalg.eigh(covariance)

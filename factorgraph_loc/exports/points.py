@@ -7,6 +7,7 @@ import numpy as np
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.maps.points import PointMap
+from factors.positive import worst_sigma
 
 HEADER = """ply
 format ascii 1.0
@@ -23,7 +24,7 @@ end_header
 
 def write_ply(points: PointMap, path: Path) -> None:
     """Write the positions of points, with the standard deviation in the worst direction [m] and the number of their views."""
-    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(points.covariances)[:, -1], 0.0)) if len(points) else np.empty(0)
+    sigma = worst_sigma(points.covariances)
     views = np.bincount(points.owners, minlength=len(points))
     rows = zip(points.positions.tolist(), sigma.tolist(), views.tolist(), strict=True)
     body = "".join(f"{x:.6f} {y:.6f} {z:.6f} {s:.6f} {count}\n" for (x, y, z), s, count in rows)

@@ -16,15 +16,14 @@ import numpy as np
 import scipy.sparse
 from gtsam.symbol_shorthand import K, L, X
 
-from factorgraph_loc.mapping.triangulation import NEAREST, Cameras, Integers, Tracks, Truths, reproject
+from factorgraph_loc.mapping.triangulation import NEAREST, Cameras, Tracks, reproject
+from factorgraph_loc.vision.consensus import Truths
 from factors.camera.model import CameraModel
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 ROUNDS = 3
-LOOSE, OUTLIER = (
-    6.0,
-    3.5,
-)  # standard deviations of a pixel beyond which an observation is an outlier, in the first round and later
+# standard deviations of a pixel beyond which an observation is an outlier, in the first round and later
+LOOSE, OUTLIER = 6.0, 3.5
 ITERATIONS = 20
 RELATIVE, ABSOLUTE = 1e-4, 1e-4  # decrease of the cost at which to stop
 FOCAL_SIGMA, ASPECT_SIGMA = 0.1, 0.005  # standard deviations of an unknown focal length and of fx / fy, relative

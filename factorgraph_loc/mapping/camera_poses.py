@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.mapping.triangulation import Cameras, Integers
+from factorgraph_loc.mapping.triangulation import Cameras
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.use import frames_of
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera.model import CameraModel, camera_pose
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 MAX_GAP = 0.5  # s between stamps of a reference, beyond which it is not interpolated
 ASKEW, AFLOAT = 0.003, 0.003  # rad, m: standard deviations of tilt and height of a robot on the floor

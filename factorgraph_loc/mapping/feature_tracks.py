@@ -8,11 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from factorgraph_loc.mapping.triangulation import Cameras, Integers, Tracks, Truths
+from factorgraph_loc.mapping.triangulation import Cameras, Tracks
+from factorgraph_loc.vision.consensus import Truths
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.matching import match
 from factors.camera.model import CameraModel, undistorted
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 RANKS = (
     0,

@@ -24,7 +24,7 @@ from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.settings import Landmark
-from factors import se2
+from factors import positive, se2
 from factors.se2 import Array
 
 GATE = 13.816  # 99.9 % of chi-square with two degrees of freedom
@@ -67,7 +67,7 @@ class Entry:
     @property
     def sigma(self) -> float | None:
         """Standard deviation [m] of the learnt position in its least certain direction."""
-        return None if self.learnt is None else float(np.sqrt(np.linalg.eigvalsh(self.learnt.covariance)[-1]))
+        return None if self.learnt is None else float(positive.worst_sigma(self.learnt.covariance))
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def make_map(
         return _unjudged(log, learnt, note)
     points = [learnt[name] for name in common]
     targets = np.array([log.world.position(name) for name in common])
-    surveys = np.array([_survey(given[name]) for name in common])
+    surveys = np.array([given[name].spread() for name in common])
     alignment = IN_FRAME if in_frame else align_robustly(points, targets, surveys)
     if not in_frame and alignment.inliers < max(MIN_COMMON, len(common) / 2):
         note = f"only {alignment.inliers} of {len(common)} landmarks agree with the given map under one alignment"
@@ -230,18 +230,10 @@ def _by_alignment(pose: Array, positions: Array) -> Array:
     return jacobian
 
 
-def _survey(landmark: Landmark) -> Array:
-    """Covariance (2, 2) of a given landmark."""
-    if landmark.covariance is None:
-        return landmark.sigma**2 * np.eye(2)
-    xx, xy, yy = landmark.covariance
-    return np.array(((xx, xy), (xy, yy)))
-
-
 def _differ(point: LearntPoint, landmark: Landmark) -> bool:
     """Whether a learnt point differs significantly from a landmark."""
     error = point.position - np.array((landmark.x, landmark.y))
-    covariance = point.covariance + _survey(landmark)
+    covariance = point.covariance + landmark.spread()
     return bool(np.hypot(*error) > TOLERANCE and error @ np.linalg.solve(covariance, error) > GATE)
 
 

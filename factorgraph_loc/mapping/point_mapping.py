@@ -18,11 +18,12 @@ from factorgraph_loc.mapping import bundle
 from factorgraph_loc.mapping.bundle import Bundle
 from factorgraph_loc.mapping.camera_poses import PosedFrames
 from factorgraph_loc.mapping.feature_tracks import chained, keyframes, matched_pairs, overlapping_pairs
-from factorgraph_loc.mapping.triangulation import PARALLAX, Cameras, Integers, Tracks, parallax, reproject, triangulate
+from factorgraph_loc.mapping.triangulation import PARALLAX, Cameras, Tracks, parallax, reproject, triangulate
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.text import told
 from factors.camera.model import CameraModel
-from factors.se2 import Array
+from factors.positive import worst_sigma
+from factors.se2 import Array, Integers
 
 MOST_KEYFRAMES = 600
 WIDER = 1.3  # factor on the distance of keyframes, until there are not too many
@@ -182,7 +183,7 @@ def _made(
         rms=float(np.sqrt(np.mean(errors**2))),
         mad=float(np.median(np.abs(errors))),
         parallax=float(np.median(angles)),
-        sigma=float(np.median(_worst(covariances))),
+        sigma=float(np.median(worst_sigma(covariances))),
         shifted=float(np.median(shift)),
         turned=float(np.median(turn)),
         focal=adjusted.model.fx,
@@ -198,7 +199,7 @@ def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Arr
     good = (
         (tracks.lengths() >= settings.observations)
         & (angles >= settings.parallax)
-        & (_worst(covariances) <= settings.sigma)
+        & (worst_sigma(covariances) <= settings.sigma)
     )
     if not good.any():
         raise RunFailedError(
@@ -228,11 +229,6 @@ def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int
             apart = np.minimum(apart, np.linalg.norm(places - places[taken[-1]], axis=1))
         chosen += rows[taken].tolist()
     return np.array(chosen, dtype=np.int64)
-
-
-def _worst(covariances: Array) -> Array:
-    """Standard deviations (T,) in the worst direction."""
-    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0)))
 
 
 def _moved(before: Cameras, after: Cameras) -> tuple[Array, Array]:

@@ -11,16 +11,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.vision.matching import distance_matrix
 from factors import positive
-from factors.se2 import Array
-
-Integers = NDArray[np.int64]
+from factors.se2 import Array, Integers
 
 GATE = 16.27  # 99.9 % of chi-square with three degrees of freedom
 FARTHEST = 0.5  # m between two estimates of one point
@@ -56,7 +53,7 @@ def thinned(points: PointMap, most: int) -> PointMap:
     seen = np.unique(points.owners)
     if len(seen) <= most:
         return points
-    sigma = _worst(points.covariances)
+    sigma = positive.worst_sigma(points.covariances)
     cells = np.floor(points.positions[seen] / CELL).astype(np.int64)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
     order = np.lexsort((sigma[seen], cell.ravel()))
@@ -173,8 +170,3 @@ def _limit(points: PointMap, views: list[Integers]) -> float:
 
 def _spread(points: PointMap, which: Integers) -> Array:
     return points.covariances[which] + LEAST**2 * np.eye(3)
-
-
-def _worst(covariances: Array) -> Array:
-    """Standard deviations (P,) in the worst direction."""
-    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0)))

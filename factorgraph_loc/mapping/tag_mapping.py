@@ -14,7 +14,7 @@ from factorgraph_loc.mapping import mapping
 from factorgraph_loc.mapping.mapping import LandmarkMap
 from factorgraph_loc.mapping.tag_focusing import focused
 from factorgraph_loc.mapping.tag_looks import TagLooks, tag_looks
-from factorgraph_loc.mapping.tag_search import TagMode, TagPosterior, search, sigma
+from factorgraph_loc.mapping.tag_search import TagMode, TagPosterior, search
 from factorgraph_loc.mapping.tag_slam import tag_slam
 from factorgraph_loc.model.belief import LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
@@ -142,7 +142,7 @@ def _why(one: TagPosterior, reads: int) -> str:
     if one.is_ambiguous:
         places = [f"({m.position[0]:.2f}, {m.position[1]:.2f}) m with {m.weight:.0%}" for m in one.modes[:3]]
         return f"{count}: ambiguous, {' or '.join(places)}"
-    return f"{count}: too uncertain, sigma {sigma(one.modes[0].covariance):.1f} m"
+    return f"{count}: too uncertain, sigma {one.modes[0].sigma:.1f} m"
 
 
 def _as_landmark(log: Log, name: str, position: Array) -> Landmark:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from factors.least_squares import minima
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.model import RfidModel, probability
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 LEAST = 0.05  # probability of a read that defines the reach of an antenna
 ITERATIONS = 30
@@ -25,12 +25,17 @@ CHUNK = 256  # candidates refined at once, to bound the memory
 class TagCandidates:
     """C candidate positions (C, 2) of the tags ``tag`` (C,), with facings (C,)."""
 
-    tag: NDArray[np.int64]
+    tag: Integers
     places: Array
     facing: Array
 
-    def __getitem__(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> TagCandidates:
+    def __getitem__(self, which: Integers | NDArray[np.bool_]) -> TagCandidates:
         return TagCandidates(self.tag[which], self.places[which], self.facing[which])
+
+
+def of_tags(looks: TagReadCounts, tags: Integers) -> TagReadCounts:
+    """The read counts of some ``tags`` (C,)."""
+    return TagReadCounts(looks.offsets, looks.antennas, looks.rounds, np.ascontiguousarray(looks.hits[:, tags]))
 
 
 def reach(model: RfidModel) -> float:
@@ -58,7 +63,7 @@ def refine(
     for first in range(0, len(nll), CHUNK):
         part = slice(first, first + CHUNK)
         tag, facing = candidates.tag[part], candidates.facing[part]
-        mine = TagReadCounts(looks.offsets, looks.antennas, looks.rounds, np.ascontiguousarray(looks.hits[:, tag]))
+        mine = of_tags(looks, tag)
         places[part], nll[part], information = _refined(model, mine, heights[tag], facing, places[part])
         covariances[part] = np.linalg.inv(information + prior)
     return TagCandidates(candidates.tag, places, candidates.facing), nll, covariances
@@ -70,11 +75,9 @@ def _refined(
     """Positions (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2), of C tags at once, each with its own
     column of hits. The information is the observed curvature where it is positive definite, else the Fisher information."""
 
-    def at(places: Array, which: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-        hits = np.ascontiguousarray(looks.hits[:, which])
-        mine = TagReadCounts(looks.offsets, looks.antennas, looks.rounds, hits)
+    def at(places: Array, which: Integers) -> tuple[Array, Array, Array]:
         tags = TagArray(np.column_stack((places, heights[which])), facing[which])
-        return RfidLikelihood(model, tags).by_tag(np.zeros(3), mine)
+        return RfidLikelihood(model, tags).by_tag(np.zeros(3), of_tags(looks, which))
 
     found, every = minima(at, places, ITERATIONS, CONVERGED, largest=LARGEST_STEP), np.arange(len(places))
     states, information = found.states, found.curvatures

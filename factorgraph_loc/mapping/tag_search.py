@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.mapping.tag_refinement import TagCandidates, reach, refine
+from factors.positive import worst_sigma
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.model import RfidModel
 from factors.se2 import Array, wrap, wrap_scalar
@@ -43,6 +44,11 @@ class TagMode:
     covariance: Array
     facing: float
 
+    @property
+    def sigma(self) -> float:
+        """Standard deviation [m] of the position in its least certain direction."""
+        return float(worst_sigma(self.covariance))
+
 
 @dataclass(frozen=True)
 class TagPosterior:
@@ -67,12 +73,7 @@ class TagPosterior:
     @property
     def is_located(self) -> bool:
         """Whether there is a single mode with a small enough uncertainty."""
-        return self.is_explained and not self.is_ambiguous and sigma(self.modes[0].covariance) < LARGEST_SIGMA
-
-
-def sigma(covariance: Array) -> float:
-    """Standard deviation [m] in the least certain direction."""
-    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+        return self.is_explained and not self.is_ambiguous and self.modes[0].sigma < LARGEST_SIGMA
 
 
 def search(model: RfidModel, looks: TagReadCounts, heights: Array, facing: Array) -> list[TagPosterior]:

@@ -18,7 +18,7 @@ from factorgraph_loc.fusion.graph.marginals import IndeterminateError
 from factorgraph_loc.fusion.graph.problem import Problem
 from factorgraph_loc.fusion.graph.variables import Values, constants_key, landmark_key, pose_key
 from factorgraph_loc.mapping.tag_looks import TagLooks
-from factorgraph_loc.mapping.tag_refinement import reach
+from factorgraph_loc.mapping.tag_refinement import of_tags, reach
 from factorgraph_loc.mapping.tag_search import TagPosterior, search
 from factorgraph_loc.model.belief import LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
@@ -117,7 +117,7 @@ class _Problem:
         tags = np.flatnonzero(wanted)
         out = [TagPosterior((), 0, 0.0) for _ in wanted]
         if len(tags) and len(poses):
-            mine = TagReadCounts(along.offsets, along.antennas, along.rounds, np.ascontiguousarray(along.hits[:, tags]))
+            mine = of_tags(along, tags)
             found = search(self._looks.model, mine, self._looks.heights[tags], self._looks.facing[tags])
             for tag, one in zip(tags.tolist(), found, strict=True):
                 out[tag] = one
@@ -191,8 +191,7 @@ class _Problem:
             hits = looks.hits[rows]
             here = TagReadCounts(self._offsets[rows], looks.antennas[rows], looks.rounds[rows], hits)
             if len(fixed):
-                mine = TagReadCounts(here.offsets, here.antennas, here.rounds, np.ascontiguousarray(hits[:, fixed]))
-                out.append((RfidFactor(map_, mine), (pose_key(i),)))
+                out.append((RfidFactor(map_, of_tags(here, fixed)), (pose_key(i),)))
             near = np.hypot(*(places - self._values[pose_key(i)][:2]).T) < self._reach
             for tag in variable[near | hits[:, variable].any(axis=0)].tolist():
                 out.append((RfidTagFactor(everything, tag, here), (pose_key(i), landmark_key(tag))))

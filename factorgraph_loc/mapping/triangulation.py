@@ -10,14 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from factorgraph_loc.vision.consensus import Truths
 from factors.camera.model import CameraModel, linearize_in_space, undistorted
 from factors.robust import huber_weight
-from factors.se2 import Array
-
-Integers = NDArray[np.int64]
-Truths = NDArray[np.bool_]
+from factors.se2 import Array, Integers
 
 ITERATIONS = 8
 NEAREST, FARTHEST = 0.1, 100.0  # m, allowed depths in every camera that sees a point

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.slam.monoslam_state import Eye, Integers, MapPoint, SlamState
+from factorgraph_loc.slam.monoslam_state import Eye, MapPoint, SlamState
 from factors.camera import inverse_depth
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 INVERSE_DEPTH, INVERSE_DEPTH_SIGMA = 0.3, 1.0  # 1/m, of a new point: so vague that many of them do not give the scale
 TRIED, FOUND = 8, 0.5  # a point that was predicted this often is kept if this fraction was found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,6 +52,5 @@ def _smoothed(here: UpdateRecord, after: UpdateRecord, later: UpdateRecord) -> U
     own = own + gain @ (later.covariance[block] - predicted) @ gain.T
     covariance = here.covariance.copy()
     covariance[block] = 0.5 * (own + own.T)
-    return UpdateRecord(
-        here.t, here.step, here.predicted, here.robot.plus(change[:ROBOT]), here.constants + change[ROBOT:], covariance
-    )
+    robot, constants = here.robot.plus(change[:ROBOT]), here.constants + change[ROBOT:]
+    return replace(here, robot=robot, constants=constants, covariance=covariance, anew=False)

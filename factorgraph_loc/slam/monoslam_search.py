@@ -9,8 +9,8 @@ the inliers, each must be inside the gate of what all others together tell.
 
 import numpy as np
 
-from factorgraph_loc.slam.monoslam_state import Innovation, Integers, Truths, squared
-from factorgraph_loc.vision.matching import match_guided
+from factorgraph_loc.slam.monoslam_state import Innovation, squared
+from factorgraph_loc.vision.consensus import Truths
 from factors.se2 import Array
 from factors.update import GATE
 
@@ -65,13 +65,3 @@ def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
     found = np.zeros(len(right), dtype=bool)
     found[rows] = True
     return found
-
-
-def find(
-    descriptors: Array, predicted: Array, covariances: Array, pixels: Array, candidates: Array, *, binary: bool
-) -> tuple[Integers, Integers]:
-    """Matching rows of the points (``descriptors`` (N, D), predicted at ``predicted`` (N, 2) with ``covariances`` (N, 2, 2)) and
-    of the features (``candidates`` (M, D) at ``pixels`` (M, 2)), each at most once.
-    """
-    matches = match_guided(descriptors, candidates, predicted, covariances, pixels, binary=binary)
-    return matches.indices[:, 0], matches.indices[:, 1]

@@ -12,17 +12,18 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.sensors.camera.known_points import DISAGREES, EXACT, MOST, Pixels
 from factorgraph_loc.slam.monoslam_motion import PLANAR
-from factorgraph_loc.slam.monoslam_search import agreeing, find
-from factorgraph_loc.slam.monoslam_state import Eye, Innovation, Integers, Sights, SlamState, Truths
+from factorgraph_loc.slam.monoslam_search import agreeing
+from factorgraph_loc.slam.monoslam_state import Eye, Innovation, Sights, SlamState
 from factorgraph_loc.slam.slipping import ENOUGH, more_probable
 from factorgraph_loc.vision import consensus
 from factorgraph_loc.vision.association import Associator
-from factorgraph_loc.vision.consensus import FEWEST, CameraPose
+from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths
 from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.matching import match_guided
 from factorgraph_loc.vision.relocalization import located
 from factorgraph_loc.vision.spread import spread_out
 from factors.camera import inverse_depth
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 APART = 15.0  # px between a new point and all others
 FEWEST_FOUND, SHARE_FOUND = 5, 0.5  # named points that must agree in relocalization, and their fraction
@@ -131,8 +132,8 @@ class FeatureMatcher:
         if which:
             descriptors = np.array([state.points[i].descriptor for i in which])
             spreads = Innovation.of(sights, state.covariance).each(sights.noise)
-            rows, features = find(descriptors, sights.pixels, spreads, m.pixels, m.descriptors, binary=binary)
-            ours = [(f, which[r]) for r, f in zip(rows.tolist(), features.tolist(), strict=True)]
+            found = match_guided(descriptors, m.descriptors, sights.pixels, spreads, m.pixels, binary=binary)
+            ours = [(feature, which[row]) for row, feature in found.indices.tolist()]
         known, wanted = self._known(m, state, eye)
         ours = self._agreeing(m.pixels, ours, state, eye)
         in_map = {f for f, _ in known}

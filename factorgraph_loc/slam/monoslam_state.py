@@ -33,11 +33,9 @@ from factors.camera import inverse_depth
 from factors.camera.floor import TiltScale
 from factors.camera.model import CameraModel, linearize_in_space, mounted
 from factors.motion import ChainState
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 from factors.update import GATE
 
-Integers = NDArray[np.int64]
-Truths = NDArray[np.bool_]
 POSE = 6  # first values of the error state: those of the pose
 VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s at the start
 
@@ -87,8 +85,7 @@ class SlamState:
 
     def starts(self) -> Integers:
         """The index of each point's first value in ``values``."""
-        sizes = [inverse_depth.SIZE if p.ray else 3 for p in self.points]
-        return np.cumsum([0, *sizes], dtype=np.int64)[:-1]
+        return np.cumsum([0, *(p.size for p in self.points)], dtype=np.int64)[:-1]
 
     def plus(self, error: Array, covariance: Array) -> SlamState:
         return replace(
@@ -154,15 +151,7 @@ class Sights:
         return len(self.pixels)
 
     def __getitem__(self, rows: Any) -> Sights:
-        return Sights(
-            self.pixels[rows],
-            self.depths[rows],
-            self.by_pose[rows],
-            self.by_point[rows],
-            self.starts[rows],
-            self.sizes[rows],
-            self.noise[rows],
-        )
+        return Sights(*(getattr(self, name)[rows] for name in Sights.__dataclass_fields__))
 
     def columns(self) -> tuple[Integers, Array]:
         """The Jacobian (2K, C) with respect to the C values of the error state it depends on, and their indices."""
