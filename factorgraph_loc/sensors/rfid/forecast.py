@@ -97,7 +97,7 @@ def _probabilities(model: RfidModel, heights: Array, layers: int, half: int) -> 
     points = np.stack((x, y, h), axis=-1).reshape(-1, 3)
     origin = np.zeros((len(antennas), 3))
     found, _ = kernels.probabilities(model.packed(), antennas, origin, points, normals[f.ravel()])
-    return np.moveaxis(found.reshape(-1, *h.shape), 0, -1)
+    return np.moveaxis(found.reshape(len(antennas), *h.shape), 0, -1)
 
 
 @compiled
