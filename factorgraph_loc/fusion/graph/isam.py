@@ -78,7 +78,7 @@ class Incremental:
         """Forget keyframes before then, as far as they have left the window; where the whole problem is solved at the end, all are
         kept."""
         graph = self._graph
-        if self._is_whole or before < next(iter(graph.keyframes.values())).t:
+        if self._is_whole or not graph.keyframes or before < next(iter(graph.keyframes.values())).t:
             return
         # points that wait are looked for in the newest ones
         looked_back = max((mapper.horizon for mapper in graph.mappers), default=0)
