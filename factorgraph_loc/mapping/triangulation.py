@@ -1,8 +1,4 @@
-"""Triangulation of points from bearings of several cameras with known poses.
-
-A linear start, the point nearest to all rays, then Gauss-Newton steps on the robust reprojection error (Hartley and Zisserman,
-"Multiple View Geometry", 2004, chapter 12), vectorised over all tracks.
-"""
+"""Tracks of features in images of cameras with known poses, and the points triangulated from them."""
 
 from __future__ import annotations
 
@@ -12,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.vision.consensus import Truths
-from factors.camera.model import CameraModel, linearize_in_space, undistorted
-from factors.robust import huber_weight
+from factors.camera import model as reprojection
+from factors.camera import triangulation_kernels as kernels
+from factors.camera.model import CameraModel, linearize_in_space
 from factors.se2 import Array, Integers
 
-ITERATIONS = 8
 NEAREST, FARTHEST = 0.1, 100.0  # m, allowed depths in every camera that sees a point
 PARALLAX = 0.02  # rad, the least angle between two rays to a point that determines its depth
+ANY_SPREAD = 1e3  # relative standard deviation of a point that is never exceeded in practice
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,13 +86,6 @@ class Triangulated:
         return np.asarray(good & np.isfinite(self.positions).all(axis=1))
 
 
-def directions(model: CameraModel, rotations: Array, pixels: Array) -> Array:
-    """Unit vectors (N, 3) in the world towards ``pixels`` (N, 2) of cameras with orientations ``rotations`` (N, 3, 3)."""
-    local = np.column_stack((undistorted(model, pixels), np.ones(len(pixels))))
-    rays = np.einsum("nij,nj->ni", rotations, local)
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-
-
 def reproject(model: CameraModel, cameras: Cameras, points: Array, tracks: Tracks) -> tuple[Array, Array, Array, Array]:
     """For each of N observations: error (N, 2) [px], predicted minus measured, its Jacobians with respect to the camera (N, 2,
     6), as in :func:`factors.camera.model.linearize_in_space`, and to the point (N, 2, 3), and the depth (N,) [m].
@@ -107,20 +97,20 @@ def reproject(model: CameraModel, cameras: Cameras, points: Array, tracks: Track
 
 
 def triangulate(model: CameraModel, cameras: Cameras, tracks: Tracks) -> Triangulated:
-    """Triangulate the points of ``tracks``, with exact camera poses."""
-    rays = directions(model, cameras.rotations[tracks.frame], tracks.pixels)
-    points = _nearest_to_rays(cameras.positions[tracks.frame], rays, tracks)
-    for _ in range(ITERATIONS):
-        error, _, by_point, _ = reproject(model, cameras, points, tracks)
-        weight = huber_weight(np.sum(error**2, axis=1) / model.sigma**2, model.robust) / model.sigma**2
-        information = _summed(np.einsum("n,nij,nik->njk", weight, by_point, by_point), tracks)
-        gradient = _summed(np.einsum("n,nij,ni->nj", weight, by_point, error), tracks)
-        step = -np.einsum("tij,tj->ti", _inverse(information), gradient)
-        # a point of undetermined depth may jump: limit the step to a metre
-        points = points + step * np.minimum(1.0, 1.0 / np.maximum(np.linalg.norm(step, axis=1), 1e-12))[:, None]
-    error, _, by_point, depth = reproject(model, cameras, points, tracks)
-    information = _summed(np.einsum("nij,nik->njk", by_point, by_point) / model.sigma**2, tracks)
-    return Triangulated(points, _inverse(information), error, depth, parallax(cameras, points, tracks))
+    """Triangulate the points of ``tracks``, with exact camera poses (:mod:`factors.camera.triangulation_kernels`). A point that is
+    not determined is at the origin, with no parallax."""
+    points, covariances = np.zeros((tracks.count, 3)), np.zeros((tracks.count, 3, 3))
+    rays, found = reprojection.rays(model, tracks.pixels), np.zeros(tracks.count, dtype=bool)
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    sigmas, lens = np.full(len(tracks), model.sigma), reprojection.lens_of(model)
+    order = np.argsort(tracks.track, kind="stable")
+    for i, rows in enumerate(np.split(order, np.cumsum(tracks.lengths())[:-1])):
+        frames = tracks.frame[rows]
+        seen = cameras.positions[frames], cameras.rotations[frames], rays[rows], tracks.pixels[rows], sigmas[rows]
+        ended, points[i], covariances[i], _ = kernels.triangulated(lens, *seen, ANY_SPREAD, 0.0, NEAREST, model.robust)
+        found[i] = ended == kernels.FOUND
+    error, _, _, depth = reproject(model, cameras, points, tracks)
+    return Triangulated(points, covariances, error, depth, np.where(found, parallax(cameras, points, tracks), 0.0))
 
 
 def parallax(cameras: Cameras, points: Array, tracks: Tracks) -> Array:
@@ -131,23 +121,3 @@ def parallax(cameras: Cameras, points: Array, tracks: Tracks) -> Array:
     bounds = np.cumsum(tracks.lengths())[:-1]
     least = [float((one @ one.T).min(initial=1.0)) for one in np.split(rays[order], bounds)]
     return np.asarray(np.arccos(np.clip(least, -1.0, 1.0)))
-
-
-def _nearest_to_rays(positions: Array, rays: Array, tracks: Tracks) -> Array:
-    """The points (T, 3) with the least sum of squared distances from their rays."""
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    right = _summed(np.einsum("nij,nj->ni", across, positions), tracks)
-    return np.asarray(np.einsum("tij,tj->ti", _inverse(_summed(across, tracks)), right))
-
-
-def _summed(values: Array, tracks: Tracks) -> Array:
-    """Sums (T, ...) of ``values`` (N, ...) over the observations of each point."""
-    out = np.zeros((tracks.count, *values.shape[1:]))
-    np.add.at(out, tracks.track, values)
-    return out
-
-
-def _inverse(matrices: Array) -> Array:
-    """Inverses of symmetric ``matrices`` (T, 3, 3), regularised where singular."""
-    size = np.trace(matrices, axis1=1, axis2=2)
-    return np.asarray(np.linalg.inv(matrices + (1e-12 * size + 1e-300)[:, None, None] * np.eye(3)))

@@ -195,6 +195,9 @@ def _triangulate(
         np.array([s.pixel for s in seen], dtype=float),
         np.array([math.hypot(model.sigma, p.slack) for p in places]),
         spread,
+        MIN_PARALLAX,
+        kernels.NEAREST,
+        math.inf,
     )
     if ended == kernels.BEHIND:
         return TriangulatedPoint(ORIGIN, UNTURNED, np.full(len(seen), np.inf))

@@ -18,13 +18,27 @@ FOUND, NONE, BEHIND = 0, 1, 2
 
 @compiled(error_model="numpy")
 def triangulated(
-    k: Lens, centres: Array, turns: Array, rays: Array, pixels: Array, sigmas: Array, spread: float
+    k: Lens,
+    centres: Array,
+    turns: Array,
+    rays: Array,
+    pixels: Array,
+    sigmas: Array,
+    spread: float,
+    parallax: float,
+    nearest: float,
+    robust: float,
 ) -> tuple[int, Array, Array, Array]:
     """How it ends, a point (3,), its covariance (3, 3) and squared whitened residuals (M,), seen by cameras at ``centres`` (M, 3)
     with rotations ``turns`` (M, 3, 3).
 
     ``rays`` (M, 3): its directions in their frames; ``pixels`` (M, 2) with standard deviations ``sigmas`` (M,) of each coordinate.
-    ``spread``: the largest standard deviation of the point that is allowed, relative to its least depth.
+    ``spread``: the largest standard deviation of the point that is allowed, relative to its least depth. ``parallax`` [rad]: the
+    least angle between the outermost rays; ``nearest`` [m]: the least depth; ``robust``: scale of Huber's loss, infinite for least
+    squares.
+
+    A linear start, the point nearest to all rays, then Gauss-Newton steps on the reprojection error (Hartley and Zisserman,
+    "Multiple View Geometry", 2004, chapter 12).
     """
     ways = np.empty_like(rays)
     for m in range(len(rays)):
@@ -32,12 +46,12 @@ def triangulated(
         ways[m, 0], ways[m, 1], ways[m, 2] = way[0, 0], way[1, 0], way[2, 0]
     covariance, squared = np.zeros((3, 3)), np.full(len(rays), np.inf)
     point = np.zeros(3)
-    if product_by_transpose(ways, ways).min() > math.cos(MIN_PARALLAX):
+    if product_by_transpose(ways, ways).min() > math.cos(parallax):
         return NONE, point, covariance, squared
     point = _nearest(centres, ways)
     for iteration in range(ITERATIONS + 1):
-        told, pull, depth = _told(k, centres, turns, pixels, sigmas, point, squared)
-        if not depth > NEAREST:
+        told, pull, depth = _told(k, centres, turns, pixels, sigmas, point, robust, squared)
+        if not depth > nearest:
             return BEHIND, point, covariance, squared
         covariance = inverse(told)
         # the initial point may be less accurate
@@ -66,7 +80,7 @@ def _nearest(centres: Array, ways: Array) -> Array:
 
 @compiled(error_model="numpy")
 def _told(
-    k: Lens, centres: Array, turns: Array, pixels: Array, sigmas: Array, point: Array, squared: Array
+    k: Lens, centres: Array, turns: Array, pixels: Array, sigmas: Array, point: Array, robust: float, squared: Array
 ) -> tuple[Array, Array, float]:
     """The information (3, 3) on a point and its gradient (3, 1), and the least depth; ``squared`` residuals (M,) in place."""
     told, pull, depth, row, error = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3), np.empty(2)
@@ -75,17 +89,18 @@ def _told(
         depth = min(depth, local[0, 2])
         u, v, by_u, by_v = pixel(k, local[0, 0], local[0, 1], local[0, 2])
         error[0], error[1] = u - pixels[m, 0], v - pixels[m, 1]
-        squared[m] = 0.0
+        error[0] /= sigmas[m]
+        error[1] /= sigmas[m]
+        squared[m] = error[0] ** 2 + error[1] ** 2
+        weight = 1.0 if squared[m] <= robust**2 else robust / math.sqrt(squared[m])
         for r in range(2):
             d = by_u if r == 0 else by_v
-            error[r] /= sigmas[m]
-            squared[m] += error[r] ** 2
             for j in range(3):
                 row[j] = (turns[m, j, 0] * d[0] + turns[m, j, 1] * d[1] + turns[m, j, 2] * d[2]) / sigmas[m]
             for i in range(3):
-                pull[i, 0] -= row[i] * error[r]
+                pull[i, 0] -= weight * row[i] * error[r]
                 for j in range(3):
-                    told[i, j] += row[i] * row[j]
+                    told[i, j] += weight * row[i] * row[j]
     return told, pull, depth
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from factorgraph_loc.mapping.triangulation import Cameras, Tracks, directions, parallax, reproject, triangulate
+from factorgraph_loc.mapping.triangulation import Cameras, Tracks, parallax, reproject, triangulate
 
 
 def test_without_noise_the_points_come_back(look):
@@ -62,15 +62,6 @@ def test_parallax_is_the_greatest_angle():
     none = np.zeros((3, 2))
     tracks = Tracks(np.zeros(3, dtype=int), np.arange(3), np.zeros(3, dtype=int), none)
     assert parallax(cameras, np.array([(0.0, 0.0, 1.0)]), tracks)[0] == pytest.approx(np.pi / 4)
-
-
-def test_directions_undo_the_projection(look):
-    sight = look(np.random.default_rng(4), noise=0.0)
-    tracks, old = sight.tracks()
-    rays = sight.points[old][tracks.track] - sight.cameras.positions[tracks.frame]
-    expected = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    found = directions(sight.model, sight.cameras.rotations[tracks.frame], tracks.pixels)
-    np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
 def test_jacobians_of_the_reprojection(look):
