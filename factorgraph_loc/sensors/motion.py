@@ -20,9 +20,7 @@ from factors.odometry import kernels
 from factors.odometry.chain import OdometryChain
 from factors.odometry.model import (
     PARAMETERS,
-    OdometryFactor,
     OdometryModel,
-    ScaleFreeOdometryFactor,
     slip,
 )
 from factors.se2 import Array
@@ -134,19 +132,9 @@ class Motion(OdometryChain):
         moved[:, 2] += changes[1] * moved[:, 2] - changes[2] * moving + changes[3] * ways
         return np.asarray(se2.exp(moved))
 
-    def factor(self, increment: Increment, *, scale_known: bool) -> OdometryFactor:
-        """An increment as a factor on two poses, and on the constants if there are any. ``scale_known``: whether anything else than
-        the motion determines the scale of what is estimated."""
-        kind = OdometryFactor if scale_known else ScaleFreeOdometryFactor
-        return kind(increment, self.constants.indices)
-
     def slip(self, increment: Increment) -> tuple[Array, float]:
         """The additional covariance (3, 3) of an increment if wheels slip, and minus the log-probability of that."""
         return slip(self.model, increment, use_gyro=self._use_gyro)
-
-    def exact_factor(self, increment: Increment) -> OdometryFactor:
-        """An increment without constants as a factor on two poses."""
-        return OdometryFactor(increment)
 
     def twist(self, t: float) -> Array:
         """The robot's velocity (3,) just before ``t``, in the robot frame."""

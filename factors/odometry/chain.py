@@ -33,7 +33,7 @@ from factors.odometry.chain_kernels import (
     without_old,
 )
 from factors.odometry.kernels import relative, relatives
-from factors.odometry.model import OdometryModel, composed
+from factors.odometry.model import OdometryFactor, OdometryModel, ScaleFreeOdometryFactor, composed
 from factors.se2 import Array
 
 
@@ -49,6 +49,7 @@ class OdometryChain:
         self, model: OdometryModel, *, use_gyro: bool = False, horizon: float = 5.0, estimated: Sequence[int] = ()
     ) -> None:
         self.model = model
+        self._estimated = tuple(estimated)
         self._indices = np.array(estimated, dtype=np.int64)
         self._use_gyro = use_gyro
         self.horizon = horizon
@@ -179,6 +180,16 @@ class OdometryChain:
         (N, 3, 3)."""
         deltas, covariances = relatives(self._noise, starts, ends, constants, self._indices)
         return deltas, covariances
+
+    def factor(self, increment: Increment, *, scale_known: bool) -> OdometryFactor:
+        """An increment as a factor on two poses, and on the constants if there are any. ``scale_known``: whether anything else than
+        the motion determines the scale of what is estimated."""
+        kind = OdometryFactor if scale_known else ScaleFreeOdometryFactor
+        return kind(increment, self._estimated)
+
+    def exact_factor(self, increment: Increment) -> OdometryFactor:
+        """An increment without constants as a factor on two poses."""
+        return OdometryFactor(increment)
 
     def _insert(self, t: float, kind: float, a: float, b: float, c: float) -> bool:
         if t < self.begin:
