@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from factorgraph_loc.fusion.graph.variables import Addition, Guess, Keyframe, Node, Values
 from factorgraph_loc.maps.points import PointMap
@@ -31,37 +31,49 @@ class GraphView:
     constants: Array | None = None
 
 
-class Mapper(Protocol):
-    """Makes variables of points that a sensor sees and no map has.
+class Mapper:
+    """Makes variables of points that a sensor sees and no map has. This base class maps nothing.
 
-    ``fewest``: sightings that a point of the graph needs; ``horizon``: keyframes back that it may look at; ``rejected``: what is
-    said of sightings that turn out to be of something else; ``estimates``: whether points become variables; ``knows_scale``:
-    whether their scale comes from elsewhere than the motion.
+    ``modality``: of the measurements that it takes, "" for none. ``fewest``: number of sightings that a point of the graph needs.
+    ``horizon``: number of recent keyframes that it needs. ``rejected``: why sightings of something else are rejected.
+    ``estimates``: whether points become variables. ``knows_scale``: whether their scale comes from elsewhere than the motion.
     """
 
-    fewest: int
-    horizon: int
-    rejected: str
-    estimates: bool
-    knows_scale: bool
+    modality: str = ""
+    fewest: int = 0
+    horizon: int = 0
+    rejected: str = ""
+
+    @property
+    def estimates(self) -> bool:
+        return False
+
+    @property
+    def knows_scale(self) -> bool:
+        return True
 
     def is_due(self, m: Any) -> bool:
         """Whether a measurement needs a keyframe of its own."""
+        return False
 
     def take(
         self, m: Any, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition, *, is_new: bool
     ) -> Guess:
-        """Add what a measurement from the newest keyframe tells to an ``addition``; returned is the guess of its pose, placed by
-        it. ``is_new``: whether the keyframe was made for it."""
+        """Add the information of a measurement from the newest keyframe to an ``addition``. Returns the corrected guess of its
+        pose. ``is_new``: whether the keyframe was made for it."""
+        return guess
 
     def is_astray(self, node: Node, values: Values) -> bool:
         """Whether a node is a sighting that cannot be of its point."""
+        return False
 
     def point(self, node: Node) -> int | None:
         """The key of the point that a node is a sighting of."""
+        return None
 
     def leave(self, t: float) -> Sequence[int]:
         """Keys of the points that were last seen before ``t``, which the graph has no more from now on."""
+        return ()
 
     def keep_only(self, keys: set[int]) -> None:
         """Give up all points but those with these ``keys``."""
@@ -69,7 +81,8 @@ class Mapper(Protocol):
     def forget(self, first: Keyframe) -> Sequence[int]:
         """Forget the keyframes before the ``first``, and the points that have left the graph and were not seen since.
         Returns the keys of these points."""
+        return ()
 
     def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
-        """All points that ever were in the graph, of which, and of the poses of keyframes, these are the ``values`` with their
-        ``spreads``."""
+        """All points that ever were in the graph. ``values`` and ``spreads``: of the points and of the poses of keyframes."""
+        return None

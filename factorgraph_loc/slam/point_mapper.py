@@ -7,7 +7,7 @@ from collections.abc import Hashable, Mapping, Sequence
 
 from factorgraph_loc.fusion.graph.settings import GraphSettings
 from factorgraph_loc.fusion.graph.variables import Addition, Guess, Keyframe, Node, Values, gather
-from factorgraph_loc.fusion.mapping import GraphView
+from factorgraph_loc.fusion.mapping import GraphView, Mapper
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.base import Sensor
@@ -26,8 +26,8 @@ KEYFRAME_INTERVAL = 0.5  # s between images that become keyframes for points tha
 LEAST_COMMON = 0.3  # share of an image's features that the last keyframe has: with less there is a new one at once
 
 
-class PointMapper:
-    """A :class:`~factorgraph_loc.fusion.mapping.Mapper` of points in images."""
+class PointMapper(Mapper):
+    """A mapper of points in images."""
 
     fewest, horizon = FEWEST, HORIZON
     rejected = "camera: not where it was seen"
@@ -35,7 +35,7 @@ class PointMapper:
     def __init__(
         self, camera: CameraSensor, model: CameraModel, diagnostics: Diagnostics, settings: GraphSettings
     ) -> None:
-        self._camera = camera
+        self._camera, self.modality = camera, camera.modality
         self._interval = KEYFRAME_INTERVAL if settings.keyframe_interval is None else settings.keyframe_interval
         self._unknown: UnknownPoints | None = None
         if settings.landmarks != "known":
@@ -56,7 +56,7 @@ class PointMapper:
 
     def is_due(self, m: Pixels) -> bool:
         # estimated points need keyframes of their own
-        if self._unknown is None or m.modality != self._camera.modality:
+        if self._unknown is None:
             return False
         return m.t - self._taken >= self._interval or self._loses(m)
 
@@ -70,8 +70,6 @@ class PointMapper:
     def take(
         self, m: Pixels, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition, *, is_new: bool
     ) -> Guess:
-        if m.modality != self._camera.modality:
-            return guess
         points = self._camera.points
         if m.frame is None:
             names: list[Hashable] = list(m.names)
@@ -122,11 +120,11 @@ class PointMapper:
         return None if self._unknown is None else self._unknown.learnt(values, spreads)
 
 
-def bind(sensors: Mapping[str, Sensor], diagnostics: Diagnostics, settings: GraphSettings) -> PointMapper | None:
-    """The mapper of a run; None if nothing is to be mapped."""
+def bind(sensors: Mapping[str, Sensor], diagnostics: Diagnostics, settings: GraphSettings) -> Mapper:
+    """The mapper of a run."""
     camera = sensors.get(CameraSensor.modality)
     if not isinstance(camera, CameraSensor) or camera.points.model is None:
-        return None
+        return Mapper()
     if settings.landmarks == "known" and not settings.visual_odometry:
-        return None
+        return Mapper()
     return PointMapper(camera, camera.points.model, diagnostics, settings)

@@ -80,18 +80,14 @@ class Smoother(Timeline):
             points=settings.landmarks,
             calibration=calibration,
         )
-        mappers: list[Mapper] = []
-        for bind in MAPPERS.values():
-            found = bind(sensors, self.diagnostics, settings)
-            if found is not None:
-                mappers.append(found)
-        self._graph = Graph(self._motion, sensors, mappers, self.diagnostics)
+        mapper: Mapper = MAPPERS["points"](sensors, self.diagnostics, settings)
+        self._graph = Graph(self._motion, sensors, mapper, self.diagnostics)
         self._search = self._seeking = Search(sensors, self._motion, setup.rng)
         self._search.remember()
         # where landmarks are estimated too, they cannot tell the place
         self.supports_unknown_start = settings.landmarks == "known"
         self._backend: Backend
-        if settings.final_only and not any(mapper.estimates for mapper in mappers):
+        if settings.final_only and not mapper.estimates:
             self._backend = AtTheEnd(self._graph, widest)
         else:
             self._backend = Incremental(self._graph, settings, widest if settings.final_only else 1.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -52,10 +52,8 @@ class Graph:
 
     newest: Keyframe
 
-    def __init__(
-        self, motion: Motion, sensors: Mapping[str, Sensor], mappers: Sequence[Mapper], diagnostics: Diagnostics
-    ) -> None:
-        self.motion, self.sensors, self.mappers, self.diagnostics = motion, sensors, mappers, diagnostics
+    def __init__(self, motion: Motion, sensors: Mapping[str, Sensor], mapper: Mapper, diagnostics: Diagnostics) -> None:
+        self.motion, self.sensors, self.mapper, self.diagnostics = motion, sensors, mapper, diagnostics
         self._constants: dict[str, Estimated] = {MOTION: motion.constants}
         self._constants |= {name: sensor.constants for name, sensor in sensors.items()}
         self.keys = {n: constants_key(i) for i, (n, c) in enumerate(self._constants.items()) if c.names}
@@ -109,10 +107,9 @@ class Graph:
         for index in range(next(iter(self.keyframes)), first):
             del self.keyframes[index]
         self.ticks = [tick for tick in self.ticks if tick.keyframe >= first]
-        for mapper in self.mappers:
-            for key in mapper.forget(next(iter(self.keyframes.values()))):
-                for departed in self.departed:
-                    departed.pop(key, None)
+        for key in self.mapper.forget(next(iter(self.keyframes.values()))):
+            for departed in self.departed:
+                departed.pop(key, None)
 
     def before(self, t: float) -> Keyframe:
         """The last keyframe at or before ``t``; the oldest one that is kept where all are later."""
@@ -183,8 +180,7 @@ class Graph:
             if keyframe.is_elsewhere:
                 keyframe.factor = self.motion.exact_factor(increment)
             else:
-                scale_free = self.mappers and not all(mapper.knows_scale for mapper in self.mappers)
-                keyframe.factor = self.motion.factor(increment, scale_known=not scale_free)
+                keyframe.factor = self.motion.factor(increment, scale_known=self.mapper.knows_scale)
         return keyframe.factor, keys
 
     def learnt(self, poses: Iterable[Array] = (), covariances: Iterable[Array] = ()) -> Learnt:
@@ -202,44 +198,41 @@ class Graph:
                 values[prefix + label] = (float(value), float(sigma))
         numbered = self.keyframes.values()
         at, spreads = ({k.key: v for k, v in zip(numbered, part)} for part in (poses, covariances))  # noqa: B905
-        for mapper in self.mappers:
-            found = mapper.learnt(self.departed[0] | self.values | at, self.departed[1] | self.spreads | spreads)
-            if found is not None:
-                return Learnt(values, landmarks, found)
-        return Learnt(values, landmarks)
+        points = self.mapper.learnt(self.departed[0] | self.values | at, self.departed[1] | self.spreads | spreads)
+        return Learnt(values, landmarks, points)
 
     def drop_astray(self, keyframes: Collection[Keyframe], values: Values) -> bool:
         """Take sightings out of the graph that cannot be of their points, as these are estimated, and points of which too few are
         left. Returns whether there were any."""
-        dropped = False
-        for mapper in self.mappers:
-            astray = {id(n) for k in keyframes for n in k.nodes if mapper.is_astray(n, values)}
-            if not astray:
-                continue
-            dropped = True
-            left = Counter(mapper.point(n) for k in self.keyframes.values() for n in k.nodes if id(n) not in astray)
-            for keyframe in keyframes:
-                kept = [
-                    n
-                    for n in keyframe.nodes
-                    if id(n) not in astray and (mapper.point(n) is None or left[mapper.point(n)] >= mapper.fewest)
-                ]
-                if len(kept) < len(keyframe.nodes):
-                    self.diagnostics.reject(mapper.rejected, len(keyframe.nodes) - len(kept))
-                    keyframe.nodes[:] = kept
-        return dropped
+        mapper = self.mapper
+        if not mapper.estimates:
+            return False
+        astray = {id(n) for k in keyframes for n in k.nodes if mapper.is_astray(n, values)}
+        if not astray:
+            return False
+        left = Counter(mapper.point(n) for k in self.keyframes.values() for n in k.nodes if id(n) not in astray)
+        for keyframe in keyframes:
+            kept = [
+                n
+                for n in keyframe.nodes
+                if id(n) not in astray and (mapper.point(n) is None or left[mapper.point(n)] >= mapper.fewest)
+            ]
+            if len(kept) < len(keyframe.nodes):
+                self.diagnostics.reject(mapper.rejected, len(keyframe.nodes) - len(kept))
+                keyframe.nodes[:] = kept
+        return True
 
     def forget_points(self) -> None:
         """Give up the points that the keyframes that are left do not tell."""
         keyframes = self.keyframes.values()
         seen = Counter(key for k in keyframes for node in k.nodes for key in node.keys if is_point(key))
-        for mapper in self.mappers:
-            kept = {key for key, count in seen.items() if count >= mapper.fewest}
+        if self.mapper.estimates:
+            kept = {key for key, count in seen.items() if count >= self.mapper.fewest}
             for k in keyframes:
                 k.nodes = [node for node in k.nodes if all(key in kept or not is_point(key) for key in node.keys)]
             for key in [key for key in self.values if is_point(key) and key not in kept]:
                 del self.values[key], self.spreads[key]
-            mapper.keep_only(kept)
+            self.mapper.keep_only(kept)
         for key in [k for k in self.values if is_of_keyframe(k) and index_of(k) >= self.newest.index]:
             del self.values[key]  # the tilt of a keyframe that was taken back
 

@@ -49,7 +49,7 @@ class Incremental:
     def __init__(self, graph: Graph, settings: SmootherSettings, widest: float = 1.0) -> None:
         self._graph, self._settings, self._widest = graph, settings, widest
         self._waits = settings.landmarks != "known"  # what is seen between keyframes: an update takes long then
-        self._maps = any(mapper.estimates for mapper in graph.mappers)
+        self._maps = graph.mapper.estimates
         self._margin = WITH_POINTS if self._maps else MARGIN
         # whether the final trajectory is that of the whole problem; and the length of the window, None where all is in the solver
         self._is_whole = settings.lag is None or settings.lag == math.inf
@@ -81,8 +81,7 @@ class Incremental:
         if self._is_whole or not graph.keyframes or before < next(iter(graph.keyframes.values())).t:
             return
         # points that wait are looked for in the newest ones
-        looked_back = max((mapper.horizon for mapper in graph.mappers), default=0)
-        last = min(graph.before(before).index, self._oldest, graph.newest.index - looked_back)
+        last = min(graph.before(before).index, self._oldest, graph.newest.index - graph.mapper.horizon)
         graph.forget(min(last, self._solver.oldest))  # it may have to be built anew
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
@@ -233,7 +232,7 @@ class Incremental:
             oldest = graph.keyframes[oldest.index + 1]
         self._oldest = oldest.index
         constants = [key for key in graph.values if key not in new and is_constant(key)]
-        points = [key for mapper in graph.mappers for key in mapper.leave(now - self._lag)]
+        points = graph.mapper.leave(now - self._lag)
         # of a start of the whole problem the covariance is not asked
         asked = [] if self._is_whole else [*(k.key for k in leaving), *constants, *points]
         spreads = window.covariances(asked) if asked else {}

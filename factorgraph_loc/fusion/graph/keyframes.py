@@ -137,8 +137,8 @@ class Builder:
                 interval = self._settings.keyframe_interval
             elif self._settings.landmarks != "known":
                 interval = MAPPING_KEYFRAME_INTERVAL
-        mappers = self._graph.mappers
-        return since >= interval or (since > 0.0 and bool(mappers) and any(mapper.is_due(m) for mapper in mappers))
+        mapper = self._graph.mapper
+        return since >= interval or (since > 0.0 and m.modality == mapper.modality and mapper.is_due(m))
 
     def gather(self) -> list[Node]:
         """What waits on the newest keyframe becomes factors of it."""
@@ -242,9 +242,8 @@ class Builder:
         if guess is None:
             return None
         guess = view.pose, view.covariance
-        for mapper in graph.mappers:
-            if keyframe is graph.newest and m.t == keyframe.t:
-                guess = mapper.take(m, keyframe, guess, self._graph_view(sensor), addition, is_new=is_new)
+        if m.modality == graph.mapper.modality and keyframe is graph.newest and m.t == keyframe.t:
+            guess = graph.mapper.take(m, keyframe, guess, self._graph_view(sensor), addition, is_new=is_new)
         return guess
 
     def _add_link(self, link: Link, sensor: Sensor, keyframe: Keyframe, addition: Addition) -> None:
