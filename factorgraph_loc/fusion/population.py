@@ -79,7 +79,7 @@ class _Waiting(NamedTuple):
 
 class Population:
     """Particles anywhere; see the module. The robot is within ``bounds`` (2, 2): lower and upper corner [m]; ``start``: at a known
-    position; ``space``: in free space. ``fewest``: least number of particles.
+    position; ``space``: in free space. ``fewest``: least number of particles, at least :data:`ASTRAY`.
 
     ``rival_evidence``: log-probability of all observations under the track that the population competes with.
     """
@@ -96,7 +96,7 @@ class Population:
         fewest: int = FEWEST,
     ) -> None:
         self._motion, self._bounds, self._rng, self._start = motion, bounds, rng, start
-        self._space, self._fewest = space, fewest
+        self._space, self._fewest = space, max(fewest, ASTRAY)
         self._cloud: Cloud | None = None
         self._room = np.empty(0)  # of each particle for itself, in cells, when it was drawn
         self._begun: ChainState | None = None  # at the last observation that left the queue
