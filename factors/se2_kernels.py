@@ -84,6 +84,44 @@ def twist_to(pose: Array, other: Array) -> Array:
 
 
 @compiled
+def compose(a: Array, b: Array) -> Array:
+    """:func:`factors.se2.compose` of two poses (3,)."""
+    return np.array(composed(a[0], a[1], a[2], b[0], b[1], b[2]))
+
+
+@compiled
+def between(a: Array, b: Array) -> Array:
+    """:func:`factors.se2.between` of two poses (3,)."""
+    return np.array(related(a[0], a[1], a[2], b[0], b[1], b[2]))
+
+
+@compiled
+def adjoint(pose: Array) -> Array:
+    """:func:`factors.se2.adjoint` of one pose (3,)."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array(((c, -s, pose[1]), (s, c, -pose[0]), (0.0, 0.0, 1.0)))
+
+
+@compiled
+def right_jacobian(xi: Array) -> Array:
+    """:func:`factors.se2.right_jacobian` of one twist (3,)."""
+    angle = xi[2]
+    p, q = arc(angle)
+    r, s = (angle / 6.0, 0.5 - angle * angle / 24.0) if abs(angle) < SMALL else ((1.0 - p) / angle, q / angle)
+    return np.array(((p, q, r * xi[0] - s * xi[1]), (-q, p, s * xi[0] + r * xi[1]), (0.0, 0.0, 1.0)))
+
+
+@compiled
+def inverse_right_jacobian(xi: Array) -> Array:
+    """The inverse (3, 3) of :func:`right_jacobian`."""
+    j = right_jacobian(xi)
+    p, q, u, v = j[0, 0], j[0, 1], j[0, 2], j[1, 2]
+    scale = 1.0 / (p * p + q * q)
+    first = scale * p, -scale * q, -scale * (p * u - q * v)
+    return np.array((first, (scale * q, scale * p, -scale * (q * u + p * v)), (0.0, 0.0, 1.0)))
+
+
+@compiled
 def body_to_world(pose: Array, covariance: Array) -> Array:
     """:func:`factors.se2.body_to_world` of one pose (3,), and of the first three components of a covariance (S, S), of which the
     upper triangle is read: the result is symmetric to the last bit."""

@@ -18,8 +18,8 @@ from factors.compiled import compiled
 from factors.motion import Increment
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array
-from factors.se2_kernels import arc, log, wrapped
-from factors.small_kernels import inverse, product
+from factors.se2_kernels import adjoint, between, compose, inverse_right_jacobian, twist_to
+from factors.small_kernels import product
 
 _NOWHERE = np.zeros(3)
 
@@ -104,50 +104,22 @@ def _linearize(
     by_later: Array,
     by_earlier: Array,
 ) -> None:
-    x = _compose(later, offset)
-    rel = _between(_compose(earlier, earlier_offset), x)
+    x = compose(later, offset)
+    rel = between(compose(earlier, earlier_offset), x)
     derivative = np.zeros((len(error), 3))
     if len(error) == 2:
         residual = np.array((rel[0], rel[1]))
         c, s = math.cos(rel[2]), math.sin(rel[2])
         derivative[0, 0], derivative[0, 1], derivative[1, 0], derivative[1, 1] = c, -s, s, c
     else:
-        off = _between(measured, rel)
-        residual = np.array(log(off[0], off[1], off[2]))
-        derivative = inverse(_right_jacobian(residual))
+        residual = twist_to(measured, rel)
+        derivative = inverse_right_jacobian(residual)
     whitened = product(whitener, derivative)
-    to_later = product(whitened, _adjoint(_between(offset, np.zeros(3))))
-    to_earlier = product(whitened, _adjoint(_between(_compose(earlier_offset, rel), np.zeros(3))))
+    to_later = product(whitened, adjoint(between(offset, np.zeros(3))))
+    to_earlier = product(whitened, adjoint(between(compose(earlier_offset, rel), np.zeros(3))))
     for i in range(len(error)):
         error[i] = 0.0
         for j in range(len(error)):
             error[i] += whitener[i, j] * residual[j]
         for j in range(3):
             by_later[i, j], by_earlier[i, j] = to_later[i, j], -to_earlier[i, j]
-
-
-@compiled
-def _compose(a: Array, b: Array) -> Array:
-    c, s = math.cos(a[2]), math.sin(a[2])
-    return np.array((a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], wrapped(a[2] + b[2])))
-
-
-@compiled
-def _between(a: Array, b: Array) -> Array:
-    c, s = math.cos(a[2]), math.sin(a[2])
-    dx, dy = b[0] - a[0], b[1] - a[1]
-    return np.array((c * dx + s * dy, c * dy - s * dx, wrapped(b[2] - a[2])))
-
-
-@compiled
-def _adjoint(pose: Array) -> Array:
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    return np.array(((c, -s, pose[1]), (s, c, -pose[0]), (0.0, 0.0, 1.0)))
-
-
-@compiled
-def _right_jacobian(xi: Array) -> Array:
-    angle = xi[2]
-    p, q = arc(angle)
-    r, s = (angle / 6.0, 0.5 - angle * angle / 24.0) if abs(angle) < 1e-4 else ((1.0 - p) / angle, q / angle)
-    return np.array(((p, q, r * xi[0] - s * xi[1]), (-q, p, s * xi[0] + r * xi[1]), (0.0, 0.0, 1.0)))

@@ -6,7 +6,7 @@ import numpy as np
 
 from factors.compiled import compiled
 from factors.se2 import Array, Integers
-from factors.se2_kernels import SMALL, arc, exp, log, wrapped
+from factors.se2_kernels import arc, between, exp, inverse_right_jacobian, log, right_jacobian, twist_to, wrapped
 from factors.small_kernels import product
 
 # Minimum variance of positions relative to the largest one. A pose known only to a hundred metres is not known better than to a
@@ -156,12 +156,6 @@ def recalibrated(delta: Array, moving: float, constants: Array, indices: Integer
 
 
 @compiled
-def twist(delta: Array) -> Array:
-    """The logarithm (3,) of a relative pose (3,)."""
-    return np.array(log(delta[0], delta[1], delta[2]))
-
-
-@compiled
 def whitener(covariance: Array) -> Array:
     """The inverse of the lower root of a covariance (3, 3)."""
     a = math.sqrt(covariance[0, 0])
@@ -186,7 +180,7 @@ def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Arr
     cx, cy = x + changes[0] * x, y + changes[0] * y
     turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * way
     p, q = arc(turn)
-    jacobian = _right_jacobian(cx, cy, turn)
+    jacobian = right_jacobian(np.array((cx, cy, turn)))
     by_changes = np.zeros((3, 4))
     for i in range(3):
         by_changes[i, 0] = jacobian[i, 0] * x + jacobian[i, 1] * y
@@ -220,52 +214,21 @@ def linearize(
 ) -> tuple[Array, Array, Array, Array]:
     """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobians by both poses (3, 3) and, through ``by_changes``
     (3, P) of ``delta``, by the constants (3, P)."""
-    rx, ry, turned = _between(start, end)
-    relative = np.array((rx, ry, turned))
-    ex, ey, angle = _between(delta, relative)
-    x, y, angle = log(ex, ey, angle)
-    by_end = product(whitener, _inverse(_right_jacobian(x, y, angle)))
+    relative = between(start, end)
+    rx, ry, turned = relative[0], relative[1], relative[2]
+    error = twist_to(delta, relative)
+    by_end = product(whitener, inverse_right_jacobian(error))
     c, s = math.cos(turned), math.sin(turned)
     # the adjoint of the inverse of the relative pose, negative
     adjoint = np.array(((-c, -s, c * ry - s * rx), (s, -c, -c * rx - s * ry), (0.0, 0.0, -1.0)))
-    by_delta = product(whitener, _inverse(_right_jacobian(-x, -y, -angle)))
+    by_delta = product(whitener, inverse_right_jacobian(-error))
     for i in range(3):
         for j in range(3):
             by_delta[i, j] = -by_delta[i, j]
     residual = np.empty(3)
     for i in range(3):
-        residual[i] = whitener[i, 0] * x + whitener[i, 1] * y + whitener[i, 2] * angle
+        residual[i] = whitener[i, 0] * error[0] + whitener[i, 1] * error[1] + whitener[i, 2] * error[2]
     return residual, product(by_end, adjoint), by_end, product(by_delta, by_changes)
-
-
-@compiled
-def _between(a: Array, b: Array) -> tuple[float, float, float]:
-    c, s, dx, dy = math.cos(a[2]), math.sin(a[2]), b[0] - a[0], b[1] - a[1]
-    return c * dx + s * dy, c * dy - s * dx, wrapped(b[2] - a[2])
-
-
-@compiled
-def _right_jacobian(x: float, y: float, angle: float) -> Array:
-    p, q = arc(angle)
-    if abs(angle) < SMALL:
-        r, s = angle / 6.0, 0.5 - angle * angle / 24.0
-    else:
-        r, s = (1.0 - p) / angle, q / angle
-    return np.array(((p, q, r * x - s * y), (-q, p, s * x + r * y), (0.0, 0.0, 1.0)))
-
-
-@compiled
-def _inverse(j: Array) -> Array:
-    """The inverse of a right Jacobian."""
-    p, q, u, v = j[0, 0], j[0, 1], j[0, 2], j[1, 2]
-    scale = 1.0 / (p * p + q * q)
-    return np.array(
-        (
-            (scale * p, -scale * q, -scale * (p * u - q * v)),
-            (scale * q, scale * p, -scale * (q * u + p * v)),
-            (0.0, 0.0, 1.0),
-        )
-    )
 
 
 @compiled
@@ -289,13 +252,11 @@ def linearize_as_reported(
         as_reported[i, 1] /= unit
     delta, by_changes = changed(twist, moving, constants, indices)
     residual, by_start, by_end, by_constants = linearize(start, end, delta, by_changes, as_reported)
-    rx, ry, turned = _between(start, end)
-    ex, ey, angle = _between(delta, np.array((rx, ry, turned)))
-    x, y, _ = log(ex, ey, angle)
+    error = twist_to(delta, between(start, end))
     for j in range(len(indices)):
         if indices[j] == 0:
             for i in range(3):
-                by_constants[i, j] -= (as_reported[i, 0] * x + as_reported[i, 1] * y) / unit
+                by_constants[i, j] -= (as_reported[i, 0] * error[0] + as_reported[i, 1] * error[1]) / unit
     return residual, by_start, by_end, by_constants
 
 
@@ -347,10 +308,7 @@ def cost_of_all(
         delta = deltas[k]
         if len(indices):
             delta, _ = recalibrate(twists[k], moving[k], _full(constants, indices))
-        rx, ry, turned = _between(poses[first[k]], poses[first[k] + 1])
-        ex, ey, angle = _between(delta, np.array((rx, ry, turned)))
-        x, y, angle = log(ex, ey, angle)
-        w = whiteners[k]
-        total += (w[0, 0] * x) ** 2 + (w[1, 0] * x + w[1, 1] * y) ** 2
-        total += (w[2, 0] * x + w[2, 1] * y + w[2, 2] * angle) ** 2
+        error, w = twist_to(delta, between(poses[first[k]], poses[first[k] + 1])), whiteners[k]
+        total += (w[0, 0] * error[0]) ** 2 + (w[1, 0] * error[0] + w[1, 1] * error[1]) ** 2
+        total += (w[2, 0] * error[0] + w[2, 1] * error[1] + w[2, 2] * error[2]) ** 2
     return 0.5 * total

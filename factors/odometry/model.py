@@ -26,7 +26,6 @@ from factors.odometry.kernels import (
     linearize_changed,
     recalibrate,
     relative,
-    twist,
     whitener,
 )
 from factors.se2 import Array, Integers
@@ -199,7 +198,7 @@ class OdometryFactor:
 
     def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
         self._increment = increment
-        self._arc = twist(increment.delta)
+        self._arc = se2.log(increment.delta)
         self._moving = increment.duration - increment.still
         self.estimated = tuple(estimated)
         self._indices = np.array(estimated, dtype=np.int64)

@@ -138,14 +138,14 @@ def _updated(
         for i in range(size):
             small = small and abs(step[i]) < CONVERGED * math.sqrt(covariance[i, i])
         if small:
-            best, changed = _stepped(best, step), _added(changed, step)
+            best, changed = se2_kernels.moved(best, step), _added(changed, step)
             break
         lower = False
         for _ in range(4):
-            tried, tried_values, error = _stepped(best, step), _added(changed, step), np.empty(size)
+            tried, tried_values, error = se2_kernels.moved(best, step), _added(changed, step), np.empty(size)
             _set(parameters, estimated, tried_values)
             nll, there, curve, _, _ = score(packed, of_map, seen, tempering, tried, parameters, estimated)
-            error[0], error[1], error[2] = _apart(pose, tried)
+            error[0], error[1], error[2] = se2_kernels.twist_to(pose, tried)
             for i in range(3, size):
                 error[i] = tried_values[i - 3] - values[i - 3]
             tried_cost = nll
@@ -172,27 +172,12 @@ def _set(parameters: Array, estimated: Integers, values: Array) -> None:
 
 
 @compiled
-def _stepped(pose: Array, step: Array) -> Array:
-    x, y, turned = se2_kernels.exp(step[0], step[1], step[2])
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    return np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, se2_kernels.wrapped(pose[2] + turned)))
-
-
-@compiled
 def _added(values: Array, step: Array) -> Array:
     """The values after a step of pose and values."""
     out = np.empty(len(values))
     for i in range(len(values)):
         out[i] = values[i] + step[3 + i]
     return out
-
-
-@compiled
-def _apart(pose: Array, other: Array) -> tuple[float, float, float]:
-    """The twist from one pose to another."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    dx, dy = other[0] - pose[0], other[1] - pose[1]
-    return se2_kernels.log(c * dx + s * dy, c * dy - s * dx, other[2] - pose[2])
 
 
 @compiled

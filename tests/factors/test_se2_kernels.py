@@ -45,3 +45,13 @@ def test_moments():
     error = near - mean
     error[:, 2] = se2.wrap(error[:, 2])
     np.testing.assert_allclose(covariance, np.einsum("n,ni,nj->ij", weights, error, error), atol=1e-12)
+
+
+def test_single_poses():
+    for pose, other, twist in zip(POSES, POSES[::-1], TWISTS, strict=True):
+        np.testing.assert_allclose(se2_kernels.adjoint(pose), se2.adjoint(pose), atol=1e-12)
+        np.testing.assert_allclose(se2_kernels.right_jacobian(twist), se2.right_jacobian(twist), atol=1e-12)
+        inverse = se2_kernels.inverse_right_jacobian(twist)
+        np.testing.assert_allclose(inverse @ se2.right_jacobian(twist), np.eye(3), atol=1e-9)
+        same_poses(se2_kernels.compose(pose, other)[None], se2.compose(pose, other)[None])
+        same_poses(se2_kernels.between(pose, other)[None], se2.between(pose, other)[None])

@@ -85,18 +85,12 @@ def _solved(
 
 def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:
     """The graph, and a prior on each variable of the share ``damping`` of what its own factors tell of it."""
-    told = {key: np.zeros(size) for key, size in sizes.items()}
-    for i in range(graph.size()):
-        factor = graph.at(i)
-        if factor is None:  # iSAM2 keeps the places of factors that were removed
-            continue
-        diagonal, first = np.diag(factor.information()), 0
-        for key in factor.keys():  # noqa: SIM118
-            told[key] += diagonal[first : first + sizes[key]]
-            first += sizes[key]
+    keys, (_, columns, values) = graph.keyVector(), graph.sparseJacobian_()
+    ends = np.cumsum([sizes[key] for key in keys])
+    # the last column is that of the right side
+    information = np.bincount(columns.astype(np.int64) - 1, values**2, int(ends[-1]) + 1)[:-1]
     out = gtsam.GaussianFactorGraph()
     out.push_back(graph)
-    for key, information in told.items():
-        held = np.sqrt(damping * information)
-        out.add(gtsam.JacobianFactor(key, np.diag(held), np.zeros(len(held)), gtsam.noiseModel.Unit.Create(len(held))))
+    for key, own in zip(keys, np.split(np.sqrt(damping * information), ends[:-1]), strict=True):
+        out.add(gtsam.JacobianFactor(key, np.diag(own), np.zeros(len(own)), gtsam.noiseModel.Unit.Create(len(own))))
     return out
