@@ -13,6 +13,7 @@ html_title = f"factorgraph-loc {release}"
 exclude_patterns = ["_build"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
+autodoc_mock_imports = ["rerun"]  # optional
 
 
 def _keep_bars(_app, _what, _name, _obj, _options, lines):

@@ -14,6 +14,22 @@ LONG_NUMBER = 40  # digits above which an integer is described instead of printe
 CUT = "..."
 
 
+def number(value: float | None, digits: int = 4) -> str:
+    """A number with that many decimals; a dash if there is none, or it is not finite."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def significant(value: float, *, sign: bool = False) -> str:
+    """A number with three significant digits, without exponent, and with a plus if ``sign``; a dash if it is not finite."""
+    if not math.isfinite(value):
+        return "–"
+    if value == 0.0:
+        return "0"
+    digits = max(0, 2 - math.floor(math.log10(abs(value))))
+    text = f"{value:+,.{min(digits, 6)}f}" if sign else f"{value:,.{min(digits, 6)}f}"
+    return text.replace(",", "\u202f").replace("-", "\u2212")
+
+
 def plain(text: object, limit: int | None = NAME) -> str:
     """``text`` on one line: non-printable characters are escaped, and the middle of a text above ``limit`` characters is cut."""
     whole = str(text)

@@ -10,7 +10,6 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.active import ActiveResults, seek
 from factorgraph_loc.experiments.cluster import Cluster
 from factorgraph_loc.experiments.experiment import Done, Prepared, prepare, run_experiment
-from factorgraph_loc.experiments.plan import MOST_RUNS
 from factorgraph_loc.experiments.reporting import report_experiment
 from factorgraph_loc.files.models import nearest, parse_model
 from factorgraph_loc.planning.settings import ActiveSettings
@@ -49,7 +48,7 @@ def experiment(
     instead. ``verify``: check the checksums of stored results and repeat damaged runs. ``progress`` is called with the numbers of
     finished, all and failed runs. A failed run is recorded as a row and in ``failures``; it raises nothing.
     """
-    plan = prepared(file, changes, out, data_root, verify=verify)
+    plan = prepare(file, changes, out=out, data_root=data_root, verify=verify)
     return execute(plan, jobs=jobs, scheduler=scheduler, retry_failed=retry_failed, progress=progress)
 
 
@@ -77,7 +76,7 @@ def status(
     verify: bool = False,
 ) -> ExperimentStatus:
     """How many runs of an experiment file are done, failed, missing or damaged. For the arguments see :func:`experiment`."""
-    plan = prepared(file, changes, out, data_root, verify=verify)
+    plan = prepare(file, changes, out=out, data_root=data_root, verify=verify)
     counts = {run.label: dict.fromkeys(STATES, 0) for run in plan.runs}
     for run in plan.runs:
         counts[run.label][plan.states[run.key]] += 1
@@ -102,7 +101,9 @@ def report(
 
     Damaged results are listed on the page and left out. For the other arguments see :func:`experiment`.
     """
-    return report_experiment(prepared(file, changes, out, data_root), None if page is None else Path(page)).page
+    return report_experiment(
+        prepare(file, changes, out=out, data_root=data_root), None if page is None else Path(page)
+    ).page
 
 
 def active(
@@ -151,18 +152,3 @@ def _active_settings(
     simulation = world if isinstance(world, SimulationSettings) else named_settings(str(world), changed)
     run = {key: value for key, value in changes.items() if key in of_run}
     return simulation, parse_model(ActiveSettings, run, "the settings")
-
-
-def prepared(
-    file: str | Path,
-    changes: Settings | None,
-    out: str | Path | None,
-    data_root: str | Path | None,
-    *,
-    verify: bool = False,
-    most: int = MOST_RUNS,
-) -> Prepared:
-    """An experiment with its plan and the states of its runs. TooManyRunsError for more than ``most`` runs; for the other arguments
-    see :func:`experiment`."""
-    folder, root = None if out is None else Path(out), None if data_root is None else str(data_root)
-    return prepare(Path(file), list((changes or {}).items()), data_root=root, out=folder, verify=verify, most=most)

@@ -7,13 +7,17 @@ from typing import Literal
 
 from factorgraph_loc.api.given import LogLike, Progress, RigLike, Settings, WorldLike, every, one
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.inspect import Inspection, inspect
+from factorgraph_loc.evaluation.plots import overview
+from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import temporary_folder, writing
 from factorgraph_loc.io.bags.manifest import BagManifest, manifest_of_bag
 from factorgraph_loc.io.native.native import require_new, write_native
 from factorgraph_loc.io.readers import Dataset, describe
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.sensors.rfid.recorded import RecordedLooks
 from factorgraph_loc.simulation import SimulationSettings, named_settings, recorded_looks, with_images
 from factorgraph_loc.simulation import simulate as make_log
@@ -24,9 +28,26 @@ def datasets(data_root: str | Path | None = None) -> list[Dataset]:
     return describe(data_root)
 
 
-def info(log: LogLike, *, rig: RigLike | None = None, world: WorldLike | None = None) -> Inspection:
-    """Summarize a log, with warnings about its content."""
-    return inspect(one(log, rig, world))
+def info(
+    log: LogLike, *, rig: RigLike | None = None, world: WorldLike | None = None, out: str | Path | None = None
+) -> Inspection:
+    """Summarize a log, with warnings about its content. ``out``: a picture (PNG) of the log from above to write."""
+    loaded = one(log, rig, world)
+    if out is not None:
+        draw([loaded], Path(out))
+    return inspect(loaded)
+
+
+def draw(logs: Sequence[Log], path: Path) -> None:
+    """Write the picture of the only log. InputError for several, and for a path that is no PNG file."""
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path}: expected a name that ends in .png")
+    if len(logs) != 1:
+        raise InputError(f"-o: there are {len(logs)} logs, expected one to draw")
+    (log,) = logs
+    odometry = run(log, RunConfig("dead_reckoning")).final if moving(tuple(log.streams)) else None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_picture(overview(log, odometry), path)
 
 
 def convert(

@@ -1,12 +1,12 @@
 """``fgloc view`` and ``fgloc export`` as functions: stored results for viewers and other programs."""
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
 from factorgraph_loc.api.given import LogLike, RigLike, WorldLike, one
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.exports import rerun_scene
 from factorgraph_loc.exports.points import write_ply
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 from factorgraph_loc.exports.ros import write_mcap
@@ -89,7 +89,17 @@ def stored(results: Sequence[L], read: Callable[[L | str], Log]) -> tuple[Log, l
 
 
 def show(log: Log, runs: list[StoredRun], rrd: Path | None, bind: str) -> None:
-    """Open the viewer, or write a file for it."""
+    """Open the viewer, or write a file for it. InputError if ``rerun-sdk`` is not installed."""
+    # Rerun prints the errors that it raises, unless RUST_LOG says otherwise when it is imported
+    is_set = "RUST_LOG" in os.environ
+    os.environ.setdefault("RUST_LOG", "off")
+    try:
+        from factorgraph_loc.exports import rerun_scene  # noqa: PLC0415
+    except ImportError as error:
+        raise InputError("the viewer needs rerun-sdk: pip install 'factorgraph-loc[viewer]'") from error
+    finally:
+        if not is_set:
+            del os.environ["RUST_LOG"]
     if rrd is None:
         rerun_scene.show(log, runs, bind)
     else:

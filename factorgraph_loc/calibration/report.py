@@ -6,8 +6,9 @@ from typing import Any
 
 from factorgraph_loc.calibration.calibrate import Calibration, Scores, estimator_for
 from factorgraph_loc.calibration.learn import calibrators
-from factorgraph_loc.drawing.pages import Part, Rows, number, sectioned
+from factorgraph_loc.drawing.pages import Part, Rows, sectioned
 from factorgraph_loc.fitting.constants import FittedConstant
+from factorgraph_loc.text import number
 from factors.se2 import Array
 
 KINDS = ("causal", "final")

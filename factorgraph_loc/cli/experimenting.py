@@ -4,6 +4,7 @@ plan their paths to localize themselves."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +21,7 @@ from factorgraph_loc.cli.options import (
     key_and_value,
     nested_changes,
     parse_list,
+    takes_options,
 )
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.seeds import parse_seeds
@@ -48,63 +50,55 @@ OutFolder = Annotated[
     typer.Option("--out", "-o", metavar="OUT", help="Folder for the results; by default the one that FILE states."),
 ]
 
-Policies = Annotated[
-    str,
-    typer.Option(
-        metavar="A,B",
-        help=f"{', '.join(POLICIES)}; the others are compared with the first.",
-        autocompletion=completion.policies,
-    ),
+
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that executes the runs.")
 ]
-ActiveEstimators = Annotated[
-    str,
-    typer.Option(
-        "--estimator",
-        "-e",
-        metavar="A,B",
-        help=f"{', '.join(ACTIVE_ESTIMATORS)}.",
-        autocompletion=completion.active_estimators,
-    ),
+RetryFailed = Annotated[bool, typer.Option("--retry-failed", help="Run failed runs again.")]
+Verify = Annotated[
+    bool, typer.Option("--verify", help="Compare stored results with their checksums; run damaged ones again.")
 ]
-ActiveSettings = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; `fgloc policies` lists those of robot "
-        "and policy, `fgloc presets WORLD` those of the world. May be repeated.",
-        autocompletion=completion.active_setting,
-    ),
-]
+VerifyAll = Annotated[bool, typer.Option("--verify", help="Read all results and compare their checksums.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="List the runs and estimate their duration.")]
+Yes = Annotated[bool, typer.Option("--yes", help=f"Confirm more than {MANY:,} runs.")]
+Page = Annotated[Path | None, typer.Option(metavar="FILE", help="The page to write; by default report.html in OUT.")]
+
+
+@dataclass(frozen=True)
+class ExperimentOptions:
+    """The options of all commands."""
+
+    set_: Changes = None
+    out: OutFolder = None
+    data_root: DataRoot = None
+
+    def given(self) -> dict[str, Any]:
+        """The arguments of the functions of the Python interface."""
+        changes = dict(key_and_value(text, "--set") for text in self.set_ or ())
+        return {"changes": changes, "out": self.out, "data_root": self.data_root}
 
 
 @app.command()
+@takes_options
 def run(
     file: File,
-    set_: Changes = None,
-    out: OutFolder = None,
+    *,
+    options: ExperimentOptions,
     jobs: Jobs = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that executes the runs."),
-    ] = None,
-    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run failed runs again.")] = False,
-    verify: Annotated[
-        bool, typer.Option("--verify", help="Compare stored results with their checksums; run damaged ones again.")
-    ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and estimate their duration.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help=f"Confirm more than {MANY:,} runs.")] = False,
-    data_root: DataRoot = None,
+    scheduler: Scheduler = None,
+    retry_failed: RetryFailed = False,
+    verify: Verify = False,
+    dry_run: DryRun = False,
+    yes: Yes = False,
     json: Json = False,
 ) -> None:
     """Execute the runs of an experiment that have no result yet; can be interrupted and resumed at any time."""
     from factorgraph_loc.api import experimenting
+    from factorgraph_loc.experiments.experiment import prepare
     from factorgraph_loc.experiments.plan import MOST_RUNS, TooManyRunsError
 
     try:
-        prepared = experimenting.prepared(
-            file, _changes(set_), out, data_root, verify=verify, most=MOST_RUNS if yes or dry_run else MANY
-        )
+        prepared = prepare(file, **options.given(), verify=verify, most=MOST_RUNS if yes or dry_run else MANY)
     except TooManyRunsError as error:
         if yes or dry_run:
             raise
@@ -125,25 +119,34 @@ def run(
     except KeyboardInterrupt as stop:
         stop.add_note(f"finished runs are kept in {prepared.folder}; the same command resumes")
         raise
-    show.warnings(done.warnings)
     _print_done(done, prepared, file, json)
     if done.failures:
         raise typer.Exit(1)
 
 
+def _print_done(done: Done, prepared: Prepared, file: Path, json: bool) -> None:
+    show.warnings(done.warnings)
+    for failure in done.failures[:SHOWN]:
+        show.note(f"failed: {failure}")
+    if len(done.failures) > SHOWN:
+        show.note(f"failed: {len(done.failures) - SHOWN} more, see `fgloc experiment status {file}`")
+    if json:
+        found = {"runs": done.rows.to_dicts(), "failures": done.failures, "warnings": done.warnings}
+        show.document({"folder": str(prepared.folder), **found})
+        return
+    header, lines = _summary(done.rows.to_dicts(), prepared.experiment.report.metrics)
+    show.table(header, lines)
+    show.line()
+    show.line(f"results are in {prepared.folder}: results.parquet, store/")
+
+
 @app.command()
-def status(
-    file: File,
-    set_: Changes = None,
-    out: OutFolder = None,
-    verify: Annotated[bool, typer.Option("--verify", help="Read all results and compare their checksums.")] = False,
-    data_root: DataRoot = None,
-    json: Json = False,
-) -> None:
+@takes_options
+def status(file: File, *, options: ExperimentOptions, verify: VerifyAll = False, json: Json = False) -> None:
     """Show how many runs of an experiment are done, failed, missing or damaged."""
     from factorgraph_loc.api import experimenting
 
-    found = experimenting.status(file, changes=_changes(set_), out=out, data_root=data_root, verify=verify)
+    found = experimenting.status(file, **options.given(), verify=verify)
     if json:
         show.document(vars(found) | {"folder": str(found.folder)})
         return
@@ -157,45 +160,18 @@ def status(
 
 
 @app.command()
-def report(
-    file: File,
-    set_: Changes = None,
-    out: OutFolder = None,
-    page: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The page to write; by default report.html in OUT.")
-    ] = None,
-    data_root: DataRoot = None,
-    json: Json = False,
-) -> None:
+@takes_options
+def report(file: File, *, options: ExperimentOptions, page: Page = None, json: Json = False) -> None:
     """Write the stored results of an experiment as one HTML page; damaged ones are left out."""
-    from factorgraph_loc.api.experimenting import prepared
+    from factorgraph_loc.experiments.experiment import prepare
     from factorgraph_loc.experiments.reporting import report_experiment
 
-    written = report_experiment(prepared(file, _changes(set_), out, data_root), page)
+    written = report_experiment(prepare(file, **options.given()), page)
     if json:
         show.document({"page": str(written.page), "damaged": written.damaged})
         return
     show.line(f"the report is {written.page}")
     _print_damaged(written.damaged, file, "left out")
-
-
-def _changes(texts: list[str] | None) -> dict[str, Any]:
-    return dict(key_and_value(text, "--set") for text in texts or ())
-
-
-def _print_done(done: Done, prepared: Prepared, file: Path, json: bool) -> None:
-    for failure in done.failures[:SHOWN]:
-        show.note(f"failed: {failure}")
-    if len(done.failures) > SHOWN:
-        show.note(f"failed: {len(done.failures) - SHOWN} more, see `fgloc experiment status {file}`")
-    if json:
-        found = {"runs": done.rows.to_dicts(), "failures": done.failures, "warnings": done.warnings}
-        show.document({"folder": str(prepared.folder), **found})
-        return
-    header, lines = _summary(done.rows.to_dicts(), prepared.experiment.report.metrics)
-    show.table(header, lines)
-    show.line()
-    show.line(f"results are in {prepared.folder}: results.parquet, store/")
 
 
 def _print_plan(prepared: Prepared, jobs: int | None, again: bool, json: bool) -> None:
@@ -270,23 +246,55 @@ def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[li
     return ["median (min to max)", "runs", *metrics, SCORED], lines
 
 
+World = Annotated[
+    str,
+    typer.Argument(
+        metavar="WORLD",
+        help="A preset of `fgloc simulate`, or a TOML file of its settings.",
+        autocompletion=completion.preset,
+    ),
+]
+Policies = Annotated[
+    str,
+    typer.Option(
+        metavar="A,B",
+        help=f"{', '.join(POLICIES)}; the others are compared with the first.",
+        autocompletion=completion.policies,
+    ),
+]
+ActiveEstimators = Annotated[
+    str,
+    typer.Option(
+        "--estimator",
+        "-e",
+        metavar="A,B",
+        help=f"{', '.join(ACTIVE_ESTIMATORS)}.",
+        autocompletion=completion.active_estimators,
+    ),
+]
+MaxMetres = Annotated[
+    float | None, typer.Option(metavar="M", help="Path length after which a robot gives up [m]; by default 100.")
+]
+ActiveChanges = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; `fgloc policies` lists those of robot "
+        "and policy, `fgloc presets WORLD` those of the world. May be repeated.",
+        autocompletion=completion.active_setting,
+    ),
+]
+
+
 def active(
-    world: Annotated[
-        str,
-        typer.Argument(
-            metavar="WORLD",
-            help="A preset of `fgloc simulate`, or a TOML file of its settings.",
-            autocompletion=completion.preset,
-        ),
-    ],
+    world: World,
     out: Out,
     policy: Policies = "information",
     estimator: ActiveEstimators = "active_mcl",
     seeds: Seeds = "0",
-    max_metres: Annotated[
-        float | None, typer.Option(metavar="M", help="Path length after which a robot gives up [m]; by default 100.")
-    ] = None,
-    set_: ActiveSettings = None,
+    max_metres: MaxMetres = None,
+    set_: ActiveChanges = None,
     jobs: Jobs = None,
     overwrite: Overwrite = False,
     json: Json = False,

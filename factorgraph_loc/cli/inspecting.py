@@ -10,7 +10,7 @@ import typer
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import DataRoot, Json, LogName, LogOptions, takes_options
-from factorgraph_loc.errors import InputError
+from factorgraph_loc.text import number
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.inspect import Inspection, StreamSummary
@@ -44,6 +44,7 @@ def info(
     json: Json = False,
 ) -> None:
     """Summarize a log, with warnings about its content; for a ROS bag, its topics."""
+    from factorgraph_loc.api.logs import draw
     from factorgraph_loc.evaluation.inspect import inspect
     from factorgraph_loc.files.shipped import manifests
     from factorgraph_loc.io.bags.file import is_bag
@@ -58,7 +59,7 @@ def info(
             show.note(f"warning: {fault}")
     logs = source.load([log])
     if out is not None:
-        _draw(logs, out)
+        draw(logs, out)
     inspections = [inspect(loaded) for loaded in logs]
     if json:
         documents = [_document(loaded, found) for loaded, found in zip(logs, inspections, strict=True)]
@@ -87,31 +88,13 @@ def convert(
     from factorgraph_loc.api import logs
 
     loaded = source.load_one(log)
-    for warning in loaded.warnings:
-        show.note(f"warning: {warning}")
+    show.warnings(loaded.warnings)
     logs.convert(loaded, out, format=format, overwrite=overwrite)
     if json:
         names = sorted(path.name for path in out.iterdir())
         show.document({"log": loaded.name, "folder": str(out), "files": names})
     else:
         show.line(f"wrote {out}")
-
-
-def _draw(logs: list[Log], path: Path) -> None:
-    """Write the picture of the only log. Raises InputError for several, and for a path that is no PNG file."""
-    from factorgraph_loc.evaluation.figures import write_picture
-    from factorgraph_loc.evaluation.plots import overview
-    from factorgraph_loc.experiments.run import RunConfig, run
-    from factorgraph_loc.sensors.registry import moving
-
-    if path.suffix.lower() != ".png":
-        raise InputError(f"{path}: expected a name that ends in .png")
-    if len(logs) != 1:
-        raise InputError(f"-o: there are {len(logs)} logs, expected one to draw")
-    (log,) = logs
-    odometry = run(log, RunConfig("dead_reckoning")).final if moving(tuple(log.streams)) else None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_picture(overview(log, odometry), path)
 
 
 def _print(log: Log, found: Inspection) -> None:
@@ -147,7 +130,7 @@ def _print(log: Log, found: Inspection) -> None:
 
 
 def _row(name: str, stream: StreamSummary) -> tuple[str, ...]:
-    numbers = (show.number(stream.rate, 1), show.number(stream.first, 1), show.number(stream.last, 1))
+    numbers = (number(stream.rate, 1), number(stream.first, 1), number(stream.last, 1))
     return (name, str(stream.rows), *numbers, str(len(stream.gaps)))
 
 

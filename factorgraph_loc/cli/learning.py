@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,6 +24,7 @@ from factorgraph_loc.cli.options import (
     takes_options,
 )
 from factorgraph_loc.plugins import MAP_ESTIMATORS
+from factorgraph_loc.text import number
 
 OutRig = Annotated[
     Path, typer.Option("--out", "-o", metavar="OUT.rig.toml", help="The rig to write; a report is written next to it.")
@@ -53,8 +54,7 @@ def calibrate(
     show.first_use()
     with show.progress("calibrating", counted=True) as progress:
         found = learning.calibrate(loaded, out, overwrite=overwrite, progress=progress)
-    for doubt in found.doubts:
-        show.note(f"warning: {doubt}")
+    show.warnings(found.doubts)
     if json:
         show.document(report.document(found) | {"files": {"rig": str(out), "report": str(page)}})
         return
@@ -83,7 +83,8 @@ MapEstimator = Annotated[
         autocompletion=completion.map_estimator,
     ),
 ]
-Layer = Annotated[
+Extend = Annotated[bool, typer.Option("--extend", help="Keep the log's map and add what it lacks.")]
+Of = Annotated[
     str | None,
     typer.Option(
         metavar="WHAT",
@@ -97,55 +98,55 @@ Poses = Annotated[
         help="For tags: reference, or odometry to estimate the poses too; by default the reference if there is one.",
     ),
 ]
+TagHeight = Annotated[
+    float | None,
+    typer.Option(metavar="Z", help="Height [m] of tags that the log's map lacks; by default that of the antennas."),
+]
+DropDead = Annotated[
+    bool, typer.Option("--drop-dead", help="Only write the log's map without the tags that are believed dead.")
+]
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """The arguments of ``build_map`` of the Python interface, except the settings."""
+
+    estimator: MapEstimator = MAP_ESTIMATORS[0]
+    extend: Extend = False
+    of: Of = None
+    poses: Poses = None
+    tag_height: TagHeight = None
+    drop_dead: DropDead = False
+    prior: Prior = None
+    overwrite: Overwrite = False
 
 
 @takes_options
 def map_(
     log: LogName,
     out: OutWorld,
-    estimator: MapEstimator = MAP_ESTIMATORS[0],
-    extend: Annotated[bool, typer.Option("--extend", help="Keep the log's map and add what it lacks.")] = False,
-    of: Layer = None,
-    poses: Poses = None,
-    tag_height: Annotated[
-        float | None,
-        typer.Option(metavar="Z", help="Height [m] of tags that the log's map lacks; by default that of the antennas."),
-    ] = None,
-    drop_dead: Annotated[
-        bool,
-        typer.Option("--drop-dead", help="Only write the log's map without the tags that are believed dead."),
-    ] = False,
-    prior: Prior = None,
-    set_: Settings = None,
     *,
+    options: MapOptions,
+    set_: Settings = None,
     source: LogOptions,
-    overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Make a map of the landmarks, RFID tags or points in a log; compare it with the log's map of landmarks or tags, if any."""
     from factorgraph_loc.api import learning
     from factorgraph_loc.experiments import maps
 
-    picture = maps.picture_beside(out, overwrite=overwrite)  # before the log is read
+    picture = maps.picture_beside(out, overwrite=options.overwrite)  # before the log is read
     loaded = source.load_one(log)
-    settings = parse_settings(set_ or (), [estimator], [maps.POINTS])
+    settings = parse_settings(set_ or (), [options.estimator], [maps.POINTS])
     made = learning.build_map(
         loaded,
         out,
-        of=of,
-        estimator=estimator,
-        settings=settings[estimator],
-        extend=extend,
-        poses=poses,
-        tag_height=tag_height,
-        prior=prior,
-        drop_dead=drop_dead,
+        settings=settings[options.estimator],
         points=settings[maps.POINTS],
-        overwrite=overwrite,
         stages=partial(show.progress, counted=False),
+        **vars(options),
     )
-    for warning in made.warnings:
-        show.note(f"warning: {warning}")
+    show.warnings(made.warnings)
     if json:
         files = {"map": str(out), "picture": str(picture)}
         show.document(document(made.details) | {"frame": made.frame, "files": files})
@@ -178,10 +179,10 @@ def tell(found: Made) -> tuple[str, ...]:
         return (f"believed dead and not in the new map: {count} of {count + found.kept} tags",)
     if isinstance(found, LandmarkMap):
         _table(("landmark", *COLUMNS), _rows(found, {}))
-        return (found.summary(), *found.notes)
+        return (found.summary(), *_notes(found))
     if isinstance(found, MadeTags):
-        _table(("tag", *COLUMNS), _rows(found.made, found.open))
-        return (found.made.summary("tags"), *_notes(found))
+        _table(("tag", *COLUMNS), _rows(found.made, _reasons(found)))
+        return (found.made.summary("tags"), *_notes_on_tags(found))
     return (
         f"{found.points} points are in the new map, with {found.observations} observations in {found.keyframes} keyframes"
         + (f", {found.fused} of them known before" if found.fused else ""),
@@ -198,22 +199,22 @@ def document(found: Made) -> dict[str, Any]:
 
     if isinstance(found, LandmarkMap):
         landmarks = [{"landmark": name} | entry for name, entry in _entries(found, {}).items()]
-        return {"landmarks": landmarks, "summary": found.summary(), "notes": [*found.notes]}
+        return {"landmarks": landmarks, "summary": found.summary(), "notes": _notes(found)}
     if not isinstance(found, MadeTags):
         return asdict(found)
     facing = {name: tag.facing for name, tag in found.world.tags.items()}
-    entries = _entries(found.made, found.open)
+    entries = _entries(found.made, _reasons(found))
     modes = {
         name: [{"weight": m.weight, "position": m.position.tolist()} for m in modes]
         for name, modes in found.modes.items()
     }
     return {
         "tags": [{"tag": name, "facing": facing.get(name)} | entry for name, entry in entries.items()],
-        "not_located": dict(found.open),
+        "not_located": _reasons(found),
         "modes": modes,
         "rms": math.nan if found.rms is None else found.rms,
         "summary": found.made.summary("tags"),
-        "notes": _notes(found),
+        "notes": _notes_on_tags(found),
     }
 
 
@@ -226,7 +227,7 @@ def _rows(made: LandmarkMap, verdicts: Mapping[str, str]) -> list[tuple[str, ...
     rows = []
     for name, entry in _entries(made, verdicts).items():
         places = (*(entry["given"] or (None, None)), *(entry["learnt"] or (None, None)))
-        numbers = (show.number(value) for value in (*places, entry["sigma"], entry["distance"]))
+        numbers = (number(value, 3) for value in (*places, entry["sigma"], entry["distance"]))
         rows.append((name, *numbers, entry["verdict"]))
     return rows
 
@@ -247,22 +248,33 @@ def _entries(made: LandmarkMap, verdicts: Mapping[str, str]) -> dict[str, dict[s
     }
 
 
-def _notes(made: MadeTags) -> list[str]:
+def _reasons(made: MadeTags) -> dict[str, str]:
+    """Why each tag that is not located is not."""
+    return {name: why.text for name, why in made.open.items()}
+
+
+def _notes(made: LandmarkMap) -> list[str]:
+    """Lines on what the table does not show."""
+    unseen = ", ".join(made.unseen)
+    return [*made.notes, *([f"kept as they are in the given map, as they were not seen: {unseen}"] if unseen else [])]
+
+
+def _notes_on_tags(made: MadeTags) -> list[str]:
     """Lines on what the table does not show: unmapped tags, and the RMS distance from the given positions."""
     listed = {entry.landmark for entry in made.made.entries}
     others = {name: why for name, why in made.open.items() if name not in listed}
-    told = [note for note in made.made.notes if not note.startswith("kept as they are")]
+    told = [*made.made.notes]
     kept = [name for name in made.open if name in made.world.tags]
     if kept:
         told.append(f"kept unchanged from the given map, as they could not be located: {', '.join(kept)}")
-    silent = [name for name, why in made.open.items() if why == "never read"]
+    silent = [name for name, why in made.open.items() if why.kind == "unread"]
     if silent:
         told.append(f"never read: {', '.join(silent)}")
     if made.rms is not None:
         told.append(f"root mean square distance from the given positions: {made.rms:.3f} m")
-    chance = [name for name, why in others.items() if "than chance" in why]
+    chance = [name for name, why in others.items() if why.kind == "chance"]
     if chance:
         told.append(
             f"{len(chance)} tags that the map lacks were read so rarely that no position explains the reads better than chance"
         )
-    return told + [f"not in the map: {name}, {why}" for name, why in others.items() if name not in chance]
+    return told + [f"not in the map: {name}, {why.text}" for name, why in others.items() if name not in chance]

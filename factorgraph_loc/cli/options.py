@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -166,10 +166,9 @@ class RunOptions:
 
 
 def takes_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the fields of :class:`LogOptions` and :class:`RunOptions` on the command line, in place of its parameters of
-    these types."""
+    """The command with the fields of dataclasses as options, in place of its parameters of these types."""
     given = inspect.signature(command, eval_str=True)
-    groups = {p.name: p.annotation for p in given.parameters.values() if p.annotation in (LogOptions, RunOptions)}
+    groups = {p.name: p.annotation for p in given.parameters.values() if is_dataclass(p.annotation)}
     parameters: list[inspect.Parameter] = []
     for parameter in given.parameters.values():
         if kind := groups.get(parameter.name):

@@ -25,6 +25,7 @@ from factorgraph_loc.cli.options import (
     takes_options,
 )
 from factorgraph_loc.experiments.seeds import parse_seeds
+from factorgraph_loc.text import number
 
 if TYPE_CHECKING:
     from factorgraph_loc.model.result import RunResult
@@ -162,7 +163,7 @@ def compare(
 def _print_accuracy(scores: Mapping[str, Any]) -> None:
     if scores["causal.position_rmse"] is not None or scores["final.position_rmse"] is not None:
         rows = [
-            (kind, *(show.number(scores[f"{kind}.{figure}"], digits) for figure, digits in COLUMNS.values()))
+            (kind, *(number(scores[f"{kind}.{figure}"], digits) for figure, digits in COLUMNS.values()))
             for kind in ("causal", "final")
         ]
         show.table(("", *COLUMNS), rows)
@@ -170,12 +171,10 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
         hardly = f", or too little: {scored} poses scored" if (scored := scores["final.scored"]) is not None else ""
         show.line(f"there is no reference to score against{hardly}")
     if scores["aligned.position_rmse"] is not None:
-        position, heading = (
-            show.number(scores[f"aligned.{what}_rmse"], n) for what, n in (("position", 3), ("heading", 4))
-        )
+        position, heading = (number(scores[f"aligned.{what}_rmse"], n) for what, n in (("position", 3), ("heading", 4)))
         show.line(f"final, aligned because the map was free: position RMSE {position} m, heading RMSE {heading} rad")
     if scores["landmarks.count"]:
-        error, anees = (show.number(scores[f"landmarks.{what}"], n) for what, n in (("rmse", 3), ("anees", 2)))
+        error, anees = (number(scores[f"landmarks.{what}"], n) for what, n in (("rmse", 3), ("anees", 2)))
         show.line(f"learnt landmarks: {scores['landmarks.count']}, aligned RMSE {error} m, ANEES {anees}, ideal 2")
     if scores["time_to_localized"]:
         show.line(f"localized after {scores['time_to_localized']:.1f} s")
@@ -187,7 +186,7 @@ def _print_further(scores: Mapping[str, Any], *, rpe: bool) -> None:
 
     for title, columns in further_tables([scores], rpe=rpe).items():
         rows = [
-            (kind, *(show.number(scores[key], n) for key, n, _ in columns.values() if key.startswith(kind)))
+            (kind, *(number(scores[key], n) for key, n, _ in columns.values() if key.startswith(kind)))
             for kind in KINDS
         ]
         if any(cell != "-" for row in rows for cell in row[1:]):
@@ -233,11 +232,11 @@ def _print_effort(scores: Mapping[str, Any]) -> None:
         show.line(
             f"images: features of {images} in {seconds:.1f} s, {images / seconds:.0f} per second, including the cache"
         )
-    final = f"{show.number(scores['timing.final_seconds'], 1)} s for the final trajectory"
+    final = f"{number(scores['timing.final_seconds'], 1)} s for the final trajectory"
     if scores["time_to_localized"] is None:  # a batch estimator has no causal updates
         show.line(f"time: {final}")
         return
     median, factor = (
-        show.number(scores[f"timing.{name}"], n) for name, n in (("update_ms_median", 2), ("real_time_factor", 0))
+        number(scores[f"timing.{name}"], n) for name, n in (("update_ms_median", 2), ("real_time_factor", 0))
     )
     show.line(f"time: {median} ms per update (median), {factor} times real time, {final}")

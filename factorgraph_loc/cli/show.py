@@ -135,11 +135,6 @@ def fields(content: Mapping[str, str]) -> None:
         line(f"{name:<{width}}  {value}")
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """A number for a table, or a dash if it is None."""
-    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
-
-
 def _is_number(text: str) -> bool:
     return text == "-" or text.replace(".", "", 1).lstrip("-").isdigit()
 

@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from factorgraph_loc.cli import completion, show
-from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, nested_changes
+from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, nested_changes, takes_options
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.seeds import parse_seeds
 from factorgraph_loc.plugins import PRESETS
 
-What = Annotated[
+Preset = Annotated[
     str,
-    typer.Argument(
-        metavar="PRESET",
-        help=f"{', '.join(PRESETS)}, or a TOML file.",
-        autocompletion=completion.preset,
+    typer.Argument(metavar="PRESET", help=f"{', '.join(PRESETS)}, or a TOML file.", autocompletion=completion.preset),
+]
+OutFolder = Annotated[
+    Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write; with --seeds, a folder of folders.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all random draws; the same seed gives the same bytes.")]
+SeedRange = Annotated[
+    str | None, typer.Option(metavar="A:B", help="One log for each seed from A to B-1, in FOLDER/NAME-SEED.")
+]
+Duration = Annotated[float | None, typer.Option(metavar="S", help="Duration of the drive [s]; 600 in the presets.")]
+Tags = Annotated[int | None, typer.Option(metavar="N", help="Number of tags.")]
+ImageRate = Annotated[float | None, typer.Option(metavar="HZ", help="Images per second; 5 in the presets.")]
+WorldSeed = Annotated[
+    int | None,
+    typer.Option(
+        min=0, metavar="N", help="Seed of the world only, for several drives in one world; by default --seed."
     ),
 ]
 Changes = Annotated[
@@ -38,31 +51,35 @@ Recorded = Annotated[
         autocompletion=completion.logs,
     ),
 ]
+Images = Annotated[bool, typer.Option("--images", help="Also render camera images.")]
 
 
+@dataclass(frozen=True)
+class ChangeOptions:
+    """Settings that differ from those of the preset."""
+
+    duration: Duration = None
+    tags: Tags = None
+    set_: Changes = None
+    image_rate: ImageRate = None
+    world_seed: WorldSeed = None
+
+    def changes(self) -> dict[str, Any]:
+        """The settings as nested tables."""
+        named = {"drive.duration": self.duration, "world.tags": self.tags, "images.rate": self.image_rate}
+        return nested_changes(self.set_ or (), named | {"world_seed": self.world_seed})
+
+
+@takes_options
 def simulate(
-    what: What,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write; with --seeds, a folder of folders.")
-    ],
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all random draws; the same seed gives the same bytes.")] = 0,
-    seeds: Annotated[
-        str | None, typer.Option(metavar="A:B", help="One log for each seed from A to B-1, in FOLDER/NAME-SEED.")
-    ] = None,
-    duration: Annotated[
-        float | None, typer.Option(metavar="S", help="Duration of the drive [s]; 600 in the presets.")
-    ] = None,
-    tags: Annotated[int | None, typer.Option(metavar="N", help="Number of tags.")] = None,
-    set_: Changes = None,
+    what: Preset,
+    out: OutFolder,
+    seed: Seed = 0,
+    seeds: SeedRange = None,
+    *,
+    options: ChangeOptions,
     recorded: Recorded = None,
-    images: Annotated[bool, typer.Option("--images", help="Also render camera images.")] = False,
-    image_rate: Annotated[float | None, typer.Option(metavar="HZ", help="Images per second; 5 in the presets.")] = None,
-    world_seed: Annotated[
-        int | None,
-        typer.Option(
-            min=0, metavar="N", help="Seed of the world only, for several drives in one world; by default --seed."
-        ),
-    ] = None,
+    images: Images = False,
     data_root: DataRoot = None,
     json: Json = False,
 ) -> None:
@@ -72,8 +89,7 @@ def simulate(
     from factorgraph_loc.files.models import file_name
     from factorgraph_loc.simulation import named_settings, recorded_looks
 
-    named = {"drive.duration": duration, "world.tags": tags, "images.rate": image_rate, "world_seed": world_seed}
-    changes = nested_changes(set_ or (), named)
+    changes = options.changes()
     if "images" in changes and not images:
         raise InputError("--image-rate and --set images.KEY configure images, expected --images with them")
     settings = named_settings(what, changes)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import math
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -78,8 +77,3 @@ def _environment() -> Environment:
 def _digest(content: str) -> str:
     """The hash of a style or script, as in a content security policy."""
     return base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
-
-
-def number(value: float | None, digits: int = 4) -> str:
-    """Format a number for a table; None gives a dash."""
-    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

@@ -15,19 +15,30 @@ multiple test procedure", Scandinavian Journal of Statistics 6(2), 1979. Band of
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from itertools import combinations
+from typing import Any, Literal
 
 import numpy as np
 from scipy.special import ndtr
 
 from factorgraph_loc.evaluation.pairing import CONFIDENCE
-from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS, bounds, draw_pooled, pair_seeds
+from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS, average, bounds, draw_pooled, pair_seeds
+from factorgraph_loc.io.results import KINDS
 from factors import chi_squared
 from factors.se2 import Array
 
 SIGNIFICANT = 1.0 - CONFIDENCE
 _EXACT = 60  # pairs up to which the distribution is computed exactly
 
+COMPARED = tuple(f"{kind}.{what}_rmse" for kind in KINDS for what in ("position", "heading"))
+# columns of a difference, with their types, as there may be no rows
+DIFFERENCES: dict[str, type] = {
+    **dict.fromkeys(("metric", "a", "b", "log"), str),
+    **dict.fromkeys(("value_a", "value_b", "difference", "low", "high"), float),
+    **dict.fromkeys(("pairs", "left_out"), int),
+}
+
+Row = Mapping[str, Any]
 Seeds = Mapping[int, float | None]  # the score of each seed, None where a run has none
 ByLog = Mapping[str, Seeds]
 Units = Literal["logs", "seeds"]
@@ -78,11 +89,11 @@ def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) 
     clusters = _clusters(known, alike)
     if not clusters:
         return None
-    per_log = np.array([_average(cluster, rms)[0] for cluster in clusters])
+    per_log = np.array([average(cluster, rms=rms)[0] for cluster in clusters])
     units, enough = _units(clusters)
     low, high = bounds(draw_pooled(clusters, rms=rms)[:, 0]) if enough else (None, None)
     spread = clusters[0] if units == "seeds" else per_log
-    value = float(_average(per_log[:, None], rms)[0])
+    value = float(average(per_log[:, None], rms=rms)[0])
     return Pooled(value, low, high, float(spread.min()), float(spread.max()), units, len(spread), len(clusters))
 
 
@@ -101,8 +112,8 @@ def contrast(
     clusters = _clusters(scores, alike)
     if not clusters:
         return None
-    per_log = np.array([_average(cluster, rms) for cluster in clusters])
-    total = _average(per_log, rms)
+    per_log = np.array([average(cluster, rms=rms) for cluster in clusters])
+    total = average(per_log, rms=rms)
     units, enough = _units(clusters)
     pairs = clusters[0] if units == "seeds" else per_log
     low, high, p, effect = None, None, None, None
@@ -111,7 +122,7 @@ def contrast(
         low, high = bounds(drawn[:, 0] - drawn[:, 1])
     if enough:
         p, effect = signed_rank(pairs[:, 0] - pairs[:, 1]), rank_biserial(pairs[:, 0] - pairs[:, 1])
-    values = {log: _average(both, rms).tolist() for log, both in scores.items()}
+    values = {log: average(both, rms=rms).tolist() for log, both in scores.items()}
     return Contrast(
         difference=float(total[0] - total[1]),
         low=low,
@@ -124,6 +135,38 @@ def contrast(
         pairs=sum(map(len, clusters)),
         left_out=left_out,
     )
+
+
+def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Differences ``a`` minus ``b`` of the RMSEs of all pairs of estimators: negative if ``a`` is better.
+
+    ``rows`` are runs with log, estimator, seed and scores. For each log: RMSE pooled over the pairs of seeds. With enough logs
+    for an interval also ``log`` = "(all)". ``pairs``: number of compared (log, seed); ``left_out``: number without a score in one
+    of the two. Without any pair the values are None.
+    """
+    logs = list(dict.fromkeys(row["log"] for row in rows))
+    names = list(dict.fromkeys(row["estimator"] for row in rows))
+    found: list[dict[str, Any]] = []
+    for metric in COMPARED:
+        scores: dict[str, dict[str, dict[int, float | None]]] = {name: {log: {} for log in logs} for name in names}
+        for row in rows:
+            scores[row["estimator"]][row["log"]][row["seed"]] = row.get(metric)
+        for a, b in combinations(names, 2):
+            lines = []
+            for log in logs:
+                both, missing = pair_seeds(scores[a][log], scores[b][log])
+                values = average(both, rms=True).tolist() if len(both) else None
+                lines.append((log, values, None, None, len(both), missing))
+            total = contrast(scores[a], scores[b], rms=True)
+            if total is not None and total.units == "logs" and total.low is not None:
+                values = average(list(total.by_log.values()), rms=True).tolist()
+                lines.append(("(all)", values, total.low, total.high, total.pairs, total.left_out))
+            for log, values, low, high, pairs, left_out in lines:
+                x, y = values or (None, None)
+                apart = None if values is None else x - y
+                cells = (metric, a, b, log, x, y, apart, low, high, pairs, left_out)
+                found.append(dict(zip(DIFFERENCES, cells, strict=True)))
+    return found
 
 
 def signed_rank(differences: Array) -> float:
@@ -204,11 +247,6 @@ def _ranks(differences: Array) -> Array:
     ``scipy.stats.rankdata``, which takes half a second to import."""
     _, which, counts = np.unique(np.abs(differences), return_inverse=True, return_counts=True)
     return np.asarray((np.cumsum(counts) - 0.5 * (counts - 1.0))[which])
-
-
-def _average(scores: Array, rms: bool) -> Array:
-    """Pooled figure over the rows of ``scores`` (K, C)."""
-    return np.asarray(np.sqrt(np.mean(np.square(scores), axis=0)) if rms else np.mean(scores, axis=0))
 
 
 def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> list[Array]:

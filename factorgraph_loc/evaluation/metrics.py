@@ -3,11 +3,10 @@
 There is no alignment, as the map's frame is known, unless it is asked for; for runs that estimated the map, aligned figures are
 added. Pairing of poses:
 :mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to
-Tracking and Navigation", 2001, section 5.4. Relative pose error: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
-systems", 2012, section IV.A, over time and over path length.
+Tracking and Navigation", 2001, section 5.4. Relative pose errors: :mod:`factorgraph_loc.evaluation.trajectories.score`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,20 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.pairing import (
-    CONFIDENCE,
-    DELTA,
-    TOLERANCE,
-    align_points,
-    between,
-    indices,
-    pairs,
-    pauses,
-    rms,
-    spread,
-    successive,
-)
-from factorgraph_loc.evaluation.trajectories.score import score_paths
+from factorgraph_loc.evaluation.pairing import CONFIDENCE, TOLERANCE, Pairs, align_points, pairs, rms, spread
+from factorgraph_loc.evaluation.trajectories.association import in_plane
+from factorgraph_loc.evaluation.trajectories.score import pose_errors, score_paths
 from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.model.belief import Learnt, LearntPoint
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -38,7 +26,7 @@ from factorgraph_loc.model.scoring import MAX_GAP, Alignment
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import path_of
 from factors import chi_squared, positive, se2
-from factors.se2 import Array, Integers
+from factors.se2 import Array
 
 FEWEST_SCORED = 10  # least number of poses for meaningful figures
 OF_FREE_MAP = ("aligned.position_rmse", "aligned.heading_rmse", "landmarks.count", "landmarks.rmse", "landmarks.anees")
@@ -175,7 +163,8 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
     """The figures of one trajectory against the reference, see :func:`errors`; all None without one.
 
     ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95``, ``max``. ``rpe_*_per_m``: root mean square of
-    :func:`relative_errors` over ``rpe_pieces`` of path; ``rpe_*_per_s``: over a second. ``anees``: mean NEES, ideally 3 (2 if the
+    the relative errors over ``rpe_pieces`` of a metre of path; ``rpe_*_per_s``: over a second (see
+    :func:`~factorgraph_loc.evaluation.trajectories.score.pose_errors`). ``anees``: mean NEES, ideally 3 (2 if the
     reference has no heading).
     ``nees_bounds``: 95 % interval of the mean of as many *independent* NEES; errors along a trajectory are correlated, so a
     consistent estimator is outside more often. ``coverage_95``: fraction of the times at which the true (x, y) lies in the 95 %
@@ -189,14 +178,12 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
     for name, values in (("position", e.position), ("heading", e.heading)):
         statistics = spread(values)
         figures |= {f"{name}_{how}": statistics[how] for how in _HOW}
-    if reference.has_heading:
-        position, heading = relative_errors(e.poses, e.reference, pauses(e.t))
-        figures["rpe_position_per_m"] = rms(position)
-        figures["rpe_heading_per_m"] = rms(heading)
-        figures["rpe_pieces"] = len(position)
-        position, heading = relative_errors(e.poses, e.reference, pauses(e.t), np.diff(e.t), DELTA - TOLERANCE)
-        figures["rpe_position_per_s"] = rms(position)
-        figures["rpe_heading_per_s"] = rms(heading)
+    _, per_m, per_s = pose_errors(in_plane(Pairs(e.t, e.poses, None, e.reference), trajectory, reference))
+    for unit, relative in (("m", per_m), ("s", per_s)):
+        if relative is not None and relative.rotation is not None:
+            figures[f"rpe_position_per_{unit}"] = rms(relative.position)
+            figures[f"rpe_heading_per_{unit}"] = rms(relative.rotation)
+    figures["rpe_pieces"] = None if per_m is None else len(per_m.position)
     nees = e.nees[np.isfinite(e.nees)]
     if len(nees):
         tail = (1.0 - CONFIDENCE) / 2.0
@@ -243,41 +230,6 @@ def free_map_figures(
         if (good := _positive_definite(covariances)).any():
             figures["landmarks.anees"] = float(np.mean(_squared(error[good], covariances[good])))
     return figures
-
-
-def relative_errors(
-    poses: Array,
-    reference: Array,
-    breaks: Sequence[int] | Integers = (),
-    steps: Array | None = None,
-    length: float = DELTA,
-) -> tuple[Array, Array]:
-    """Relative pose errors over 1 m of the reference's path: position (K,) [m] and heading (K,) [rad, absolute].
-
-    ``poses`` and ``reference`` (N, 3) at the same times, NaN where missing; ``breaks``: indices of the poses after a gap of the
-    reference. ``steps`` (N - 1,): what is counted between the poses until it is ``length``, by default the reference's path [m]. A
-    piece begins at the first pose, or at the end of the previous piece, and ends at the first pose for which the reference has
-    moved 1 m or more along its path; a NaN or a break discards the piece. With the motions Q of the reference and P of the
-    estimate over a piece, the error is the translation and rotation of ``Q^-1 P``, not divided by the length. Without gaps this is
-    evo's RPE with ``delta=1``, ``delta_unit=meters``, ``all_pairs=False``, ``pairs_from_reference=True``.
-    """
-    if steps is None:
-        steps = np.linalg.norm(np.diff(reference[:, :2], axis=0), axis=1)
-    found: list[tuple[int, int]] = []
-    for start, stop in _unbroken(np.isfinite(reference[:, 0]) & np.isfinite(poses[:, 0]), breaks):
-        found += successive(steps[start : stop - 1], length, start)
-    begins, ends = indices(found)
-    error = se2.between(se2.between(reference[begins], reference[ends]), se2.between(poses[begins], poses[ends]))
-    return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
-
-
-def _unbroken(valid: NDArray[np.bool_], breaks: Sequence[int] | Integers) -> list[tuple[int, int]]:
-    """The half-open ranges of indices in which ``valid`` holds throughout, also split at ``breaks``."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], valid, [False])).astype(int)))
-    found = []
-    for start, stop in edges.reshape(-1, 2).tolist():
-        found += [(start + a, start + b) for a, b in between(stop - start, (int(i) - start for i in breaks))]
-    return found
 
 
 def _since(trajectory: Trajectory, t: float) -> Trajectory:

@@ -1,4 +1,4 @@
-"""Pooled figures, differences between estimators with intervals, and paired comparison of two methods on the same cases.
+"""Pooled figures, their bootstrap, and paired comparison of two methods on the same cases.
 
 Runs are paired by log and seed; logs are clusters. The interval is a percentile bootstrap over logs and, within each, over seeds
 (Davison and Hinkley, "Bootstrap Methods and their Application", 1997, section 3.8).
@@ -13,8 +13,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations
-from typing import Any
 
 import numpy as np
 import scipy
@@ -23,60 +21,20 @@ from numpy.typing import ArrayLike, NDArray
 from factorgraph_loc.evaluation.pairing import CONFIDENCE
 from factors.se2 import Array
 
-COMPARED = tuple(f"{kind}.{what}_rmse" for kind in ("causal", "final") for what in ("position", "heading"))
 ENOUGH_LOGS = 6  # needed for a bootstrap over logs
 DRAWS = 4000
 _SEED = 0  # of the bootstrap, for reproducible intervals
 
-# columns of a difference, with their types, as there may be no rows
-DIFFERENCES: dict[str, type] = {
-    **dict.fromkeys(("metric", "a", "b", "log"), str),
-    **dict.fromkeys(("value_a", "value_b", "difference", "low", "high"), float),
-    **dict.fromkeys(("pairs", "left_out"), int),
-}
 
-Row = Mapping[str, Any]
+def average(scores: ArrayLike, *, rms: bool) -> Array:
+    """The root mean square, or else the mean, over the rows of ``scores`` (K, ...)."""
+    values = np.asarray(scores, dtype=float)
+    return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)) if rms else np.mean(values, axis=0))
 
 
 def pooled_rms(values: Sequence[float]) -> float:
     """Root mean square of RMSEs of several logs or seeds, with equal weights."""
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
-def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Differences ``a`` minus ``b`` of the RMSEs of all pairs of estimators: negative if ``a`` is better.
-
-    ``rows`` are runs with log, estimator, seed and scores; an estimator that ran with one seed is paired with each seed of the
-    other. For each log: RMSE pooled over the pairs. With 6 logs or more also ``log`` = "(all)": RMSE pooled over logs and seeds,
-    with 95 % interval ``low`` to ``high``. ``pairs``: number of compared (log, seed); ``left_out``: number without a score in one
-    of the two. Without any pair the values are None.
-    """
-    logs = list(dict.fromkeys(row["log"] for row in rows))
-    names = list(dict.fromkeys(row["estimator"] for row in rows))
-    found: list[dict[str, Any]] = []
-    for metric in COMPARED:
-        for a, b in combinations(names, 2):
-            pairs = {log: _pairs(rows, log, a, b, metric) for log in logs}
-            head = {"metric": metric, "a": a, "b": b}
-            for log, (scores, missing) in pairs.items():
-                counts = {"pairs": len(scores), "left_out": missing}
-                found.append(head | {"log": log} | _difference(scores[None]) | counts)
-            used = [scores for scores, _ in pairs.values() if len(scores)]
-            if len(used) >= ENOUGH_LOGS:
-                drawn = draw_pooled(used)
-                low, high = bounds(drawn[:, 0] - drawn[:, 1])
-                per_log = np.sqrt([np.mean(np.square(scores), axis=0) for scores in used])
-                counts = {"pairs": sum(map(len, used)), "left_out": sum(missing for _, missing in pairs.values())}
-                total = _difference(per_log[:, None]) | {"low": low, "high": high}
-                found.append(head | {"log": "(all)"} | total | counts)
-    return found
-
-
-def _pairs(rows: Sequence[Row], log: str, a: str, b: str, metric: str) -> tuple[Array, int]:
-    by_seed = [
-        {r["seed"]: r.get(metric) for r in rows if r["log"] == log and r["estimator"] == name} for name in (a, b)
-    ]
-    return pair_seeds(*by_seed)
+    return float(average(values, rms=True))
 
 
 def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> tuple[Array, int]:
@@ -89,14 +47,6 @@ def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> 
         both = [pair for seed, pair in zip(seeds, both, strict=True) if seed in longer]
     complete = [pair for pair in both if None not in pair]
     return np.array(complete, dtype=float).reshape(-1, 2), len(both) - len(complete)
-
-
-def _difference(scores: Array) -> dict[str, Any]:
-    """The difference for ``scores`` (L, K, 2) of L logs and K seeds."""
-    if not scores.size:
-        return dict.fromkeys(("value_a", "value_b", "difference", "low", "high"))
-    a, b = np.sqrt(np.mean(np.square(scores), axis=(0, 1))).tolist()
-    return {"value_a": a, "value_b": b, "difference": a - b, "low": None, "high": None}
 
 
 def bounds(figures: Array) -> tuple[float, float]:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from factorgraph_loc.evaluation.statistics import pooled_rms
+from factorgraph_loc.evaluation.statistics import average, pooled_rms
+from factorgraph_loc.io.results import KINDS
 from factorgraph_loc.text import MESSAGE, plain
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ COLUMNS = {
 # after an unknown start
 SINCE_THE_START = {"localized after [s]": ("time_to_localized", 1, False)}
 ALL = "(all logs)"
-KINDS = ("causal", "final")
 ALIGNED = {
     f"{kind} {what}": (f"{kind}.aligned_{key}_rmse", digits, True)
     for kind in KINDS
@@ -179,18 +179,14 @@ def _cell(values: Sequence[float | None], digits: int, rms: bool) -> str:
     known = [v for v in values if v is not None]
     if not known:
         return "-"
-    text = f"{_average(known, rms):.{digits}f}"
+    text = f"{average(known, rms=rms):.{digits}f}"
     return text if len(known) == 1 else f"{text} ±{np.std(known, ddof=1):.{digits}f}"
 
 
 def _pooled(key: str, digits: int, rms: bool, by_log: Sequence[Sequence[Row]]) -> str:
     known = [[v for v in (_figure(r, key) for r in runs) if v is not None] for runs in by_log]
-    averages = [_average(values, rms) for values in known if values]
-    return f"{_average(averages, rms):.{digits}f}" if averages else "-"
-
-
-def _average(values: Sequence[float], rms: bool) -> float:
-    return pooled_rms(values) if rms else float(np.mean(values))
+    averages = [average(values, rms=rms) for values in known if values]
+    return f"{average(averages, rms=rms):.{digits}f}" if averages else "-"
 
 
 def counted(*by_log: Sequence[Row]) -> str:

@@ -13,9 +13,9 @@ import polars as pl
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.figures import Track
+from factorgraph_loc.evaluation.inference import DIFFERENCES, differences
 from factorgraph_loc.evaluation.plots import plot_log, remove_plots
 from factorgraph_loc.evaluation.report import DEFAULT, RunFiles, Scene, write_report
-from factorgraph_loc.evaluation.statistics import DIFFERENCES, differences
 from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, further_tables, markdown, unscored, verdict
 from factorgraph_loc.evaluation.warned import WARNINGS, lines, row_of
 from factorgraph_loc.experiments.output import TABLES, reason_of, remove_run, write_run, write_tables
@@ -85,7 +85,7 @@ def compare(
 
     Deterministic estimators run with the first of their seeds only. A run that fails, or whose process dies, becomes a row with
     its reason; the others continue. Written into ``out``: ``results.parquet`` and ``results.csv`` (the rows), ``differences.csv``
-    (see :func:`~factorgraph_loc.evaluation.statistics.differences`), ``table.md``, ``report.html`` (see
+    (see :func:`~factorgraph_loc.evaluation.inference.differences`), ``table.md``, ``report.html`` (see
     :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png`` and ``runs/LOG/ESTIMATOR/seedK/`` with the files of
     each run, or ``error.txt`` with the traceback. ``align``: also score after this alignment, see
     :func:`~factorgraph_loc.evaluation.metrics.score`; ``rpe``: also show relative errors. Both are further tables in ``table.md``,

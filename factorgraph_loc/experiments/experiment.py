@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -71,27 +71,31 @@ class Done:
 
 
 def prepare(
-    file: Path,
-    changes: Sequence[tuple[str, Any]] = (),
+    file: str | Path,
+    changes: Mapping[str, Any] | None = None,
     *,
-    data_root: str | None = None,
-    out: Path | None = None,
+    data_root: str | Path | None = None,
+    out: str | Path | None = None,
     verify: bool = False,
     most: int = MOST_RUNS,
 ) -> Prepared:
-    """Plan the experiment of a ``file`` with ``changes``, and look up stored results; ``verify``: check all checksums.
+    """Plan the experiment of a ``file`` with ``changes``, and look up stored results.
+
+    ``changes``: values by dotted key, see :func:`~factorgraph_loc.experiments.experiment_file.read_experiment`. ``out``: folder of
+    the results, by default the file's. ``verify``: check all checksums.
 
     Raises InputError for errors in the file, TooManyRunsError for more than ``most`` runs, StoreError if the folder for results
     cannot be written.
     """
+    file = Path(file)
     experiment = read_experiment(file, changes)
-    folder = out or experiment.folder()
+    folder = experiment.folder() if out is None else Path(out)
     if (found := kind(folder)) not in ("", "a folder"):
         raise InputError(f"{folder}: is {found}, expected a folder for the results")
     store = Store(folder)
     store.create()
     try:
-        runs = plan(experiment, file.parent, store.folder, data_root, most=most)
+        runs = plan(experiment, file.parent, store.folder, None if data_root is None else str(data_root), most=most)
     except TooManyRunsError as error:
         raise TooManyRunsError(f"{plain(file)}: {error}") from error
     states = {key: store.state(key, thorough=verify) for key in dict.fromkeys(run.key for run in runs)}
@@ -136,33 +140,24 @@ def run_experiment(
 
 def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
     """Estimated sum of the run times [s], from stored runs of the same estimator and the duration of the log, else a default."""
-    import polars as pl  # noqa: PLC0415
-
     from factorgraph_loc.experiments.result_table import load_results  # noqa: PLC0415
 
-    columns = {
-        "label": "String",
-        "estimator": "String",
-        "log": "String",
-        "timing.run_seconds": "Float64",
-        "duration": "Float64",
-    }
-    known: dict[tuple[str, str], list[float]] = {}
     try:
-        rows = load_results(folder)
+        rows = load_results(folder).to_dicts()
     except InputError:
-        rows = pl.DataFrame()
-    is_whole = columns.items() <= {name: str(kind) for name, kind in rows.schema.items()}.items()
-    for label, estimator, log, seconds, duration in rows.select(*columns).drop_nulls().iter_rows() if is_whole else ():
-        for like in ((label, log), (label, ""), (estimator, "")):
-            known.setdefault(like, []).append(seconds / max(duration, 1e-9))
-    total = 0.0
-    for run in runs:
-        paces = next(
-            (known[k] for k in ((run.label, run.log), (run.label, ""), (run.estimator, "")) if k in known), None
-        )
-        total += run.duration * (median(paces) if paces else 1.0 / PACE)
-    return total
+        rows = []
+    paces: dict[tuple[str, str], list[float]] = {}
+    for row in rows:
+        seconds, duration = row.get("timing.run_seconds"), row.get("duration")
+        if isinstance(seconds, float) and isinstance(duration, float) and duration > 0.0:
+            for like in ((row["label"], row["log"]), (row["label"], ""), (row["estimator"], "")):
+                paces.setdefault(like, []).append(seconds / duration)
+
+    def pace(run: PlannedRun) -> float:
+        keys = ((run.label, run.log), (run.label, ""), (run.estimator, ""))
+        return median(next((paces[key] for key in keys if key in paces), [1.0 / PACE]))
+
+    return sum(run.duration * pace(run) for run in runs)
 
 
 def _write_rows(prepared: Prepared, states: dict[str, State]) -> pl.DataFrame:

@@ -233,11 +233,11 @@ class Experiment(FileModel):
         return Path("out", self.name) if self.out is None else Path(self.out)
 
 
-def read_experiment(path: Path, changes: Sequence[tuple[str, Any]] = ()) -> Experiment:
+def read_experiment(path: Path, changes: Mapping[str, Any] | None = None) -> Experiment:
     """Read an experiment from a TOML file. ``changes``: dotted keys of the file with other values; ``LABEL.KEY`` is a setting of
     an estimator, ``simulation.KEY`` one of all simulated logs. Raises InputError with file, key and what is expected."""
     content = read_toml(path)
-    for key, value in changes:
+    for key, value in (changes or {}).items():
         _change(content, key, value, path)
     check_content(content, path)
     return parse_model(Experiment, content, path)

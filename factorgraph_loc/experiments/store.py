@@ -190,17 +190,14 @@ class Store:
         """The causal trajectory from the first localized estimate on, and the final one, with covariances, times [s] from the
         first estimate."""
         import numpy as np  # noqa: PLC0415
-        import polars as pl  # noqa: PLC0415
 
         from factorgraph_loc.evaluation.figures import Track  # noqa: PLC0415
-        from factorgraph_loc.io.results import ESTIMATES, parse_estimates, trajectory_of  # noqa: PLC0415
+        from factorgraph_loc.io.results import ESTIMATES, by_kind, parse_estimates, trajectory_of  # noqa: PLC0415
 
         table = parse_estimates(self.read(key, ESTIMATES), ESTIMATES)
-        causal, final = (table.filter(pl.col("kind") == kind) for kind in ("causal", "final"))
         t0_ns = int(table["t_ns"].to_numpy().min(initial=np.iinfo(np.int64).max))
-        localized = causal.filter(pl.col("status") == "localized")["t_ns"]
-        causal = causal.filter(pl.col("t_ns") >= localized.min()) if len(localized) else causal.clear()
-        return Track(trajectory_of(causal, t0_ns) if len(causal) else None, trajectory_of(final, t0_ns), np.empty(0))
+        causal, final = (trajectory_of(rows, t0_ns) for rows in by_kind(table).values())
+        return Track(causal if len(causal) else None, final, np.empty(0))
 
     def put(self, key: str, files: Mapping[str, bytes]) -> None:
         """Write the files of a run atomically, replacing existing ones; its claim must be held."""

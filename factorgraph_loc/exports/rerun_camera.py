@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+import rerun as rr
 
 from factorgraph_loc.exports.runs import StoredRun
 from factorgraph_loc.exports.scene import GAP, LIT, SEEN
@@ -17,9 +17,6 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factors.camera import model as reprojection
 from factors.se2 import Array
 
-if TYPE_CHECKING:
-    import rerun as rr
-
 TIMELINE = "log_time"
 WORLD, CAMERA = "/world", "/camera"  # the latter without a robot pose
 FRUSTUM = 0.4  # m from the camera to its image
@@ -29,8 +26,6 @@ NEAREST = 300  # map points drawn into an image
 
 def record_camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) -> None:
     """Record images with the identified points and the predicted map points, as a picture in front of the first robot."""
-    import rerun as rr  # noqa: PLC0415
-
     settings = log.rig.find(CameraSettings)
     if settings is None or not pictures_of.has_pictures(log):
         return
@@ -67,8 +62,6 @@ def _batches(pictures: Iterator[tuple[float, bytes]]) -> Iterator[list[tuple[flo
 
 
 def _pictures(recording: rr.RecordingStream, at: str, pictures: Sequence[tuple[float, bytes]]) -> None:
-    import rerun as rr  # noqa: PLC0415
-
     t, contents = zip(*pictures, strict=True)
     columns = rr.EncodedImage.columns(blob=list(contents), media_type=["image/jpeg"] * len(contents))
     recording.send_columns(at, times(np.array(t)), columns)
@@ -80,8 +73,6 @@ def _pixels_over_time(
     """Points (K, 2) in each image, shifted by half a pixel: the viewer's origin is the corner of the first pixel, not its
     centre.
     """
-    import rerun as rr  # noqa: PLC0415
-
     columns = rr.Points2D.columns(positions=np.concatenate(pixels) + 0.5, labels=labels)
     recording.send_columns(at, times(t), columns.partition([len(p) for p in pixels]))
 
@@ -111,6 +102,4 @@ def camera_path(log: Log, runs: Sequence[StoredRun]) -> str:
 
 def times(t: Array) -> list[rr.TimeColumn]:
     """Seconds of the log as a Rerun time column."""
-    import rerun as rr  # noqa: PLC0415
-
     return [rr.TimeColumn(TIMELINE, duration=t)]

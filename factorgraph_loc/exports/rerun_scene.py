@@ -2,19 +2,19 @@
 
 Everything is in the world frame [m], z up; the timeline ``log_time`` counts seconds from the log's start. All data are sent as
 columns: Rerun 0.41 writes broken files for single values logged with ``set_time(duration=...)``. The library ``rerun-sdk`` is
-optional and imported only where it is used.
+optional: without it these modules cannot be imported.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
@@ -30,10 +30,6 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.summary import has_pictures
 from factors.se2 import Array
 
-if TYPE_CHECKING:
-    import rerun as rr
-    import rerun.blueprint as rrb
-
 PLOTS, EVENTS = "/plots", "/events"
 LINE, POINT = 0.02, 0.06  # m: radii
 ARROW = 0.6  # m
@@ -42,11 +38,9 @@ ARROW = 0.6  # m
 def write_rrd(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
     """Write a file that ``rerun FILE`` opens.
 
-    Raises InputError if ``rerun-sdk`` is not installed, an image cannot be read, or the file cannot be written.
+    Raises InputError if an image cannot be read, or the file cannot be written.
     """
-    recording = _recording()
-    import rerun as rr  # noqa: PLC0415 - once it is known to be installed
-
+    recording = rr.RecordingStream("fgloc")
     stream = rr.binary_stream(recording)  # in memory, because Rerun's own writer hangs when the disk is full
     recording.send_blueprint(_blueprint(log, runs), make_active=False)
     _record(recording, log, runs)
@@ -64,38 +58,14 @@ def show(log: Log, runs: Sequence[StoredRun], bind: str = LOOPBACK) -> None:
     """
     if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
         raise InputError("there is no display to open the viewer on, expected --rrd FILE, for a viewer elsewhere")
-    recording = _recording()
+    recording = rr.RecordingStream("fgloc")
     with open_viewer(bind) as url:
         recording.connect_grpc(url, default_blueprint=_blueprint(log, runs))
         _record(recording, log, runs)
         recording.flush()
 
 
-def _recording() -> rr.RecordingStream:
-    try:
-        with _quiet():
-            import rerun as rr  # noqa: PLC0415 - an optional library
-    except ImportError as error:
-        raise InputError("the viewer needs rerun-sdk: pip install 'factorgraph-loc[viewer]'") from error
-    return rr.RecordingStream("fgloc")
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Import Rerun such that it does not print the errors that it raises, unless the environment variable ``RUST_LOG`` is set."""
-    if "RUST_LOG" in os.environ:
-        yield
-        return
-    os.environ["RUST_LOG"] = "off"
-    try:
-        yield
-    finally:
-        del os.environ["RUST_LOG"]
-
-
 def _record(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) -> None:
-    import rerun as rr  # noqa: PLC0415
-
     recording.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _map(recording, log)
     if log.reference is not None:
@@ -108,8 +78,6 @@ def _record(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
 
 def _map(recording: rr.RecordingStream, log: Log) -> None:
     """Walls and mapped objects (landmarks, tags, points), and when each was observed."""
-    import rerun as rr  # noqa: PLC0415
-
     if log.world.walls:
         walls = np.array(log.world.walls).reshape(-1, 2, 2)
         lines = np.concatenate((walls, np.zeros((len(walls), 2, 1))), axis=2)
@@ -123,8 +91,6 @@ def _map(recording: rr.RecordingStream, log: Log) -> None:
 
 
 def _lamps(recording: rr.RecordingStream, what: str, positions: Mapping[str, Array], lights: scene.Lights) -> None:
-    import rerun as rr  # noqa: PLC0415
-
     if not positions:
         return
     places = np.array(list(positions.values()))
@@ -142,8 +108,6 @@ def _lamps(recording: rr.RecordingStream, what: str, positions: Mapping[str, Arr
 
 def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
     """The estimates of a run and their errors."""
-    import rerun as rr  # noqa: PLC0415
-
     at = f"{WORLD}/{run.name}"
     _path(recording, f"{at}/final", run.final, colour)
     _trail(recording, f"{at}/causal", run.causal, colour)
@@ -172,8 +136,6 @@ def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
 
 def _path(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
     """A whole trajectory, at all times."""
-    import rerun as rr  # noqa: PLC0415
-
     lines = [_on_floor(part) for part in scene.segments(trajectory)]
     if lines:
         recording.log(at, rr.LineStrips3D(lines, radii=LINE / 2.0, colors=colour), static=True)
@@ -189,8 +151,6 @@ def _trail(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
 
 def _lines_over_time(recording: rr.RecordingStream, at: str, t: Array, lines: Array, colour: Colour) -> None:
     """A line (L, 2) of ``lines`` (K, L, 2) for each of the times ``t`` (K,)."""
-    import rerun as rr  # noqa: PLC0415
-
     if len(t):
         recording.send_columns(at, times(t), rr.LineStrips3D.columns(strips=list(_on_floor(lines))))
         recording.log(at, rr.LineStrips3D.from_fields(radii=LINE, colors=colour), static=True)
@@ -198,8 +158,6 @@ def _lines_over_time(recording: rr.RecordingStream, at: str, t: Array, lines: Ar
 
 def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
     """The robot over time, as an arrow where its heading is known."""
-    import rerun as rr  # noqa: PLC0415
-
     if not len(trajectory):
         return
     half = trajectory.poses[:, 2] / 2.0 if trajectory.has_heading else np.zeros(len(trajectory))
@@ -214,9 +172,6 @@ def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
 
 def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
     """Layout of the viewer: the plan from above; beside it camera, errors and events, where there are any."""
-    import rerun as rr  # noqa: PLC0415
-    import rerun.blueprint as rrb  # noqa: PLC0415
-
     past = rrb.VisibleTimeRanges(
         timeline=TIMELINE, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
     )

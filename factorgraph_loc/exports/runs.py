@@ -13,7 +13,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import DATA, foreign, read_bytes
 from factorgraph_loc.files.columns import LATEST
 from factorgraph_loc.files.models import FileModel, parse_model, read_json, read_toml
-from factorgraph_loc.io.results import ESTIMATES, FILES, parse_estimates, trajectory_of
+from factorgraph_loc.io.results import ESTIMATES, FILES, by_kind, parse_estimates, trajectory_of
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
@@ -123,11 +123,7 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
     path = folder.path / ESTIMATES
     table = parse_estimates(read_bytes(path, DATA), path)
     table = table.filter(pl.all_horizontal(pl.col(key).is_finite() for key in ("x", "y", "heading")))
-    table = table.with_columns(t=(pl.col("t_ns") - log.t0_ns) / 1e9)
-    causal = table.filter(pl.col("kind") == "causal")
-    localized = causal.filter(pl.col("status") == "localized")["t"].min()
-    causal = causal.filter(pl.col("t") >= (np.inf if localized is None else localized))
-    final = table.filter(pl.col("kind") == "final")
+    causal, final = by_kind(table).values()
     try:
         of_causal, of_final = trajectory_of(causal, log.t0_ns), trajectory_of(final, log.t0_ns)
     except ValueError as error:

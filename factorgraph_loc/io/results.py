@@ -12,6 +12,7 @@ from factorgraph_loc.files.tables import parse_parquet
 from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory
 
 ESTIMATES = "estimates.parquet"
+KINDS = ("causal", "final")
 TEXTS, STAMP = ("kind", "status"), "t_ns"
 NUMBERS = (
     *("x", "y", "heading", *COVARIANCES),
@@ -36,6 +37,14 @@ def trajectory_of(table: pl.DataFrame, t0_ns: int) -> Trajectory:
         covariances[:, i, j] = covariances[:, j, i] = table[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
     t = (table["t_ns"].to_numpy() - t0_ns) / 1e9
     return Trajectory(t, table.select("x", "y", "heading").fill_null(np.nan).to_numpy(), covariances)
+
+
+def by_kind(table: pl.DataFrame) -> dict[str, pl.DataFrame]:
+    """The rows of each of :data:`KINDS`: the causal ones from the first localized estimate on, and the final ones."""
+    found = {kind: table.filter(pl.col("kind") == kind) for kind in KINDS}
+    localized = (found["causal"]["status"] == "localized").arg_true()
+    found["causal"] = found["causal"][int(localized[0]) :] if len(localized) else found["causal"].clear()
+    return found
 
 
 def parse_estimates(content: bytes, source: object, columns: Sequence[str] = COLUMNS) -> pl.DataFrame:

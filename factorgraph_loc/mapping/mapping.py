@@ -31,11 +31,12 @@ GATE = 13.816  # 99.9 % of chi-square with two degrees of freedom
 MEDIAN = 1.386  # 50 % of the same
 TOLERANCE = 0.15  # m; a smaller deviation of a landmark is never significant
 # verdicts on landmarks that are not wrong, and how a summary counts them
+UNSEEN = "not seen"  # verdict
 VERDICTS = {
     "agrees": "agreeing with the given one",
     "given": "as given",
     "new": "new",
-    "not seen": "not seen",
+    UNSEEN: "not seen",
     "not judged": "not judged",
 }
 MIN_COMMON = 3  # landmarks: two can always be aligned with two others at the same distance
@@ -83,6 +84,11 @@ class LandmarkMap:
     frame: Array
     judged: bool
     notes: tuple[str, ...]
+
+    @property
+    def unseen(self) -> tuple[str, ...]:
+        """Names of the landmarks that were not seen, whose given positions are kept."""
+        return tuple(entry.landmark for entry in self.entries if entry.verdict == UNSEEN)
 
     @property
     def flagged(self) -> tuple[str, ...]:
@@ -150,11 +156,8 @@ def make_map(
     wrong = [n for n in common if _differ(moved[n], given[n])]
     verdicts = {name: _verdict(name, moved, given, wrong) for name in common}
     unseen = tuple(name for name in given if name not in learnt)
-    notes = []
-    if unseen:
-        verdicts |= dict.fromkeys(unseen, "not seen")
-        notes.append(f"kept as they are in the given map, as they were not seen: {', '.join(unseen)}")
-    return _assemble(log, moved, alignment.pose, verdicts, keep=unseen, flagged=wrong, judged=True, notes=notes)
+    verdicts |= dict.fromkeys(unseen, UNSEEN)
+    return _assemble(log, moved, alignment.pose, verdicts, keep=unseen, flagged=wrong, judged=True)
 
 
 def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) -> Alignment:

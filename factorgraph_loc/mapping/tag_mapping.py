@@ -5,7 +5,7 @@ The map is written in the frame of the survey of the log's rig (``[survey]``), s
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,14 @@ MAX_GAP = 0.5  # s between poses of the reference, beyond which it is not interp
 Poses = Literal["reference", "odometry"]
 
 
+class Unlocated(NamedTuple):
+    """Why a tag was not located: it was never read (``unread``), its reads may be due to ``chance``, or its position is
+    ``ambiguous`` or ``uncertain``. ``text``: the reason with its figures."""
+
+    kind: Literal["unread", "chance", "ambiguous", "uncertain"]
+    text: str
+
+
 @dataclass(frozen=True)
 class MadeTags:
     """A map of tags: ``world`` as written to a file; ``made``: the same as landmarks in the world frame, with verdicts on the
@@ -42,7 +50,7 @@ class MadeTags:
     world: World
     made: LandmarkMap
     poses: Array
-    open: Mapping[str, str]
+    open: Mapping[str, Unlocated]
     modes: Mapping[str, tuple[TagMode, ...]]
 
     @property
@@ -132,17 +140,17 @@ def _along_reference(log: Log, looks: TagLooks) -> tuple[dict[int, LearntPoint],
     return learnt, facing, found, at[which]
 
 
-def _why(one: TagPosterior, reads: int) -> str:
+def _why(one: TagPosterior, reads: int) -> Unlocated:
     """The reason why a tag is not in the map."""
     if not reads:
-        return "never read"
+        return Unlocated("unread", "never read")
     count = f"read {reads} times" if reads > 1 else "read once"
     if not one.is_explained:
-        return f"{count}: no position explains that significantly better than chance"
+        return Unlocated("chance", f"{count}: no position explains that significantly better than chance")
     if one.is_ambiguous:
         places = [f"({m.position[0]:.2f}, {m.position[1]:.2f}) m with {m.weight:.0%}" for m in one.modes[:3]]
-        return f"{count}: ambiguous, {' or '.join(places)}"
-    return f"{count}: too uncertain, sigma {one.modes[0].sigma:.1f} m"
+        return Unlocated("ambiguous", f"{count}: ambiguous, {' or '.join(places)}")
+    return Unlocated("uncertain", f"{count}: too uncertain, sigma {one.modes[0].sigma:.1f} m")
 
 
 def _as_landmark(log: Log, name: str, position: Array) -> Landmark:

@@ -8,7 +8,10 @@ from evo.core import metrics as evo
 from evo.core.trajectory import PosePath3D
 from scipy.stats import binom, chi2
 
-from factorgraph_loc.evaluation.metrics import OF_FREE_MAP, accuracy, errors, relative_errors, score
+from factorgraph_loc.evaluation.metrics import OF_FREE_MAP, accuracy, errors, score
+from factorgraph_loc.evaluation.pairing import Pairs
+from factorgraph_loc.evaluation.trajectories.association import in_plane
+from factorgraph_loc.evaluation.trajectories.score import pose_errors
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
@@ -70,12 +73,19 @@ def test_in_a_gap_of_the_reference_nothing_is_scored():
 
 def test_no_relative_error_spans_a_gap():
     poses = np.stack((np.arange(8) * 0.6, np.zeros(8), np.zeros(8)), axis=1)
-    reference = poses.copy()
-    reference[3] = np.nan
+    missing = poses.copy()
+    missing[3] = np.nan
+
+    def pieces(t, estimate, reference):
+        both = [Trajectory(t, poses) for poses in (estimate, reference)]
+        return len(pose_errors(in_plane(Pairs(t, estimate, None, reference), *both))[1].position)
+
+    t = 0.1 * np.arange(8)
     # 0..2 holds one piece of 1.2 m, 4..7 one more; the rest is too short
-    assert len(relative_errors(poses, reference)[0]) == 2
-    assert len(relative_errors(poses, poses, [4])[0]) == 2
-    assert len(relative_errors(poses, poses)[0]) == 3
+    assert pieces(t, poses, missing) == 2
+    assert pieces(t, missing, poses) == 2
+    assert pieces(t + 9.0 * (t > 0.35), poses, poses) == 2
+    assert pieces(t, poses, poses) == 3
 
 
 def test_heading_is_not_scored_where_the_reference_has_none():

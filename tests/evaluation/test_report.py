@@ -15,8 +15,9 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import plots, tracks, write_report
-from factorgraph_loc.evaluation.report.metrics import metric_of, number
+from factorgraph_loc.evaluation.report.metrics import metric_of
 from factorgraph_loc.evaluation.report.results import Results
+from factorgraph_loc.text import significant
 
 BAD = "<script>window.hacked = 1</script>\"'&</script><img src=x onerror=alert(1)> ../../etc"
 LOGS = [f"log{i}" for i in range(8)]
@@ -251,7 +252,7 @@ NUMBERS = {
 
 @pytest.mark.parametrize(("value", "text"), NUMBERS.items())
 def test_numbers_have_three_digits(value, text):
-    assert number(value) == text
+    assert significant(value) == text
 
 
 def _bytes(table):

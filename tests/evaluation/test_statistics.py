@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.evaluation.statistics import differences, pooled_rms
+from factorgraph_loc.evaluation.inference import differences
+from factorgraph_loc.evaluation.statistics import pooled_rms
 from factorgraph_loc.evaluation.tables import ALL, comparison_cells, verdict
 
 METRIC = "causal.position_rmse"

@@ -24,7 +24,7 @@ def read(tmp_path):
     def read_text(text, *changes):
         file = tmp_path / "a.toml"
         file.write_text(text)
-        return read_experiment(file, changes)
+        return read_experiment(file, dict(changes))
 
     return read_text
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.exports import rerun_scene
 from factorgraph_loc.exports.runs import find_runs, read_runs
 from factorgraph_loc.maps.points import PointMap
 from factors.camera import model as reprojection
@@ -16,6 +15,8 @@ from factors.camera import model as reprojection
 rr = pytest.importorskip("rerun")
 from rerun.chunk import RrdReader  # noqa: E402
 from rerun.error_utils import RerunWarning  # noqa: E402
+
+from factorgraph_loc.exports import rerun_scene  # noqa: E402
 
 POINTS = np.array(((2.0, 0.0, 0.5), (2.0, 0.2, 0.6), (-5.0, 0.0, 0.5)))
 

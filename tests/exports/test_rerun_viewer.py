@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.exports import rerun_scene, rerun_viewer
+from factorgraph_loc.exports import rerun_viewer
 
 pytest.importorskip("rerun")
+from factorgraph_loc.exports import rerun_scene
+
 LISTEN = "0A"  # state of a socket
 
 

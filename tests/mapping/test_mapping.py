@@ -143,7 +143,7 @@ def test_landmarks_that_were_not_seen_are_kept_and_new_ones_taken_in():
     assert made.world.landmarks["5"] == Landmark(x=points[5, 0], y=points[5, 1], sigma=0.01)
     np.testing.assert_allclose(made.world.position("11"), points[11], atol=0.2)
     assert made.world.landmarks["11"].covariance is not None
-    assert "not seen: 5" in made.notes[0]
+    assert made.unseen == ("5",)
 
 
 def test_without_a_map_all_is_new_and_in_the_frame_of_the_start():

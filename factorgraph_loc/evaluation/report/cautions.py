@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 
-from factorgraph_loc.evaluation.report.results import SCORED, MetricComparison, Results, score
+from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
+from factorgraph_loc.evaluation.report.results import MetricComparison, Results, score
 from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS
 from factorgraph_loc.text import listed
 
@@ -11,7 +12,7 @@ def cautions(results: Results, comparisons: Sequence[MetricComparison]) -> list[
     """Sentences on logs that are not scored, and on differences that cannot become significant."""
     said = []
     if poor := results.unscored():
-        said.append(f"Fewer than {SCORED} poses of {listed(poor)} have a reference: nothing is scored there.")
+        said.append(f"Fewer than {FEWEST_SCORED} poses of {listed(poor)} have a reference: nothing is scored there.")
     contrasts = [c for comparison in comparisons for c in comparison.contrasts.values()]
     if contrasts and all(c.p is None for c in contrasts):
         units = f"{ENOUGH_LOGS} logs, or {ENOUGH_LOGS} seeds of one log"

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from factorgraph_loc.evaluation.inference import Pooled
+from factorgraph_loc.text import significant
 
 DEFAULT = (
     "causal.position_rmse",
@@ -34,7 +35,7 @@ class Metric:
 
     def text(self, value: float, *, sign: bool = False) -> str:
         """A formatted value without the unit."""
-        return number(self.factor * value, sign=sign)
+        return significant(self.factor * value, sign=sign)
 
     def range(self, least: float, most: float, *, sign: bool = False) -> str:
         """A formatted range."""
@@ -91,14 +92,3 @@ _OTHERS = {
     )
 }
 TIMINGS = tuple(key for key in _OTHERS if key.startswith("timing."))
-
-
-def number(value: float, *, sign: bool = False) -> str:
-    """Three significant digits without exponent, with a plus if ``sign``, and a true minus sign."""
-    if not math.isfinite(value):
-        return "–"
-    if value == 0.0:
-        return "0"
-    digits = max(0, 2 - math.floor(math.log10(abs(value))))
-    text = f"{value:+,.{min(digits, 6)}f}" if sign else f"{value:,.{min(digits, 6)}f}"
-    return text.replace(",", "\u202f").replace("-", "\u2212")

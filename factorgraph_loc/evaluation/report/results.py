@@ -20,11 +20,13 @@ from factorgraph_loc.evaluation.inference import (
     mean_nees_band,
     pooled,
 )
+from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
 from factorgraph_loc.evaluation.report import tracks
 from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.report.scene import Scene
-from factorgraph_loc.evaluation.report.tracks import KINDS, Series
+from factorgraph_loc.evaluation.report.tracks import Series
 from factorgraph_loc.evaluation.warned import label_of
+from factorgraph_loc.io.results import KINDS
 from factors.se2 import Array
 
 POSES = 120_000  # on the page, shared by all trajectories
@@ -33,7 +35,6 @@ TRACKS = 1000  # maximum number of runs with trajectories; further logs appear i
 _ESTIMATES, _CONFIG = "estimates.parquet", "config.toml"
 SWEEP = "sweep."
 SIMULATION = "simulation"  # first word of swept settings that change the log
-SCORED = 10  # least number of scored poses
 
 Row = Mapping[str, Any]
 
@@ -224,12 +225,12 @@ class Results:
 
     def unscored(self) -> list[str]:
         """Logs with too short a reference to be scored."""
-        kinds = [f"{kind}.scored" for kind in ("causal", "final")]
+        kinds = [f"{kind}.scored" for kind in KINDS]
         return [
             log
             for log in self.logs
             if any(
-                0 < (row.get(kind) or 0) < SCORED
+                0 < (row.get(kind) or 0) < FEWEST_SCORED
                 for name in self.variants
                 for row in self.runs(name, log)
                 for kind in kinds
@@ -278,7 +279,7 @@ def score(row: Row, metric: str) -> float | None:
         return None
     scored = row.get(f"{kind}.scored")
     value = row.get(metric)
-    if row["status"] != "ok" or value is None or (scored is not None and scored < SCORED):
+    if row["status"] != "ok" or value is None or (scored is not None and scored < FEWEST_SCORED):
         return None
     return float(value)
 

@@ -4,11 +4,13 @@ from collections.abc import Sequence
 from statistics import median
 
 from factorgraph_loc.drawing.pages import Cell, Table
-from factorgraph_loc.evaluation.report.metrics import Metric, number
+from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.report.results import MetricComparison, Results, Row, score
+from factorgraph_loc.evaluation.statistics import average
 from factorgraph_loc.evaluation.tables import counted
 from factorgraph_loc.evaluation.warned import by_text, label_of
 from factorgraph_loc.fitting.shares import wilson
+from factorgraph_loc.text import significant
 
 _NONE = "–"
 
@@ -49,7 +51,7 @@ def by_log(results: Results, metric: Metric) -> Table:
     rows = []
     for log in results.logs:
         found = {v: _known(results.runs(v, log), metric) for v in results.variants}
-        values = {v: _average(known, metric) for v, known in found.items() if known}
+        values = {v: float(average(known, rms=metric.rms)) for v, known in found.items() if known}
         pick = {"low": min, "high": max}.get(metric.better or "")
         best = pick(values.values()) if pick and len(values) > 1 else None
         cells = [_log_cell(metric, found[v], len(results.runs(v, log)), best) for v in results.variants]
@@ -124,14 +126,14 @@ def _difference_cell(c: MetricComparison, variant: str) -> Cell:
         apart = [x - y for x, y in found.by_log.values()]
         return Cell(value, [c.metric.range(min(apart), max(apart), sign=True)] if len(apart) > 1 else [], "grey")
     bounds = f"[{c.metric.text(found.low, sign=True)}, {c.metric.text(found.high, sign=True)}]"
-    tested = f"p {p_value(c.p[variant])}, effect {number(found.effect, sign=True)}"
+    tested = f"p {p_value(c.p[variant])}, effect {significant(found.effect, sign=True)}"
     return Cell(value, [bounds, tested], "" if c.is_significant(variant) else "grey")
 
 
 def _log_cell(metric: Metric, known: Sequence[float], planned: int, best: float | None) -> Cell:
     if not known:
         return Cell(_NONE)
-    value = _average(known, metric)
+    value = float(average(known, rms=metric.rms))
     lines = [metric.range(min(known), max(known))] if len(known) > 1 else []
     if len(known) < planned:
         lines.append(f"{len(known)} of {planned} runs")
@@ -155,8 +157,3 @@ def _share(held: Sequence[bool]) -> Cell:
 
 def _known(rows: Sequence[Row], metric: Metric) -> list[float]:
     return [value for row in rows if (value := score(row, metric.key)) is not None]
-
-
-def _average(values: Sequence[float], metric: Metric) -> float:
-    power = 2.0 if metric.rms else 1.0
-    return float((sum(v**power for v in values) / len(values)) ** (1.0 / power))

@@ -9,10 +9,9 @@ import polars as pl
 from numpy.typing import NDArray
 
 from factorgraph_loc.evaluation.inference import independent_count
-from factorgraph_loc.io.results import ESTIMATES, parse_estimates
+from factorgraph_loc.io.results import ESTIMATES, by_kind, parse_estimates
 from factors.se2 import Array
 
-KINDS = ("causal", "final")
 LEVELS = np.linspace(0.0, 1.0, 51)  # of the plotted distribution of errors
 _NUMBERS = ("x", "y", "cov_xx", "cov_xy", "cov_yy", "error_position", "error_heading", "nees")
 
@@ -42,11 +41,7 @@ def read_series(estimates: bytes, t0_ns: int | None) -> dict[str, Series]:
     table = parse_estimates(estimates, ESTIMATES, ("kind", "t_ns", "status", *_NUMBERS))
     start_ns = table["t_ns"].min() if t0_ns is None else t0_ns
     found = {}
-    for kind in KINDS:
-        rows = table.filter(pl.col("kind") == kind)
-        if kind == "causal":
-            localized = (rows["status"] == "localized").arg_true()
-            rows = rows[int(localized[0]) :] if len(localized) else rows.clear()
+    for kind, rows in by_kind(table).items():
         if len(rows):
             t = ((rows["t_ns"] - start_ns) / 1e9).to_numpy()
             found[kind] = _series(t, {name: _numbers(rows[name]) for name in _NUMBERS})

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.pairing import align_points, pairs, pairs_in_space, pauses
+from factorgraph_loc.evaluation.pairing import Pairs, align_points, pairs, pairs_in_space, pauses
 from factorgraph_loc.model.pose_path import PosePath, upright
 from factorgraph_loc.model.scoring import Alignment, Association
+from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
 from factors.se2 import Array, Integers
 
@@ -84,16 +85,26 @@ def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> As
     if estimate.is_planar or reference.is_planar:
         above = replace(ours.planar(), has_heading=estimate.has_rotations)
         true = replace(theirs.planar(), has_heading=reference.has_rotations)
-        pair = pairs(above, true, max_gap)
-        known = np.isfinite(pair.poses[:, 0])
-        kept = np.flatnonzero(known)
-        gaps = np.searchsorted(kept, np.concatenate((pauses(pair.t), np.flatnonzero(~known))))
-        found = path_of(replace(above, t=pair.t[kept], poses=pair.poses[kept]), estimate.name, t0_ns)
-        truth = path_of(replace(true, t=pair.t[kept], poses=pair.truth[kept]), reference.name, t0_ns)
-        return Associated(found, truth, np.asarray(gaps, dtype=np.int64), from_reference=True)
+        return in_plane(pairs(above, true, max_gap), above, true, (estimate.name, reference.name), t0_ns)
     space, true3 = pairs_in_space(ours, theirs, max_gap)
     paths = path_of(space, estimate.name, t0_ns), path_of(true3, reference.name, t0_ns)
     return Associated(*paths, pauses(true3.t), from_reference=True)
+
+
+def in_plane(
+    pair: Pairs, estimate: Trajectory, reference: Trajectory, names: tuple[str, str] = ("", ""), t0_ns: int = 0
+) -> Associated:
+    """The poses of a ``pair`` of two planar trajectories where both are known.
+
+    Each other row is a gap, as is a pause of the reference. ``names``: of the estimate and the reference.
+    """
+    known = np.isfinite(pair.poses[:, 0]) & np.isfinite(pair.truth[:, 0])
+    kept = np.flatnonzero(known)
+    gaps = np.searchsorted(kept, np.concatenate((pauses(pair.t), np.flatnonzero(~known))))
+    found = Trajectory(pair.t[kept], pair.poses[kept], has_heading=estimate.has_heading)
+    truth = Trajectory(pair.t[kept], pair.truth[kept], has_heading=reference.has_heading)
+    paths = (path_of(trajectory, name, t0_ns) for trajectory, name in zip((found, truth), names, strict=True))
+    return Associated(*paths, np.asarray(gaps, dtype=np.int64), from_reference=True)
 
 
 def _nothing_in_common(

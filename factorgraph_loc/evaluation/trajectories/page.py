@@ -12,12 +12,13 @@ import polars as pl
 from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
-from factorgraph_loc.drawing.pages import Part, Rows, number, sectioned
+from factorgraph_loc.drawing.pages import Part, Rows, sectioned
 from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.pairing import HOW, pauses
 from factorgraph_loc.evaluation.trajectories.score import TrajectoryScore
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import require_free, writing
+from factorgraph_loc.text import number
 from factors.se2 import Array
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import scipy
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation import pairing
 from factorgraph_loc.evaluation.pairing import DELTA, TOLERANCE, pauses, spread
-from factorgraph_loc.evaluation.trajectories.association import Similarity, alignment, associate
+from factorgraph_loc.evaluation.trajectories.association import Associated, Similarity, alignment, associate
 from factorgraph_loc.model.planar import MOST, RISE
 from factorgraph_loc.model.pose_path import PosePath, require_poses
 from factorgraph_loc.model.scoring import (
@@ -143,16 +143,7 @@ def score_paths(
     settings: dict[str, Any] = {"align": align, "associate": associate_by, "all_pairs": all_pairs}
     if found.t_ns is not None and truth.t_ns is not None:
         settings |= {"max_diff": max_diff} if associate_by == "nearest" else {"max_gap": max_gap}
-    distance = np.linalg.norm(found.positions - truth.positions, axis=1)
-    ape = PoseErrors(distance, None, np.arange(len(found)))
-    per_m = per_s = None
-    if found.has_rotations and truth.has_rotations:
-        ape = replace(ape, rotation=_angles(found.rotations.transpose(0, 2, 1) @ truth.rotations))
-        path = _steps(truth if pair.from_reference else found)
-        per_m = _relative(found, truth, path, DELTA, pair.gaps, all_pairs=all_pairs)
-        if (t := _seconds(found, truth)) is not None:
-            gaps = np.union1d(pair.gaps, pauses(t))
-            per_s = _relative(found, truth, np.diff(t), DELTA - TOLERANCE, gaps, all_pairs=all_pairs)
+    errors = pose_errors(replace(pair, estimate=found, reference=truth), all_pairs=all_pairs)
     lengths = float(_steps(estimate).sum()), float(_steps(reference).sum())
     poses = len(estimate), len(reference)
     warnings = [*estimate.warnings, *reference.warnings, *_doubts(estimate, reference, associate_by, align)]
@@ -161,7 +152,25 @@ def score_paths(
             f"{estimate.name}: {len(found)} of {min(poses)} poses have a stamp within {max_diff:g} s in {reference.name}: a larger "
             "max_diff finds more, and associate interpolate needs none"
         )
-    return TrajectoryScore(found, truth, transform, ape, per_m, per_s, lengths, poses, settings, tuple(warnings))
+    return TrajectoryScore(found, truth, transform, *errors, lengths, poses, settings, tuple(warnings))
+
+
+def pose_errors(
+    pair: Associated, *, all_pairs: bool = False
+) -> tuple[PoseErrors, PoseErrors | None, PoseErrors | None]:
+    """Absolute errors, and relative ones over a metre and over a second; see :class:`TrajectoryScore`."""
+    found, truth = pair.estimate, pair.reference
+    distance = np.linalg.norm(found.positions - truth.positions, axis=1)
+    ape = PoseErrors(distance, None, np.arange(len(found)))
+    if not (found.has_rotations and truth.has_rotations):
+        return ape, None, None
+    ape = replace(ape, rotation=_angles(found.rotations.transpose(0, 2, 1) @ truth.rotations))
+    path = _steps(truth if pair.from_reference else found)
+    per_m = _relative(found, truth, path, DELTA, pair.gaps, all_pairs=all_pairs)
+    if (t := _seconds(found, truth)) is None:
+        return ape, per_m, None
+    gaps = np.union1d(pair.gaps, pauses(t))
+    return ape, per_m, _relative(found, truth, np.diff(t), DELTA - TOLERANCE, gaps, all_pairs=all_pairs)
 
 
 def _check(align: str, associate_by: str, max_diff: float, max_gap: float) -> None:
@@ -206,7 +215,7 @@ def _angles(rotations: Array) -> Array:
 
 def _seconds(found: PosePath, truth: PosePath) -> Array | None:
     t_ns = truth.t_ns if found.t_ns is None else found.t_ns
-    return None if t_ns is None else (t_ns - t_ns[0]) / 1e9
+    return None if t_ns is None else (t_ns - t_ns[:1]) / 1e9
 
 
 def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, align: Alignment) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
-from factorgraph_loc.drawing.pages import Part, Picture, Rows, number
+from factorgraph_loc.drawing.pages import Part, Picture, Rows
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.fitting.robust import Fit, folds, gains
@@ -18,7 +18,7 @@ from factorgraph_loc.sensors.calibrating import BLOCKS, ConstantsCalibrator, Con
 from factorgraph_loc.sensors.landmarks import calibration as sightings
 from factorgraph_loc.sensors.landmarks.calibration import Correlation, Sightings
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
-from factorgraph_loc.text import plain
+from factorgraph_loc.text import number, plain
 from factors.landmarks import model as bearing_range
 
 MIN_SIGHTINGS = 100

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
-from factorgraph_loc.drawing.pages import Part, Picture, Rows, number
+from factorgraph_loc.drawing.pages import Part, Picture, Rows
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.fitting.robust import Constant, Fit, folds, gains
@@ -28,6 +28,7 @@ from factorgraph_loc.sensors.odometry.calibration import (
 )
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
+from factorgraph_loc.text import number
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 

@@ -13,8 +13,8 @@ from benchmarking.report import Report, pooled, ratio_text, rmses, together
 from benchmarking.statistics import rmse_ratio, share_in_band
 
 from factorgraph_loc.errors import FglocError
+from factorgraph_loc.evaluation.inference import differences
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.evaluation.statistics import differences
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log
 
