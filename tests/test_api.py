@@ -60,7 +60,8 @@ def test_compare_takes_names_and_settings_by_estimator(office, tmp_path):
     assert [(row["log"], row["status"], row["seed"]) for row in found.rows] == [
         (office.name, "ok", 0)
     ]  # needs no seeds
-    config = tomllib.loads((tmp_path / "out/runs/office-3/ekf/seed0/config.toml").read_text())
+    key = found.rows[0]["key"]
+    config = tomllib.loads((tmp_path / "out/store" / key[:2] / key / "config.toml").read_text())
     assert config["settings"]["iterations"] == 2
     assert not found.failures
     assert repr(found).startswith("| log ")

@@ -97,7 +97,7 @@ def compare(
     final_only: bool = False,
     jobs: int | None = None,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> comparing.Comparison:
     """Run several estimators on several logs with each seed, in ``jobs`` processes, and write tables and plots to ``out``.
 
@@ -111,15 +111,15 @@ def compare(
     named: Mapping[str, Settings] = {name: (settings or {}).get(name, {}) for name in estimators}
     if final_only:
         named = for_final_only(named)
-    used = None if sensors is None else tuple(sensors)
-    chosen = list(seeds)
-    configs = [
-        RunConfig(name, named[name], used, prior, seed, max_gap, tick_gap) for name in estimators for seed in chosen
-    ]
     return comparing.compare(
         every(logs, rig, world),
-        configs,
+        named,
         Path(out),
+        sensors=(None if sensors is None else tuple(sensors),),
+        prior=prior,
+        seeds=tuple(seeds),
+        max_gap=max_gap,
+        tick_gap=tick_gap,
         align=align,
         rpe=rpe,
         jobs=jobs,

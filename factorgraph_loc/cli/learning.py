@@ -108,7 +108,7 @@ DropDead = Annotated[
 
 
 @dataclass(frozen=True)
-class MapOptions:
+class MapArguments:
     """The arguments of ``build_map`` of the Python interface, except the settings."""
 
     estimator: MapEstimator = MAP_ESTIMATORS[0]
@@ -126,7 +126,7 @@ def map_(
     log: LogName,
     out: OutWorld,
     *,
-    options: MapOptions,
+    options: MapArguments,
     set_: Settings = None,
     source: LogOptions,
     json: Json = False,

@@ -168,7 +168,7 @@ class RunOptions:
 def takes_options(command: Callable[..., None]) -> Callable[..., None]:
     """The command with the fields of dataclasses as options, in place of its parameters of these types."""
     given = inspect.signature(command, eval_str=True)
-    groups = {p.name: p.annotation for p in given.parameters.values() if is_dataclass(p.annotation)}
+    groups: dict[str, Any] = {p.name: p.annotation for p in given.parameters.values() if is_dataclass(p.annotation)}
     parameters: list[inspect.Parameter] = []
     for parameter in given.parameters.values():
         if kind := groups.get(parameter.name):

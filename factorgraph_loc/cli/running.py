@@ -154,7 +154,7 @@ def compare(
             show.line(line)
         show.line()
         show.line(
-            f"results are in {out}: report.html, table.md, results.csv, results.parquet, differences.csv, plots/, runs/"
+            f"results are in {out}: report.html, table.md, results.csv, results.parquet, differences.csv, plots/, store/"
         )
     if comparison.failures:
         raise typer.Exit(1)
@@ -182,7 +182,8 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
 
 def _print_further(scores: Mapping[str, Any], *, rpe: bool) -> None:
     """The tables that are asked for; nothing without a reference."""
-    from factorgraph_loc.evaluation.tables import KINDS, further_tables
+    from factorgraph_loc.evaluation.tables import further_tables
+    from factorgraph_loc.io.results import KINDS
 
     for title, columns in further_tables([scores], rpe=rpe).items():
         rows = [

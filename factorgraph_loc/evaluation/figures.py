@@ -46,14 +46,13 @@ _IDEAL: dict[str, Any] = {"color": "black", "linewidth": 1.0, "label": "ideal"}
 class Track:
     """The plotted data of one run.
 
-    ``causal`` (None if never localized), ``final`` (may be empty); ``update_ms`` (M,) of each update; ``nis``: by sensor, rows
+    ``causal`` (None if never localized), ``final`` (may be empty); ``nis``: by sensor, rows
     (K, 3) of time, normalised innovation squared and degrees of freedom; ``events``: time and text; ``max_gap`` [s]: largest
     interval between estimates that is interpolated for errors. ``reliability``: of the sensors' models, by sensor.
     """
 
     causal: Trajectory | None
     final: Trajectory
-    update_ms: Array
     nis: Mapping[str, Array] = field(default_factory=dict)
     events: Sequence[tuple[float, str]] = ()
     max_gap: float = MAX_GAP
@@ -64,8 +63,7 @@ class Track:
         """The data of a run."""
         nis = {s: np.array(rows, dtype=float).reshape(-1, 3) for s, rows in result.diagnostics.nis.items()}
         events = tuple(result.diagnostics.events)
-        causal, timings = result.causal(), result.timings
-        return cls(causal, result.final, timings.update_ms, nis, events, result.max_gap, result.reliability)
+        return cls(result.causal(), result.final, nis, events, result.max_gap, result.reliability)
 
     def kinds(self) -> tuple[tuple[str, Trajectory | None], tuple[str, Trajectory | None]]:
         """Both trajectories by name, None if there is nothing to plot."""

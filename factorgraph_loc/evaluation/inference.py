@@ -152,19 +152,17 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
         for row in rows:
             scores[row["estimator"]][row["log"]][row["seed"]] = row.get(metric)
         for a, b in combinations(names, 2):
-            lines = []
+            lines: list[tuple[Any, ...]] = []
             for log in logs:
                 both, missing = pair_seeds(scores[a][log], scores[b][log])
-                values = average(both, rms=True).tolist() if len(both) else None
-                lines.append((log, values, None, None, len(both), missing))
+                values = average(both, rms=True).tolist() if len(both) else (None, None)
+                lines.append((log, *values, None, None, len(both), missing))
             total = contrast(scores[a], scores[b], rms=True)
             if total is not None and total.units == "logs" and total.low is not None:
                 values = average(list(total.by_log.values()), rms=True).tolist()
-                lines.append(("(all)", values, total.low, total.high, total.pairs, total.left_out))
-            for log, values, low, high, pairs, left_out in lines:
-                x, y = values or (None, None)
-                apart = None if values is None else x - y
-                cells = (metric, a, b, log, x, y, apart, low, high, pairs, left_out)
+                lines.append(("(all)", *values, total.low, total.high, total.pairs, total.left_out))
+            for log, x, y, *rest in lines:
+                cells = (metric, a, b, log, x, y, None if x is None else x - y, *rest)
                 found.append(dict(zip(DIFFERENCES, cells, strict=True)))
     return found
 

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 _FILES = (
     "*-trajectories.png",
-    "*-update-time.png",
     "*-error-distribution.png",
     "*-errors-*.png",
     "*-consistency-*.png",
@@ -36,10 +35,10 @@ _FILES = (
 def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path, name: str) -> list[Path]:
     """Write the plots of a log, for estimators by name, into ``folder`` and return their paths.
 
-    Those of :func:`plot_run` for each estimator, with all trajectories in one plot, and ``NAME-update-time.png``; with a
-    reference also ``NAME-error-distribution.png``.
+    Those of :func:`plot_run` for each estimator, with all trajectories in one plot; with a reference also
+    ``NAME-error-distribution.png``.
     """
-    figures = {"trajectories": trajectories(log, tracks), "update-time": update_times(log, tracks)}
+    figures = {"trajectories": trajectories(log, tracks)}
     if log.reference is not None:
         figures["error-distribution"] = error_distribution(log, log.reference, tracks)
     for estimator, track in tracks.items():
@@ -185,20 +184,6 @@ def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Tra
         for axis in axes[row]:
             axis.set(xlabel=f"{what} error [{unit}]", ylabel="share of times below")
         same_range(axes[row])
-    legend(figure, axes[0])
-    return figure
-
-
-def update_times(log: Log, tracks: Mapping[str, Track]) -> Figure:
-    """Cumulative distribution of the time per update on a logarithmic axis."""
-    figure, axes = grid(1, 1, 6.0, f"{log.name}: time per update")
-    axis = axes[0, 0]
-    for (estimator, track), style in zip(tracks.items(), styles(), strict=False):
-        if track.causal is None:  # an offline estimator only collects in its updates
-            axis.plot([], [], label=f"{estimator} (offline)", **style)
-        else:
-            distribution(axis, track.update_ms, label=estimator, **style)
-    axis.set(xlabel="time per update [ms]", ylabel="share of updates below")
     legend(figure, axes[0])
     return figure
 

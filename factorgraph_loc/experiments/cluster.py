@@ -21,7 +21,7 @@ from uuid import uuid4
 from factorgraph_loc.errors import FglocError, InputError, RunFailedError
 from factorgraph_loc.experiments.execute import Executor, Files, Take, compute, failure
 from factorgraph_loc.experiments.keys import code_version, digest_of, library_versions
-from factorgraph_loc.experiments.log_source import LogSource, SimulatedSource
+from factorgraph_loc.experiments.log_source import GivenSource, LogSource, SimulatedSource
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.text import quoted, told
 
@@ -161,6 +161,8 @@ def _absolute(source: LogSource) -> LogSource:
 
     if isinstance(source, SimulatedSource):
         return replace(source, preset=path(source.preset))
+    if isinstance(source, GivenSource):
+        return source
     root = source.data_root or os.environ.get("FGLOC_DATA")
     return replace(
         source,

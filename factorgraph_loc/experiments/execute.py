@@ -149,7 +149,7 @@ def compute(run: PlannedRun) -> Files:
     started = perf_counter()
     try:
         log = _load(run.source, run.log_digest)
-        return run_files(run_log(log, run.config), log, started)
+        return run_files(run_log(log, run.config), log, started, run.align)
     except MemoryError:
         return failure("memory", "there was no memory left")
     except FglocError as error:

@@ -37,6 +37,13 @@ class Prepared:
     runs: list[PlannedRun]
     states: dict[str, State]
 
+    @classmethod
+    def of(cls, experiment: Experiment, folder: Path, runs: list[PlannedRun], *, verify: bool = False) -> Prepared:
+        """The same with the states of stored results; ``verify``: check all checksums."""
+        store = Store(folder)
+        keys = dict.fromkeys(run.key for run in runs)
+        return cls(experiment, folder, runs, {key: store.state(key, thorough=verify) for key in keys})
+
     @property
     def store(self) -> Store:
         """The store of the results."""
@@ -98,8 +105,7 @@ def prepare(
         runs = plan(experiment, file.parent, store.folder, None if data_root is None else str(data_root), most=most)
     except TooManyRunsError as error:
         raise TooManyRunsError(f"{plain(file)}: {error}") from error
-    states = {key: store.state(key, thorough=verify) for key in dict.fromkeys(run.key for run in runs)}
-    return Prepared(experiment, folder, runs, states)
+    return Prepared.of(experiment, folder, runs, verify=verify)
 
 
 def run_experiment(

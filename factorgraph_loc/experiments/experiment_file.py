@@ -16,7 +16,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.seeds import LARGEST_SEED, MOST_SEEDS, parse_seeds
 from factorgraph_loc.files.models import FileModel, check_content, nearest, parse_model, read_toml, set_key
-from factorgraph_loc.model.scoring import LONGEST, MAX_GAP, SHORTEST, TICK_GAP
+from factorgraph_loc.model.scoring import LONGEST, MAX_GAP, SHORTEST, TICK_GAP, Alignment
 from factorgraph_loc.text import listed, plain, quoted
 
 SIMULATION = "simulation"  # first word of settings of simulated logs
@@ -177,7 +177,7 @@ class Experiment(FileModel):
     """An experiment. ``out``: the folder of the results, by default out/NAME; ``sensors``: one list, or a list of lists, by
     default those of each log's rig; ``prior``: of the start; ``seeds``: of the estimators; ``max_gap`` [s]: the largest interval
     between estimates that is interpolated for scoring; ``tick_gap`` [s]: there are no estimates inside longer gaps between
-    measurements."""
+    measurements; ``align``: also score after this alignment with the reference."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$", max_length=LONGEST_NAME)]
     out: PathName | None = None
@@ -191,6 +191,7 @@ class Experiment(FileModel):
     seeds: Seeds = (0,)
     max_gap: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = MAX_GAP
     tick_gap: Annotated[float, Field(ge=SHORTEST, le=LONGEST)] = TICK_GAP
+    align: Alignment = "none"
     sweep: Sweep = Sweep()
     report: ReportSettings = ReportSettings()
     limits: Limits = Limits()

@@ -10,7 +10,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -203,7 +203,31 @@ class SimulatedSource:
         return {"simulated": Path(self.preset).name, "settings": json.loads(self.settings), "seed": self.seed}
 
 
-LogSource = RecordedSource | SimulatedSource
+@dataclass(frozen=True)
+class GivenSource:
+    """A ``log`` in memory, whose content has the ``digest``."""
+
+    log: Log = field(compare=False)
+    digest: str
+
+    def load_all(self) -> list[Log]:
+        """The log alone."""
+        return [self.log]
+
+    def load(self) -> Log:
+        """The log."""
+        return self.log
+
+    def files(self) -> dict[str, Path]:
+        """No files: the digest stands for them."""
+        return {}
+
+    def identity(self) -> dict[str, Any]:
+        """The digest of the content."""
+        return {"given": self.digest}
+
+
+LogSource = RecordedSource | SimulatedSource | GivenSource
 
 
 def recorded_sources(name: str, folder: Path, **others: Any) -> list[RecordedSource]:

@@ -14,7 +14,7 @@ import numpy as np
 from factorgraph_loc.drawing.figures import save
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import beside
-from factorgraph_loc.experiments.preparation import START_SIGMA, first_odometry, resolve_prior
+from factorgraph_loc.experiments.preparation import first_odometry, resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import parse_model, replacing
 from factorgraph_loc.files.temporary import writing
@@ -25,7 +25,7 @@ from factorgraph_loc.mapping.mapping import LandmarkMap
 from factorgraph_loc.mapping.point_mapping import PointReport, PointSettings, map_points
 from factorgraph_loc.mapping.point_maps import merged, thinned
 from factorgraph_loc.mapping.tag_mapping import MadeTags
-from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.belief import EXACT_SIGMA, PosePrior
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import MAP_ESTIMATORS
@@ -275,7 +275,7 @@ def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
         t, pose, source = first_odometry(log), np.zeros(3), "the first pose is the origin (0, 0, 0)"
     else:
         t, pose, source = start.t, start.pose, _in_words(start, source)
-    return replace(log, start=StartPose(t, pose, np.full(3, START_SIGMA))), source
+    return replace(log, start=StartPose(t, pose, np.full(3, EXACT_SIGMA))), source
 
 
 def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str]:
@@ -285,7 +285,7 @@ def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str
         if options.extend:
             raise InputError(f"{log.name}: its map can be extended from odometry only with a known start; give --prior")
         return None, "that of the start: the first pose is the origin (0, 0, 0)"
-    certain = replace(prior, covariance=tag_mapping.START_SIGMA**2 * np.eye(3))
+    certain = replace(prior, covariance=EXACT_SIGMA**2 * np.eye(3))
     return (prior if options.extend else certain), f"that of the start: {_in_words(prior, source)}"
 
 

@@ -25,7 +25,7 @@ from factorgraph_loc.files.models import write_text, write_toml
 from factorgraph_loc.files.tables import write_parquet
 from factorgraph_loc.files.temporary import of_system, require_free, sweep, temporary_folder, writing
 from factorgraph_loc.io.native.world_file import write_world
-from factorgraph_loc.io.results import FILES
+from factorgraph_loc.io.results import EVENTS, FILES, INNOVATIONS
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
@@ -52,6 +52,8 @@ def write_run(
     estimates from the first localized one on. ``learnt.json``:
     ``constants`` by name with ``value`` and ``sigma``, ``landmarks`` by name with ``x``, ``y`` [m] and ``covariance`` (xx, xy,
     yy) [m^2] in the world frame. ``events.csv``: ``t_ns`` (absolute), ``t`` [s from the log's start] and the event.
+    ``innovations.parquet``: ``sensor``, ``t_ns`` (absolute), the normalised innovation squared ``nis`` and its degrees of freedom
+    ``dof``, of each update.
     ``map.world.toml``, with its points beside it: the map with the points that were found, if any were; see :func:`map_of`.
 
     Everything is written to a temporary folder first; other files in ``out`` are not changed. Raises InputError if ``out``
@@ -111,7 +113,8 @@ def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: 
     write_parquet(estimates(result, log), folder / "estimates.parquet")
     write_toml(folder / "config.toml", result.config)
     write_text(folder / "learnt.json", _json(learnt_tables(result.learnt)))
-    write_text(folder / "events.csv", events(result, log).write_csv())
+    write_parquet(innovations(result, log), folder / INNOVATIONS)
+    write_text(folder / EVENTS, events(result, log).write_csv())
     write_text(folder / "metrics.json", _json(scores))
 
 
@@ -184,6 +187,14 @@ def events(result: RunResult, log: Log) -> pl.DataFrame:
     return pl.DataFrame(rows, schema={"t_ns": pl.Int64, "t": pl.Float64, "event": pl.String}, orient="row")
 
 
+def innovations(result: RunResult, log: Log) -> pl.DataFrame:
+    """The table of ``innovations.parquet``; see :func:`write_run`."""
+    updates = sorted(result.diagnostics.nis.items())
+    rows = [(sensor, log.t0_ns + round(t * 1e9), nis, dof) for sensor, rows in updates for t, nis, dof in rows]
+    schema = {"sensor": pl.String, "t_ns": pl.Int64, "nis": pl.Float64, "dof": pl.Float64}
+    return pl.DataFrame(rows, schema=schema, orient="row")
+
+
 def _rows(
     kind: str,
     trajectory: Trajectory,
@@ -238,12 +249,12 @@ def _plain(content: Any) -> Any:
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
-def run_files(result: RunResult, log: Log, started: float) -> dict[str, bytes]:
+def run_files(result: RunResult, log: Log, started: float, align: Alignment = "none") -> dict[str, bytes]:
     """The files of a run by name: see :func:`~factorgraph_loc.experiments.output.write_run`; ``update_ms`` is empty.
 
     ``started``: the value of ``perf_counter`` at the start, for the total time.
     """
-    scores = score(result, log)
+    scores = score(result, log, align)
     timings = {name: value for name, value in scores.items() if name.startswith(TIMING)}
     untimed = replace(result, timings=replace(result.timings, update_t=np.empty(0), update_ms=np.empty(0)))
     with temporary_folder(of_system("run")) as folder:

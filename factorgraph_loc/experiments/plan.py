@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ from factorgraph_loc.experiments.keys import Facts, FileDigests, run_key
 from factorgraph_loc.experiments.log_source import LogSource, RecordedSource, SimulatedSource, recorded_sources
 from factorgraph_loc.files.data_root import named_path
 from factorgraph_loc.files.models import nearest, set_key
+from factorgraph_loc.model.scoring import Alignment
 from factorgraph_loc.text import quoted
 
 if TYPE_CHECKING:
@@ -39,8 +40,8 @@ class PlannedRun:
     """One run, as plain data that can be sent to other processes.
 
     ``source``: of the log, whose content has the digest ``log_digest``; ``log``: its name; ``duration`` [s] of it. ``label``: of
-    the ``estimator`` with these ``settings``; ``max_gap`` [s]: of scoring; ``tick_gap`` [s]: of the estimates; ``sweep``: swept
-    settings by dotted name. ``key``: of its results.
+    the ``estimator`` with these ``settings``; ``max_gap`` [s] and ``align``: of scoring; ``tick_gap`` [s]: of the estimates;
+    ``sweep``: swept settings by dotted name. ``key``: of its results.
     """
 
     source: LogSource
@@ -55,6 +56,7 @@ class PlannedRun:
     seed: int
     max_gap: float
     tick_gap: float
+    align: Alignment
     key: str
     sweep: Mapping[str, Any] = field(default_factory=dict)
 
@@ -69,9 +71,7 @@ class PlannedRun:
         """The configuration of the run."""
         from factorgraph_loc.experiments.run import RunConfig  # noqa: PLC0415 - the plan needs no estimator
 
-        return RunConfig(
-            self.estimator, self.settings, self.sensors, self.prior, self.seed, self.max_gap, self.tick_gap
-        )
+        return RunConfig(**{one.name: getattr(self, one.name) for one in fields(RunConfig)})
 
 
 @dataclass(frozen=True)
@@ -88,9 +88,16 @@ class TooManyRunsError(InputError):
 
 
 def plan(
-    experiment: Experiment, folder: Path, cache: Path, data_root: str | None = None, *, most: int = MOST_RUNS
+    experiment: Experiment,
+    folder: Path,
+    cache: Path,
+    data_root: str | None = None,
+    *,
+    most: int = MOST_RUNS,
+    given: Sequence[LogSource] = (),
 ) -> list[PlannedRun]:
-    """All runs of an experiment with paths relative to ``folder``; cached facts are stored below ``cache``.
+    """All runs of an experiment with paths relative to ``folder``; cached facts are stored below ``cache``. ``given``: logs in
+    place of those that the experiment names.
 
     Estimators are run once for values of a sweep that do not apply to them, deterministic ones with the first seed only. Raises
     InputError, before anything runs, for an unreadable log, two logs of one name, invalid settings or prior, or a sensor that no
@@ -102,8 +109,8 @@ def plan(
     sweep = experiment.sweep
     if experiment.prior is not None:
         facts.check_prior(experiment.prior)
-    recorded = {
-        place: _recorded(entry, folder, data_root)
+    recorded: dict[int, Sequence[LogSource]] = {
+        place: given[place : place + 1] or _recorded(entry, folder, data_root)
         for place, entry in enumerate(experiment.logs)
         if entry.simulate is None
     }
@@ -204,30 +211,19 @@ def _runs(
         estimator = facts.estimator(entry.name, settings)
     for sensors in experiment.sensors:
         for seed in experiment.seeds[:1] if estimator.deterministic else experiment.seeds:
-            config = {
+            config: dict[str, Any] = {
                 "estimator": entry.name,
-                "settings": estimator.effective,
+                "settings": settings,
                 "sensors": sensors,
                 "prior": experiment.prior,
                 "seed": seed,
                 "max_gap": experiment.max_gap,
                 "tick_gap": experiment.tick_gap,
+                "align": experiment.align,
             }
+            key = run_key(log.digest, config | {"settings": estimator.effective})
             yield PlannedRun(
-                source=log.source,
-                log_digest=log.digest,
-                log=log.name,
-                duration=log.duration,
-                label=entry.shown,
-                estimator=entry.name,
-                settings=settings,
-                sensors=sensors,
-                prior=experiment.prior,
-                seed=seed,
-                max_gap=experiment.max_gap,
-                tick_gap=experiment.tick_gap,
-                key=run_key(log.digest, config),
-                sweep=point,
+                log.source, log.digest, log.name, log.duration, entry.shown, key=key, sweep=point, **config
             )
 
 

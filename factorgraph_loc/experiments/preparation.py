@@ -10,7 +10,7 @@ import numpy as np
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.files.models import FARTHEST, FileModel, nearest
 from factorgraph_loc.fusion import registry
-from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, PosePrior
+from factorgraph_loc.model.belief import EXACT_SIGMA, HEADING_SIGMA, POSITION_SIGMA, PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.use import prepare
 from factorgraph_loc.sensors.interfaces import Use, lacking_section
@@ -20,7 +20,6 @@ from factorgraph_loc.text import listed, quoted
 # of a start taken from the reference
 REFERENCE_POSITION_SIGMA = 0.02  # m
 REFERENCE_HEADING_SIGMA = 0.01  # rad
-START_SIGMA = 1e-3  # m and rad: of a start that defines the frame
 
 KNOWN = "reference, log or X,Y,HEADING"
 EXPECTED = "reference, log, unknown, X,Y or X,Y,HEADING"
@@ -54,7 +53,7 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
 
 def at_origin(log: Log) -> PosePrior:
     """The start (0, 0, 0) of a log without other information, at the first odometry: exact, as it defines the frame."""
-    return PosePrior(first_odometry(log), np.zeros(3), _covariance(START_SIGMA, START_SIGMA))
+    return PosePrior(first_odometry(log), np.zeros(3), _covariance(EXACT_SIGMA, EXACT_SIGMA))
 
 
 def check_prior(prior: str | None) -> None:

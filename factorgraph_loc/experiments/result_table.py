@@ -16,7 +16,7 @@ from factorgraph_loc.text import told
 
 INDEX = "results.parquet"
 SWEEP = "sweep."
-TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "reason", "key", WARNINGS}
+TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "reason", "key", "scoring.align", WARNINGS}
 
 
 def collect(runs: Iterable[PlannedRun], store: Store) -> pl.DataFrame:

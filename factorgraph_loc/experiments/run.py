@@ -33,7 +33,7 @@ from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import TURN
 from factorgraph_loc.model.result import RunResult
-from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Ticks, check_max_gap, check_tick_gap
+from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment, Ticks, check_max_gap, check_tick_gap
 from factorgraph_loc.sensors.camera.use import MapFrame, PreparedLog, prepare
 from factorgraph_loc.sensors.interfaces import Ending, Use
 from factorgraph_loc.sensors.registry import detecting, functions, moving
@@ -50,8 +50,8 @@ class RunConfig:
     ``estimator``: its registered name; ``settings``: overrides of its settings. ``sensors``: names of the streams it may use,
     None for those of the rig; ``rssi`` and ``phase`` are optional parts of the reads of ``rfid``. ``prior``: see
     :func:`~factorgraph_loc.experiments.preparation.resolve_prior`. ``seed``: of the estimator's random generator. ``max_gap``
-    [s]: the largest interval between estimates that is interpolated for scoring; it changes no estimate. ``tick_gap`` [s]: there
-    are no estimates inside longer gaps between measurements.
+    [s]: the largest interval between estimates that is interpolated for scoring. ``tick_gap`` [s]: there are no estimates inside
+    longer gaps between measurements. ``align``: also score after this alignment with the reference. Scoring changes no estimate.
     """
 
     estimator: str
@@ -61,6 +61,7 @@ class RunConfig:
     seed: int = 0
     max_gap: float = MAX_GAP
     tick_gap: float = TICK_GAP
+    align: Alignment = "none"
 
 
 def run(

@@ -23,6 +23,7 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.evaluation.warned import row_of
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files.temporary import sweep
+from factorgraph_loc.model.scoring import Alignment
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.figures import Track
@@ -68,10 +69,10 @@ class Failure(StoredFile):
 
 
 class Figures(StoredFile):
-    """Scores or times of a run: numbers, None, and lists of these, besides the ``warnings``."""
+    """Scores or times of a run: numbers, None, and lists of these, besides the alignment and the ``warnings``."""
 
     model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, Figure | list[Figure]] = Field(init=False)
+    __pydantic_extra__: dict[str, Figure | list[Figure] | Alignment] = Field(init=False)
     warnings: list[str] = []
 
 
@@ -186,18 +187,32 @@ class Store:
         except InputError as error:
             raise DamagedError(f"{error}{_AGAIN}") from error
 
-    def track(self, key: str) -> Track:
-        """The causal trajectory from the first localized estimate on, and the final one, with covariances, times [s] from the
-        first estimate."""
+    def track(self, key: str, t0_ns: int | None = None) -> Track:
+        """The causal trajectory from the first localized estimate on, and the final one, with covariances; innovations and events.
+        Times [s] are from ``t0_ns`` on, by default from the first estimate."""
         import numpy as np  # noqa: PLC0415
+        import polars as pl  # noqa: PLC0415
 
         from factorgraph_loc.evaluation.figures import Track  # noqa: PLC0415
-        from factorgraph_loc.io.results import ESTIMATES, by_kind, parse_estimates, trajectory_of  # noqa: PLC0415
+        from factorgraph_loc.files.tables import parse_parquet  # noqa: PLC0415
+        from factorgraph_loc.io.results import (  # noqa: PLC0415
+            ESTIMATES,
+            EVENTS,
+            INNOVATIONS,
+            by_kind,
+            parse_estimates,
+            parse_events,
+            trajectory_of,
+        )
 
         table = parse_estimates(self.read(key, ESTIMATES), ESTIMATES)
-        t0_ns = int(table["t_ns"].to_numpy().min(initial=np.iinfo(np.int64).max))
-        causal, final = (trajectory_of(rows, t0_ns) for rows in by_kind(table).values())
-        return Track(causal if len(causal) else None, final, np.empty(0))
+        begin = t0_ns if t0_ns is not None else int(table["t_ns"].to_numpy().min(initial=np.iinfo(np.int64).max))
+        causal, final = (trajectory_of(rows, begin) for rows in by_kind(table).values())
+        updates = parse_parquet(self.read(key, INNOVATIONS), INNOVATIONS)
+        updates = updates.select("sensor", (pl.col("t_ns") - begin) / 1e9, "nis", "dof")
+        nis = {str(s): rows.drop("sensor").to_numpy() for (s,), rows in updates.group_by("sensor", maintain_order=True)}
+        events = parse_events(self.read(key, EVENTS), EVENTS, begin)
+        return Track(causal if len(causal) else None, final, nis, events)
 
     def put(self, key: str, files: Mapping[str, bytes]) -> None:
         """Write the files of a run atomically, replacing existing ones; its claim must be held."""

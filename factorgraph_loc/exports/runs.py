@@ -1,4 +1,4 @@
-"""Results of runs, read from the folders that ``fgloc run`` and ``fgloc compare`` write."""
+"""Results of runs, read from the folders that ``fgloc run``, ``fgloc compare`` and ``fgloc experiment`` write."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,15 +11,16 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import DATA, foreign, read_bytes
-from factorgraph_loc.files.columns import LATEST
 from factorgraph_loc.files.models import FileModel, parse_model, read_json, read_toml
-from factorgraph_loc.io.results import ESTIMATES, FILES, by_kind, parse_estimates, trajectory_of
+from factorgraph_loc.files.tables import read_parquet
+from factorgraph_loc.io.results import ESTIMATES, EVENTS, FILES, by_kind, parse_estimates, parse_events, trajectory_of
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.text import told
 from factors.se2 import Array
 
+TABLE, STORE = "results.parquet", "store"  # of several runs
 COMPLETE = FILES[-1]  # written last, so that its presence marks a complete run
 OUTSIDE = 60.0  # s that an estimate may lie outside of its log
 SERIES = ("error_position", "error_heading", "nees")
@@ -87,18 +88,24 @@ class StoredRun:
 
 
 def is_results(path: Path) -> bool:
-    """Whether ``path`` is a result folder of a run or of a comparison."""
-    return (path / COMPLETE).is_file() or any(path.glob(f"runs/*/*/seed*/{COMPLETE}"))
+    """Whether ``path`` is a result folder of a run, a comparison or an experiment."""
+    return (path / COMPLETE).is_file() or ((path / TABLE).is_file() and (path / STORE).is_dir())
 
 
 def find_runs(path: Path) -> list[RunFolder]:
-    """The runs below a result folder of ``fgloc run`` or ``fgloc compare``. Raises InputError if there is none."""
-    folders = (
-        [path] if (path / COMPLETE).is_file() else sorted(p.parent for p in path.glob(f"runs/*/*/seed*/{COMPLETE}"))
-    )
+    """The successful runs of a result folder. Raises InputError if there is none."""
+    folders = [path] if (path / COMPLETE).is_file() else _stored(path) if is_results(path) else []
     if not folders:
         raise InputError(f"{path}: holds no results, expected a folder that `fgloc run` or `fgloc compare` wrote")
     return [RunFolder(folder, _config(folder)) for folder in folders]
+
+
+def _stored(path: Path) -> list[Path]:
+    """The folders of the successful runs in the table of a comparison or an experiment."""
+    table = read_parquet(path / TABLE)
+    with foreign(path / TABLE, "is no table of runs"):
+        keys = table.filter(pl.col("status") == "ok")["key"].cast(pl.String).unique(maintain_order=True)
+    return [path / STORE / key[:2] / key for key in keys]
 
 
 def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
@@ -135,7 +142,7 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
         of_final,
         {key: _series(causal if len(causal) else final, key, log.t0_ns) for key in SERIES},
         _landmarks(folder.path / "learnt.json"),
-        _events(folder.path / "events.csv", log.t0_ns),
+        parse_events(read_bytes(folder.path / EVENTS, DATA), folder.path / EVENTS, log.t0_ns),
     )
     _check_times(run, log)
     return run
@@ -168,12 +175,3 @@ def _landmarks(path: Path) -> dict[str, LearntPoint]:
         xx, xy, yy = (np.nan if value is None else value for value in entry.covariance)
         found[name] = LearntPoint(np.array((entry.x, entry.y), dtype=float), np.array(((xx, xy), (xy, yy))))
     return found
-
-
-def _events(path: Path, t0_ns: int) -> tuple[tuple[float, str], ...]:
-    content = read_bytes(path, DATA)
-    with foreign(path, "is no table of events"):
-        table = pl.read_csv(content, schema_overrides={"t_ns": pl.Int64, "event": pl.String}).select("t_ns", "event")
-    if table.null_count().sum_horizontal().item() or not table["t_ns"].is_between(-LATEST, LATEST).all():
-        raise InputError(f"{path}: has a row without a stamp and an event, expected both")
-    return tuple(((t_ns - t0_ns) / 1e9, text) for t_ns, text in table.iter_rows())

@@ -7,11 +7,12 @@ import numpy as np
 import polars as pl
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.bounded import foreign
 from factorgraph_loc.files.columns import LATEST
 from factorgraph_loc.files.tables import parse_parquet
 from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory
 
-ESTIMATES = "estimates.parquet"
+ESTIMATES, INNOVATIONS, EVENTS = "estimates.parquet", "innovations.parquet", "events.csv"
 KINDS = ("causal", "final")
 TEXTS, STAMP = ("kind", "status"), "t_ns"
 NUMBERS = (
@@ -23,8 +24,9 @@ FILES = (
     "final.tum",
     "causal.tum",
     ESTIMATES,
+    INNOVATIONS,
     "learnt.json",
-    "events.csv",
+    EVENTS,
     "config.toml",
     "metrics.json",
 )  # the last one is written last
@@ -37,6 +39,15 @@ def trajectory_of(table: pl.DataFrame, t0_ns: int) -> Trajectory:
         covariances[:, i, j] = covariances[:, j, i] = table[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
     t = (table["t_ns"].to_numpy() - t0_ns) / 1e9
     return Trajectory(t, table.select("x", "y", "heading").fill_null(np.nan).to_numpy(), covariances)
+
+
+def parse_events(content: bytes, source: object, t0_ns: int) -> tuple[tuple[float, str], ...]:
+    """Time [s after ``t0_ns``] and text of the events in the bytes of ``events.csv``. Raises InputError with ``source``."""
+    with foreign(source, "is no table of events"):
+        table = pl.read_csv(content, schema_overrides={"t_ns": pl.Int64, "event": pl.String}).select("t_ns", "event")
+    if table.null_count().sum_horizontal().item() or not table["t_ns"].is_between(-LATEST, LATEST).all():
+        raise InputError(f"{source}: has a row without a stamp and an event, expected both")
+    return tuple(((t_ns - t0_ns) / 1e9, text) for t_ns, text in table.iter_rows())
 
 
 def by_kind(table: pl.DataFrame) -> dict[str, pl.DataFrame]:

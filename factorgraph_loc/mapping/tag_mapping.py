@@ -16,7 +16,7 @@ from factorgraph_loc.mapping.tag_focusing import focused
 from factorgraph_loc.mapping.tag_looks import TagLooks, tag_looks
 from factorgraph_loc.mapping.tag_search import TagMode, TagPosterior, search
 from factorgraph_loc.mapping.tag_slam import tag_slam
-from factorgraph_loc.model.belief import LearntPoint, PosePrior
+from factorgraph_loc.model.belief import EXACT_SIGMA, LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
@@ -26,7 +26,6 @@ from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factors import se2
 from factors.se2 import Array
 
-START_SIGMA = 1e-3  # m and rad
 MAX_GAP = 0.5  # s between poses of the reference, beyond which it is not interpolated
 
 Poses = Literal["reference", "odometry"]
@@ -88,7 +87,7 @@ def map_tags(
         if prior is None:
             if extend:
                 raise InputError(f"{log.name}: its map can be extended from odometry only with a known start")
-            prior = PosePrior(log.span()[0], np.zeros(3), START_SIGMA**2 * np.eye(3))
+            prior = PosePrior(log.span()[0], np.zeros(3), EXACT_SIGMA**2 * np.eye(3))
             looks = replace(looks, facing=np.full(len(given), np.nan))
         slam = tag_slam(log, looks, prior, known, progress)
         learnt = focused(log, looks, slam.tags, Trajectory(slam.t, slam.poses))

@@ -15,6 +15,7 @@ from factors.se2 import Array
 # of a start given as a pose only
 POSITION_SIGMA = 0.05  # m
 HEADING_SIGMA = 0.05  # rad
+EXACT_SIGMA = 1e-3  # m and rad: of a start that defines the frame
 
 Status = Literal["unlocalized", "ambiguous", "localized"]
 

@@ -40,7 +40,7 @@ def test_compare_prints_one_table_with_seeds_pooled_and_the_best_in_words(fgloc,
     assert [line[-1] for line in lines if line[:1] == ["short"]] == ["1/1", "2/2"]
     assert "least causal position error: particle_filter, " in result.stdout
     assert "(dead_reckoning: " in result.stdout
-    for name in ("results.parquet", "results.csv", "table.md", "differences.csv", "plots", "runs"):
+    for name in ("results.parquet", "results.csv", "table.md", "differences.csv", "plots", "store"):
         assert name in result.stdout
         assert (out / name).exists()
 

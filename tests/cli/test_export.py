@@ -4,6 +4,7 @@ import json
 
 import gtsam
 import numpy as np
+import polars as pl
 import pytest
 from evo.tools import file_interface
 from tum_files import read_tum
@@ -18,13 +19,14 @@ def comparison(short_log, tmp_path_factory):
     (log,) = load(str(short_log))
     out = tmp_path_factory.mktemp("export")
     for name in ("dead_reckoning", "ekf"):
-        write_run(run(log, RunConfig(name)), log, out / "runs" / "short" / name / "seed0")
+        write_run(run(log, RunConfig(name)), log, out / "store" / name[:2] / name)
+    pl.DataFrame({"key": ["dead_reckoning", "ekf"], "status": ["ok", "ok"]}).write_parquet(out / "results.parquet")
     return out
 
 
 @pytest.fixture
 def ekf(comparison):
-    return comparison / "runs" / "short" / "ekf" / "seed0"
+    return comparison / "store" / "ek" / "ekf"
 
 
 def test_trajectories(fgloc, short_log, ekf, tmp_path):

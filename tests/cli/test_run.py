@@ -16,6 +16,7 @@ RUN_FILES = {
     "final.tum",
     "causal.tum",
     "estimates.parquet",
+    "innovations.parquet",
     "learnt.json",
     "events.csv",
     "metrics.json",

@@ -18,7 +18,7 @@ def track_of(rng, **kwargs):
     covariance = np.diag((0.04, 0.09, 0.01))
     poses = rng.multivariate_normal(np.zeros(3), covariance, len(T))
     trajectory = Trajectory(T, poses, np.tile(covariance, (len(T), 1, 1)))
-    return Track(trajectory, trajectory, np.ones(1), **kwargs)
+    return Track(trajectory, trajectory, **kwargs)
 
 
 def log_of(*, has_heading=True, until=600):

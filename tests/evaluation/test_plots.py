@@ -32,7 +32,7 @@ def track():
     t = np.arange(30) * 0.1
     poses = np.stack((t, np.sin(t), t * 0.0), axis=1)
     trajectory = Trajectory(t, poses, np.tile(np.eye(3) * 0.01, (30, 1, 1)))
-    return Track(trajectory, trajectory, np.array([0.1, 0.2, 0.5]))
+    return Track(trajectory, trajectory)
 
 
 def log_of(track, *, reference=True, has_heading=True):
@@ -41,9 +41,9 @@ def log_of(track, *, reference=True, has_heading=True):
 
 
 def test_files(track, tmp_path):
-    offline = Track(None, track.final, track.update_ms)
+    offline = Track(None, track.final)
     paths = plot_log(log_of(track), {"ekf": track, "batch": offline}, tmp_path / "plots", "log")
-    names = {"trajectories", "update-time", "error-distribution"}
+    names = {"trajectories", "error-distribution"}
     names |= {f"{what}-{who}" for what in ("errors", "consistency") for who in ("ekf", "batch")}
     assert {path.name for path in paths} == {f"log-{name}.png" for name in names}
     assert {width(path) for path in paths} == {1600}
@@ -71,7 +71,7 @@ def test_walls_and_tags_are_drawn_where_the_estimators_take_them_to_be(track):
 def test_without_reference(track, tmp_path):
     log = log_of(track, reference=False)
     paths = plot_log(log, {"ekf": track}, tmp_path, "log")
-    assert {path.name for path in paths} == {"log-trajectories.png", "log-update-time.png"}
+    assert {path.name for path in paths} == {"log-trajectories.png"}
     told = replace(track, nis={"bearing_range": np.array([(1.0, 2.0, 2.0)])})
     paths = plot_run(log, "ekf", told, tmp_path, "log")
     assert {path.name for path in paths} == {"log-trajectories.png", "log-consistency-ekf.png"}
@@ -79,7 +79,7 @@ def test_without_reference(track, tmp_path):
 
 def test_a_run_that_nothing_told_the_pose(track, tmp_path):
     """Its log is plotted, with an empty line; one that found its place stands beside it."""
-    nowhere = Track(None, Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3))), track.update_ms)
+    nowhere = Track(None, Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3))))
     paths = plot_run(log_of(track), "ekf", nowhere, tmp_path, "log")
     assert [path.name for path in paths] == ["log-trajectories.png"]
     paths = plot_log(log_of(track), {"ekf": nowhere, "batch": track}, tmp_path, "log")

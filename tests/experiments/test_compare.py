@@ -6,35 +6,44 @@ import polars as pl
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.compare import compare
-from factorgraph_loc.experiments.run import RunConfig
+from factorgraph_loc.experiments.compare import compare, digest_of_log
+from factorgraph_loc.exports.runs import find_runs
 from factorgraph_loc.io.results import FILES
 
 
 @pytest.mark.usefixtures("runs_here", "blank_pictures")
 def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
     nowhere = replace(log, name="no/where", reference=None)
-    configs = [
-        RunConfig(name, seed=seed, prior="reference")
-        for name in ("dead_reckoning", "particle_filter")
-        for seed in (3, 4)
-    ]
+    estimators = {"dead_reckoning": {}, "particle_filter": {}}
     out = tmp_path / "out"
     done = []
-    comparison = compare([log, nowhere], configs, out, progress=lambda *counts: done.append(counts))
-    assert done == [(i + 1, 6) for i in range(6)]
+    comparison = compare(
+        [log, nowhere],
+        estimators,
+        out,
+        seeds=[3, 4],
+        prior="reference",
+        align="se2",
+        progress=lambda *counts: done.append(counts),
+    )
+    assert done == [(i, 6) for i in range(7)]
     assert [(r["log"], r["estimator"], r["seed"], r["status"]) for r in comparison.rows] == [
         (name, estimator, seed, status)
         for name, status in (("straight", "ok"), ("no/where", "failed"))
         for estimator, seed in (("dead_reckoning", 3), ("particle_filter", 3), ("particle_filter", 4))
     ]
     assert len({tuple(row) for row in comparison.rows}) == 1
+    assert [row["scoring.align"] for row in comparison.rows] == ["se2"] * 3 + [None] * 3
+    assert "errors after alignment by se2" in (out / "table.md").read_text()
     assert len(comparison.failures) == 3
     assert comparison.failures[0].startswith(
         "no/where, dead_reckoning, seed 3: no/where: has no reference to start from"
     )
 
-    assert {path.name for path in (out / "runs/straight/particle_filter/seed4").iterdir()} == set(FILES)
+    keys = {(row["log"], row["seed"]): row["key"] for row in comparison.rows if row["estimator"] == "particle_filter"}
+    key = keys["straight", 4]
+    assert {path.name for path in (out / "store" / key[:2] / key).iterdir()} >= set(FILES)
+    assert [folder.log for folder in find_runs(out)] == ["straight"] * 3
     for table in (pl.read_csv(out / "results.csv"), pl.read_parquet(out / "results.parquet")):
         assert len(table) == 6
         assert table["causal.position_rmse"].null_count() == 3
@@ -46,68 +55,63 @@ def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
     assert "has no reference to start from" in page
 
     with pytest.raises(InputError, match="holds results already"):
-        compare([log], configs[:1], out)
+        compare([log], {"dead_reckoning": {}}, out)
     (out / "notes.txt").write_text("mine")
     (out / "plots/mine.png").write_text("mine")
-    compare([log], configs[:1], out, overwrite=True)
+    compare([log], {"dead_reckoning": {}}, out, overwrite=True)
     assert len(pl.read_csv(out / "results.csv")) == 1
     assert pl.read_csv(out / "differences.csv").is_empty()
-    assert not list((out / "runs/straight/particle_filter").rglob("metrics.json"))
+    assert [folder.estimator for folder in find_runs(out)] == ["dead_reckoning"]
     assert (out / "notes.txt").is_file()
     assert (out / "plots/mine.png").is_file()
     assert [path.name for path in (out / "plots").glob("*-errors-*")] == ["straight-errors-dead_reckoning.png"]
 
 
 def test_bad_input_is_found_before_anything_runs(log, tmp_path):
-    config = RunConfig("dead_reckoning")
-    for logs, configs, message in (
-        ([], [config], "nothing to compare"),
-        ([log], [], "nothing to compare"),
-        ([log, log], [config], "two logs are called straight"),
-        ([log], [config, RunConfig("dead_reckoning", {"max_delay": 0.1})], "given twice"),
-        ([log], [RunConfig("dead_reckoning", {"max_dely": 0.1})], "did you mean max_delay"),
-        ([log], [RunConfig("smother")], "did you mean smoother"),
-        ([log], [RunConfig("ekf", prior="1")], "prior is '1'"),
-        ([log], [RunConfig("ekf", sensors=("odometri",))], "did you mean odometry"),
+    for logs, estimators, others, message in (
+        ([], {"ekf": {}}, {}, "nothing to compare"),
+        ([log], {}, {}, "nothing to compare"),
+        ([log, log], {"ekf": {}}, {}, "two logs are called straight"),
+        ([log], {"dead_reckoning": {"max_dely": 0.1}}, {}, "did you mean max_delay"),
+        ([log], {"smother": {}}, {}, "did you mean smoother"),
+        ([log], {"ekf": {}}, {"prior": "1"}, "prior is '1'"),
+        ([log], {"ekf": {}}, {"sensors": ["odometri"]}, "did you mean odometry"),
     ):
         with pytest.raises(InputError, match=message):
-            compare(logs, configs, tmp_path / "out")
+            compare(logs, estimators, tmp_path / "out", **others)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.usefixtures("runs_here", "blank_pictures")
-def test_the_same_comparison_may_be_made_again_where_it_was_interrupted(log, tmp_path):
+def test_a_comparison_that_was_interrupted_goes_on_where_it_was(log, tmp_path):
     out = tmp_path / "out"
-    configs = [RunConfig("dead_reckoning", prior="reference"), RunConfig("ekf", prior="reference")]
+    estimators = {"dead_reckoning": {}, "ekf": {}}
 
     def interrupt(done, _):
         if done == 1:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        compare([log], configs, out, progress=interrupt)
-    assert len(list(out.glob("runs/*/*/seed*"))) >= 1
+        compare([log], estimators, out, prior="reference", progress=interrupt)
+    assert len(find_runs(out)) == 1
+    left = []
+    compare([log], estimators, out, prior="reference", progress=lambda *counts: left.append(counts))
+    assert left == [(0, 1), (1, 1)]
+    assert len(find_runs(out)) == 2
     with pytest.raises(InputError, match="holds results already"):
-        compare([log], configs[:1], out)
-    compare([log], configs, out)
-    assert not (out / "unfinished.txt").exists()
-    with pytest.raises(InputError, match="holds results already"):
-        compare([log], configs, out)
+        compare([log], estimators, out, prior="reference")
 
 
-@pytest.mark.usefixtures("runs_here", "blank_pictures")
-def test_what_a_killed_run_has_left_beside_its_place_is_removed(log, tmp_path):
-    place = tmp_path / "out/runs/straight/ekf"
-    (place / ".seed0.fgloc-0123abcd").mkdir(parents=True)
-    (place / ".seed0.fgloc-0123abcd" / "final.tum").write_text("half")
-    compare([log], [RunConfig("dead_reckoning", prior="reference")], tmp_path / "out")
-    assert list(place.iterdir()) == []
+def test_a_log_that_differs_has_another_digest(log):
+    assert digest_of_log(log) == digest_of_log(replace(log))
+    odometry = log.streams["odometry"]
+    other = replace(log, streams={**log.streams, "odometry": replace(odometry, t=odometry.t + 1e-6)})
+    assert digest_of_log(other) != digest_of_log(log)
 
 
 @pytest.mark.usefixtures("runs_here", "blank_pictures")
 def test_no_terminal_obeys_the_tables_of_a_log_with_any_name(log, tmp_path):
-    configs = [RunConfig("dead_reckoning"), RunConfig("ekf")]
-    compare([replace(log, name="a\x1b[31m\u202eb")], configs, tmp_path / "out")
+    compare([replace(log, name="a\x1b[31m\u202eb")], {"dead_reckoning": {}, "ekf": {}}, tmp_path / "out")
     for name in ("table.md", "results.csv", "differences.csv"):
         text = (tmp_path / "out" / name).read_text()
         assert all(line.isprintable() for line in text.split("\n")), name

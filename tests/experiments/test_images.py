@@ -8,7 +8,6 @@ import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.experiments import compare as comparing
 from factorgraph_loc.experiments.compare import compare
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.maps.points import PointMap
@@ -45,15 +44,6 @@ def sees(fake, monkeypatch):
     """The estimator of the tests as one that takes pixels."""
     monkeypatch.setattr(fake, "modalities", frozenset({"camera"}), raising=False)
     return fake
-
-
-def in_this_process(function, jobs, _):
-    """In place of a process for each job."""
-    for i, job in enumerate(jobs):
-        try:
-            yield i, function(job)
-        except InputError as error:
-            yield i, error
 
 
 def frames_fed(fake):
@@ -120,6 +110,7 @@ def test_the_feature_is_that_of_the_map(seeing):
     assert frontend_of(seeing.rig, named) == FrontendSettings(feature="orb", count=30, everywhere=True)
 
 
+@pytest.mark.usefixtures("runs_here")
 def test_a_comparison_finds_features_once(seeing, sees, tmp_path, monkeypatch):
     found = []
     find = frontend._find
@@ -129,8 +120,7 @@ def test_a_comparison_finds_features_once(seeing, sees, tmp_path, monkeypatch):
         return find(file, *rest)
 
     monkeypatch.setattr(frontend, "_find", noted)
-    monkeypatch.setattr(comparing, "run_each", in_this_process)
     monkeypatch.setattr(sees, "deterministic", False)
-    rows = compare([seeing], [RunConfig("fake", seed=k) for k in range(3)], tmp_path / "out").rows
+    rows = compare([seeing], {"fake": {}}, tmp_path / "out", seeds=range(3)).rows
     assert [row["timing.images"] for row in rows] == [8, 8, 8]
     assert sorted(found) == [f"{k}.png" for k in range(8)]

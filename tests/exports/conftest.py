@@ -4,6 +4,7 @@ import dataclasses
 
 import cv2
 import numpy as np
+import polars as pl
 import pytest
 
 from factorgraph_loc.experiments.output import write_run
@@ -79,10 +80,11 @@ def log(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def results(log, tmp_path_factory):
-    """A folder as of `fgloc compare`, with runs of the ekf and of dead reckoning."""
+    """A folder as of `fgloc compare`, whose keys are the names of the estimators, with runs of the ekf and of dead reckoning."""
     out = tmp_path_factory.mktemp("results")
     for estimator in ("ekf", "dead_reckoning"):
         result = run(log, RunConfig(estimator))
         events = dataclasses.replace(result.diagnostics, events=[(1.25, "a jump")])
-        write_run(dataclasses.replace(result, diagnostics=events), log, out / "runs" / "arc" / estimator / "seed0")
+        write_run(dataclasses.replace(result, diagnostics=events), log, out / "store" / estimator[:2] / estimator)
+    pl.DataFrame({"key": ["dead_reckoning", "ekf"], "status": ["ok", "ok"]}).write_parquet(out / "results.parquet")
     return out

@@ -30,7 +30,7 @@ def test_a_run_is_read_as_it_was(log, results):
 
 
 def test_one_run_or_all_of_a_comparison(results):
-    one = results / "runs" / "arc" / "ekf" / "seed0"
+    one = results / "store" / "ek" / "ekf"
     assert is_results(one)
     assert [folder.estimator for folder in find_runs(one)] == ["ekf"]
     assert [folder.estimator for folder in find_runs(results)] == ["dead_reckoning", "ekf"]
@@ -44,7 +44,7 @@ def test_bad_folders(log, results, tmp_path):
         read_runs(find_runs(results), replace(log, name="hall"))
     with pytest.raises(InputError, match="is it a run of another log arc"):
         read_runs(find_runs(results), replace(log, t0_ns=0))
-    shutil.copytree(results / "runs" / "arc" / "ekf" / "seed0", tmp_path / "cut")
+    shutil.copytree(results / "store" / "ek" / "ekf", tmp_path / "cut")
     (tmp_path / "cut" / "estimates.parquet").write_bytes(b"PAR1")
     with pytest.raises(InputError, match=r"cut/estimates.parquet: is not a Parquet file"):
         read_runs(find_runs(tmp_path / "cut"), log)

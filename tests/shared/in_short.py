@@ -34,8 +34,7 @@ def runs_here(monkeypatch):
                 value = error
             yield i, value
 
-    for user in ("active", "compare"):
-        monkeypatch.setattr(f"factorgraph_loc.experiments.{user}.run_each", run_each)
+    monkeypatch.setattr("factorgraph_loc.experiments.active.run_each", run_each)
     monkeypatch.setattr("factorgraph_loc.experiments.experiment.Processes", Here)
 
 

@@ -1,3 +1,3 @@
 """Scores of any trajectory against any other: association, alignment, absolute and relative errors, and their report."""
 
-__all__ = ["page", "score"]
+__all__ = ["association", "page", "score"]

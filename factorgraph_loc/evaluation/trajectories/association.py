@@ -103,7 +103,7 @@ def in_plane(
     gaps = np.searchsorted(kept, np.concatenate((pauses(pair.t), np.flatnonzero(~known))))
     found = Trajectory(pair.t[kept], pair.poses[kept], has_heading=estimate.has_heading)
     truth = Trajectory(pair.t[kept], pair.truth[kept], has_heading=reference.has_heading)
-    paths = (path_of(trajectory, name, t0_ns) for trajectory, name in zip((found, truth), names, strict=True))
+    paths = path_of(found, names[0], t0_ns), path_of(truth, names[1], t0_ns)
     return Associated(*paths, np.asarray(gaps, dtype=np.int64), from_reference=True)
 
 
