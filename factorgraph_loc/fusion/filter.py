@@ -96,8 +96,8 @@ class Filter(Timeline):
         ticks = bisect.bisect_left(self._ticks, self._records[records].t) if records else 0
         del self._records[:records], self._ticks[:ticks]
 
-        def moved(at: _Checkpoint) -> _Checkpoint:
-            return at._replace(records=at.records - records, ticks=at.ticks - ticks)
+        def moved(at: _Checkpoint | None) -> _Checkpoint | None:
+            return at and at._replace(records=at.records - records, ticks=at.ticks - ticks)
 
         self._taken = deque(taken._replace(before=moved(taken.before)) for taken in self._taken)
 
