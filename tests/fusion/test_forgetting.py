@@ -73,7 +73,7 @@ def test_nothing_is_kept_of_points_seen_before(log):
     settings = {"lag": 3.0, "landmarks": "unknown"}
     whole, _ = driven(log, "smoother", ("odometry", "sightings"), settings, None)
     short, _ = driven(log, "smoother", ("odometry", "sightings"), settings, 0.0)
-    oldest, points = next(iter(short._graph.keyframes.values())), short._graph.mappers[0]._unknown
+    oldest, points = next(iter(short._graph.keyframes.values())), short._graph.mapper._unknown
     assert oldest.index > 0
     assert min(points._cameras.anchored) >= oldest.index
     assert all(point.last >= oldest.t for point in points._gone)
