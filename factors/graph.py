@@ -31,9 +31,6 @@ class Factor(Protocol):
         """The loss, robust if the factor is."""
 
 
-Placed = tuple[Factor, tuple[int, ...]]  # a factor with the keys of its variables
-
-
 class Stack(Protocol):
     """Factors of one kind on N poses in a row and on P parameters that all have in common, linearised by one call."""
 
@@ -60,10 +57,6 @@ class Alike(Factor, Protocol):
     @staticmethod
     def linearize_all(factors: Sequence[Any], values: Sequence[Sequence[Array]]) -> tuple[Array, list[Array]]:
         """Residuals (N, m) of N factors, and a Jacobian (N, m, d) for each of their variables."""
-
-    @staticmethod
-    def cost_all(factors: Sequence[Any], values: Sequence[Sequence[Array]]) -> float:
-        """The sum of the losses of N factors."""
 
 
 @runtime_checkable
@@ -116,20 +109,6 @@ def jacobian_factors(
         for i, (_, keys, *_), residual, *parts in zip(numbers, some, residuals, *blocks, strict=True):
             out[i] = gaussian_factor(keys, residual, parts)
     return out
-
-
-def total_cost(factors: Sequence[Placed], values: Mapping[int, Array]) -> float:
-    """The sum of the losses of factors at ``values``; those that are alike are evaluated together."""
-    cost, alike = 0.0, defaultdict[Hashable, list[Placed]](list)
-    for factor, keys in factors:
-        if hasattr(factor, "alike"):
-            alike[factor.alike].append((factor, keys))
-        else:
-            cost += factor.cost([values[key] for key in keys])
-    for some in alike.values():
-        first: Any = some[0][0]
-        cost += first.cost_all([f for f, _ in some], [[values[key] for key in keys] for _, keys in some])
-    return cost
 
 
 def gaussian_factor(keys: Sequence[int], residual: Array, blocks: Sequence[Array]) -> gtsam.GaussianFactor:

@@ -10,21 +10,17 @@ from collections.abc import Hashable, Mapping, Sequence
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.problem import Problem
-from factorgraph_loc.fusion.graph.variables import Keyframe, gather, point_key, pose_key, tilt_key
+from factorgraph_loc.fusion.graph.variables import Keyframe
 from factorgraph_loc.slam.new_points import FEWEST, PointSighting
 from factorgraph_loc.vision.consensus import Truths
-from factors import se2
+from factors import positive, se2
+from factors.camera import bundle_kernels as kernels
 from factors.camera.model import CameraModel, camera_pose, lens_of
-from factors.camera.point import PointFactor
-from factors.graph import Placed, PriorFactor, VectorPriorFactor
-from factors.odometry.model import OdometryFactor
 from factors.se2 import Array
 
 DISTANCE = 3.0  # m: first guess of how far points are away
 FEW, ENOUGH = 5, 8  # points that a keyframe shares with the one before: a third of what it sees, within these bounds
 ITERATIONS = 30
-FIXED = 1e-10 * np.eye(3)  # covariance [m^2, rad^2] of the first pose, which does not move
 FITS, MOST = 3.0, 0.5  # standard deviations, and the share of a keyframe's sightings that must fit
 SLIPPED = 0.1  # rad: what points that move with the image for their nearness cannot explain
 
@@ -66,28 +62,36 @@ def bundled(
 
 def _adjusted(
     model: CameraModel, keyframes: Sequence[Keyframe], poses: Sequence[Array], often: Sequence[Sequence[PointSighting]]
-) -> tuple[list[Array], list[Array], Truths]:
-    """Adjusted poses (3,) and tilts (2,) of N keyframes, and which of the M sightings fit. The first pose is fixed."""
-    first, lens = keyframes[0].index, lens_of(model)
-    values = {pose_key(k): pose for k, pose in enumerate(poses)} | {tilt_key(k): np.zeros(2) for k in range(len(poses))}
-    factors: list[Placed] = [(PriorFactor(poses[0], FIXED), (pose_key(0),))]
-    factors += [(VectorPriorFactor(np.zeros(2), np.full(2, model.tilt)), (tilt_key(k),)) for k in range(len(poses))]
-    for k, keyframe in enumerate(keyframes[1:]):
-        if keyframe.from_previous is not None:
-            factors.append((OdometryFactor(keyframe.from_previous), (pose_key(k), pose_key(k + 1))))
-    sightings: list[tuple[PointFactor, tuple[int, ...]]] = []
-    for p, seen in enumerate(often):
+) -> tuple[Sequence[Array], Array, Truths]:
+    """Adjusted poses (3,) and tilts (N, 2) of N keyframes, and which of the M sightings fit; no sighting fits where the points
+    cannot be determined."""
+    first = keyframes[0].index
+    places = [camera_pose(model, pose) for pose in poses]
+    points = []
+    for seen in often:
         middle = seen[len(seen) // 2]
-        centre, rotation = camera_pose(model, poses[middle.keyframe - first])
-        values[point_key(p)] = centre + DISTANCE * (rotation @ middle.ray)
-        for s in seen:
-            keys = pose_key(s.keyframe - first), tilt_key(s.keyframe - first), point_key(p)
-            sightings.append((PointFactor(model, lens, s.pixel), keys))
-    found = Problem([*factors, *sightings]).solve(values, ITERATIONS).values
-    at = [gather(found, keys) for _, keys in sightings]
-    residuals, _ = PointFactor.linearize_all([factor for factor, _ in sightings], at)
-    fits = np.einsum("mi,mi->m", residuals, residuals) < FITS**2
-    return [found[pose_key(k)] for k in range(len(poses))], [found[tilt_key(k)] for k in range(len(poses))], fits
+        centre, rotation = places[middle.keyframe - first]
+        points.append(centre + DISTANCE * (rotation @ middle.ray))
+    steps = [k.from_previous for k in keyframes[1:] if k.from_previous is not None]
+    frames = np.array([s.keyframe - first for seen in often for s in seen])
+    try:
+        adjusted, tilts, residuals = kernels.adjusted(
+            lens_of(model),
+            model.position,
+            model.rotation,
+            np.array(poses),
+            np.array(points),
+            frames,
+            np.cumsum([0, *map(len, often)]),
+            np.array([s.pixel for seen in often for s in seen]),
+            np.array((model.sigma, model.robust, model.tilt)),
+            np.array([step.delta for step in steps]),
+            positive.whitener(np.array([step.covariance for step in steps])),
+            ITERATIONS,
+        )
+    except np.linalg.LinAlgError:
+        return poses, np.zeros((len(poses), 2)), np.zeros(len(frames), dtype=bool)
+    return list(adjusted), tilts, np.einsum("mi,mi->m", residuals, residuals) < FITS**2
 
 
 def _seen_often(first: int, waiting: Mapping[Hashable, Sequence[PointSighting]]) -> list[list[PointSighting]]:

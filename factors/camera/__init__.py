@@ -1,6 +1,7 @@
 """Pixels of points in space: model, kernels, factors."""
 
 __all__ = [
+    "bundle_kernels",
     "factor",
     "floor",
     "inverse_depth",

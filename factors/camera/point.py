@@ -66,12 +66,7 @@ class PointFactor:
 
     def cost(self, values: Sequence[Array]) -> float:
         """The robust loss."""
-        return self.cost_all([self], [values])
-
-    @staticmethod
-    def cost_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> float:
-        """The sum of the robust losses of factors with the same camera and constants."""
-        return float(huber_loss(_seen(factors, values)[2], factors[0].model.robust).sum())
+        return float(huber_loss(_seen([self], [values])[2], self.model.robust).sum())
 
     def is_astray(self, values: Sequence[Array]) -> bool:
         """Whether the point cannot be what the robot saw: it is behind the camera, or :data:`BEHIND` standard deviations away."""

@@ -3,12 +3,17 @@
 import camera_world
 import numpy as np
 
-from factorgraph_loc.fusion.graph.variables import Keyframe
+from factorgraph_loc.fusion.graph.problem import Problem
+from factorgraph_loc.fusion.graph.variables import Keyframe, point_key, pose_key, tilt_key
 from factorgraph_loc.slam.local_bundle import bundled
 from factorgraph_loc.slam.new_points import sightings_of
-from factors import se2
+from factors import positive, se2
 from factors.camera import model as reprojection
+from factors.camera.bundle_kernels import adjusted
+from factors.camera.point import PointFactor
+from factors.graph import PriorFactor, VectorPriorFactor
 from factors.motion import ChainState, Increment
+from factors.odometry.model import OdometryFactor
 
 MODEL = camera_world.CAMERA.model()
 TURN = 0.015  # rad, that the odometry is off by from one keyframe to the next
@@ -82,3 +87,36 @@ def test_few_points_tell_nothing():
     few = dict(list(waiting.items())[:6])
     assert bundled(MODEL, keyframes, guess, few) is None
     assert bundled(MODEL, keyframes[:2], guess[:2], {}) is None
+
+
+def test_it_ends_where_the_general_solver_does():
+    """The first pose is held there by a narrow prior."""
+    rng = np.random.default_rng(1)
+    truth, keyframes, guess, waiting = drive(rng)
+    tilts = 0.01 * rng.standard_normal((len(truth), 2))
+    names = list(waiting)[:12]
+    starts = np.cumsum([0, *(len(waiting[name]) for name in names)])
+    frames = np.array([s.keyframe for name in names for s in waiting[name]])
+    points = camera_world.room(240).positions[names]
+    steps = [k.from_previous for k in keyframes[1:]]
+    lens, sigmas = reprojection.lens_of(MODEL), np.full(2, MODEL.tilt)
+    pixels, values = [], {pose_key(k): pose for k, pose in enumerate(guess)}
+    values |= {tilt_key(k): np.zeros(2) for k in range(len(truth))} | {point_key(p): x for p, x in enumerate(points)}
+    factors = [(PriorFactor(guess[0], 1e-8 * np.eye(3)), (pose_key(0),))]
+    factors += [(VectorPriorFactor(np.zeros(2), sigmas), (tilt_key(k),)) for k in range(len(truth))]
+    factors += [(OdometryFactor(step), (pose_key(k), pose_key(k + 1))) for k, step in enumerate(steps)]
+    for p, point in enumerate(points):
+        for k in frames[starts[p] : starts[p + 1]].tolist():
+            at = reprojection.camera_pose(MODEL, truth[k], tilts[k])
+            pixels.append(reprojection.linearize_in_space(MODEL, *at, point[None])[0][0] + rng.standard_normal(2))
+            factors.append((PointFactor(MODEL, lens, pixels[-1]), (pose_key(k), tilt_key(k), point_key(p))))
+    poses, found, _ = adjusted(
+        *(lens, MODEL.position, MODEL.rotation, np.array(guess), points, frames, starts, np.array(pixels)),
+        np.array((MODEL.sigma, MODEL.robust, MODEL.tilt)),
+        np.array([step.delta for step in steps]),
+        positive.whitener(np.array([step.covariance for step in steps])),
+        50,
+    )
+    solved = Problem(factors).solve(values).values
+    np.testing.assert_allclose(poses, [solved[pose_key(k)] for k in range(len(truth))], atol=1e-4)
+    np.testing.assert_allclose(found, [solved[tilt_key(k)] for k in range(len(truth))], atol=1e-4)

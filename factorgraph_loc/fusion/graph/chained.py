@@ -13,10 +13,11 @@ import numpy as np
 from factorgraph_loc.fusion.graph.marginals import Covariances
 from factorgraph_loc.fusion.graph.variables import Values, index_of, is_pose
 from factors import chain, se2
-from factors.graph import Factor, Placed, Stack, Stackable
+from factors.graph import Factor, Stack, Stackable
 from factors.se2 import Array
 
 MOST_PARAMETERS = 40  # all have to do with all: beyond this number GTSAM's elimination, which knows better, is faster
+Placed = tuple[Factor, tuple[int, ...]]  # a factor with the keys of its variables
 State = tuple[Array, Array]  # poses (N, 3), and parameters (P,)
 
 

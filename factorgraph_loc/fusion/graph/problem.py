@@ -14,8 +14,8 @@ import gtsam
 from factorgraph_loc.fusion.graph.chained import Chained
 from factorgraph_loc.fusion.graph.least_squares import MAX_ITERATIONS, damped_step, optimum
 from factorgraph_loc.fusion.graph.marginals import Covariances, covariances
-from factorgraph_loc.fusion.graph.variables import Values, retract
-from factors.graph import Placed, jacobian_factors, total_cost
+from factorgraph_loc.fusion.graph.variables import Values, gather, retract
+from factors.graph import Factor, jacobian_factors
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Solution:
 class Problem:
     """Factors, each with the keys of its variables."""
 
-    def __init__(self, factors: Sequence[Placed]) -> None:
+    def __init__(self, factors: Sequence[tuple[Factor, tuple[int, ...]]]) -> None:
         self._factors = factors
 
     @cached_property
@@ -57,7 +57,7 @@ class Problem:
 
     def cost(self, values: Values) -> float:
         """The robust cost, infinite where it is not a number."""
-        cost = total_cost(self._factors, values)
+        cost = sum(factor.cost(gather(values, keys)) for factor, keys in self._factors)
         return math.inf if math.isnan(cost) else cost
 
     def linearize(self, values: Values) -> gtsam.GaussianFactorGraph:
