@@ -58,6 +58,6 @@ def test_two_processes_share_the_work_of_one_experiment_and_one_that_is_killed_l
     undisturbed = start("undisturbed")
     assert [process.wait(120) for process in (*both, undisturbed)] == [0, 0, 0]
     found = contents(tmp_path / "disturbed")
-    assert len(found) == 8 * 8  # runs, and files of each
+    assert len(found) == 8 * 9  # runs, and files of each
     assert found == contents(tmp_path / "undisturbed")
     assert list((tmp_path / "disturbed" / "store" / "tmp").iterdir()) == []

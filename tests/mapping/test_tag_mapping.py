@@ -199,7 +199,7 @@ def test_merged_looks_count_the_same():
 def test_tags_that_were_never_read_are_listed_and_kept(room):
     far = room.world.model_copy(update={"tags": {**room.world.tags, "far": Tag(x=80.0, y=0.0, z=1.2)}})
     made = map_tags(replace(room, world=far), "reference", None)
-    assert made.open["far"] == "never read"
+    assert made.open["far"].kind == "unread"
     assert made.world.tags["far"] == far.tags["far"]
 
 
