@@ -26,8 +26,8 @@ CONFIGS = {
     "smoother_lag": RunConfig("smoother", {**UNKNOWN, "lag": 6.0}),
     "batch": RunConfig("batch", UNKNOWN),
 }
-SEEDS = range(1, 9)
-SECONDS = 24.0
+SEEDS = range(1, 6)
+SECONDS = 18.0
 
 
 def with_object(log, count=40, seed=0):
@@ -114,7 +114,7 @@ def test_the_points_are_where_they_are(mapped, log, name):
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_the_scale_is_that_of_the_odometry(mapped, log, name):
-    # 5 % of noise per square root of a metre is about 2 % of the 7 m that the robot drives
+    # 5 % of noise per square root of a metre is about 2 % of the 5 m that the robot drives
     points = mapped(name).learnt.points
     true = truth_of(points, log)
     spread, expected = (np.linalg.norm(p - p.mean(axis=0), axis=1).mean() for p in (points.positions, true))
@@ -128,30 +128,30 @@ def test_smoother_and_batch_agree(mapped):
     squared = [d @ np.linalg.solve(c, d) for d, c in zip(apart, batch.final.covariances, strict=True)]
     # they differ in which sightings they took for wrong or came too late, not in what they make of them
     assert np.mean(squared) < 0.3
+    variances = [np.diagonal(one.final.covariances, axis1=1, axis2=2) for one in (smoother, batch)]
+    np.testing.assert_allclose(variances[0][-1], variances[1][-1], rtol=0.3)
 
 
-@pytest.mark.parametrize("name", ["smoother", "batch"])
-def test_errors_are_as_large_as_the_covariances_say(mapped, logs, name):
-    # the last pose of eight runs; the mean leaves this band once in a thousand
+def test_errors_are_as_large_as_the_covariances_say(mapped, logs):
+    # the last pose of five runs; the mean leaves this band once in a thousand
     total = 0.0
     for seed in SEEDS:
-        result = mapped(name, seed)
+        result = mapped("smoother", seed)
         error = errors(result, logs[seed])[-1]
         total += error @ np.linalg.solve(result.final.covariances[-1], error)
-    assert chi2.ppf(0.0005, 24) < total < chi2.ppf(0.9995, 24)
+    assert chi2.ppf(0.0005, 15) < total < chi2.ppf(0.9995, 15)
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", ["smoother", "smoother_lag"])
 def test_wrong_pixels_do_little_harm(mapped, log, name):
     result = run(with_wrong(log, 0.1), CONFIGS[name])
     assert rmse(result, log) < max(2.0 * rmse(mapped(name), log), 0.2)
     assert result.diagnostics.rejected["camera: does not agree with the others"] > 5
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_an_object_with_most_of_the_points_is_not_taken_for_the_room(mapped, logs, seed):
-    result = run(with_object(logs[seed]), CONFIGS["smoother"])
-    assert rmse(result, logs[seed]) < max(2.0 * rmse(mapped("smoother", seed), logs[seed]), 0.2)
+def test_an_object_with_most_of_the_points_is_not_taken_for_the_room(mapped, log):
+    result = run(with_object(log), CONFIGS["smoother"])
+    assert rmse(result, log) < max(2.0 * rmse(mapped("smoother"), log), 0.2)
 
 
 @pytest.mark.parametrize("name", ["smoother", "batch"])
@@ -190,15 +190,16 @@ def test_a_step_that_leads_astray_is_undone(mapped, log, monkeypatch):
     assert rmse(result, log) < 1.2 * rmse(mapped("smoother"), log)
 
 
-@pytest.mark.parametrize("turn", [0.0, 0.4])
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize(
+    ("name", "turn"), [("smoother", 0.0), ("smoother", 0.4), ("smoother_lag", 0.0), ("batch", 0.4)]
+)
 def test_a_robot_at_rest_or_turning_on_the_spot(name, turn):
     camera = camera_world.CAMERA.model_copy(update={"x": 0.0, "y": 0.0})
-    t = np.arange(0.0, 15.0, 0.05)
+    t = np.arange(0.0, 8.0, 0.05)
     poses = np.column_stack((0.0 * t, 0.0 * t, se2.wrap(turn * t)))
     truth, points = Trajectory(t, poses), camera_world.room()
     rng = np.random.default_rng(3)
-    seen = camera_world.sightings(truth, points, np.arange(0.1, 14.9, 0.2), rng, camera)
+    seen = camera_world.sightings(truth, points, np.arange(0.1, 7.9, 0.2), rng, camera)
     log = replace(
         camera_world.with_camera(camera_world.simulate(1, 2.0), x=0.0, y=0.0),
         streams={"odometry": VelocityStream(t, 0.0 * t, 0.0 * t + turn), "sightings": seen},
@@ -225,9 +226,8 @@ def with_features(log, lifetime, seed=5, points=None):
     return replace(log, rig=rig, streams=streams, world=World())
 
 
-@pytest.mark.parametrize("name", ["smoother", "batch"])
-def test_points_whose_tracks_end_are_found_again(log, name):
-    result = run(with_features(log, 4.0), CONFIGS[name])
+def test_points_whose_tracks_end_are_found_again(log):
+    result = run(with_features(log, 4.0), CONFIGS["smoother"])
     points, true = result.learnt.points, camera_world.room()
     assert rmse(result, log) < 0.25
     assert points.feature == "colour"
@@ -259,35 +259,33 @@ def test_a_track_that_comes_back_meets_the_one_that_took_its_place(log):
     assert rmse(run(replace(film, streams=streams), CONFIGS["smoother"]), log) < 0.25
 
 
-def test_few_features_that_cannot_confirm_each_other_are_not_believed(log):
-    """For 8 s three tracks are left, which slip: the robot goes on by its wheels, as with nothing to see."""
-    film = with_features(log, 100.0)
+def test_few_features_that_cannot_confirm_each_other_are_not_believed():
+    """For 6 s three tracks are left, which slip: the robot goes on by its wheels, as with nothing to see."""
+    film = with_features(camera_world.simulate(1, 11.0), 100.0)
     ends = []
     for left in (3, 0):
         frames = []
         for t, frame in zip(film.streams["camera"].t.tolist(), film.streams["camera"].frame, strict=True):
             there = np.flatnonzero(frame.tracks < 10**6)
-            rows = there[:left] if 12.0 < t < 20.0 else np.arange(len(frame.tracks))
-            slipped = 40.0 * (t - 12.0) if 12.0 < t < 20.0 else 0.0
+            rows = there[:left] if 4.0 < t < 10.0 else np.arange(len(frame.tracks))
+            slipped = 40.0 * (t - 4.0) if 4.0 < t < 10.0 else 0.0
             parts = {name: getattr(frame, name)[rows] for name in ("sizes", "descriptors", "tracks")}
             frames.append(replace(frame, pixels=frame.pixels[rows] + (slipped, 0.0), **parts))
         streams = {**film.streams, "camera": FeatureStream(film.streams["camera"].t, frames)}
         found = run(replace(film, streams=streams), CONFIGS["smoother"])
-        ends.append(found.poses[np.searchsorted(found.t, 19.5)])
+        ends.append(found.poses[np.searchsorted(found.t, 9.5)])
     np.testing.assert_allclose(ends[0], ends[1], atol=0.02)
 
 
-@pytest.mark.parametrize("seed", [101, 104])
-def test_a_few_named_points_close_a_loop(seed):
+def test_a_few_named_points_close_a_loop():
     """Some five points are in an image, so few of them come back at once; the error was 0.2 m to 0.4 m when six were needed."""
     changed = {"world": {"tags": 1, "points": 150}, "pixels": {"rate": 5.0}, "drive": {"duration": 200.0}}
-    log = fgloc.simulate("office", seed, changes=changed)
+    log = fgloc.simulate("office", 104, changes=changed)
     result = run(log, RunConfig("smoother", UNKNOWN, ("odometry", "sightings")))
     assert score(result, log)["aligned.position_rmse"] < 0.16
 
 
-@pytest.mark.parametrize("late", [0.1, -0.1])
-@pytest.mark.parametrize("name", ["smoother", "batch"])
+@pytest.mark.parametrize(("name", "late"), [("smoother", 0.1), ("batch", -0.1)])
 def test_points_without_a_map_tell_the_time_offset(name, late):
     """Four standard deviations: below 1e-4 of false alarms."""
     log = camera_world.simulate(1, SECONDS, speeds=camera_world.weave)
