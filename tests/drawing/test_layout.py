@@ -8,9 +8,19 @@ import pytest
 from factorgraph_loc.drawing.figures import grid, legend, save
 
 
-@pytest.mark.parametrize("wide", [0.2, 30.0])
-@pytest.mark.parametrize("aspect", ["auto", "equal"])
-@pytest.mark.parametrize(("rows", "columns", "entries"), [(1, 1, 1), (1, 2, 12), (3, 2, 0), (3, 1, 40)])
+@pytest.mark.parametrize(
+    ("rows", "columns", "entries", "aspect", "wide"),  # how wide the data are is of no account where the aspect is free
+    [
+        (1, 1, 1, "equal", 0.2),
+        (1, 2, 12, "auto", 30.0),
+        (1, 2, 12, "equal", 30.0),
+        (3, 2, 0, "equal", 0.2),
+        (3, 2, 0, "auto", 30.0),
+        (3, 1, 40, "auto", 0.2),
+        (3, 1, 40, "equal", 0.2),
+        (3, 1, 40, "equal", 30.0),
+    ],
+)
 def test_nothing_overlaps(rows: int, columns: int, entries: int, aspect: str, wide: float, tmp_path: Path) -> None:
     figure, axes = grid(rows, columns, 3.0 * rows + 2.0, "title")
     for axis in axes.flat:

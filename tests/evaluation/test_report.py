@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import polars as pl
 import pytest
+from in_short import blank_pictures  # noqa: F401 - a fixture
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import plots, tracks, write_report
@@ -89,6 +90,7 @@ def eight(made):
     return made({"ekf": 0.1, "smoother": 0.1, "dead": 0.5}, LOGS, 2, count=200)
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_names_the_best_and_what_is_not_significantly_different(eight, tmp_path):
     words = words_of(page_of(eight, tmp_path, baseline="dead", title="Eight logs"))
     assert words.startswith("Eight logs")
@@ -136,6 +138,7 @@ def test_every_string_is_escaped(made, tmp_path):
     assert BAD in words_of(page)
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_few_logs_are_not_tested(made, tmp_path):
     page = page_of(made({"a": 0.1, "b": 0.5}, LOGS[:3], count=40), tmp_path)
     words = words_of(page)
@@ -145,6 +148,7 @@ def test_few_logs_are_not_tested(made, tmp_path):
     assert 'class="grey"' in page
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_failures_and_warnings_stand_with_their_runs(made, tmp_path):
     words = words_of(page_of(troubled(made), tmp_path))
     assert "2 warnings , in 4 of 8 runs. 2 estimators on 2 logs" in words
@@ -154,6 +158,7 @@ def test_failures_and_warnings_stand_with_their_runs(made, tmp_path):
     assert "2 of 4 [15, 85] %" in words
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_rows_of_tables_have_a_cell_in_each_column(made, tmp_path):
     tables = Elements(page_of(troubled(made), tmp_path)).tables
     assert len(tables) == 11  # results, differences, five metrics, times, warnings, failures, versions
@@ -162,6 +167,7 @@ def test_rows_of_tables_have_a_cell_in_each_column(made, tmp_path):
         assert len(set(widths)) == 1
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_log_with_hardly_any_reference_is_not_scored(made, tmp_path):
     some = made({"a": 0.1, "b": 0.2}, LOGS[:2], count=40)
     poor = pl.col("log") == "log1"
@@ -174,6 +180,7 @@ def test_a_log_with_hardly_any_reference_is_not_scored(made, tmp_path):
     assert Results(some.rows).scores("causal.position_rmse", "a")["log1"] == {0: None}
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_swept_settings_are_drawn_and_told_apart(made, tmp_path):
     swept = made({"ekf": 0.1}, LOGS[:2], count=40, sweep=("sweep.ekf.lag", [1.0, 2.0, 4.0]))
     page = page_of(swept, tmp_path)

@@ -52,6 +52,7 @@ def damage(run, store):
     os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_damaged_result_is_named_and_left_out(prepared):
     some = prepared()
     damage(some.runs[0], some.store)
@@ -65,6 +66,7 @@ def test_a_damaged_result_is_named_and_left_out(prepared):
         report_experiment(some)
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_damaged_result_is_made_again_where_all_is_verified(prepared, tmp_path):
     some = prepared()
     damage(some.runs[0], some.store)
@@ -75,10 +77,11 @@ def test_a_damaged_result_is_made_again_where_all_is_verified(prepared, tmp_path
     assert report_experiment(some).damaged == []
 
 
-@pytest.mark.parametrize("content", [b"", b"[]", b"5", b'{"walls": 3}', b"[" * 5000, b'{"files": {"a": 5}, "logs": 1}'])
-def test_what_is_kept_beside_the_results_is_made_again_where_it_is_damaged(prepared, content, tmp_path):
+@pytest.mark.usefixtures("blank_pictures")
+def test_what_is_kept_beside_the_results_is_made_again_where_it_is_damaged(prepared, tmp_path):
     first = report_experiment(prepared()).page.read_bytes()
     (scene,) = (tmp_path / "out/store/scenes").iterdir()
-    for file in (scene, *(tmp_path / "out/store").glob("*.json")):
-        file.write_bytes(content)
-    assert report_experiment(prepared(made=0)).page.read_bytes() == first
+    for content in (b"", b"[]", b"5", b'{"walls": 3}', b"[" * 5000, b'{"files": {"a": 5}, "logs": 1}'):
+        for file in (scene, *(tmp_path / "out/store").glob("*.json")):
+            file.write_bytes(content)
+        assert report_experiment(prepared(made=0)).page.read_bytes() == first, content

@@ -3,31 +3,39 @@
 import subprocess
 import sys
 import time
+from pathlib import Path
 
+import computed_here
 import pytest
+from computed_here import Here
+
+from factorgraph_loc.experiments.experiment import prepare, run_experiment
 
 SCRIPT = """
 import sys
-from pathlib import Path
+sys.path.append(sys.argv[1])
+from computed_here import Here
 from factorgraph_loc.experiments.experiment import prepare, run_experiment
-run_experiment(prepare(Path(sys.argv[1]), out=Path(sys.argv[2])), jobs=1)
+for out in sys.argv[3:]:
+    run_experiment(prepare(sys.argv[2], out=out), executor=Here())
 """
 MANY = """
 name = "many"
-logs = [{simulate = "office", settings = {drive = {duration = 3}}}]
-estimators = [{name = "particle_filter", settings = {particles = 20}}]
-seeds = "0:8"
+logs = [{simulate = "office", seeds = "0:8", settings = {drive = {duration = 3}, world = {tags = 0, landmarks = 12}}}]
+estimators = ["dead_reckoning"]
+sensors = ["odometry"]
 """
 
 
 @pytest.fixture
 def start(tmp_path):
-    """``start(out)``: a process that runs many short runs."""
+    """``start(out, ...)``: a process that makes many short runs, once into each folder."""
     (tmp_path / "many.toml").write_text(MANY)
     (tmp_path / "script.py").write_text(SCRIPT)
 
-    def run(out):
-        return subprocess.Popen([sys.executable, tmp_path / "script.py", tmp_path / "many.toml", tmp_path / out])
+    def run(*outs):
+        shared, folders = Path(computed_here.__file__).parent, [tmp_path / out for out in outs]
+        return subprocess.Popen([sys.executable, tmp_path / "script.py", shared, tmp_path / "many.toml", *folders])
 
     return run
 
@@ -49,13 +57,12 @@ def wait_for_results(out, count):
 
 def test_two_processes_share_the_work_of_one_experiment_and_one_that_is_killed_loses_nothing(start, tmp_path):
     # what numba compiles in one go is rounded in another way than what it has kept, which the others use
-    assert start("compiled").wait(120) == 0
-    killed, other = start("disturbed"), start("disturbed")
+    run_experiment(prepare(tmp_path / "many.toml", out=tmp_path / "compiled"), executor=Here())
+    killed, other = start("disturbed"), start("disturbed", "undisturbed")
     wait_for_results(tmp_path / "disturbed", 3)
     killed.kill()
     killed.wait()
-    undisturbed = start("undisturbed")
-    assert [process.wait(120) for process in (other, undisturbed)] == [0, 0]
+    assert other.wait(120) == 0
     found = contents(tmp_path / "disturbed")
     assert len(found) == 8 * 9  # runs, and files of each
     assert found == contents(tmp_path / "undisturbed")
