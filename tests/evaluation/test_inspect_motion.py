@@ -64,7 +64,7 @@ def test_a_log_that_fits_has_no_problems(log):
     assert motion_problems(log) == []
 
 
-@pytest.mark.parametrize("shift", [-1.5, -0.2, 0.2, 0.6, 2.0])
+@pytest.mark.parametrize("shift", [-1.5, 0.2, 2.0])
 @pytest.mark.parametrize("sensor", ["imu", "bearing_range"])
 def test_a_clock_that_is_off_is_told_with_what_mends_it(log, sensor, shift):
     off = later(log, **{sensor: shift})
