@@ -67,7 +67,7 @@ def test_runs_of_one_seed_share_world_and_start() -> None:
 
 
 def test_the_robot_never_comes_near_walls() -> None:
-    run = run_active(preset("symmetric"), "random", "active_mcl", 2, ActiveSettings(max_metres=20.0, particles=200))
+    run = run_active(preset("symmetric"), "random", "active_mcl", 2, ActiveSettings(max_metres=10.0, particles=200))
     gaps = distance_to_walls(run.world, run.truth.poses[:, :2])
     # free cells of 0.2 m are those whose middle is 0.35 m from walls
     assert gaps.min() > 0.35 - 0.2 / math.sqrt(2.0) - 1e-9
@@ -94,10 +94,10 @@ def enclosed(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("policy", ["information", "random", "patrol", "nearest_tags"])
 def test_an_enclosed_robot_waits_and_gives_up(monkeypatch: pytest.MonkeyPatch, policy: str) -> None:
     enclosed(monkeypatch)
-    settings = ActiveSettings(start=(3.0, 3.0, 0.5), max_seconds=20.0, particles=200)
+    settings = ActiveSettings(start=(3.0, 3.0, 0.5), max_seconds=8.0, particles=200)
     run = run_active(preset("office"), policy, "active_mcl", 1, settings)
     assert not run.localized
-    assert run.seconds >= 20.0
+    assert run.seconds >= 8.0
     assert np.abs(run.truth.poses[:, :2] - 3.0).max() < 0.4
 
 
@@ -130,12 +130,12 @@ def test_wrong_names(policy: str, estimator: str, message: str) -> None:
 
 def test_two_places_that_look_alike_are_told_apart() -> None:
     """Beside the tag in the middle of the corridors the robot may be at two places, turned by half. It has to go where the arms
-    differ to find out, and to say nothing before. Four runs in a hundred claim a wrong place (8 of seeds 1 to 200), so two of
-    these five would by chance in 1.5 % of all choices of seeds."""
+    differ to find out, and to say nothing before. Four runs in a hundred claim a wrong place (8 of seeds 1 to 200), so one of
+    these two would by chance in 8 % of all choices of seeds."""
     settings = ActiveSettings(start=(12.0, 12.0, 0.1))
-    runs = [run_active(preset("symmetric"), "information", "active_mcl", seed, settings) for seed in range(1, 6)]
+    runs = [run_active(preset("symmetric"), "information", "active_mcl", seed, settings) for seed in (1, 2)]
     assert all(run.localized for run in runs)
-    assert sum(run.claimed_wrong for run in runs) <= 1
+    assert not any(run.claimed_wrong for run in runs)
     assert min(run.metres for run in runs) > 8.0
     for run in runs:
         early = next(step for step in run.steps if step.metres > 3.0)
@@ -155,7 +155,7 @@ def test_modes_that_are_next_to_each_other_are_one_place() -> None:
     assert [tuple(place.pose) for place in places] == [at["here"], at["turned"]]
 
 
-@pytest.mark.parametrize("estimator", ["active_mcl", "particle_filter", "smoother"])
+@pytest.mark.parametrize("estimator", ["active_mcl", "smoother"])
 def test_landmarks_are_seen_too(estimator: str) -> None:
     """Where there are some on all walls, the place is known much sooner than by the three tags."""
     world = preset("symmetric", {"world": {"landmarks": 40}})
@@ -175,6 +175,6 @@ def test_the_belief_is_of_where_the_robot_is_now(monkeypatch: pytest.MonkeyPatch
         return out
 
     monkeypatch.setattr(closed_loop._ClosedLoop, "_choose", watched)
-    run_active(preset("symmetric"), "information", "active_mcl", 3, ActiveSettings(max_metres=5.0, particles=200))
+    run_active(preset("symmetric"), "information", "active_mcl", 3, ActiveSettings(max_metres=3.0, particles=200))
     assert len(seen) > 3
     assert all(known == now for known, now in seen)
