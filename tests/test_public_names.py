@@ -29,6 +29,7 @@ def test_every_name_is_there_and_documented(name):
 def test_names_cost_nothing_until_they_are_used():
     code = (
         "import sys, factorgraph_loc as fgloc\n"
+        "assert set(fgloc.__all__) <= set(dir(fgloc))\n"
         "from factorgraph_loc import InputError\n"
         "assert {'numpy', 'gtsam', 'pydantic', 'polars'}.isdisjoint(sys.modules)\n"
         "from factorgraph_loc import VelocityOdometry\n"

@@ -8,6 +8,7 @@ that are compared, looked up, matched or keys of a dictionary. ``KEPT`` are thos
 import ast
 from collections import Counter
 from dataclasses import fields
+from functools import cache
 
 import pytest
 from package_tables import ROOT
@@ -84,6 +85,7 @@ def _has_type(node: ast.AST) -> bool:
     return any(isinstance(one, ast.Name) and one.id in TYPES for one in ast.walk(node))
 
 
+@cache
 def counted() -> Counter[str]:
     """How many choices there are, by file."""
     files = [file for file in sorted(PACKAGE.rglob("*.py")) if file.relative_to(PACKAGE).parts[0] not in APART]
