@@ -1,8 +1,6 @@
-"""The verbs as functions: they give what the commands print, and importing the package costs nothing."""
+"""The verbs as functions: they give what the commands print."""
 
 import json
-import subprocess
-import sys
 import tomllib
 from dataclasses import replace
 
@@ -20,17 +18,6 @@ SHORT = {"drive": {"duration": 20.0}, "world": {"tags": 12, "landmarks": 6}}
 def office():
     """A short drive through an office with tags and landmarks."""
     return fgloc.simulate("office", 3, changes=SHORT)
-
-
-def test_the_package_is_light_and_knows_its_verbs():
-    code = (
-        "import sys, factorgraph_loc as fgloc\n"
-        "assert {'numpy', 'gtsam', 'pydantic'}.isdisjoint(sys.modules)\n"
-        "assert set(fgloc.__all__) <= set(dir(fgloc))\n"
-        "print(all(getattr(fgloc, name) is not None for name in fgloc.__all__), 'numpy' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "True True\n"
 
 
 def test_a_run_has_the_scores_of_its_files(office, tmp_path):
@@ -76,9 +63,6 @@ def test_simulated_logs_are_those_of_the_same_seed(office, tmp_path):
     assert np.array_equal(read.streams["odometry"].dx, office.streams["odometry"].dx)
     with pytest.raises(fgloc.InputError, match="images need out"):
         fgloc.simulate("office", images=True)
-    changes = {"drive": {"duration": 2.0}, "images": {"rate": 2.0}, "world": {"width": 9.0, "depth": 8.0}}
-    seen = fgloc.simulate("office", changes=changes, images=True, out=tmp_path / "seen")
-    assert all(path.is_file() for path in seen.streams["camera"].file)
 
 
 def test_calibrate_writes_a_rig(tmp_path):

@@ -26,7 +26,6 @@ def file(tmp_path, short_log, monkeypatch):
     return made
 
 
-@pytest.mark.in_full
 def test_runs_are_made_once_and_can_be_looked_at(fgloc, file, tmp_path):
     plan = fgloc("experiment", "run", file, "--dry-run")
     assert plan.exit_code == 0, plan.output

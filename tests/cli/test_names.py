@@ -1,13 +1,10 @@
 """Names of logs and landmarks are whatever others wrote: results are made, and no terminal obeys what is printed of them."""
 
 import json
-import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from factorgraph_loc.cli import show
@@ -23,7 +20,6 @@ from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, Landmark
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 
-ANY = st.text(st.characters(), max_size=60) | st.sampled_from(["n" * 300, "a $x^{$ b", "[/red]{x}:smile:", "../../up"])
 RIG = Rig(sensors=("odometry", "bearing_range"), bearing_range=BearingRangeSettings(range_sigma=0.1))
 
 
@@ -42,24 +38,20 @@ def shown(text: str) -> bool:
     return all(c == "\n" or c.isprintable() for c in text)
 
 
-@pytest.mark.in_full
-@settings(max_examples=1, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
-@given(
-    name=ANY, landmark=st.text("ab$_\\é廊\x1b\u202e", min_size=1, max_size=40).filter(lambda text: text == text.strip())
+@pytest.mark.parametrize(
+    ("name", "landmark"), [("a $x^{$ b\x1b[31m\u202e\n" + "n" * 300, "$$\x1b[2J"), ("caf\udce9", "\x9b")]
 )
-@example(name="a $x^{$ b\x1b[31m\u202e\n" + "n" * 300, landmark="$$\x1b[2J")
-@example(name="caf\udce9", landmark="\x9b")
-def test_any_name_gives_a_run_with_tables_and_plots(name: str, landmark: str) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        log, out = Path(folder, "log"), Path(folder, "out")
-        write_native(named(name, landmark), log)
-        for command in (["info", log], ["info", log, "--json"], ["run", log, "-e", "ekf", "-o", out]):
-            done = CliRunner().invoke(app, [str(word) for word in command])
-            assert done.exit_code == 0, done.output
-            assert shown(done.stdout + done.stderr)
-        assert read_toml(out / "config.toml")
-        assert json.loads((out / "metrics.json").read_text())
-        assert list((out / "plots").glob("*.png"))
+def test_any_name_gives_a_run_with_tables_and_plots(name: str, landmark: str, tmp_path: Path) -> None:
+    """How names are drawn is tested in ``tests/drawing``."""
+    log, out = tmp_path / "log", tmp_path / "out"
+    write_native(named(name, landmark), log)
+    for command in (["info", log], ["info", log, "--json"], ["run", log, "-e", "ekf", "-o", out]):
+        done = CliRunner().invoke(app, [str(word) for word in command])
+        assert done.exit_code == 0, done.output
+        assert shown(done.stdout + done.stderr)
+    assert read_toml(out / "config.toml")
+    assert json.loads((out / "metrics.json").read_text())
+    assert list((out / "plots").glob("*.png"))
 
 
 @pytest.mark.parametrize("name", ["\x1b[31m\x00\u202e\x9b", "a\nb", "caf\udce9", "[/red]:smile:{x}"])

@@ -1,10 +1,6 @@
 """What scripts rely on: JSON from every command, and exit codes that say what happened."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 
 import pytest
@@ -73,14 +69,3 @@ def test_an_unknown_command_is_bad_input(monkeypatch, capsys):
         main()
     assert left.value.code == 2
     assert capsys.readouterr().out == ""
-
-
-def test_an_interrupted_comparison_has_its_code(tmp_path, processes):
-    command = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
-    line = ["compare", "plaza2", "-e", "smoother", "--seeds", "0:50", "-o", tmp_path / "out", "--jobs", "1"]
-    running = processes.start(*command, *line, stderr=subprocess.PIPE)
-    processes.wait_until((tmp_path / "out").exists)
-    os.killpg(running.pid, signal.SIGINT)  # as a terminal does it
-    said = running.communicate(timeout=processes.PATIENCE)[1]
-    assert running.returncode == 130
-    assert said.endswith("interrupted\n")

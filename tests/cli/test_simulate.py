@@ -56,17 +56,17 @@ def test_reads_may_come_from_another_log(fgloc, tmp_path):
 
 def test_images_are_written_with_the_log(fgloc, tmp_path):
     small = ("--set", "world.width=9", "--set", "world.depth=8")
-    options = ("--images", "--image-rate", 2, "--duration", 2, "--world-seed", 5, *small)
+    options = ("--images", "--image-rate", 2, "--duration", 1, "--world-seed", 5, *small)
     done = fgloc("simulate", "office", "-o", tmp_path / "new" / "log", "--seed", 3, *options)
     assert done.exit_code == 0, done.stderr
     assert [folder.name for folder in (tmp_path / "new").iterdir()] == ["log"]
     (log,) = load(str(tmp_path / "new" / "log"))
-    assert log.streams["camera"].t.tolist() == [0.5, 1.0, 1.5, 2.0]
+    assert log.streams["camera"].t.tolist() == [0.5, 1.0]
     assert log.rig.sensors == ("odometry", "rfid", "camera")
-    changes = {"world_seed": 5, "world": {"width": 9.0, "depth": 8.0}, "drive": {"duration": 2.0}}
+    changes = {"world_seed": 5, "world": {"width": 9.0, "depth": 8.0}, "drive": {"duration": 1.0}}
     images = film(preset("office", changes | {"images": {"rate": 2.0}}), 3)
-    read = cv2.imread(str(log.streams["camera"].file[3]))
-    assert abs(read.astype(float) - images[3]).mean() < 4.0  # what the file's compression takes
+    read = cv2.imread(str(log.streams["camera"].file[1]))
+    assert abs(read.astype(float) - images[1]).mean() < 4.0  # what the file's compression takes
 
 
 @pytest.mark.parametrize(

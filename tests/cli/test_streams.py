@@ -1,12 +1,15 @@
-"""The command with standard output and standard error of all kinds. Each case is a process, as the interpreter's own end counts."""
+"""The command with standard output and standard error of all kinds. Where the interpreter's own end counts, a case is a process."""
 
 import os
+import resource
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import Result
 
 from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.model.log import Log
@@ -14,6 +17,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 
+Fgloc = Callable[..., Result]
 NAME = "Gärtnerstraße ± 廊下 🤖"
 FGLOC = f"{sys.executable} -c 'from factorgraph_loc.cli.main import main; main()'"
 REFUSED = "error: standard output: cannot be written: "
@@ -62,21 +66,22 @@ def test_who_reads_no_further_ends_the_command_quietly() -> None:
     assert done.returncode == 141
 
 
-def test_file_names_of_all_kinds_are_told(tmp_path: Path) -> None:
-    path = tmp_path / os.fsdecode(b"caf\xe9 \x1b[31mred \xe2\x80\xae")
-    command = ["bash", "-c", f'{FGLOC} info "$1"', "-", str(path)]
-    done = subprocess.run(command, capture_output=True, check=False, timeout=60)
-    assert done.returncode == 2
-    told = done.stderr.decode()
-    assert "caf\\udce9 \\x1b[31mred \\u202e" in told
-    assert told.removesuffix("\n").isprintable()
+def test_file_names_of_all_kinds_are_told(fgloc: Fgloc, tmp_path: Path) -> None:
+    done = fgloc("info", tmp_path / os.fsdecode(b"caf\xe9 \x1b[31mred \xe2\x80\xae"))
+    assert done.exit_code == 2
+    assert "caf\\udce9 \\x1b[31mred \\u202e" in done.stderr
+    assert done.stderr.removesuffix("\n").isprintable()
 
 
-def test_a_full_disk_is_one_line_and_leaves_nothing(named_log: Path, tmp_path: Path) -> None:
+def test_a_full_disk_is_one_line_and_leaves_nothing(fgloc: Fgloc, named_log: Path, tmp_path: Path) -> None:
     """The limit is on the size of files; Python ignores its signal, so that writing fails as on a full disk."""
-    command = f"ulimit -f 1; {FGLOC} convert {named_log} {tmp_path}/out"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, check=False, timeout=60)
-    assert done.returncode == 2
-    assert done.stderr.decode().count("\n") == 1
-    assert "File too large" in done.stderr.decode()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
+    try:
+        done = fgloc("convert", named_log, tmp_path / "out")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert done.exit_code == 2
+    assert done.stderr.count("\n") == 1
+    assert "File too large" in done.stderr
     assert list(tmp_path.iterdir()) == []

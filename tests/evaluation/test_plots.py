@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from in_short import blank_pictures  # noqa: F401 - a fixture
 from typer.testing import CliRunner
 
 from factorgraph_loc.cli.app import app
@@ -86,8 +87,8 @@ def test_a_run_that_nothing_told_the_pose(track, tmp_path):
     assert {path.name for path in paths if "ekf" in path.name or "errors" in path.name} == {"log-errors-batch.png"}
 
 
-@pytest.mark.parametrize("estimator", ["particle_filter", "smoother", "batch"])
-@pytest.mark.parametrize("reference", [True, False])
+@pytest.mark.usefixtures("blank_pictures")
+@pytest.mark.parametrize(("estimator", "reference"), [("particle_filter", True), ("smoother", False), ("batch", True)])
 def test_a_log_that_never_tells_the_pose_is_run_and_plotted(track, estimator, reference, tmp_path):
     t = track.final.t
     streams = {

@@ -65,15 +65,15 @@ def stored(monkeypatch):
 
 
 def test_a_worker_that_is_killed_loses_no_run_and_none_is_stored_twice(workers, planned, stored):
-    runs, folder = planned(6)
+    runs, folder = planned(4)
     outcomes = []
     for outcome in execute(runs, folder, Cluster(workers.scheduler_address, Limits())):
         outcomes.append(outcome)
         if len(outcomes) == 3:  # both are at work, with more runs than they compute
             os.kill(workers.workers[0].pid, signal.SIGKILL)
     keys = {run.key for run in runs}
-    assert len(runs) == len(keys) == 12
-    assert [outcome.status for outcome in outcomes] == ["ok"] * 12
+    assert len(runs) == len(keys) == 8
+    assert [outcome.status for outcome in outcomes] == ["ok"] * 8
     assert stored == dict.fromkeys(keys, 1)
     store = Store(folder)
     assert all(store.state(key, thorough=True) == "ok" for key in keys)
@@ -98,22 +98,6 @@ def test_a_run_that_takes_too_long_is_a_failure_and_its_worker_begins_anew(worke
     assert [(o.status, o.reason) for o in outcomes] == [("failed", "it took more than 0.001 s")]
     assert Store(folder).row(runs[0].key)["kind"] == "timeout"
     assert {worker.pid for worker in workers.workers.values()} != before
-    kept = list(execute(runs, folder, Cluster(workers.scheduler_address, Limits())))
-    assert sorted(o.status for o in kept) == ["failed", "ok"]
-    tried = list(execute(runs[:1], folder, Cluster(workers.scheduler_address, Limits()), again=True))
-    assert [o.status for o in tried] == ["ok"]
-
-
-def test_a_run_that_ends_its_workers_is_a_failure_and_the_others_go_on(workers, planned, monkeypatch):
-    runs, folder = planned(1)
-    monkeypatch.setattr(workers.scheduler, "allowed_failures", 0)
-    with monkeypatch.context() as patch:
-        patch.setattr(cluster, "make", lambda *_: os._exit(1))
-        (outcome,) = execute(runs[:1], folder, Cluster(workers.scheduler_address, Limits()))
-    assert outcome.status == "failed"
-    assert Store(folder).row(runs[0].key)["kind"] == "killed"
-    others = list(execute(runs[1:], folder, Cluster(workers.scheduler_address, Limits())))
-    assert [other.status for other in others] == ["ok"]
 
 
 def test_the_command_takes_a_scheduler(workers, planned, tmp_path):
@@ -134,6 +118,18 @@ def test_workers_with_other_code_are_refused(workers, planned, stored, monkeypat
         list(execute(runs, folder, Cluster(workers.scheduler_address, Limits())))
     assert not stored
     assert not list((Store(folder).folder / "claims").iterdir())
+
+
+def test_a_run_that_ends_its_workers_is_a_failure_and_the_others_go_on(workers, planned, monkeypatch):
+    runs, folder = planned(1)
+    monkeypatch.setattr(workers.scheduler, "allowed_failures", 0)
+    with monkeypatch.context() as patch:
+        patch.setattr(cluster, "make", lambda *_: os._exit(1))
+        (outcome,) = execute(runs[:1], folder, Cluster(workers.scheduler_address, Limits()))
+    assert outcome.status == "failed"
+    assert Store(folder).row(runs[0].key)["kind"] == "killed"
+    others = list(execute(runs[1:], folder, Cluster(workers.scheduler_address, Limits())))
+    assert [other.status for other in others] == ["ok"]
 
 
 def test_no_scheduler_and_no_package_are_told_in_a_line(planned, monkeypatch):

@@ -110,7 +110,7 @@ def test_the_feature_is_that_of_the_map(seeing):
     assert frontend_of(seeing.rig, named) == FrontendSettings(feature="orb", count=30, everywhere=True)
 
 
-@pytest.mark.usefixtures("runs_here")
+@pytest.mark.usefixtures("runs_here", "blank_pictures")
 def test_a_comparison_finds_features_once(seeing, sees, tmp_path, monkeypatch):
     found = []
     find = frontend._find

@@ -16,9 +16,8 @@ from factorgraph_loc.experiments.pool import Processes
 from factorgraph_loc.experiments.store import Store
 
 SHORT = {"simulate": "office", "settings": {"drive": {"duration": 4}}}
-LONG = {"simulate": "office", "settings": {"name": "long", "drive": {"duration": 60}}}
+LONG = {"simulate": "office", "settings": {"name": "long", "drive": {"duration": 10}}}
 HUGE = {"name": "particle_filter", "label": "huge", "settings": {"particles": 1_000_000}}
-ENDLESS = {"name": "particle_filter", "label": "endless", "settings": {"particles": 100_000}}
 
 
 @pytest.fixture
@@ -40,9 +39,9 @@ def test_a_run_that_takes_too_long_or_too_much_memory_fails_and_the_others_go_on
     assert [o.status for o in outcomes] == ["failed", "ok"]
     assert outcomes[0].reason == "its process held more than 450 MB"
     assert store.row(runs[0].key)["kind"] == "memory"
-    runs = planned([LONG], [ENDLESS])
-    (outcome,) = execute(runs, tmp_path / "out", Processes(1, Limits(time=1.0)))
-    assert outcome.reason == "it took more than 1 s"
+    runs = planned([LONG], [{**HUGE, "label": "endless", "settings": {"particles": 900_000}}])
+    (outcome,) = execute(runs, tmp_path / "out", Processes(1, Limits(time=0.5)))
+    assert outcome.reason == "it took more than 0.5 s"
     assert store.row(runs[0].key)["kind"] == "timeout"
     assert [list((store.folder / name).iterdir()) for name in ("tmp", "claims")] == [[], []]
 
@@ -74,7 +73,7 @@ def test_a_run_whose_worker_is_killed_is_tried_once_more(planned, tmp_path, monk
 
 
 def test_workers_end_when_the_caller_stops_listening(planned, tmp_path):
-    runs = planned([SHORT], ["dead_reckoning"]) + planned([LONG], [ENDLESS])
+    runs = planned([SHORT], ["dead_reckoning"]) + planned([LONG], [HUGE])
     outcomes = execute(runs, tmp_path / "out", Processes(1, Limits()))
     assert next(outcomes).status == "ok"
     outcomes.close()

@@ -45,8 +45,8 @@ def started(folder: Path, code: str, **environment: str) -> subprocess.Popen[str
 
 
 def test_of_processes_that_need_a_function_at_once_one_compiles_it(tmp_path: Path) -> None:
-    processes = [started(tmp_path, CALL) for _ in range(3)]
-    assert sorted(process.communicate()[0].strip() for process in processes) == ["0", "0", "1"]
+    processes = [started(tmp_path, CALL) for _ in range(2)]
+    assert sorted(process.communicate()[0].strip() for process in processes) == ["0", "1"]
 
 
 def test_a_process_that_ends_while_it_compiles_is_waited_for_no_longer(tmp_path: Path) -> None:
@@ -63,10 +63,10 @@ def test_a_process_that_ends_while_it_compiles_is_waited_for_no_longer(tmp_path:
 
 
 def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(tmp_path: Path) -> None:
-    for _ in range(2):
-        process = started(tmp_path, CALL, NUMBA_CACHE_LOCATOR_CLASSES="ZipCacheLocator")
-        assert process.communicate()[0].strip() == "1"
-        assert process.returncode == 0
+    process = started(tmp_path, CALL, NUMBA_CACHE_LOCATOR_CLASSES="ZipCacheLocator")
+    assert process.communicate()[0].strip() == "1"
+    assert process.returncode == 0
+    assert not (tmp_path / "cache").exists()
 
 
 def test_locks_of_somebody_else_are_not_waited_for(tmp_path: Path) -> None:

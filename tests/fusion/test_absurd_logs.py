@@ -21,10 +21,9 @@ CONFIGS = {
 BEYOND = ("glitch_beyond_bounds", "clocks_years_apart")  # the bounds of their columns, or of a log's length
 
 
-# each fault with two of the configurations, each configuration with many of the faults
+# each fault with one of the configurations, each configuration with several faults; tests/fuzz draws others
 @pytest.mark.parametrize(
-    ("fault", "config"),
-    [(fault, list(CONFIGS)[(i + k) % len(CONFIGS)]) for i, fault in enumerate(FAULTS) for k in (0, 5)],
+    ("fault", "config"), [(fault, list(CONFIGS)[i % len(CONFIGS)]) for i, fault in enumerate(FAULTS)]
 )
 def test_a_log_with_a_fault_is_survived(fault, config):
     rng = np.random.default_rng(sum(map(ord, fault + config)))

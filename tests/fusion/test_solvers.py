@@ -52,12 +52,13 @@ def test_nothing_is_learnt_of_a_start_that_nothing_measures(log):
     assert np.allclose(sigmas, SIGMA, rtol=1e-4)
 
 
-@pytest.mark.parametrize("world", [camera_world, landmark_world])
-@pytest.mark.parametrize("lag", [1.5, 6.0, "all"])
+@pytest.mark.parametrize(
+    ("world", "lag"), [(camera_world, 1.5), (landmark_world, 6.0), (camera_world, "all"), (landmark_world, "all")]
+)
 def test_what_comes_and_goes_tells_nothing_of_the_heading_at_the_start(world, lag):
     """The heading is never known better than it was then: not by landmarks that share its error, nor where all has moved and the
     start has left the window."""
-    log = world.simulate(seed=1, seconds=40.0)
+    log = world.simulate(seed=1, seconds=30.0)
     result = run(log, RunConfig("smoother", {"landmarks": "unknown", "lag": lag}, prior=START))
     assert np.sqrt(result.covariances[:, 2, 2]).min() > SIGMA * (1.0 - 1e-3)
 

@@ -25,7 +25,7 @@ RIG = Rig(
     bearing_range=BearingRangeSettings(range_sigma=0.05, bearing_sigma=0.02, robust=100.0),
 )
 MARK, PRIOR = np.array((4.0, 1.0)), np.array((1.0, 1.0, 0.05))
-LOOKS, SEEDS = 24, 30
+LOOKS, SEEDS = 20, 20
 
 
 def world(sigma):
@@ -60,7 +60,7 @@ def nees(estimator, sigma, settings=None, seeds=SEEDS):
 
 @pytest.mark.parametrize(("estimator", "settings"), [("ekf", {}), ("smoother", {}), ("smoother", {"lag": 5.0})])
 def test_many_looks_do_not_make_a_poor_survey_better(estimator, settings):
-    """The mean of 30 chi-squares of two degrees of freedom, within what it is in all but 1 of 10,000 cases."""
+    """The mean of 20 chi-squares of two degrees of freedom, within what it is in all but 1 of 10,000 cases."""
     low, high = chi2.ppf((5e-5, 1.0 - 5e-5), 2 * SEEDS) / SEEDS
     assert low < nees(estimator, 0.3, settings) < high
 
@@ -110,7 +110,7 @@ def looked_at_a_marker(estimator, seed, settings=None):
 
 @pytest.mark.parametrize(("estimator", "settings"), [("ekf", {}), ("smoother", {}), ("smoother", {"lag": 5.0})])
 def test_the_corners_of_a_marker_have_the_error_of_its_survey_in_common(estimator, settings):
-    """Within what the mean of 30 such chi-squares is in all but 1 of 10,000 cases."""
+    """Within what the mean of 20 such chi-squares is in all but 1 of 10,000 cases."""
     low, high = chi2.ppf((5e-5, 1.0 - 5e-5), 2 * SEEDS) / SEEDS
     assert low < np.mean([looked_at_a_marker(estimator, seed, settings) for seed in range(SEEDS)]) < high
 
@@ -119,13 +119,11 @@ def test_particles_count_the_looks_at_a_marker():
     assert 0.2 < np.mean([looked_at_a_marker("particle_filter", seed, {"particles": 3000}) for seed in range(12)]) < 5.0
 
 
-@pytest.mark.parametrize(
-    ("estimator", "most"), [("ekf", 5.0), ("smoother", 5.0), ("batch", 5.0), ("particle_filter", 6.0)]
-)
+@pytest.mark.parametrize(("estimator", "most"), [("ekf", 5.0), ("smoother", 5.0), ("particle_filter", 6.0)])
 def test_points_of_a_poor_survey_while_driving(estimator, most):
     """Before, where the error was noise of each look, the mean was 11 to 15."""
     found = []
-    for seed in range(6):
+    for seed in range(4):
         points = camera_world.room(40, seed)
         log = camera_world.simulate(seed, 15.0, points=points)
         error = 0.05 * np.random.default_rng(100 + seed).standard_normal(points.positions.shape)

@@ -85,19 +85,29 @@ def check(name, log, result, *, within, off=0.4):
     assert difference[first] @ np.linalg.solve(result.covariances[first], difference[first]) < UNLIKELY
 
 
-@pytest.mark.parametrize("missing", [None, "bearing", "range"])
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize(
+    ("name", "missing"),
+    [
+        *((name, None) for name in CONFIGS),
+        *((name, column) for name in ("ekf", "particle_filter", "smoother") for column in ("bearing", "range")),
+    ],
+)
 def test_landmarks_tell_the_heading(name, missing, log):
     log = log if missing is None else without(log, missing)
     # ranges alone tell it once the robot has moved by more than their noise
     check(name, log, run(log, replace(CONFIGS[name], prior=position(log))), within=12.0 if missing else 6.0)
 
 
-@pytest.mark.parametrize("name", [*CONFIGS, "switching"])
+@cache
+def seen_from_afar():
+    told = {"drive": {"duration": 14.0}, "world": {"tags": 25, "landmarks": 20, "points": 60}}
+    return simulated(preset("office", told), 2)
+
+
+@pytest.mark.parametrize("name", ["ekf", "particle_filter", "smoother", "switching"])
 def test_sightings_that_fit_no_heading_leave_the_start_as_it_was_told(name):
     """The robot is 9 m away: at times no heading explains what is seen from there, and the robot claims none."""
-    told = {"drive": {"duration": 14.0}, "world": {"tags": 25, "landmarks": 20, "points": 60}}
-    log = simulated(preset("office", told), 2)
+    log = seen_from_afar()
     config = CONFIGS.get(name, RunConfig("switching"))
     result = run(log, replace(config, prior="10,6", sensors=("odometry", "bearing_range")))
     assert "localized" not in result.status

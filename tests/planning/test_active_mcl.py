@@ -50,10 +50,10 @@ def test_fewer_particles_are_enough_once_the_place_is_known():
 
 
 def test_stated_errors_fit_the_real_ones():
-    """Squared errors over covariances of 12 robots that stand still: the mean of 12 chi-squares of 3 degrees of freedom is below 6
-    in all but 2 of 100,000 cases; twice that is left to the few particles."""
+    """Squared errors over covariances of 6 robots that stand still: the mean of 6 chi-squares of 3 degrees of freedom is below 9
+    in all but 2 of 100,000 cases; a third more is left to the few particles."""
     values = []
-    for seed in range(12):
+    for seed in range(6):
         estimator, robot, _ = made(seed)
         for m in (*robot.begin(), *robot.wait(3.0)):
             estimator.process(m)

@@ -1,6 +1,7 @@
 """The paper's EKF: against the planar EKF, its consistency, its map, and what must not break it."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -75,9 +76,9 @@ def test_in_a_known_map_it_is_the_planar_filter(drive, self_calibration, monkeyp
 
 
 def test_its_covariance_is_that_of_its_errors(drive):
-    """NEES at the end of 10 independent runs: a right filter fails with 0.1 %."""
+    """NEES at the end of 6 independent runs: a right filter fails with 0.1 %."""
     last = []
-    for seed in range(10):
+    for seed in range(6):
         log = drive(seed, seconds=12.0)
         result = estimated(log, **EXACT_FLOOR)
         last.append(errors(result.causal(), log.reference).nees[-1])
@@ -313,6 +314,7 @@ def test_an_innovation_that_rounding_made_singular_still_has_a_gain():
 def turning():
     """``turning(seed)``: a drive among many points, and the same with wheels that rest while the robot turns by some 0.35 rad."""
 
+    @cache
     def make(seed):
         world = {"points": 900, "tags": 20}
         log = simulate(preset("office", {"world": world, "world_seed": 5, "drive": {"duration": SECONDS}}), seed)
@@ -325,16 +327,15 @@ def turning():
     return make
 
 
-@pytest.mark.parametrize("seed", [5, 7])
-def test_wheels_that_rest_while_it_turns_are_told_by_the_points(turning, seed):
+def test_wheels_that_rest_while_it_turns_are_told_by_the_points(turning):
     """The heading was off by a third of the turn."""
-    log, slid = turning(seed)
+    log, slid = turning(5)
     result = estimated(slid, landmarks="unknown")
     assert errors(result.causal(), log.reference).heading[-20:].mean() < 0.03
 
 
 def test_wheels_that_hold_do_not_slip(turning, monkeypatch):
-    """Of some 450 images at most 0.9 count as slips on average, as a slip must be the likelier at one in a hundred seconds."""
+    """Of some 300 images at most 0.6 count as slips on average, as a slip must be the likelier at one in a hundred seconds."""
     slipped, judged = [], FeatureMatcher.unless_slipped
 
     def counted(self, m, state, *slip):
@@ -343,7 +344,7 @@ def test_wheels_that_hold_do_not_slip(turning, monkeypatch):
         return found
 
     monkeypatch.setattr(FeatureMatcher, "unless_slipped", counted)
-    for seed in (4, 5, 6):
+    for seed in (4, 5):
         estimated(turning(seed)[0], landmarks="unknown")
-    assert len(slipped) > 400
+    assert len(slipped) > 270
     assert sum(slipped) <= 1

@@ -18,7 +18,7 @@ WHEELS = OdometryModel(
     along=Growth(0.05, 0.0, 0.005), lateral=Growth(0.02, 0.0, 0.005), heading=Growth(0.05, 0.05, 0.002)
 )
 ROOM, OBJECT = 40, 80
-SEEDS = range(20)
+SEEDS = range(8)
 SLOW = -4.0  # px, where what is far away moves by 18 between two images
 
 

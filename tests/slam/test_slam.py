@@ -18,7 +18,7 @@ CONFIGS = {
     "smoother_lag": RunConfig("smoother", {**UNKNOWN, "lag": 10.0}),
     "batch": RunConfig("batch", UNKNOWN),
 }
-SEEDS = range(1, 7)
+SEEDS = range(1, 5)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_all_landmarks_are_found(name, log, mapped):
 
 @pytest.mark.parametrize(("name", "overconfident"), [("smoother", 1.0), ("ekf", 1.8)])
 def test_errors_of_landmarks_are_as_large_as_stated(name, overconfident, logs, mapped):
-    """Over six seeds, bounds of 0.1 % of false alarms on each side if all landmarks of a run are off together, as they nearly are.
+    """Over four seeds, bounds of 0.1 % of false alarms on each side if all landmarks of a run are off together, as they nearly are.
 
     EKF-SLAM states too little, over 24 seeds 1.8 times (Julier, Uhlmann, "A counter example to the theory of simultaneous
     localization and map building", 2001).
@@ -129,7 +129,7 @@ def test_what_the_map_lacks_is_added_and_the_rest_taken_as_it_is(name, log):
     assert np.hypot(*(whole.final.poses - known.final.poses)[:, :2].T).max() < (0.0 if name == "ekf" else 0.05) + 1e-9
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", ["ekf", "smoother"])
 def test_a_landmark_needs_two_sightings_that_agree(name, log):
     """One is seen once; one at first far off, then three times where it is; one each time elsewhere."""
     t, place = np.array((5.13, 6.13, 7.13)), np.array((3.0, 3.0))
@@ -141,7 +141,7 @@ def test_a_landmark_needs_two_sightings_that_agree(name, log):
     assert np.hypot(*(result.learnt.landmarks["late"].position - place)) < 0.4
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", ["ekf", "smoother"])
 def test_ranges_alone_of_unknown_landmarks_are_ignored(name, log):
     """Every fifth row lacks its bearing; one landmark never had one."""
     s = log.streams["bearing_range"]
@@ -152,7 +152,7 @@ def test_ranges_alone_of_unknown_landmarks_are_ignored(name, log):
     assert set(result.learnt.landmarks) == often_seen(log) - {"b"}
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", ["ekf", "smoother", "smoother_lag"])
 def test_late_rows(name, log, mapped):
     """Each row arrives up to 0.4 s late, also behind others of its stamp; what was seen once is not joined with itself."""
     odd = with_rows(log, *((4.13 + 2.0 * i, f"once {i}", 2.0, 1.0) for i in range(10)))

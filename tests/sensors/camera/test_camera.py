@@ -36,7 +36,7 @@ CONFIGS = {
     "batch": RunConfig("batch"),
 }
 CAUSAL = ("ekf", "particle_filter", "smoother", "smoother_lag")
-EXACT = ("ekf", "smoother", "smoother_lag", "batch")
+EXACT = ("ekf", "smoother", "batch")
 LOST = "lost: points in images were not where they were expected since {:.1f} s"
 
 
@@ -147,11 +147,11 @@ def test_estimators_agree(log):
 
 
 def test_errors_are_those_that_the_covariances_say():
-    """Over eight runs: average normalised errors of three degrees of freedom, at steps 5 s apart."""
+    """Over five runs: average normalised errors of three degrees of freedom, at steps 5 s apart."""
+    drives = [simulate(seed=seed, seconds=15.5) for seed in range(5)]
     for name in ("ekf", "smoother", "particle_filter"):
         squared = []
-        for seed in range(8):
-            made = simulate(seed=seed, seconds=15.5)
+        for seed, made in enumerate(drives):
             settings = {"particles": 300, "smooth": False} if name == "particle_filter" else {"smooth": False}
             result = run(made, RunConfig(name, settings, seed=seed))
             for t in (5.0, 10.0, 15.0):
@@ -159,8 +159,8 @@ def test_errors_are_those_that_the_covariances_say():
                 error = result.poses[i] - made.reference.at(np.array([t]))[0]
                 error[2] = se2.wrap_scalar(error[2])
                 squared.append(error @ np.linalg.solve(result.covariances[i], error))
-        # 72 degrees of freedom: the bounds have 1e-4 of false alarms on either side
-        assert 1.59 < np.mean(squared) < 4.95, name
+        # 45 degrees of freedom: the bounds have 1e-4 of false alarms on either side, or less
+        assert 1.19 < np.mean(squared) < 5.7, name
 
 
 @pytest.mark.parametrize("name", CONFIGS)

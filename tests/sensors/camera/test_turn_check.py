@@ -19,7 +19,7 @@ from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
 from factors.camera.model import FOCAL, PARAMETERS, TIME_OFFSET
 
-STEP, SECONDS = 0.05, 60.0
+STEP, SECONDS = 0.05, 40.0
 NOISE = np.array((0.02, 0.03))  # m/s and rad/s, of the wheels' velocities
 POINTS = room(500, seed=3)
 RIGHT_LENS = CAMERA.model_copy(update={"pixel_sigma": 0.5})
@@ -53,27 +53,25 @@ def told(log, camera=RIGHT_LENS, late=0.0, scale=1.0, estimated=NOTHING):
     return [what for _, what in diagnostics.events]
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.95])
-def test_nothing_is_told_of_a_camera_as_the_rig_says(scale):
-    """Four runs, in two of which the wheels are wrong; five standard deviations beyond the tolerance leave less than one
+@pytest.mark.parametrize(("seed", "scale"), [(0, 1.0), (1, 0.95)])
+def test_nothing_is_told_of_a_camera_as_the_rig_says(seed, scale):
+    """Two runs, in one of which the wheels are wrong; five standard deviations beyond the tolerance leave less than one
     false alarm in 10,000 runs."""
-    assert [told(drive(seed), scale=scale) for seed in range(2)] == [[]] * 2
+    assert told(drive(seed), scale=scale) == []
 
 
-@pytest.mark.parametrize("late", [0.1, -0.1])
-def test_an_offset_of_the_clock_is_told_once(late):
-    for seed in range(2):
-        (event,) = told(drive(seed), late=late)
-        assert f"s {'earlier' if late > 0.0 else 'later'} than they are stamped" in event
-        assert float(event.split("taken ")[1].split(" s ")[0]) == pytest.approx(0.1, abs=0.03)
+@pytest.mark.parametrize(("seed", "late"), [(0, 0.1), (1, -0.1)])
+def test_an_offset_of_the_clock_is_told_once(seed, late):
+    (event,) = told(drive(seed), late=late)
+    assert f"s {'earlier' if late > 0.0 else 'later'} than they are stamped" in event
+    assert float(event.split("taken ")[1].split(" s ")[0]) == pytest.approx(0.1, abs=0.03)
 
 
 def test_a_wrong_focal_length_is_told_once_whatever_the_wheels_say():
-    for scale in (1.0, 0.95):
-        (event,) = told(drive(1), WRONG_LENS, scale=scale)
-        assert "the focal length seems to be" in event
-        assert float(event.split("be ")[1].split(" %")[0]) == pytest.approx(5.0, abs=1.5)
-        assert "shorter" in event
+    (event,) = told(drive(1), WRONG_LENS, scale=0.95)
+    assert "the focal length seems to be" in event
+    assert float(event.split("be ")[1].split(" %")[0]) == pytest.approx(5.0, abs=1.5)
+    assert "shorter" in event
 
 
 def test_what_is_estimated_is_not_told():
@@ -86,11 +84,10 @@ def test_where_the_robot_hardly_turns_nothing_is_told():
     assert told(straight, WRONG_LENS, late=0.1) == []
 
 
-@pytest.mark.parametrize("estimator", ["smoother", "monoslam"])
-def test_a_run_without_a_map_does_not_claim_to_be_localized_with_a_wrong_clock(estimator):
-    log = drive(1, seconds=25.0)
-    for late, status in ((0.0, "localized"), (0.1, "ambiguous")):
-        stamped = with_sightings(log, t=log.streams["sightings"].t + late)
-        result = run(stamped, RunConfig(estimator, {"landmarks": "unknown"}))
-        assert result.status[-1] == status
-        assert any("time_offset" in what for _, what in result.diagnostics.events) == (late > 0.0)
+@pytest.mark.parametrize(("estimator", "late"), [("smoother", 0.0), ("smoother", 0.1), ("monoslam", 0.1)])
+def test_a_run_without_a_map_does_not_claim_to_be_localized_with_a_wrong_clock(estimator, late):
+    log = drive(1, seconds=20.0)
+    stamped = with_sightings(log, t=log.streams["sightings"].t + late)
+    result = run(stamped, RunConfig(estimator, {"landmarks": "unknown"}))
+    assert result.status[-1] == ("ambiguous" if late else "localized")
+    assert any("time_offset" in what for _, what in result.diagnostics.events) == (late > 0.0)

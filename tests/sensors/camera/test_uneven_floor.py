@@ -80,7 +80,7 @@ def test_covariances_hold_on_an_uneven_floor(name):
     found = []
     for seed in SEEDS:
         log = uneven(simulate(seconds=15.0, seed=seed))
-        scores = score(run(log, RunConfig(name)), log)
+        scores = score(run(log, RunConfig(name, {"particles": 500} if name == "particle_filter" else {})), log)
         found.append([scores[f"causal.{figure}"] for figure in ("position_rmse", "anees")])
     position, anees = np.mean(found, axis=0)
     assert position < 0.03
@@ -91,7 +91,7 @@ def test_covariances_hold_on_an_uneven_floor(name):
 def test_a_level_floor_is_recognised():
     """Known points tell more of a pose there: with one standard deviation of the tilt for all floors, equal to 0.02 %."""
     for seed in SEEDS:
-        log = simulate(seconds=25.0, seed=seed, limit=100)
+        log = simulate(seconds=15.0, seed=seed, limit=100)
         level, other = (run(one, RunConfig("smoother")).final for one in (log, uneven(log)))
         assert spread_of(other) > 1.01 * spread_of(level)
 
@@ -105,7 +105,7 @@ def spread_of(trajectory):
 def test_covariances_hold_where_the_points_are_estimated_too():
     found = []
     for seed in SEEDS:
-        log = uneven(simulate(seconds=30.0, seed=seed, limit=100))
+        log = uneven(simulate(seconds=20.0, seed=seed, limit=60))
         scores = score(run(log, RunConfig("smoother", {"landmarks": "unknown"})), log)
         found.append([scores[figure] for figure in ("aligned.position_rmse", "causal.anees", "final.anees")])
     position, causal, final = np.mean(found, axis=0)

@@ -62,6 +62,6 @@ def test_scans_that_come_again_count_once():
 @pytest.mark.parametrize("estimator", ["ekf", "smoother", "particle_filter"])
 def test_covariances_are_right_although_the_rig_knows_of_no_bursts(estimator):
     log = simulate(preset("office", {"drive": {"duration": 120.0}, **BURSTS}), 43)
-    result = run(log, RunConfig(estimator, {"particles": 2000} if estimator == "particle_filter" else {}))
+    result = run(log, RunConfig(estimator, {"particles": 1000} if estimator == "particle_filter" else {}))
     found = score(result, log)
     assert found["causal.anees"] < 4.5  # 8.8 to 10.3 by the tempering of the rig

@@ -38,9 +38,9 @@ def without(log: Log, tags: frozenset[str]) -> Log:
 
 @pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
 def test_hardly_worse_than_who_is_told(estimator: str) -> None:
-    """After half a minute, three logs pooled. All that are named are dead, and most of the dead are named."""
+    """After half a minute, two logs pooled. All that are named are dead, and most of the dead are named."""
     errors: list[list[float]] = []
-    for seed in (2, 3, 4):
+    for seed in (2, 3):
         log, dead = office(seed)
         assert log.reference is not None
         config = RunConfig(estimator, {"particles": 1000} if estimator == "particle_filter" else {})
@@ -64,8 +64,8 @@ def test_hardly_worse_than_who_is_told(estimator: str) -> None:
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_what_comes_later_changes_no_causal_estimate(estimator: str) -> None:
     log, _ = office()
-    half = cut(log, 0.0, 12.0)
-    whole, first = run(cut(log, 0.0, 24.0), RunConfig(estimator)), run(half, RunConfig(estimator))
+    config = RunConfig(estimator, {"particles": 500} if estimator in ("particle_filter", "switching") else {})
+    whole, first = run(cut(log, 0.0, 16.0), config), run(cut(log, 0.0, 8.0), config)
     count = len(first.t)
     assert np.array_equal(whole.t[:count], first.t)
     assert np.array_equal(whole.poses[:count], first.poses)

@@ -13,7 +13,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.rfid.calibration.phase import fit_phase
+from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit, fit_phase
 from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi, rssi_nll
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.map import Tag
@@ -99,10 +99,14 @@ def log() -> Log:
     return simulated(0)
 
 
-def test_survey_and_lever_arm_are_found(log: Log) -> None:
+@pytest.fixture(scope="module")
+def fit(log: Log) -> PhaseFit:
+    return fit_phase([log], SETTINGS)
+
+
+def test_survey_and_lever_arm_are_found(fit: PhaseFit) -> None:
     """Five standard deviations and 2 mm for the bends of the reference: false alarms below 1e-4, as the jackknife's spread is
     itself known to a quarter."""
-    fit = fit_phase([log], SETTINGS)
     point = np.array((fit.survey.about_x, fit.survey.about_y))
     shift = se2.transform_from(SURVEY.transform(), point) - point
     found = (fit.survey.x, fit.survey.y, fit.survey.heading, *fit.lever_arm)
@@ -148,12 +152,11 @@ def test_settings_make_models_of_one_window() -> None:
     assert RSSI.model(antennas).coefficients == RSSI.coefficients
 
 
-def test_logs_are_focused_together(log: Log) -> None:
+def test_logs_are_focused_together(log: Log, fit: PhaseFit) -> None:
     """The same log twice says the same, to the accuracy of the search: windows of different logs are never mixed."""
-    once = fit_phase([log], SETTINGS)
     twice = fit_phase([log, without_signals(log), log], SETTINGS)
-    assert twice.reads == 2 * once.reads
-    assert twice.after == pytest.approx(once.after, abs=1e-5)
+    assert twice.reads == 2 * fit.reads
+    assert twice.after == pytest.approx(fit.after, abs=1e-5)
 
 
 def test_rssi_is_found() -> None:

@@ -115,18 +115,18 @@ def test_where_there_are_no_data_the_grid_is_the_parametric_model(pairs):
 
 def test_the_way_to_fit_that_is_true_is_chosen():
     """Of reads of a logistic model with facing no grid is better by a thousandth of a nat."""
-    choice = choose(drawn(TRUTH, 8000), FLOOR, 1, facing=True)
+    choice = choose(drawn(TRUTH, 5000), FLOOR, 1, facing=True)
     assert choice.kind == Kind("logistic", facing=True)
     assert choice.best.nll < min(t.nll for t in choice.trials if t.kind.name == "beam") - 0.01
 
 
 def test_antennas_that_differ_have_their_own_models():
     other = LogisticModel((2.5, -1.0, -0.05, -0.5, 0.1, -0.06, -0.6, -0.1, 1.9, 0.23, -0.15))
-    one, two = drawn(TRUTH, 5000), drawn(other, 5000, seed=5)
+    one, two = drawn(TRUTH, 3000), drawn(other, 3000, seed=5)
     names = [name for name in one.__dataclass_fields__ if name != "antenna"]
     both = TagPairs(
         **{name: np.concatenate((getattr(one, name), getattr(two, name))) for name in names},
-        antenna=np.repeat((0, 1), 5000),
+        antenna=np.repeat((0, 1), 3000),
     )
     assert choose(both, FLOOR, 2, facing=True).kind.own
 
