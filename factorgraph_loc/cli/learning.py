@@ -256,25 +256,25 @@ def _reasons(made: MadeTags) -> dict[str, str]:
 def _notes(made: LandmarkMap) -> list[str]:
     """Lines on what the table does not show."""
     unseen = ", ".join(made.unseen)
-    return [*made.notes, *([f"kept as they are in the given map, as they were not seen: {unseen}"] if unseen else [])]
+    return [*made.notes, *([f"not observed, kept from the given map: {unseen}"] if unseen else [])]
 
 
 def _notes_on_tags(made: MadeTags) -> list[str]:
     """Lines on what the table does not show: unmapped tags, and the RMS distance from the given positions."""
     listed = {entry.landmark for entry in made.made.entries}
-    others = {name: why for name, why in made.open.items() if name not in listed}
-    told = [*made.made.notes]
+    unmapped = {name: why for name, why in made.open.items() if name not in listed}
+    lines = [*made.made.notes]
     kept = [name for name in made.open if name in made.world.tags]
     if kept:
-        told.append(f"kept unchanged from the given map, as they could not be located: {', '.join(kept)}")
+        lines.append(f"not located, kept from the given map: {', '.join(kept)}")
     silent = [name for name, why in made.open.items() if why.kind == "unread"]
     if silent:
-        told.append(f"never read: {', '.join(silent)}")
+        lines.append(f"never read: {', '.join(silent)}")
     if made.rms is not None:
-        told.append(f"root mean square distance from the given positions: {made.rms:.3f} m")
-    chance = [name for name, why in others.items() if why.kind == "chance"]
+        lines.append(f"root mean square distance from the given positions: {made.rms:.3f} m")
+    chance = [name for name, why in unmapped.items() if why.kind == "chance"]
     if chance:
-        told.append(
+        lines.append(
             f"{len(chance)} tags that the map lacks were read so rarely that no position explains the reads better than chance"
         )
-    return told + [f"not in the map: {name}, {why.text}" for name, why in others.items() if name not in chance]
+    return lines + [f"not in the map: {name}, {why.text}" for name, why in unmapped.items() if name not in chance]

@@ -115,7 +115,7 @@ def run(
 
 
 def _use(log: Log, config: RunConfig) -> Use:
-    """What a run uses of its log; InputError if the log or the configuration is out of bounds."""
+    """The sensors and settings of a run. Raises InputError if the log or the configuration is out of bounds."""
     check_max_gap(config.max_gap)
     check_tick_gap(config.tick_gap)
     require_bounds(log)  # the log may have been made by a program

@@ -107,24 +107,24 @@ def _mapped(
     rows: Integers,
     columns: Mapping[str, Sequence[str]],
     mapping: ColumnMapping,
-    there: Iterable[str],
+    available: Iterable[str],
     *,
     unwanted: int,
     passed: int = 0,
 ) -> Cells:
-    """The cells by field of the ``columns`` of a file, which has the columns ``there``."""
+    """The cells by field of the ``columns`` of a file with the columns ``available``."""
     fields = {field: columns[name] for field, name in mapping.columns.items() if name in columns}
     read = {*mapping.columns.values(), *mapping.where}
-    left_out = tuple(name for name in there if name not in read)
+    left_out = tuple(name for name in available if name not in read)
     labels, units = mapping.columns, mapping.units
     return Cells(path, rows, fields, labels, units, mapping.decimal, left_out, passed, unwanted)
 
 
 class TableFolder:
-    """A folder of tables, with notes on what is not read of them.
+    """A folder of tables, with notes on unread rows and columns.
 
-    ``warnings``: lines about the content of the tables. Several mappings may read one file. What one of them reads is
-    not left out.
+    ``warnings``: lines about the content of the tables. Several mappings may read one file. A row or column counts as read if one
+    of them reads it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -154,14 +154,14 @@ class TableFolder:
         for path, tables in self._read.items():
             read: set[int] = set()
             count = tables[0][0].unwanted + len(tables[0][0].rows)
-            others = count if all(cells.unwanted for cells, _ in tables) else 0
+            unchosen = count if all(cells.unwanted for cells, _ in tables) else 0
             for rows in (cells.rows.tolist() for cells, _ in tables):
-                others -= sum(row not in read for row in rows)  # a line of JSON may hold several
+                unchosen -= sum(row not in read for row in rows)  # a line of JSON may hold several
                 read.update(rows)
-            if others > 0:
+            if unchosen > 0:
                 names = listed(dict.fromkeys(name for _, mapping in tables for name in mapping.where))
                 lines.append(
-                    f"{path.name}: {others} of {count + tables[0][0].passed} rows have another {names} than where says"
+                    f"{path.name}: {unchosen} of {count + tables[0][0].passed} rows have another {names} than where says"
                 )
             never = [set(cells.left_out) for cells, _ in tables]
             names_of = tuple(name for name in tables[0][0].left_out if all(name in unread for unread in never))

@@ -67,7 +67,7 @@ def adjusted(
         gained = cost - new
         poses, tilts, points, cost, damping = new_poses, new_tilts, new_points, new, damping / 10.0
         residual, jacobian, other, others = other, others, residual, jacobian
-        if gained < GAIN * cost:
+        if gained <= GAIN * cost:
             break
     return poses, tilts, residual
 

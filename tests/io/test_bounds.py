@@ -50,7 +50,7 @@ def write(folder, table, column, value, kind):
     return folder / f"{table.name}.{kind}"
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(place=st.sampled_from(NUMBERS), share=st.floats(0.0, 1.0), kind=st.sampled_from(["csv", "parquet"]))
 @example(place=(INCREMENTS, INCREMENTS["dx"]), share=0.0, kind="csv")
 @example(place=(INCREMENTS, INCREMENTS["dx"]), share=1.0, kind="parquet")

@@ -297,7 +297,7 @@ def logs(draw: st.DrawFn) -> Log:
 
 
 @given(log=logs(), format=st.sampled_from(["csv", "parquet"]))
-@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 def test_what_is_written_comes_back(tmp_path_factory, log, format):
     folder = tmp_path_factory.mktemp("logs") / "out"
     write_native(log, folder, format=format)

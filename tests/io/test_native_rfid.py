@@ -174,7 +174,7 @@ def streams(draw):
 
 
 @given(stream=streams(), format=st.sampled_from(["csv", "parquet"]), t0_ns=st.integers(-(10**18), 2 * 10**18))
-@settings(max_examples=40, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, suppress_health_check=list(HealthCheck))
 def test_what_is_written_comes_back(tmp_path_factory, stream, format, t0_ns):
     odometry = VelocityStream(np.array((0.0, 1.0)), np.ones(2), np.zeros(2))
     rig = Rig(sensors=("odometry", "rfid"), rfid=RfidSettings(antennas={"left": AntennaSettings(yaw=0.5)}))

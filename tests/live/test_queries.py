@@ -111,9 +111,7 @@ def answers(localizer):
     return {what: bits(getattr(localizer, what)()) for what in ASKED}
 
 
-questions = st.lists(
-    st.tuples(st.floats(0.0, 1.0), st.sampled_from(ASKED), st.floats(0.0, 5.0)), min_size=4, max_size=20
-)
+questions = st.lists(st.tuples(st.floats(0.0, 1.0), st.sampled_from(ASKED), st.floats(0.0, 5.0)), max_size=12)
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
@@ -134,7 +132,7 @@ def unchanged(log, case):
     expected = answers(expected)
 
     @given(asked=questions)
-    @settings(max_examples=4, deadline=None)
+    @settings(max_examples=8, deadline=None)
     def check(asked):
         localizer, rows = started(log, case)
         for i, m in enumerate(rows):

@@ -130,12 +130,12 @@ def test_wrong_names(policy: str, estimator: str, message: str) -> None:
 
 def test_two_places_that_look_alike_are_told_apart() -> None:
     """Beside the tag in the middle of the corridors the robot may be at two places, turned by half. It has to go where the arms
-    differ to find out, and to say nothing before. Four runs in a hundred claim a wrong place (8 of seeds 1 to 200), so one of
-    these two would by chance in 8 % of all choices of seeds."""
+    differ to find out, and to say nothing before. Four runs in a hundred claim a wrong place (8 of seeds 1 to 200), so two of
+    these five would by chance in 1.5 % of all choices of seeds."""
     settings = ActiveSettings(start=(12.0, 12.0, 0.1))
-    runs = [run_active(preset("symmetric"), "information", "active_mcl", seed, settings) for seed in (1, 2)]
+    runs = [run_active(preset("symmetric"), "information", "active_mcl", seed, settings) for seed in range(1, 6)]
     assert all(run.localized for run in runs)
-    assert not any(run.claimed_wrong for run in runs)
+    assert sum(run.claimed_wrong for run in runs) <= 1
     assert min(run.metres for run in runs) > 8.0
     for run in runs:
         early = next(step for step in run.steps if step.metres > 3.0)

@@ -81,25 +81,25 @@ def found_again(points: np.ndarray, sizes: np.ndarray, keypoints: Keypoints) -> 
     return np.asarray((away < 0.5 * sizes[:, None]) & (np.maximum(ratio, 1.0 / ratio) < 1.3))
 
 
-@settings(max_examples=8)
+@settings(max_examples=15)
 @given(angle=st.floats(-np.pi, np.pi))
 def test_rotation(angle: float) -> None:
     check(*warped(angle, 1.0))
 
 
-@settings(max_examples=8)
+@settings(max_examples=15)
 @given(zoom=st.floats(0.5, 2.0))
 def test_zoom(zoom: float) -> None:
     check(*warped(0.0, zoom))
 
 
-@settings(max_examples=8)
+@settings(max_examples=15)
 @given(angle=st.floats(-np.pi, np.pi), zoom=st.floats(0.6, 1.6))
 def test_rotation_and_zoom(angle: float, zoom: float) -> None:
     check(*warped(angle, zoom))
 
 
-@settings(max_examples=8)
+@settings(max_examples=15)
 @given(contrast=st.floats(0.3, 1.0), brightness=st.floats(0.0, 1.0))
 def test_brightness_and_contrast(contrast: float, brightness: float) -> None:
     image = texture() * contrast + 255.0 * (1.0 - contrast) * brightness
