@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factorgraph_loc.evaluation.features.repeatability import OVERLAP_ERROR, SCALE_RATIO, common, overlaps
+from factorgraph_loc.evaluation.features.repeatability import alike_regions, common
 from factorgraph_loc.evaluation.features.sequences import Sequence
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.vision.colour import Float
@@ -40,9 +40,7 @@ def matched_values(sequence: Sequence) -> list[tuple[Float, Float]]:
         homography = to[j] @ np.linalg.inv(to[i])
         both = common(first, second, homography, (shape, other_shape))
         rows, columns = (np.flatnonzero(one) for one in both)
-        pairs = overlaps(first[rows], second[columns], homography, magnified=False)
-        alike = np.maximum(pairs.ratio, 1.0 / pairs.ratio) < SCALE_RATIO
-        same = pairs.best((pairs.error < OVERLAP_ERROR) & alike)
+        same = alike_regions(first[rows], second[columns], homography)
         matched.append((first_values[rows[same.first]], second_values[columns[same.second]]))
     return matched
 

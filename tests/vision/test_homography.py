@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.features.sequences import (
-    corner_error,
     inside,
     jacobians,
     project,
@@ -50,11 +49,6 @@ def test_inside_is_up_to_the_centres_of_the_border_pixels():
 def test_view_of_a_similarity(zoom, angle):
     found = view(similarity(zoom, angle, (30.0, -7.0)), SHAPE)
     assert found == pytest.approx((zoom, angle, 1.0), rel=1e-6, abs=1e-6)
-
-
-def test_corner_error_is_in_pixels_of_the_second_image():
-    assert corner_error(similarity(2.0, 0.3, (3.0, 4.0)), similarity(2.0, 0.3), SHAPE) == pytest.approx(5.0)
-    assert corner_error(np.array(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-0.01, 0.0, 1.0))), np.eye(3), SHAPE) == np.inf
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ from factorgraph_loc.evaluation.features.repeatability import (
     OVERLAP_ERROR,
     RADIUS,
     SCALE_RATIO,
-    distinct_count,
     overlaps,
     pair_errors,
     repeatability,
@@ -101,8 +100,7 @@ def test_no_pair_is_missed():
 def test_the_same_points_repeat_fully():
     points = scattered(100, np.random.default_rng(3))
     found = repeatability(points, points, np.eye(3), SHAPES)
-    assert (found.regions, found.repeatability, found.strict, found.near) == (100, 1.0, 1.0, 1.0)
-    assert found.non_redundant > 0.8
+    assert (found.regions, found.repeatability, found.strict) == (100, 1.0, 1.0)
 
 
 def test_only_the_common_part_counts():
@@ -111,49 +109,28 @@ def test_only_the_common_part_counts():
     # two more where only the second image looks
     second = points_at([*seen.points, (5.0, 5.0), (600.0, 470.0)], 4.0)
     found = repeatability(first, second, ZOOM, SHAPES)
-    assert (found.regions, found.repeatability, found.strict, found.near) == (3, 1.0, 1.0, 1.0)
+    assert (found.regions, found.repeatability, found.strict) == (3, 1.0, 1.0)
 
 
-def test_each_score_is_lenient_about_its_own_thing():
+def test_the_strict_score_rejects_other_places_and_sizes():
     grid = [(x, y) for x in range(100, 600, 100) for y in range(100, 400, 100)]
     first = points_at(grid, 4.0)
     moved = points_at([(x + 7.0, y) for x, y in grid], 4.0)
     found = repeatability(first, moved, np.eye(3), SHAPES)
-    assert (found.repeatability, found.strict, found.near) == (1.0, 0.0, 0.0)
+    assert (found.repeatability, found.strict) == (1.0, 0.0)
     grown = points_at(grid, 4.0 * (SCALE_RATIO + 0.04))
     found = repeatability(first, grown, np.eye(3), SHAPES)
-    assert (found.repeatability, found.strict, found.near) == (1.0, 0.0, 1.0)
+    assert (found.repeatability, found.strict) == (1.0, 0.0)
     larger = points_at(grid, 4.0 * 1.4)
     found = repeatability(first, larger, np.eye(3), SHAPES)
-    assert (found.repeatability, found.strict, found.near) == (0.0, 0.0, 1.0)
-
-
-def test_redundant_points_repeat_but_cover_little():
-    rng = np.random.default_rng(5)
-    spread = scattered(40, rng)
-    heap = points_at(rng.normal((300.0, 200.0), 1.0, (40, 2)), 4.5)
-    for points, low, high in ((spread, 0.8, 1.0), (heap, 0.02, 0.15)):
-        found = repeatability(points, points, np.eye(3), SHAPES)
-        assert found.repeatability == 1.0
-        assert low < found.non_redundant < high
+    assert (found.repeatability, found.strict) == (0.0, 0.0)
 
 
 def test_several_orientations_are_one_region():
     once = scattered(30, np.random.default_rng(6))
     twice = once[np.repeat(np.arange(30), 2)]
-    single, double = (repeatability(points, points, np.eye(3), SHAPES) for points in (once, twice))
-    assert (double.regions, double.repeatability, double.strict, double.near) == (30, 1.0, 1.0, 1.0)
-    # but they are redundant
-    assert double.non_redundant == pytest.approx(0.5 * single.non_redundant)
-
-
-def test_distinct_count_of_known_sets():
-    far = np.array(((0.0, 0.0), (1e4, 0.0), (0.0, 1e4)))
-    assert distinct_count(far, np.array((1.0, 2.0, 3.0))) == pytest.approx(3.0)
-    assert distinct_count(np.zeros((7, 2)), np.full(7, 2.5)) == pytest.approx(1.0)
-    # two Gaussians 2 sigma apart: each is the highest on its side, Phi(1) of its volume
-    near = np.array(((0.0, 0.0), (2.0, 0.0)))
-    assert distinct_count(near, np.ones(2)) == pytest.approx(2.0 * 0.8413, abs=0.05)
+    found = repeatability(twice, twice, np.eye(3), SHAPES)
+    assert (found.regions, found.repeatability, found.strict) == (30, 1.0, 1.0)
 
 
 def test_the_level_of_chance():
@@ -164,7 +141,6 @@ def test_the_level_of_chance():
     found = repeatability(first, second, np.eye(3), ((640, 800), (640, 800)))
     assert 0.15 < found.repeatability < 0.35
     assert found.strict < 0.1
-    assert found.near < 0.1
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,7 @@
-"""Evaluation of features on image sequences with known homographies: repeatability, matching, and homography estimation.
+"""Evaluation of features on image sequences with known homographies: repeatability and matching.
 
 Matching score and recall over 1 - precision: Mikolajczyk, Schmid, "A Performance Evaluation of Local Descriptors", PAMI 27, 2005,
 section 3; a match is correct if the regions of its points overlap (:mod:`~factorgraph_loc.evaluation.features.repeatability`).
-Mean average accuracy of the homography: Jin et al., "Image Matching across Wide Baselines", IJCV 129, 2021, section 4, with the
-error at the image's corners.
 """
 
 import time
@@ -29,18 +27,13 @@ from factorgraph_loc.evaluation.features.repeatability import (
     pair_errors,
     repeatability,
 )
-from factorgraph_loc.evaluation.features.sequences import Sequence, corner_error
+from factorgraph_loc.evaluation.features.sequences import Sequence
 from factorgraph_loc.files.models import nearest
 from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.features import EXTRACTORS, Descriptors, Integers, Keypoints, extractor
 from factorgraph_loc.vision.images import Image
 from factorgraph_loc.vision.matching import RATIO, distance_matrix, nearest_neighbours, resolution
 from factors.se2 import Array
-
-THRESHOLDS = np.arange(1.0, 11.0)  # px, of the homography's error
-
-_INLIER = 3.0  # px, of the robust fit
-_CONFIDENCE, _ITERATIONS = 0.9999, 10_000
 
 Matched = tuple[Integers, Integers, Array]  # indices in the first and the second image, ratio of distances
 
@@ -58,17 +51,14 @@ class MatchScores:
     """Matching scores of a pair of images; NaN for detectors without descriptors.
 
     ``matching_score``: correct mutual matches over the smaller number of features in the common part; ``matches``: mutual ones
-    with a ratio below :data:`RATIO`, ``precision``: fraction of correct ones; ``average_precision``: area below precision over
-    recall; ``homography_error`` [px]: at the corners, of the homography fitted to them, infinite if there is none; ``accuracy``:
-    fraction of :data:`THRESHOLDS` that it is below. Without matches the scores are 0.
+    with a ratio below :data:`~factorgraph_loc.vision.matching.RATIO`, ``precision``: fraction of correct ones;
+    ``average_precision``: area below precision over recall. Without matches the scores are 0.
     """
 
     matches: int = 0
     matching_score: float = np.nan
     precision: float = np.nan
     average_precision: float = np.nan
-    homography_error: float = np.nan
-    accuracy: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -99,21 +89,18 @@ class RankedMatches:
     """Mutual nearest neighbours of a pair of images, by increasing ratio.
 
     ``ratio`` (M,): of the distances to the nearest and the second nearest; ``right`` (M,): whether the match is correct;
-    ``possible``: the number of correct matches of a perfect matcher.
+    ``possible``: the number of correct matches of a perfect matcher; ``features``: the smaller number of features in the common
+    part.
     """
 
     ratio: Array
     right: Truths
     possible: int
-
-    def curve(self) -> tuple[Array, Array]:
-        """Recall (M,) and 1 - precision (M,) for an increasing number of matches."""
-        correct = np.cumsum(self.right)
-        return correct / max(self.possible, 1), 1.0 - correct / np.arange(1, len(self.right) + 1)
+    features: int
 
     def average_precision(self) -> float:
         """Sum of the precision at each correct match, over ``possible``; 0 if nothing could be matched."""
-        precision = 1.0 - self.curve()[1]
+        precision = np.cumsum(self.right) / np.arange(1, len(self.right) + 1)
         return float(np.sum(precision[self.right]) / max(self.possible, 1))
 
 
@@ -128,13 +115,8 @@ def feature(name: str, count: int) -> Feature:
     return Feature(name, lambda image: (DETECTORS[name](image, count), None))
 
 
-def evaluate(
-    sequence: Sequence, what: Feature, progress: Callable[[], None] = lambda: None
-) -> Iterator[tuple[PairScores, RankedMatches | None]]:
-    """Scores of a feature on each pair of a sequence, with the ranked matches if it has descriptors.
-
-    Each image is processed on one thread; ``progress`` is called after it.
-    """
+def evaluate(sequence: Sequence, what: Feature, progress: Callable[[], None] = lambda: None) -> Iterator[PairScores]:
+    """Scores of a feature on each pair of a sequence. Each image is processed on one thread; ``progress`` is called after it."""
     with _one_thread():
         what.find(sequence.first)  # exclude compilation and allocation at first use from the time
         (keypoints, descriptors), _ = _timed(what, sequence.first)
@@ -143,13 +125,12 @@ def evaluate(
             (others, others_described), milliseconds = _timed(what, image)
             shapes = (sequence.first.shape, image.shape)
             again = repeatability(keypoints, others, homography, shapes)
-            ranked, matched = None, MatchScores()
+            matched = MatchScores()
             if descriptors is not None and others_described is not None:
                 matches = mutual_matches(descriptors, others_described)
-                ranked = rank(keypoints, others, matches, homography, shapes)
-                matched = _match_scores(keypoints, others, matches, ranked, homography, shapes)
+                matched = match_scores(rank(keypoints, others, matches, homography, shapes))
             about = (what.name, sequence.name, sequence.change, k + 2, sequence.amounts[k])
-            yield PairScores(*about, len(others), milliseconds, again, matched), ranked
+            yield PairScores(*about, len(others), milliseconds, again, matched)
             progress()
 
 
@@ -184,37 +165,17 @@ def rank(first: Keypoints, second: Keypoints, matches: Matched, homography: Arra
     graph = csr_array((np.ones(int(np.count_nonzero(close))), (pairs.first[close], pairs.second[close])), shape=size)
     possible = int(np.count_nonzero(maximum_bipartite_matching(graph) >= 0)) if min(size) else 0
     order = np.argsort(ratio, kind="stable")
-    return RankedMatches(ratio[order], right[order], possible)
+    return RankedMatches(ratio[order], right[order], possible, min(size))
 
 
-def homography_error(first: Array, second: Array, truth: Array, shape: tuple[int, ...]) -> float:
-    """Error [px] at the corners of the first image, of ``shape``, of a homography fitted robustly to matched points (M, 2).
-
-    Infinite if the fit fails.
-    """
-    if len(first) < 4:
-        return np.inf
-    estimate, _ = cv2.findHomography(
-        first, second, cv2.USAC_MAGSAC, _INLIER, maxIters=_ITERATIONS, confidence=_CONFIDENCE
-    )
-    return np.inf if estimate is None else corner_error(np.asarray(estimate, dtype=float), truth, shape)
-
-
-def _match_scores(
-    first: Keypoints, second: Keypoints, matches: Matched, ranked: RankedMatches, homography: Array, shapes: Shapes
-) -> MatchScores:
-    i, j, ratio = matches
-    clear = ratio < RATIO
-    clear_right = int(np.count_nonzero(ranked.right[ranked.ratio < RATIO]))
-    error = homography_error(first.points[i[clear]], second.points[j[clear]], homography, shapes[0])
-    in_both = min(int(np.count_nonzero(inner)) for inner in common(first, second, homography, shapes))
+def match_scores(ranked: RankedMatches) -> MatchScores:
+    """The scores of the matches of a pair of images."""
+    clear = ranked.right[ranked.ratio < RATIO]
     return MatchScores(
-        int(np.count_nonzero(clear)),
-        int(np.count_nonzero(ranked.right)) / max(in_both, 1),
-        clear_right / max(int(np.count_nonzero(clear)), 1),
+        len(clear),
+        int(np.count_nonzero(ranked.right)) / max(ranked.features, 1),
+        int(np.count_nonzero(clear)) / max(len(clear), 1),
         ranked.average_precision(),
-        error,
-        float(np.mean(error <= THRESHOLDS)),
     )
 
 

@@ -5,10 +5,7 @@ Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005, se
 correspondences over the smaller number of regions in the common part of the scene. Both regions of a pair are scaled such that
 the one in the first image has a radius of 30 px; otherwise large regions would overlap however inaccurate they are.
 
-The other scores are stricter: in the size of a region and its position in units of the size (``strict``); in the position in
-pixels of the first image (``near``); in the image area covered by the repeated regions, each as a Gaussian whose standard
-deviation is the size of its point (``non_redundant``: Rey-Otero, Delbracio, Morel, "Comparing Feature Detectors: A Bias in the
-Repeatability Criteria", ICIP 2015).
+The ``strict`` score compares regions in their own size: their position in units of the size, and a ratio of sizes near 1.
 """
 
 from __future__ import annotations
@@ -27,10 +24,8 @@ OVERLAP_ERROR = 0.4
 RADIUS = 30.0  # px, of a scaled region in the first image
 MEASUREMENT = 3.0  # radius of the region that describes a point, in units of half its size
 SCALE_RATIO = 1.2  # maximum ratio of sizes in the strict score
-NEAR = 3.0  # px
 
 _NODES = 64  # of the integration over a disc
-_SAMPLES = 48  # points that represent one Gaussian
 _CHUNK = 20_000
 
 Truths = NDArray[np.bool_]
@@ -47,8 +42,6 @@ class Repeatability:
     regions: int
     repeatability: float
     strict: float
-    non_redundant: float
-    near: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,24 +64,24 @@ class Candidates:
 def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> Repeatability:
     """The scores of points found in two images of ``shapes`` (height, width, ...); ``homography`` maps the first to the second.
 
-    Points with several orientations count as one region, except for the redundancy score.
+    Points with several orientations count as one region.
     """
     in_first, in_second = common(first, second, homography, shapes)
-    first, second = first[in_first], second[in_second]
-    points = min(len(first), len(second))
-    first, second = distinct(first), distinct(second)
+    first, second = distinct(first[in_first]), distinct(second[in_second])
     count = min(len(first), len(second))
     if count == 0:
-        return Repeatability(0, 0.0, 0.0, 0.0, 0.0)
+        return Repeatability(0, 0.0, 0.0)
     pairs = overlaps(first, second, homography)
     again = pairs.best(pairs.error < OVERLAP_ERROR)
-    own = overlaps(first, second, homography, magnified=False)
-    alike = np.maximum(own.ratio, 1.0 / own.ratio) < SCALE_RATIO
-    strict = own.best((own.error < OVERLAP_ERROR) & alike)
-    found = first[again.first]
-    covered = distinct_count(found.points, found.sizes)
-    near = _near(first, second, homography)
-    return Repeatability(count, len(again.first) / count, len(strict.first) / count, covered / points, near / count)
+    strict = alike_regions(first, second, homography)
+    return Repeatability(count, len(again.first) / count, len(strict.first) / count)
+
+
+def alike_regions(first: Keypoints, second: Keypoints, homography: Array) -> Candidates:
+    """One-to-one pairs of points whose regions, in their own size, overlap, with a ratio of sizes below :data:`SCALE_RATIO`."""
+    pairs = overlaps(first, second, homography, magnified=False)
+    alike = np.maximum(pairs.ratio, 1.0 / pairs.ratio) < SCALE_RATIO
+    return pairs.best((pairs.error < OVERLAP_ERROR) & alike)
 
 
 def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> tuple[Truths, Truths]:
@@ -170,28 +163,6 @@ def one_to_one(first: Integers, second: Integers, error: Array) -> Integers:
     return np.array(rows, dtype=np.int64)
 
 
-def distinct_count(points: Array, sigmas: Array) -> float:
-    """The number of ``points`` (N, 2) without redundancy: the volume below the maximum of Gaussians of volume 1 around them, of
-    standard deviations ``sigmas`` (N,) (Rey-Otero et al., 2015, section 3).
-
-    N for distant points, 1 for N identical ones. Computed as the fraction of each Gaussian in which it is the highest, on a fixed
-    sample.
-    """
-    n = len(points)
-    k = np.arange(_SAMPLES) + 0.5
-    radius, angle = np.sqrt(-2.0 * np.log(1.0 - k / _SAMPLES)), k * np.pi * (3.0 - np.sqrt(5.0))
-    pattern = np.column_stack((radius * np.cos(angle), radius * np.sin(angle)))
-    height = -2.0 * np.log(sigmas)
-    total = 0
-    for i in range(n):
-        at = points[i] + sigmas[i] * pattern
-        squared = ((at[:, None] - points) ** 2).sum(axis=2) / sigmas**2
-        logs = height - 0.5 * squared
-        # of equal ones the first counts
-        total += int(np.count_nonzero(np.argmax(logs, axis=1) == i))
-    return total / _SAMPLES
-
-
 def distinct(keypoints: Keypoints) -> Keypoints:
     """Each position and size once, in the order of the points."""
     rows = np.column_stack((keypoints.points, keypoints.sizes))
@@ -203,12 +174,3 @@ def _sizes_in_first(second: Keypoints, homography: Array) -> Array:
     """The sizes of the second image's points in the first, for discs of equal area."""
     areas = np.abs(np.linalg.det(jacobians(invert(homography), second.points)))
     return np.asarray(second.sizes * np.sqrt(areas))
-
-
-def _near(first: Keypoints, second: Keypoints, homography: Array) -> int:
-    """Number of one-to-one pairs within :data:`NEAR` in the first image, whatever their sizes."""
-    mapped = project(invert(homography), second.points)
-    near = cKDTree(mapped).query_ball_point(first.points, NEAR)
-    i = np.repeat(np.arange(len(first)), [len(row) for row in near]).astype(np.int64)
-    j = np.concatenate([np.asarray(row, dtype=np.int64) for row in near])
-    return len(one_to_one(i, j, np.linalg.norm(first.points[i] - mapped[j], axis=1)))

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from collections.abc import Sequence as Several
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import polars as pl
 
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend
-from factorgraph_loc.evaluation.features.feature_evaluation import Feature, RankedMatches, evaluate
+from factorgraph_loc.evaluation.features.feature_evaluation import Feature, evaluate
 from factorgraph_loc.evaluation.features.sequences import OTHER, Sequence
 from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.tables import markdown
@@ -21,29 +22,20 @@ from factorgraph_loc.files.tables import write_parquet
 from factorgraph_loc.files.temporary import require_free, writing
 from factorgraph_loc.vision.matching import RATIO
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-FILES = ("table.md", "pairs.parquet", "matches.parquet", "figure3.png", "matching.png")
+FILES = ("table.md", "pairs.parquet", "figure3.png")
 OURS = "colour"
-HOMOGRAPHY = 5.0  # px, largest error of a correct homography in the table
 
 # columns of the table: key of the rows, digits
 COLUMNS = {
     "features": ("features", 0),
     "repeatability": ("repeatability", 3),
     "strict": ("strict", 3),
-    "non-redundant": ("non_redundant", 3),
-    "within 3 px": ("near", 3),
     "matching score": ("matching_score", 3),
     f"precision at {RATIO:g}": ("precision", 3),
     "average precision": ("average_precision", 3),
-    "H mAA": ("accuracy", 3),
-    f"H < {HOMOGRAPHY:g} px": ("homography_found", 2),
     "time [ms]": ("milliseconds", 1),
 }
 _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
-_PANELS = 3  # side by side
 
 Row = dict[str, Any]
 
@@ -51,13 +43,9 @@ Row = dict[str, Any]
 @dataclass(frozen=True)
 class FeatureScores:
     """``rows``: one per feature and pair of images, with the fields of
-    :class:`~factorgraph_loc.evaluation.features.feature_evaluation.PairScores`.
-
-    ``ranked``: the ranked matches of each row, None for detectors.
-    """
+    :class:`~factorgraph_loc.evaluation.features.feature_evaluation.PairScores`."""
 
     rows: list[Row]
-    ranked: list[RankedMatches | None]
 
     def names(self) -> list[str]:
         """The features, in the order of the rows."""
@@ -67,34 +55,25 @@ class FeatureScores:
         """The names of the sequences, in the order of the rows."""
         return list(dict.fromkeys(row["sequence"] for row in self.rows))
 
-    def of(self, name: str, sequences: Several[str]) -> list[int]:
-        """The indices of the rows of one feature on some sequences."""
-        return [i for i, r in enumerate(self.rows) if r["feature"] == name and r["sequence"] in sequences]
+    def of(self, name: str, sequences: Several[str]) -> list[Row]:
+        """The rows of one feature on some sequences."""
+        return [row for row in self.rows if row["feature"] == name and row["sequence"] in sequences]
 
 
 def evaluate_all(
     sequences: Several[Sequence], features: Several[Feature], progress: Callable[[float, float], None]
 ) -> FeatureScores:
     """The scores of each feature on each sequence; ``progress`` is called with the number of images done, and of all."""
-    scores = FeatureScores([], [])
     total = len(features) * sum(1 + len(sequence.others) for sequence in sequences)
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        progress(done, total)
-
-    for sequence in sequences:
-        for feature in features:
-            for pair, ranked in evaluate(sequence, feature, step):
-                row = pair.row()
-                # detectors have no homography, which is not the same as a failed one
-                error = row["homography_error"]
-                row["homography_found"] = error if np.isnan(error) else float(error < HOMOGRAPHY)
-                scores.rows.append(row)
-                scores.ranked.append(ranked)
-    return scores
+    done = itertools.count(1)
+    return FeatureScores(
+        [
+            pair.row()
+            for sequence in sequences
+            for feature in features
+            for pair in evaluate(sequence, feature, lambda: progress(next(done), total))
+        ]
+    )
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:
@@ -103,16 +82,13 @@ def check_free(out: Path, *, overwrite: bool) -> None:
 
 
 def write_scores(scores: FeatureScores, out: Path) -> None:
-    """Write :data:`FILES` into ``out``: tables, the scores of all pairs, all ranked matches, and both plots."""
+    """Write :data:`FILES` into ``out``: tables, the scores of all pairs, and the plot of repeatability."""
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         write_text(out / "table.md", tables(scores))
-        frame = pl.DataFrame(scores.rows).drop("homography_found")
-        unknown = (pl.col(pl.Float64).is_nan()) | (pl.col(pl.Float64).is_infinite())
-        write_parquet(frame.with_columns(pl.when(~unknown).then(pl.col(pl.Float64))), out / "pairs.parquet")
-        write_parquet(_matches(scores), out / "matches.parquet")
-        for name, draw in (("figure3.png", figure3), ("matching.png", recall_curves)):
-            write_picture(draw(scores), out / name)
+        frame = pl.DataFrame(scores.rows).with_columns(pl.col(pl.Float64).fill_nan(None))
+        write_parquet(frame, out / "pairs.parquet")
+        write_picture(figure3(scores), out / "figure3.png")
 
 
 def summary(scores: FeatureScores, sequences: Several[str] | None = None) -> tuple[list[str], list[list[str]]]:
@@ -121,7 +97,7 @@ def summary(scores: FeatureScores, sequences: Several[str] | None = None) -> tup
     chosen = scores.sequences() if sequences is None else sequences
     lines = []
     for name in scores.names():
-        rows = [scores.rows[i] for i in scores.of(name, chosen)]
+        rows = scores.of(name, chosen)
         lines.append([name, *(_cell([row[key] for row in rows], key, digits) for key, digits in COLUMNS.values())])
     return ["feature", *COLUMNS], lines
 
@@ -164,40 +140,10 @@ def figure3(scores: FeatureScores) -> Any:
             row[1].fill_between(x, values.min(axis=0), values.max(axis=0), color="0.88", label="range of the others")
             row[1].plot(*_means(scores, OURS, members), label=OURS, **_style(OURS, scores.names()))
         for axis in row:
-            axis.set(
-                title=title, ylim=(0.0, 1.0), xlabel=scores.rows[scores.of(scores.names()[0], members)[0]]["change"]
-            )
+            axis.set(title=title, ylim=(0.0, 1.0), xlabel=scores.of(scores.names()[0], members)[0]["change"])
         row[0].set_ylabel("repeatability")
     legend(figure, axes.flat)
     return figure
-
-
-def recall_curves(scores: FeatureScores) -> Any:
-    """Plot recall over 1 - precision for all pairs of a group, with the ratio of distances as threshold."""
-    groups = _groups(scores)
-    columns = min(_PANELS, len(groups))
-    rows = -(-len(groups) // columns)
-    figure, axes = grid(
-        rows, columns, 5.0 * rows + 1.2, "Mutual nearest neighbours, by a threshold on the ratio of distances"
-    )
-    for axis, (title, members) in zip(axes.flat, groups.items(), strict=False):
-        axis.set(title=title, xlim=(0.0, 1.0), ylim=(0.0, 1.0), xlabel="1 - precision", ylabel="recall")
-        for name in scores.names():
-            ranked = [r for i in scores.of(name, members) if (r := scores.ranked[i]) is not None]
-            if ranked:
-                _curve(axis, ranked, label=_label(name), **_style(name, scores.names(), markers=False))
-    for axis in axes.flat[len(groups) :]:
-        axis.set_visible(False)
-    legend(figure, axes.flat)
-    return figure
-
-
-def _curve(axis: Axes, ranked: Several[RankedMatches], **style: Any) -> None:
-    ratio = np.concatenate([r.ratio for r in ranked])
-    order = np.argsort(ratio, kind="stable")
-    right = np.concatenate([r.right for r in ranked])[order]
-    recall, false = RankedMatches(ratio[order], right, sum(r.possible for r in ranked)).curve()
-    axis.plot(false, recall, **style)
 
 
 def _groups(scores: FeatureScores) -> dict[str, list[str]]:
@@ -205,7 +151,7 @@ def _groups(scores: FeatureScores) -> dict[str, list[str]]:
     groups: dict[tuple[Any, ...], list[str]] = {}
     first = scores.names()[0]
     for sequence in scores.sequences():
-        rows = [scores.rows[i] for i in scores.of(first, [sequence])]
+        rows = scores.of(first, [sequence])
         change = rows[0]["change"]
         amounts = tuple(row["amount"] for row in rows)
         groups.setdefault((change, amounts, sequence if change == OTHER else ""), []).append(sequence)
@@ -218,16 +164,16 @@ def _groups(scores: FeatureScores) -> dict[str, list[str]]:
 
 def _means(scores: FeatureScores, name: str, sequences: Several[str]) -> tuple[list[float], list[float]]:
     """Amounts of change in ascending order, and the mean repeatability at each."""
-    rows = [scores.rows[i] for i in scores.of(name, sequences)]
+    rows = scores.of(name, sequences)
     amounts = sorted({row["amount"] for row in rows})
     return amounts, [float(np.mean([r["repeatability"] for r in rows if r["amount"] == x])) for x in amounts]
 
 
-def _style(name: str, names: Several[str], *, markers: bool = True) -> dict[str, Any]:
-    # the same style in all panels and both plots
+def _style(name: str, names: Several[str]) -> dict[str, Any]:
+    """The style of a feature, the same in all panels."""
     i = names.index(name)
-    style = {"color": COLOURS[i % len(COLOURS)], "linewidth": 2.0}
-    return style | {"marker": _MARKERS[i % len(_MARKERS)], "markersize": 7} if markers else style
+    marks = {"marker": _MARKERS[i % len(_MARKERS)], "markersize": 7}
+    return {"color": COLOURS[i % len(COLOURS)], "linewidth": 2.0, **marks}
 
 
 def _label(name: str) -> str:
@@ -240,16 +186,3 @@ def _cell(values: Several[float], key: str, digits: int) -> str:
     # first calls of a process and a busy machine cause outliers
     middle = np.median(values) if key == "milliseconds" else np.mean(values)
     return f"{middle:.{digits}f}"
-
-
-def _matches(scores: FeatureScores) -> pl.DataFrame:
-    """Every mutual match: feature, sequence, image, ratio of distances, and whether it is correct."""
-    frames = [
-        pl.DataFrame({"ratio": r.ratio, "right": r.right}).select(
-            *(pl.lit(row[key]).alias(key) for key in ("feature", "sequence", "image")), "ratio", "right"
-        )
-        for row, r in zip(scores.rows, scores.ranked, strict=True)
-        if r is not None
-    ]
-    schema = {"feature": pl.String, "sequence": pl.String, "image": pl.Int32, "ratio": pl.Float64, "right": pl.Boolean}
-    return pl.concat([pl.DataFrame(schema=schema), *(frame.cast({"image": pl.Int32}) for frame in frames)])

@@ -75,14 +75,6 @@ def corners(shape: tuple[int, ...]) -> Array:
     return np.array(((0.0, 0.0), (right, 0.0), (right, bottom), (0.0, bottom)))
 
 
-def corner_error(estimate: Array, truth: Array, shape: tuple[int, ...]) -> float:
-    """Mean distance [px] in the second image between the corners of the first, of ``shape``, mapped by both homographies;
-    infinite if ``estimate`` maps one to infinity."""
-    at = corners(shape)
-    distances = np.linalg.norm(project(estimate, at) - project(truth, at), axis=1)
-    return float(np.mean(distances)) if np.isfinite(distances).all() else np.inf
-
-
 def view(homography: Array, shape: tuple[int, ...]) -> ViewChange:
     """Zoom, rotation and tilt at the centre of the first image, of ``shape``."""
     (local,) = jacobians(homography, corners(shape).mean(axis=0, keepdims=True))
