@@ -116,7 +116,7 @@ def active(
     changes: Settings | None = None,
     jobs: int | None = None,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> ActiveResults:
     """Drive simulated robots from an unknown start until they are localized, and compare policies on the same seeds.
 

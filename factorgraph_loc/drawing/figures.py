@@ -99,7 +99,7 @@ def drawing(figure: Figure) -> Iterator[None]:
 
 def png(figure: Figure) -> Picture:
     """Return the figure as a PNG image for a page."""
-    return Picture.of("image/png", _png(figure))
+    return Picture.of("image/png", png_bytes(figure))
 
 
 def svg(figure: Figure) -> Picture:
@@ -115,10 +115,10 @@ def svg(figure: Figure) -> Picture:
 
 def save(figure: Figure, path: Path) -> None:
     """Write the figure as a PNG."""
-    path.write_bytes(_png(figure))
+    path.write_bytes(png_bytes(figure))
 
 
-def _png(figure: Figure) -> bytes:
+def png_bytes(figure: Figure) -> bytes:
     """A PNG with a palette, a third of the size of one in full colour.
 
     The octree quantizer keeps the colours of thin lines, which the default (median cut) blends.

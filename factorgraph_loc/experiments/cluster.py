@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from factorgraph_loc.errors import FglocError, InputError, RunFailedError
-from factorgraph_loc.experiments.execute import Executor, Files, Take, compute, failure
+from factorgraph_loc.experiments.execute import Executor, Files, Planned, Take, compute, failure
 from factorgraph_loc.experiments.keys import code_version, digest_of, library_versions
 from factorgraph_loc.experiments.log_source import GivenSource, LogSource, SimulatedSource
 from factorgraph_loc.experiments.plan import PlannedRun
@@ -56,7 +56,7 @@ class Cluster(Executor):
     def __init__(self, scheduler: str, limits: Limits) -> None:
         self._scheduler, self._seconds = scheduler, limits.time
         self._session = uuid4().hex  # for unique keys: a scheduler returns the stored result of a key, even a failure
-        self._sent: dict[Any, PlannedRun] = {}
+        self._sent: dict[Any, Planned] = {}
 
     def __enter__(self) -> Cluster:
         self._distributed = _import()
@@ -82,7 +82,7 @@ class Cluster(Executor):
     def submit(self, take: Take, left: int) -> None:
         room = AHEAD * max(1, sum(self._client.nthreads().values()))
         while len(self._sent) < min(room, left) and (run := take()) is not None:
-            findable = replace(run, source=_absolute(run.source))
+            findable = replace(run, source=_absolute(run.source)) if isinstance(run, PlannedRun) else run
             key = f"fgloc-{run.key}-{self._session}"
             future = self._client.submit(make, findable, version_here(), self._seconds, key=key, pure=False)
             self._sent[future] = run
@@ -119,7 +119,7 @@ class Cluster(Executor):
         raise RunFailedError(f"a worker could not make a run: {type(error).__name__}: {told(error)}") from error
 
 
-def make(run: PlannedRun, version: str, seconds: float) -> _Made:
+def make(run: Planned, version: str, seconds: float) -> _Made:
     """Compute a run on a worker, if its code and libraries have the digest ``version``, in at most ``seconds``."""
     from distributed import get_worker  # noqa: PLC0415
 

@@ -17,7 +17,7 @@ from factorgraph_loc.evaluation.plots import plot_log, remove_plots
 from factorgraph_loc.evaluation.report import DEFAULT
 from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, further_tables, markdown, unscored, verdict
 from factorgraph_loc.experiments.experiment import Prepared, run_experiment
-from factorgraph_loc.experiments.experiment_file import Experiment
+from factorgraph_loc.experiments.experiment_file import ENDLESS, Experiment
 from factorgraph_loc.experiments.log_source import GivenSource
 from factorgraph_loc.experiments.output import TABLES, write_tables
 from factorgraph_loc.experiments.plan import plan
@@ -31,7 +31,6 @@ from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.text import plain
 
-ENDLESS = 1e9  # s: no limit of a run
 # without results.parquet, which an unfinished comparison has
 _WRITTEN = (*(name for name in TABLES if name != "results.parquet"), PAGE)
 

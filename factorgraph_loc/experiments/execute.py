@@ -11,25 +11,19 @@ import json
 import tempfile
 import time
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
-from time import perf_counter
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
-from factorgraph_loc.errors import FglocError, InputError
-from factorgraph_loc.experiments.plan import PlannedRun
+from factorgraph_loc.errors import FglocError
+from factorgraph_loc.experiments.keys import VanishedError
 from factorgraph_loc.experiments.store import FAILURE, Store, StoreError
 from factorgraph_loc.text import told
 
-if TYPE_CHECKING:
-    from factorgraph_loc.experiments.log_source import LogSource
-    from factorgraph_loc.model.log import Log
-
 Files = dict[str, bytes]
-Kind = Literal["error", "timeout", "memory", "killed", "vanished"]
+Kind = Literal["error", "timeout", "memory", "killed", "vanished", "refused"]
 AGAIN = 0.5  # s after which a run that another process has claimed is tried again
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
@@ -43,15 +37,24 @@ class Outcome:
     reason: str | None = None
 
 
-class VanishedError(InputError):
-    """A log disappeared, or differs from the planned one."""
+class Planned(Protocol):
+    """A run as plain data that can be sent to other processes. ``key``: of its results; ``source``: of the data that it loads,
+    which the next run in the same process may share."""
+
+    @property
+    def key(self) -> str: ...
+    @property
+    def source(self) -> Hashable: ...
+
+    def make(self) -> Files:
+        """The files of the run. Raises FglocError if it fails for a known reason."""
 
 
 class Take(Protocol):
     """A function that returns the next claimed run, or None if there is none now."""
 
-    def __call__(self, loaded: LogSource | None = None, others: Sequence[LogSource] = ()) -> PlannedRun | None:
-        """The run is of the log ``loaded`` if possible, else of one that is not among ``others``."""
+    def __call__(self, loaded: Hashable = None, others: Sequence[Hashable] = ()) -> Planned | None:
+        """The run has the source ``loaded`` if possible, else one that is not among ``others``."""
 
 
 class Executor(AbstractContextManager[Any], Protocol):
@@ -65,18 +68,18 @@ class Executor(AbstractContextManager[Any], Protocol):
 
 
 class _Queue:
-    """The runs that are to be made, by log, and the ``later`` ones, which another process has claimed."""
+    """The runs that are to be made, by source, and the ``later`` ones, which another process has claimed."""
 
-    def __init__(self, runs: Sequence[PlannedRun]) -> None:
-        self._runs: dict[LogSource, list[PlannedRun]] = {}
-        self.later: list[tuple[float, PlannedRun]] = []
+    def __init__(self, runs: Sequence[Planned]) -> None:
+        self._runs: dict[Hashable, list[Planned]] = {}
+        self.later: list[tuple[float, Planned]] = []
         for run in runs:
             self._add(run)
 
     def __len__(self) -> int:
         return sum(map(len, self._runs.values())) + len(self.later)
 
-    def next(self, loaded: LogSource | None, others: Sequence[LogSource]) -> PlannedRun | None:
+    def next(self, loaded: Hashable, others: Sequence[Hashable]) -> Planned | None:
         """The next run; see :class:`Take`."""
         while self.later and self.later[0][0] <= time.monotonic():
             self._add(self.later.pop(0)[1])
@@ -85,17 +88,16 @@ class _Queue:
         most = max(self._runs, key=lambda source: len(self._runs[source]))
         free = next((source for source in self._runs if source not in others), most)
         chosen = loaded if loaded in self._runs else free
-        assert chosen is not None
         run = self._runs[chosen].pop(0)
         if not self._runs[chosen]:
             del self._runs[chosen]
         return run
 
-    def _add(self, run: PlannedRun) -> None:
+    def _add(self, run: Planned) -> None:
         self._runs.setdefault(run.source, []).append(run)
 
 
-def execute(runs: Sequence[PlannedRun], folder: Path, executor: Executor, *, again: bool = False) -> Iterator[Outcome]:
+def execute(runs: Sequence[Planned], folder: Path, executor: Executor, *, again: bool = False) -> Iterator[Outcome]:
     """Make ``runs``, store their results or failures in the store below ``folder`` unless they exist, and yield their outcomes.
 
     ``again``: repeat stored failures. A run that another process has claimed is waited for. When the generator is closed, the
@@ -105,7 +107,7 @@ def execute(runs: Sequence[PlannedRun], folder: Path, executor: Executor, *, aga
     claims: dict[str, ExitStack] = {}
     found: list[Outcome] = []
 
-    def take(loaded: LogSource | None = None, others: Sequence[LogSource] = ()) -> PlannedRun | None:
+    def take(loaded: Hashable = None, others: Sequence[Hashable] = ()) -> Planned | None:
         while (run := queue.next(loaded, others)) is not None:
             with ExitStack() as claim:
                 if not claim.enter_context(store.claim(run.key)):
@@ -134,22 +136,17 @@ def execute(runs: Sequence[PlannedRun], folder: Path, executor: Executor, *, aga
         store.sweep()
 
 
-def compute(run: PlannedRun) -> Files:
+def compute(run: Planned) -> Files:
     """The files of a run, or of its failure, for :meth:`~factorgraph_loc.experiments.store.Store.put`.
 
     Raises StoreError only, if there is no space for them.
     """
     import cv2  # noqa: PLC0415
 
-    from factorgraph_loc.experiments.output import run_files  # noqa: PLC0415
-    from factorgraph_loc.experiments.run import run as run_log  # noqa: PLC0415
-
     cv2.setNumThreads(1)
     _forget_peak_memory()
-    started = perf_counter()
     try:
-        log = _load(run.source, run.log_digest)
-        return run_files(run_log(log, run.config), log, started, run.align)
+        return run.make()
     except MemoryError:
         return failure("memory", "there was no memory left")
     except FglocError as error:
@@ -165,20 +162,6 @@ def failure(kind: Kind, reason: str, details: str = "") -> Files:
     """The files of a failed run; ``details``: a traceback."""
     content = {"kind": kind, "reason": reason} | ({"traceback": details} if details else {})
     return {FAILURE: (json.dumps(content, indent=2) + "\n").encode()}
-
-
-@lru_cache(maxsize=4)
-def _load(source: LogSource, digest: str) -> Log:
-    """The log of a source; cached, as consecutive runs use the same log."""
-    from factorgraph_loc.experiments.keys import source_digest  # noqa: PLC0415
-
-    try:
-        now = source_digest(source)
-    except InputError as error:
-        raise VanishedError(f"the log has vanished: {error}") from error
-    if now != digest:
-        raise VanishedError("the log has changed since the experiment was planned")
-    return source.load()
 
 
 def stored_outcome(key: str, store: Store) -> Outcome:

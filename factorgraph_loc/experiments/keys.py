@@ -1,6 +1,8 @@
 """Keys of runs, digests of all that a result depends on (log, configuration, code, libraries); and cached facts about
 logs and estimators for planning, as obtaining them requires numerical libraries or reading the log."""
 
+from __future__ import annotations
+
 import hashlib
 import importlib.metadata
 import json
@@ -11,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -22,6 +24,9 @@ from factorgraph_loc.files import bounded
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.shipped import readers
 from factorgraph_loc.text import plain
+
+if TYPE_CHECKING:
+    from factorgraph_loc.model.log import Log
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "numba")
 PACKAGE = __name__.partition(".")[0]
@@ -175,6 +180,22 @@ class FileDigests:
 def source_digest(source: LogSource) -> str:
     """The digest of a log's source, with every file read. Raises InputError if one is missing."""
     return FileDigests(None).of_source(source)
+
+
+class VanishedError(InputError):
+    """A log disappeared, or differs from the planned one."""
+
+
+@lru_cache(maxsize=4)
+def load_planned(source: LogSource, digest: str) -> Log:
+    """The log of a source that has the ``digest`` of the plan; cached, as consecutive runs use the same log."""
+    try:
+        now = source_digest(source)
+    except InputError as error:
+        raise VanishedError(f"the log has vanished: {error}") from error
+    if now != digest:
+        raise VanishedError("the log has changed since the experiment was planned")
+    return source.load()
 
 
 @dataclass(frozen=True)

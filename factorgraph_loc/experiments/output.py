@@ -8,7 +8,6 @@ import json
 import math
 import shutil
 import tempfile
-import traceback
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
 from factorgraph_loc.files.models import write_text, write_toml
@@ -112,10 +111,10 @@ def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: 
     write_tum(causal, folder / "causal.tum", log.t0_ns)
     write_parquet(estimates(result, log), folder / "estimates.parquet")
     write_toml(folder / "config.toml", result.config)
-    write_text(folder / "learnt.json", _json(learnt_tables(result.learnt)))
+    write_text(folder / "learnt.json", json_text(learnt_tables(result.learnt)))
     write_parquet(innovations(result, log), folder / INNOVATIONS)
     write_text(folder / EVENTS, events(result, log).write_csv())
-    write_text(folder / "metrics.json", _json(scores))
+    write_text(folder / "metrics.json", json_text(scores))
 
 
 def map_of(result: RunResult, log: Log) -> World | None:
@@ -236,7 +235,8 @@ def _slowest_update(result: RunResult) -> Array:
     return slowest
 
 
-def _json(content: Mapping[str, Any]) -> str:
+def json_text(content: Mapping[str, Any]) -> str:
+    """Plain values as JSON; numbers that are not finite are null."""
     return json.dumps(_plain(content), indent=2, allow_nan=False) + "\n"
 
 
@@ -260,12 +260,7 @@ def run_files(result: RunResult, log: Log, started: float, align: Alignment = "n
     with temporary_folder(of_system("run")) as folder:
         write_files(untimed, log, {k: v for k, v in scores.items() if k not in timings}, folder)
         files = {name: (folder / name).read_bytes() for name in FILES}
-    return files | {TIMINGS: timings_file(timings | {"timing.run_seconds": perf_counter() - started})}
-
-
-def timings_file(timings: Mapping[str, Any]) -> bytes:
-    """The content of ``timings.json``; non-finite values are null."""
-    return _json(timings).encode()
+    return files | {TIMINGS: json_text(timings | {"timing.run_seconds": perf_counter() - started}).encode()}
 
 
 def write_tables(table: pl.DataFrame, differences: pl.DataFrame, text: str, out: Path) -> None:
@@ -274,13 +269,3 @@ def write_tables(table: pl.DataFrame, differences: pl.DataFrame, text: str, out:
     write_text(out / "differences.csv", plain_lines(differences.write_csv()))
     write_text(out / "table.md", plain_lines(text))
     write_parquet(table, out / "results.parquet")
-
-
-def reason_of(error: Exception, details: Path) -> str:
-    """Why a run failed, on one line. The traceback of an unexpected error is written to the file ``details``."""
-    reason = " ".join(str(error).split())
-    if isinstance(error, FglocError):
-        return reason
-    details.parent.mkdir(parents=True, exist_ok=True)
-    write_text(details, "".join(traceback.format_exception(error)))
-    return f"{type(error).__name__}: {reason}"

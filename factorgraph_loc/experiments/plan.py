@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
@@ -19,7 +20,7 @@ from factorgraph_loc.experiments.experiment_file import (
     Sweep,
     canonical,
 )
-from factorgraph_loc.experiments.keys import Facts, FileDigests, run_key
+from factorgraph_loc.experiments.keys import Facts, FileDigests, load_planned, run_key
 from factorgraph_loc.experiments.log_source import LogSource, RecordedSource, SimulatedSource, recorded_sources
 from factorgraph_loc.files.data_root import named_path
 from factorgraph_loc.files.models import nearest, set_key
@@ -72,6 +73,15 @@ class PlannedRun:
         from factorgraph_loc.experiments.run import RunConfig  # noqa: PLC0415 - the plan needs no estimator
 
         return RunConfig(**{one.name: getattr(self, one.name) for one in fields(RunConfig)})
+
+    def make(self) -> dict[str, bytes]:
+        """The files of the run. Raises VanishedError if the log differs from the planned one, FglocError if the run fails."""
+        from factorgraph_loc.experiments.output import run_files  # noqa: PLC0415
+        from factorgraph_loc.experiments.run import run  # noqa: PLC0415
+
+        started = perf_counter()
+        log = load_planned(self.source, self.log_digest)
+        return run_files(run(log, self.config), log, started, self.align)
 
 
 @dataclass(frozen=True)

@@ -8,20 +8,18 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 from typing import TYPE_CHECKING
 
-from factorgraph_loc.experiments.execute import Executor, Files, Kind, Take, compute, failure
+from factorgraph_loc.experiments.execute import Executor, Files, Kind, Planned, Take, compute, failure
 from factorgraph_loc.files.bounded import resident_memory
 from factorgraph_loc.files.temporary import of_system, sweep
 from factorgraph_loc.processes import ProcessDiedError, Worker, serve, start
 
 if TYPE_CHECKING:
     from factorgraph_loc.experiments.experiment_file import Limits
-    from factorgraph_loc.experiments.log_source import LogSource
-    from factorgraph_loc.experiments.plan import PlannedRun
 
 LOOK = 0.1  # s between checks of memory and time
 ATTEMPTS = (
@@ -33,7 +31,7 @@ SLOW = ("cv2", "factorgraph_loc.experiments.output")  # modules that a worker im
 
 @dataclass(eq=False)
 class _Worker(Worker):
-    source: LogSource | None = None  # of its last run, whose log is loaded
+    source: Hashable = None  # of its last run, whose data are loaded
     since: float = 0.0
 
 
@@ -45,7 +43,7 @@ class Processes(Executor):
         self._memory = limits.memory * 1e6 if limits.memory is not None else SHARE * _machine_memory() / jobs
         self._deaths: Counter[str] = Counter()
         self._stillborn = 0
-        self._repeated: list[PlannedRun] = []
+        self._repeated: list[Planned] = []
         self._team: list[_Worker] = []
 
     def __exit__(self, *_: object) -> None:

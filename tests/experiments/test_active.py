@@ -5,10 +5,11 @@ import math
 import numpy as np
 import polars as pl
 import pytest
+from computed_here import Here
 
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.experiments import active
-from factorgraph_loc.experiments.active import ROW, jobs_of, run_job, run_jobs, seek
+from factorgraph_loc.experiments.active import ROW, jobs_of, run_jobs, seek
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
@@ -43,17 +44,11 @@ def calls(monkeypatch):
         ends = (metres < 14.0, metres, 2.0 * metres, 0.1, 0.05, False)
         return ActiveRun(seed, simulation.name, World(walls=WALLS), policy, estimator, *ends, truth, steps)
 
-    def here(function, jobs, *_, **__):
-        for i, job in enumerate(jobs):
-            try:
-                yield i, function(job)
-            except Exception as error:
-                yield i, error
-
     monkeypatch.setattr(active, "run_active", run)
-    monkeypatch.setattr(active, "run_each", here)
+    monkeypatch.setattr(active, "Processes", Here)
     monkeypatch.setattr(active, "CHUNK", 5)
     monkeypatch.setattr(active, "write_picture", lambda figure, path: path.write_text(type(figure).__name__))
+    monkeypatch.setattr(active, "png_bytes", lambda figure: type(figure).__name__.encode())
     return seen
 
 
@@ -81,7 +76,9 @@ def test_each_policy_runs_on_each_seed(calls, tmp_path):
 def test_files_of_an_experiment(tmp_path):
     out = tmp_path / "out"
     results = seek(OFFICE, ("information", "random"), ("active_mcl",), range(3), out)
-    assert sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()) == [
+    assert sorted(
+        str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and "store" not in path.parts
+    ) == [
         "config.toml",
         "differences.csv",
         "plots/comparison.png",
@@ -96,7 +93,6 @@ def test_files_of_an_experiment(tmp_path):
     assert difference["pairs"] == 3
     assert difference["difference"] == -math.inf  # the other never came there
     assert "information / random" in (out / "table.md").read_text()
-    assert not (out / "parts").exists()
     assert (out / "plots" / "comparison.png").read_text() == "Figure"
 
 
@@ -110,7 +106,8 @@ def test_a_run_that_fails_is_a_row(tmp_path):
         "office, information, active_mcl, seed 7: the pose is not finite",
         "office, information, active_mcl, seed 8: ZeroDivisionError: by zero",
     ]
-    assert "Traceback" in (tmp_path / "parts" / "office-active_mcl-information-8.error.txt").read_text()
+    stored = [path.read_text() for path in tmp_path.glob("store/*/*/failure.json")]
+    assert sorted("Traceback" in text for text in stored) == [False, True]
 
 
 @pytest.mark.usefixtures("calls")
@@ -121,20 +118,19 @@ def test_input_that_no_run_takes_is_an_error(tmp_path):
 
 
 def test_what_was_interrupted_goes_on(calls, tmp_path):
-    settings = ActiveSettings()
-    jobs = jobs_of(OFFICE, ("information",), ("active_mcl",), range(12), tmp_path, settings)
+    jobs = jobs_of(OFFICE, ("information",), ("active_mcl",), range(12), ActiveSettings())
     assert [job.seed for job in jobs] == list(range(12))
-    done = [run_job(job) for job in jobs[:5]]
+    done = run_jobs(jobs[:5], tmp_path, 1).rows
     calls.clear()
     told = []
-    rows = run_jobs(jobs, 1, lambda *counts: told.append(counts)).rows
+    rows = run_jobs(jobs, tmp_path, 1, lambda *counts: told.append(counts)).rows
     assert {seed for _, _, seed in calls} == set(range(5, 12))
     assert rows[:5] == done
     assert [row["seed"] for row in rows] == list(range(12))
     assert told[0] == (5, 12)
     calls.clear()
-    run_jobs(jobs, 1)
-    assert {seed for _, _, seed in calls} == {7, 8}  # they failed: nothing was kept
+    run_jobs(jobs, tmp_path, 1)
+    assert {seed for _, _, seed in calls} == {7, 8}  # those that failed
 
 
 @pytest.mark.parametrize(

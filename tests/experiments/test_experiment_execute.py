@@ -9,7 +9,8 @@ import pytest
 from computed_here import Here, run_planned
 
 from factorgraph_loc.errors import FglocError
-from factorgraph_loc.experiments import execute
+from factorgraph_loc.experiments import keys
+from factorgraph_loc.experiments.execute import execute
 from factorgraph_loc.experiments.experiment import prepare, run_experiment
 from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.plan import plan
@@ -25,7 +26,7 @@ NASTY = "../../a 'b' \"c\" <script>alert(1)</script>/.."
 
 @pytest.fixture(autouse=True)
 def _no_logs_kept():
-    execute._load.cache_clear()
+    keys.load_planned.cache_clear()
 
 
 @pytest.fixture
@@ -79,7 +80,7 @@ def test_the_same_run_again_is_the_same_to_the_byte_but_for_times(planned, out, 
 def test_a_claimed_run_is_left_to_its_owner(planned, out):
     one, other = planned(estimators=["fake", "ekf"])
     with Store(out).claim(one.key):
-        outcomes = execute.execute([one, other], out, Here())
+        outcomes = execute([one, other], out, Here())
         assert next(outcomes).key == other.key
         assert Store(out).state(one.key) == "missing"
     assert [outcome.key for outcome in outcomes] == [one.key]
@@ -117,7 +118,7 @@ def test_a_failure_is_stored_with_its_reason_and_tried_again_if_told(
 def test_a_log_that_vanishes_or_changes_mid_way_is_a_failure(planned, out, tmp_path, how):
     one, other = planned(estimators=["dead_reckoning", "ekf"])
     run_planned(one, out)
-    execute._load.cache_clear()
+    keys.load_planned.cache_clear()
     if how == "removed":
         shutil.rmtree(tmp_path / "log")
     else:

@@ -5,7 +5,7 @@ Comparisons and experiments in processes of their own, and pictures in full, hav
 """
 
 import pytest
-from computed_here import Here, sent
+from computed_here import Here
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -25,16 +25,7 @@ def in_short(request):
 @pytest.fixture
 def runs_here(monkeypatch):
     """Comparisons and experiments make their runs in this process. What would be sent to another is pickled all the same."""
-
-    def run_each(function, jobs, *_, **__):
-        for i, job in enumerate(jobs):
-            try:
-                value = sent(sent(function)(sent(job)))
-            except Exception as error:
-                value = error
-            yield i, value
-
-    monkeypatch.setattr("factorgraph_loc.experiments.active.run_each", run_each)
+    monkeypatch.setattr("factorgraph_loc.experiments.active.Processes", Here)
     monkeypatch.setattr("factorgraph_loc.experiments.experiment.Processes", Here)
 
 

@@ -28,9 +28,9 @@ def compared(
         job
         for world in WORLDS
         for estimator, policies in estimators.items()
-        for job in jobs_of(preset(world), policies, (estimator,), seeds, options.out, SETTINGS)
+        for job in jobs_of(preset(world), policies, (estimator,), seeds, SETTINGS)
     ]
-    results = run_jobs(jobs, options.jobs, lambda done, total: tell(name, done, total))
+    results = run_jobs(jobs, options.out, options.jobs, lambda done, total: tell(name, done, total))
     print(file=sys.stderr)
     report.failed += results.failures
     report.say(text)
