@@ -51,19 +51,6 @@ OutFolder = Annotated[
 ]
 
 
-Scheduler = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that executes the runs.")
-]
-RetryFailed = Annotated[bool, typer.Option("--retry-failed", help="Run failed runs again.")]
-Verify = Annotated[
-    bool, typer.Option("--verify", help="Compare stored results with their checksums; run damaged ones again.")
-]
-VerifyAll = Annotated[bool, typer.Option("--verify", help="Read all results and compare their checksums.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="List the runs and estimate their duration.")]
-Yes = Annotated[bool, typer.Option("--yes", help=f"Confirm more than {MANY:,} runs.")]
-Page = Annotated[Path | None, typer.Option(metavar="FILE", help="The page to write; by default report.html in OUT.")]
-
-
 @dataclass(frozen=True)
 class ExperimentOptions:
     """The options of all commands."""
@@ -85,11 +72,16 @@ def run(
     *,
     options: ExperimentOptions,
     jobs: Jobs = None,
-    scheduler: Scheduler = None,
-    retry_failed: RetryFailed = False,
-    verify: Verify = False,
-    dry_run: DryRun = False,
-    yes: Yes = False,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that executes the runs."),
+    ] = None,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run failed runs again.")] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Compare stored results with their checksums; run damaged ones again.")
+    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and estimate their duration.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help=f"Confirm more than {MANY:,} runs.")] = False,
     json: Json = False,
 ) -> None:
     """Execute the runs of an experiment that have no result yet; can be interrupted and resumed at any time."""
@@ -142,7 +134,13 @@ def _print_done(done: Done, prepared: Prepared, file: Path, json: bool) -> None:
 
 @app.command()
 @takes_options
-def status(file: File, *, options: ExperimentOptions, verify: VerifyAll = False, json: Json = False) -> None:
+def status(
+    file: File,
+    *,
+    options: ExperimentOptions,
+    verify: Annotated[bool, typer.Option("--verify", help="Read all results and compare their checksums.")] = False,
+    json: Json = False,
+) -> None:
     """Show how many runs of an experiment are done, failed, missing or damaged."""
     from factorgraph_loc.api import experimenting
 
@@ -161,7 +159,15 @@ def status(file: File, *, options: ExperimentOptions, verify: VerifyAll = False,
 
 @app.command()
 @takes_options
-def report(file: File, *, options: ExperimentOptions, page: Page = None, json: Json = False) -> None:
+def report(
+    file: File,
+    *,
+    options: ExperimentOptions,
+    page: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The page to write; by default report.html in OUT.")
+    ] = None,
+    json: Json = False,
+) -> None:
     """Write the stored results of an experiment as one HTML page; damaged ones are left out."""
     from factorgraph_loc.experiments.experiment import prepare
     from factorgraph_loc.experiments.reporting import report_experiment
@@ -246,55 +252,66 @@ def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[li
     return ["median (min to max)", "runs", *metrics, SCORED], lines
 
 
-World = Annotated[
-    str,
-    typer.Argument(
-        metavar="WORLD",
-        help="A preset of `fgloc simulate`, or a TOML file of its settings.",
-        autocompletion=completion.preset,
-    ),
-]
-Policies = Annotated[
-    str,
-    typer.Option(
-        metavar="A,B",
-        help=f"{', '.join(POLICIES)}; the others are compared with the first.",
-        autocompletion=completion.policies,
-    ),
-]
-ActiveEstimators = Annotated[
-    str,
-    typer.Option(
-        "--estimator",
-        "-e",
-        metavar="A,B",
-        help=f"{', '.join(ACTIVE_ESTIMATORS)}.",
-        autocompletion=completion.active_estimators,
-    ),
-]
-MaxMetres = Annotated[
-    float | None, typer.Option(metavar="M", help="Path length after which a robot gives up [m]; by default 100.")
-]
-ActiveChanges = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; `fgloc policies` lists those of robot "
-        "and policy, `fgloc presets WORLD` those of the world. May be repeated.",
-        autocompletion=completion.active_setting,
-    ),
-]
+@dataclass(frozen=True)
+class ActiveOptions:
+    """Policies, estimators, seeds and settings of ``fgloc active``."""
+
+    policy: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B",
+            help=f"{', '.join(POLICIES)}; the others are compared with the first.",
+            autocompletion=completion.policies,
+        ),
+    ] = "information"
+    estimator: Annotated[
+        str,
+        typer.Option(
+            "--estimator",
+            "-e",
+            metavar="A,B",
+            help=f"{', '.join(ACTIVE_ESTIMATORS)}.",
+            autocompletion=completion.active_estimators,
+        ),
+    ] = "active_mcl"
+    seeds: Seeds = "0"
+    max_metres: Annotated[
+        float | None, typer.Option(metavar="M", help="Path length after which a robot gives up [m]; by default 100.")
+    ] = None
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; `fgloc policies` lists those of robot "
+            "and policy, `fgloc presets WORLD` those of the world. May be repeated.",
+            autocompletion=completion.active_setting,
+        ),
+    ] = None
+
+    def given(self) -> dict[str, Any]:
+        """The arguments of ``active`` of the Python interface."""
+        return {
+            "policies": parse_list(self.policy),
+            "estimators": parse_list(self.estimator),
+            "seeds": parse_seeds(self.seeds),
+            "changes": nested_changes(self.set_ or (), {"max_metres": self.max_metres}),
+        }
 
 
+@takes_options
 def active(
-    world: World,
+    world: Annotated[
+        str,
+        typer.Argument(
+            metavar="WORLD",
+            help="A preset of `fgloc simulate`, or a TOML file of its settings.",
+            autocompletion=completion.preset,
+        ),
+    ],
     out: Out,
-    policy: Policies = "information",
-    estimator: ActiveEstimators = "active_mcl",
-    seeds: Seeds = "0",
-    max_metres: MaxMetres = None,
-    set_: ActiveChanges = None,
+    *,
+    options: ActiveOptions,
     jobs: Jobs = None,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -308,10 +325,7 @@ def active(
         results = experimenting.active(
             world,
             out,
-            policies=parse_list(policy),
-            estimators=parse_list(estimator),
-            seeds=parse_seeds(seeds),
-            changes=nested_changes(set_ or (), {"max_metres": max_metres}),
+            **options.given(),
             jobs=jobs,
             overwrite=overwrite,
             progress=report,

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from factorgraph_loc.io.bags.manifest import TopicUse
     from factorgraph_loc.model.log import Log
 
-BagPath = Annotated[Path, typer.Argument(metavar="BAG", help="A .bag, .mcap or .db3, or the folder of a ROS 2 bag.")]
-
 
 def datasets(data_root: DataRoot = None, json: Json = False) -> None:
     """List the logs that are known by name, and whether their files exist."""
@@ -150,7 +148,10 @@ def _document(log: Log, found: Inspection) -> dict[str, Any]:
     }
 
 
-def manifest(bag: BagPath, json: Json = False) -> None:
+def manifest(
+    bag: Annotated[Path, typer.Argument(metavar="BAG", help="A .bag, .mcap or .db3, or the folder of a ROS 2 bag.")],
+    json: Json = False,
+) -> None:
     """Propose a manifest for a ROS bag: which topic is which sensor. Write it to a file and check it."""
     from factorgraph_loc.io.bags.manifest import manifest_of_bag
 
@@ -181,5 +182,4 @@ def info_of_bag(bag: Path, json: Json) -> None:
 
 
 def _topic_row(t: TopicUse) -> tuple[str, ...]:
-    use = t.use or (f"{t.unused}, not used" if t.unused else "")
-    return (t.topic, t.type, str(t.messages), "" if t.rate is None else f"{t.rate:.1f}", use)
+    return (t.topic, t.type, str(t.messages), "" if t.rate is None else f"{t.rate:.1f}", t.use or "")

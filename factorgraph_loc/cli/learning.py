@@ -26,20 +26,16 @@ from factorgraph_loc.cli.options import (
 from factorgraph_loc.plugins import MAP_ESTIMATORS
 from factorgraph_loc.text import number
 
-OutRig = Annotated[
-    Path, typer.Option("--out", "-o", metavar="OUT.rig.toml", help="The rig to write; a report is written next to it.")
-]
-OutWorld = Annotated[
-    Path,
-    typer.Option("--out", "-o", metavar="OUT.world.toml", help="The map to write; a picture is written next to it."),
-]
 COLUMNS = ("given x [m]", "y [m]", "learnt x [m]", "y [m]", "sigma [m]", "distance [m]", "verdict")
 
 
 @takes_options
 def calibrate(
     logs: LogNames,
-    out: OutRig,
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", metavar="OUT.rig.toml", help="The rig to write; a report is written next to it."),
+    ],
     *,
     source: LogOptions,
     overwrite: Overwrite = False,
@@ -73,50 +69,42 @@ def calibrate(
     show.line(f"the rig is in {out}, the report in {page}")
 
 
-MapEstimator = Annotated[
-    str,
-    typer.Option(
-        "--estimator",
-        "-e",
-        metavar="NAME",
-        help=f"One of {', '.join(MAP_ESTIMATORS)}.",
-        autocompletion=completion.map_estimator,
-    ),
-]
-Extend = Annotated[bool, typer.Option("--extend", help="Keep the log's map and add what it lacks.")]
-Of = Annotated[
-    str | None,
-    typer.Option(
-        metavar="WHAT",
-        help="landmarks, tags or points; by default points if the log has images, landmarks if it has sightings of them.",
-    ),
-]
-Poses = Annotated[
-    str | None,
-    typer.Option(
-        metavar="SOURCE",
-        help="For tags: reference, or odometry to estimate the poses too; by default the reference if there is one.",
-    ),
-]
-TagHeight = Annotated[
-    float | None,
-    typer.Option(metavar="Z", help="Height [m] of tags that the log's map lacks; by default that of the antennas."),
-]
-DropDead = Annotated[
-    bool, typer.Option("--drop-dead", help="Only write the log's map without the tags that are believed dead.")
-]
-
-
 @dataclass(frozen=True)
 class MapArguments:
     """The arguments of ``build_map`` of the Python interface, except the settings."""
 
-    estimator: MapEstimator = MAP_ESTIMATORS[0]
-    extend: Extend = False
-    of: Of = None
-    poses: Poses = None
-    tag_height: TagHeight = None
-    drop_dead: DropDead = False
+    estimator: Annotated[
+        str,
+        typer.Option(
+            "--estimator",
+            "-e",
+            metavar="NAME",
+            help=f"One of {', '.join(MAP_ESTIMATORS)}.",
+            autocompletion=completion.map_estimator,
+        ),
+    ] = MAP_ESTIMATORS[0]
+    extend: Annotated[bool, typer.Option("--extend", help="Keep the log's map and add what it lacks.")] = False
+    of: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHAT",
+            help="landmarks, tags or points; by default points if the log has images, landmarks if it has sightings of them.",
+        ),
+    ] = None
+    poses: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SOURCE",
+            help="For tags: reference, or odometry to estimate the poses too; by default the reference if there is one.",
+        ),
+    ] = None
+    tag_height: Annotated[
+        float | None,
+        typer.Option(metavar="Z", help="Height [m] of tags that the log's map lacks; by default that of the antennas."),
+    ] = None
+    drop_dead: Annotated[
+        bool, typer.Option("--drop-dead", help="Only write the log's map without the tags that are believed dead.")
+    ] = False
     prior: Prior = None
     overwrite: Overwrite = False
 
@@ -124,7 +112,12 @@ class MapArguments:
 @takes_options
 def map_(
     log: LogName,
-    out: OutWorld,
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", metavar="OUT.world.toml", help="The map to write; a picture is written next to it."
+        ),
+    ],
     *,
     options: MapArguments,
     set_: Settings = None,

@@ -42,17 +42,6 @@ DataRoot = Annotated[
         help="Folder of data that manifests and experiments may name; by default the environment's FGLOC_DATA."
     ),
 ]
-Reader = Annotated[
-    str | None,
-    typer.Option(
-        help="Reader of LOG, if LOG is neither a manifest nor a native folder.", autocompletion=completion.reader
-    ),
-]
-ReaderOption = Annotated[
-    list[str] | None, typer.Option(metavar="KEY=VALUE", help="Option of the reader; may be repeated.")
-]
-RigFile = Annotated[Path | None, typer.Option(metavar="FILE", help="A .rig.toml to use instead of the log's rig.")]
-WorldFile = Annotated[Path | None, typer.Option(metavar="FILE", help="A .world.toml to use instead of the log's map.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
 Out = Annotated[Path, typer.Option("--out", "-o", metavar="OUT", help="Folder for the results.")]
 Estimator = Annotated[
@@ -63,22 +52,7 @@ Estimators = Annotated[
     str,
     typer.Option("--estimators", "-e", metavar="A,B", help="The estimators.", autocompletion=completion.estimators),
 ]
-FinalOnly = Annotated[
-    bool,
-    typer.Option(
-        "--final-only",
-        help="Want only the final trajectory: the smoother solves all at the end, without causal estimates.",
-    ),
-]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing results.")]
-Sensors = Annotated[
-    str | None,
-    typer.Option(
-        metavar="A,B",
-        help="Sensors that the estimators may use; by default those of the rig.",
-        autocompletion=completion.sensors,
-    ),
-]
 Prior = Annotated[
     str | None,
     typer.Option(
@@ -93,18 +67,6 @@ MaxGap = Annotated[
     float,
     typer.Option(metavar="SECONDS", help="Longest time between estimates across which scoring interpolates."),
 ]
-TickGap = Annotated[
-    float,
-    typer.Option(metavar="SECONDS", help="Gaps between measurements longer than this contain no estimates."),
-]
-Align = Annotated[
-    Alignment,
-    typer.Option(
-        help="Show the errors after this alignment with the reference too: first pose onto first pose, or by least squares in the "
-        "plane, in space, or in space with a scale."
-    ),
-]
-Rpe = Annotated[bool, typer.Option("--rpe", help="Show relative errors too, over a metre of path and over a second.")]
 Settings = Annotated[
     list[str] | None,
     typer.Option(
@@ -120,11 +82,22 @@ Settings = Annotated[
 class LogOptions:
     """The options for reading logs."""
 
-    reader: Reader = None
-    reader_option: ReaderOption = None
+    reader: Annotated[
+        str | None,
+        typer.Option(
+            help="Reader of LOG, if LOG is neither a manifest nor a native folder.", autocompletion=completion.reader
+        ),
+    ] = None
+    reader_option: Annotated[
+        list[str] | None, typer.Option(metavar="KEY=VALUE", help="Option of the reader; may be repeated.")
+    ] = None
     data_root: DataRoot = None
-    rig: RigFile = None
-    world: WorldFile = None
+    rig: Annotated[Path | None, typer.Option(metavar="FILE", help="A .rig.toml to use instead of the log's rig.")] = (
+        None
+    )
+    world: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A .world.toml to use instead of the log's map.")
+    ] = None
 
     def load(self, names: Sequence[str]) -> list[Log]:
         """The logs of several names; a name may refer to several logs."""
@@ -149,14 +122,38 @@ class LogOptions:
 class RunOptions:
     """The options of runs."""
 
-    sensors: Sensors = None
+    sensors: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A,B",
+            help="Sensors that the estimators may use; by default those of the rig.",
+            autocompletion=completion.sensors,
+        ),
+    ] = None
     prior: Prior = None
     set_: Settings = None
     max_gap: MaxGap = MAX_GAP
-    tick_gap: TickGap = TICK_GAP
-    align: Align = "none"
-    rpe: Rpe = False
-    final_only: FinalOnly = False
+    tick_gap: Annotated[
+        float,
+        typer.Option(metavar="SECONDS", help="Gaps between measurements longer than this contain no estimates."),
+    ] = TICK_GAP
+    align: Annotated[
+        Alignment,
+        typer.Option(
+            help="Show the errors after this alignment with the reference too: first pose onto first pose, or by least "
+            "squares in the plane, in space, or in space with a scale."
+        ),
+    ] = "none"
+    rpe: Annotated[
+        bool, typer.Option("--rpe", help="Show relative errors too, over a metre of path and over a second.")
+    ] = False
+    final_only: Annotated[
+        bool,
+        typer.Option(
+            "--final-only",
+            help="Want only the final trajectory: the smoother solves all at the end, without causal estimates.",
+        ),
+    ] = False
     overwrite: Overwrite = False
 
     def given(self) -> dict[str, Any]:

@@ -12,59 +12,62 @@ from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import Json, MaxGap, Overwrite, takes_options
 from factorgraph_loc.model.scoring import MAX_DIFF, MAX_GAP, Alignment, Association
 
-Trajectory = Annotated[
-    str,
-    typer.Argument(
-        metavar="ESTIMATE",
-        help="A file of poses (TUM, KITTI or EuRoC), BAG:TOPIC, BAG:/tf:PARENT.CHILD, the folder of a run, or a log, which "
-        "stands for its reference.",
-    ),
-]
-Reference = Annotated[str, typer.Argument(metavar="REFERENCE", help="Another one, of any of these kinds.")]
-ScoreAlign = Annotated[
-    Alignment,
-    typer.Option(
-        help="How the estimate is moved onto the reference first: not at all, first pose onto first pose, or by least "
-        "squares in the plane, in space, or in space with a scale."
-    ),
-]
-Associate = Annotated[
-    Association,
-    typer.Option(
-        help="Which poses are compared: those with the nearest stamps, or estimates interpolated at the stamps of the "
-        "reference, as runs are scored."
-    ),
-]
-MaxDiff = Annotated[float, typer.Option(metavar="SECONDS", help="Largest difference of the nearest stamps.")]
-AllPairs = Annotated[
-    bool,
-    typer.Option("--all-pairs", help="Relative errors over pieces from each pose on, instead of one after the other."),
-]
-OptionalOut = Annotated[
-    Path | None, typer.Option("--out", "-o", metavar="OUT", help="Folder for the results; without it they are printed.")
-]
-
 
 @dataclass(frozen=True)
 class ScoreOptions:
     """The arguments of ``score`` of the Python interface."""
 
-    align: ScoreAlign = "none"
-    associate: Associate = "nearest"
-    max_diff: MaxDiff = MAX_DIFF
+    align: Annotated[
+        Alignment,
+        typer.Option(
+            help="How the estimate is moved onto the reference first: not at all, first pose onto first pose, or by least "
+            "squares in the plane, in space, or in space with a scale."
+        ),
+    ] = "none"
+    associate: Annotated[
+        Association,
+        typer.Option(
+            help="Which poses are compared: those with the nearest stamps, or estimates interpolated at the stamps of the "
+            "reference, as runs are scored."
+        ),
+    ] = "nearest"
+    max_diff: Annotated[float, typer.Option(metavar="SECONDS", help="Largest difference of the nearest stamps.")] = (
+        MAX_DIFF
+    )
     max_gap: MaxGap = MAX_GAP
-    all_pairs: AllPairs = False
-    out: OptionalOut = None
+    all_pairs: Annotated[
+        bool,
+        typer.Option(
+            "--all-pairs", help="Relative errors over pieces from each pose on, instead of one after the other."
+        ),
+    ] = False
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="OUT", help="Folder for the results; without it they are printed."),
+    ] = None
     overwrite: Overwrite = False
 
 
 @takes_options
-def score(estimate: Trajectory, reference: Reference, *, options: ScoreOptions, json: Json = False) -> None:
+def score(
+    estimate: Annotated[
+        str,
+        typer.Argument(
+            metavar="ESTIMATE",
+            help="A file of poses (TUM, KITTI or EuRoC), BAG:TOPIC, BAG:/tf:PARENT.CHILD, the folder of a run, or a log, which "
+            "stands for its reference.",
+        ),
+    ],
+    reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="Another one, of any of these kinds.")],
+    *,
+    options: ScoreOptions,
+    json: Json = False,
+) -> None:
     """Score any trajectory against any other: absolute and relative errors, with or without alignment."""
+    from factorgraph_loc.api import results
     from factorgraph_loc.evaluation.trajectories.page import errors_table, extents
-    from factorgraph_loc.experiments import trajectory_score
 
-    found = trajectory_score.score(estimate, reference, **vars(options))
+    found = results.score(estimate, reference, **vars(options))
     show.warnings(found.warnings)
     if json:
         show.document(found.document())

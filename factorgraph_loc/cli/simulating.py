@@ -14,25 +14,8 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.seeds import parse_seeds
 from factorgraph_loc.plugins import PRESETS
 
-Preset = Annotated[
-    str,
-    typer.Argument(metavar="PRESET", help=f"{', '.join(PRESETS)}, or a TOML file.", autocompletion=completion.preset),
-]
 OutFolder = Annotated[
     Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write; with --seeds, a folder of folders.")
-]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of all random draws; the same seed gives the same bytes.")]
-SeedRange = Annotated[
-    str | None, typer.Option(metavar="A:B", help="One log for each seed from A to B-1, in FOLDER/NAME-SEED.")
-]
-Duration = Annotated[float | None, typer.Option(metavar="S", help="Duration of the drive [s]; 600 in the presets.")]
-Tags = Annotated[int | None, typer.Option(metavar="N", help="Number of tags.")]
-ImageRate = Annotated[float | None, typer.Option(metavar="HZ", help="Images per second; 5 in the presets.")]
-WorldSeed = Annotated[
-    int | None,
-    typer.Option(
-        min=0, metavar="N", help="Seed of the world only, for several drives in one world; by default --seed."
-    ),
 ]
 Changes = Annotated[
     list[str] | None,
@@ -43,26 +26,24 @@ Changes = Annotated[
         autocompletion=completion.simulation_setting,
     ),
 ]
-Recorded = Annotated[
-    str | None,
-    typer.Option(
-        metavar="LOG",
-        help="Resample the reads from this recording, with its antennas (semi-real).",
-        autocompletion=completion.logs,
-    ),
-]
-Images = Annotated[bool, typer.Option("--images", help="Also render camera images.")]
 
 
 @dataclass(frozen=True)
 class ChangeOptions:
     """Settings that differ from those of the preset."""
 
-    duration: Duration = None
-    tags: Tags = None
+    duration: Annotated[
+        float | None, typer.Option(metavar="S", help="Duration of the drive [s]; 600 in the presets.")
+    ] = None
+    tags: Annotated[int | None, typer.Option(metavar="N", help="Number of tags.")] = None
     set_: Changes = None
-    image_rate: ImageRate = None
-    world_seed: WorldSeed = None
+    image_rate: Annotated[float | None, typer.Option(metavar="HZ", help="Images per second; 5 in the presets.")] = None
+    world_seed: Annotated[
+        int | None,
+        typer.Option(
+            min=0, metavar="N", help="Seed of the world only, for several drives in one world; by default --seed."
+        ),
+    ] = None
 
     def changes(self) -> dict[str, Any]:
         """The settings as nested tables."""
@@ -72,14 +53,28 @@ class ChangeOptions:
 
 @takes_options
 def simulate(
-    what: Preset,
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="PRESET", help=f"{', '.join(PRESETS)}, or a TOML file.", autocompletion=completion.preset
+        ),
+    ],
     out: OutFolder,
-    seed: Seed = 0,
-    seeds: SeedRange = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random draws; the same seed gives the same bytes.")] = 0,
+    seeds: Annotated[
+        str | None, typer.Option(metavar="A:B", help="One log for each seed from A to B-1, in FOLDER/NAME-SEED.")
+    ] = None,
     *,
     options: ChangeOptions,
-    recorded: Recorded = None,
-    images: Images = False,
+    recorded: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOG",
+            help="Resample the reads from this recording, with its antennas (semi-real).",
+            autocompletion=completion.logs,
+        ),
+    ] = None,
+    images: Annotated[bool, typer.Option("--images", help="Also render camera images.")] = False,
     data_root: DataRoot = None,
     json: Json = False,
 ) -> None:

@@ -49,7 +49,7 @@ def test_the_wheels_and_what_is_not_read(recorded, fgloc, monkeypatch):
     manifest["options"]["odometry"] = {"topic": "/joint_states", "wheels": wheels}
     Path("wheels.toml").write_text(tomli_w.dumps(manifest))
     (by_wheels,), (by_poses,) = load(Path("wheels.toml")), load(Path("run.toml"))
-    assert by_wheels.metadata["not read"] == "/odom (nav_msgs/msg/Odometry), /scan (laser scan)"
+    assert by_wheels.metadata["not read"] == "/odom (nav_msgs/msg/Odometry), /scan (sensor_msgs/msg/LaserScan)"
     moved = [log.streams["odometry"] for log in (by_wheels, by_poses)]
     np.testing.assert_allclose(moved[0].dtheta, moved[1].dtheta, atol=1e-6)
     assert "not read" in fgloc("info", "wheels.toml").stdout

@@ -61,7 +61,7 @@ def test_odometry_without_poses_is_read_by_its_velocities(proposal, tmp_path):
     log = fgloc.read_log(tmp_path / "drive.toml")
     np.testing.assert_array_equal(log.streams["odometry"].v, (0.5, 0.5, 0.5))
     # what the manifest leaves out is told
-    assert log.metadata["not read"] == "/depth (sonar or infrared range), /robot_pose (geometry_msgs/msg/PoseStamped)"
+    assert log.metadata["not read"] == "/depth (sensor_msgs/msg/Range), /robot_pose (geometry_msgs/msg/PoseStamped)"
 
 
 def test_an_estimate_is_not_taken_for_the_truth_without_a_word(proposal):

@@ -58,48 +58,17 @@ BESIDE = {
     "rig": 'no rig is given: set rig = "NAME.rig.toml" to a file next to this one; `fgloc rigs new` writes one',
     "world": 'no map is given: set world = "NAME.world.toml" to a file next to this one with tags and landmarks',
 }
-UNUSED = {
-    "sensor_msgs/msg/LaserScan": "laser scan",
-    "sensor_msgs/msg/MultiEchoLaserScan": "laser scan",
-    "sensor_msgs/msg/PointCloud": "point cloud",
-    "sensor_msgs/msg/PointCloud2": "point cloud",
-    "velodyne_msgs/msg/VelodyneScan": "point cloud",
-    "livox_ros_driver/msg/CustomMsg": "point cloud",
-    "livox_ros_driver2/msg/CustomMsg": "point cloud",
-    "sensor_msgs/msg/NavSatFix": "GNSS",
-    "sensor_msgs/msg/NavSatStatus": "GNSS",
-    "gps_common/msg/GPSFix": "GNSS",
-    "gps_msgs/msg/GPSFix": "GNSS",
-    "nmea_msgs/msg/Sentence": "GNSS",
-    "ublox_msgs/msg/NavPVT": "GNSS",
-    "sensor_msgs/msg/Range": "sonar or infrared range",
-    "sensor_msgs/msg/MagneticField": "magnetometer",
-    "sensor_msgs/msg/FluidPressure": "pressure",
-    "sensor_msgs/msg/Temperature": "temperature",
-    "sensor_msgs/msg/BatteryState": "battery",
-    "sensor_msgs/msg/Joy": "joystick",
-    "geometry_msgs/msg/WrenchStamped": "force",
-    "nav_msgs/msg/OccupancyGrid": "grid map",
-    "nav_msgs/msg/Path": "path",
-    "stereo_msgs/msg/DisparityImage": "depth image",
-    "dvs_msgs/msg/EventArray": "event camera",
-    "diagnostic_msgs/msg/DiagnosticArray": "diagnostics",
-    "rosgraph_msgs/msg/Log": "messages of programs",
-    "rcl_interfaces/msg/Log": "messages of programs",
-}
 
 
 @dataclass(frozen=True)
 class TopicUse:
-    """A topic of a bag. ``rate``: messages per second, None for fewer than two; ``use``: what it is taken for, or None; ``unused``:
-    what it carries that nothing here uses, such as a laser scan, or None."""
+    """A topic of a bag. ``rate``: messages per second, None for fewer than two; ``use``: what it is taken for, or None."""
 
     topic: str
     type: str
     messages: int
     rate: float | None
     use: str | None
-    unused: str | None
 
 
 @dataclass(frozen=True)
@@ -147,7 +116,6 @@ def manifest_of_bag(bag: Path, here: Path) -> BagManifest:
                 topic.count,
                 (topic.count - 1) / span if span > 0.0 and topic.count > 1 else None,
                 proposal.uses.get(topic.name),
-                None if topic.name in proposal.uses else UNUSED.get(topic.type),
             )
             for topic in opened.topics.values()
         )
@@ -162,8 +130,7 @@ def manifest_of_bag(bag: Path, here: Path) -> BagManifest:
             remarks.append(advice)
     for topic in topics:
         if topic.use is None:
-            what = f", {topic.unused}: nothing here uses it" if topic.unused else ""
-            remarks.append(f"not used: {topic.topic} ({topic.type}, {topic.messages} messages){what}")
+            remarks.append(f"not used: {topic.topic} ({topic.type}, {topic.messages} messages)")
     content |= {"licence": "none stated", "origin": "your own recording"}
     options = dict(sorted(proposal.options.items(), key=lambda item: isinstance(item[1], dict)))  # tables last
     comments = "".join(f"# {line}\n" for line in remarks)

@@ -17,7 +17,6 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, add_fields, parse_model
 from factorgraph_loc.io.bags.camera import CameraTopic, Images, Info
 from factorgraph_loc.io.bags.file import Bag, open_bag
-from factorgraph_loc.io.bags.manifest import UNUSED
 from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, YawRates, odometry
 from factorgraph_loc.io.bags.poses import (
     POINT,
@@ -165,9 +164,9 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
 
 
 def _left_out(bag: Bag, listeners: Listeners) -> str:
-    """The topics with messages that the manifest does not name, and what they carry."""
+    """The topics with messages that the manifest does not name, with their types."""
     there = [topic for topic in bag.topics.values() if topic.count and topic.name not in (*listeners.topics, STATIC)]
-    return ", ".join(f"{topic.name} ({UNUSED.get(topic.type, topic.type)})" for topic in there)
+    return ", ".join(f"{topic.name} ({topic.type})" for topic in there)
 
 
 def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack: ExitStack) -> dict[str, Streamed]:
