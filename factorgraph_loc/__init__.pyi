@@ -25,7 +25,7 @@ from factorgraph_loc.api.lookups import (
     known_sensors as known_sensors,
     new_rig as new_rig,
 )
-from factorgraph_loc.api.results import export as export, view as view
+from factorgraph_loc.api.results import export as export, score as score, view as view
 from factorgraph_loc.api.running import Run as Run, compare as compare, run as run
 from factorgraph_loc.errors import (
     FglocError as FglocError,
@@ -34,7 +34,6 @@ from factorgraph_loc.errors import (
 )
 from factorgraph_loc.evaluation.inference import contrast as contrast
 from factorgraph_loc.experiments.result_table import load_results as load_results
-from factorgraph_loc.experiments.trajectory_score import score as score
 from factorgraph_loc.exports.trajectories import write_trajectory as write_trajectory
 from factorgraph_loc.io.native.native import write_native as write_native
 from factorgraph_loc.io.native.rig_file import read_rig as read_rig, write_rig as write_rig

@@ -16,5 +16,4 @@ __all__ = [
     "run",
     "seeds",
     "store",
-    "trajectory_score",
 ]

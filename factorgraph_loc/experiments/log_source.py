@@ -47,10 +47,34 @@ def matching(pattern: str, folder: Path, source: object) -> list[Path]:
         raise InputError(f"{source}: {quoted(pattern)} has {len(parts)} parts, expected at most {DEEPEST}")
     if wrong := [part for part in parts if ANY_DEPTH in part and part != ANY_DEPTH]:
         raise InputError(f"{source}: {quoted(pattern)} has {quoted(wrong[0])}, expected {ANY_DEPTH} to be a whole part")
-    walk = _Walk(f"{source}: {quoted(pattern)} visits more than {VISITED:,} files and folders, expected a narrower one")
-    found = {Path(path.anchor) if path.anchor else folder}
+    found = [Path(path.anchor) if path.anchor else folder]
+    visited = 0
+
+    def entries(place: Path) -> list[os.DirEntry[str]]:
+        """The entries of a folder; none if it is not a readable folder."""
+        nonlocal visited
+        try:
+            with os.scandir(place) as every:
+                some = list(itertools.islice(every, VISITED + 1 - visited))
+        except OSError:
+            return []
+        visited += len(some)
+        if visited > VISITED:
+            raise InputError(
+                f"{source}: {quoted(pattern)} visits more than {VISITED:,} files and folders, expected a narrower one"
+            )
+        return some
+
     for part in parts:
-        found = {one for base in found for one in walk.step(base, part)}
+        if part == ANY_DEPTH:
+            for here in found:  # which grows meanwhile
+                found += [Path(entry.path) for entry in entries(here) if entry.is_dir(follow_symlinks=False)]
+        elif is_pattern(part):
+            fits = re.compile(fnmatch.translate(part)).match
+            found = [Path(entry.path) for place in found for entry in entries(place) if fits(entry.name)]
+        else:
+            found = [place / part for place in found]
+        found = list(dict.fromkeys(found))
     return sorted(one for one in found if os.path.lexists(one))
 
 
@@ -58,44 +82,6 @@ def _fixed_part(pattern: str) -> str:
     """The path before the first part of a pattern that may match several names."""
     parts = itertools.takewhile(lambda part: not is_pattern(part), Path(pattern).parts)
     return str(Path(*parts))
-
-
-class _Walk:
-    def __init__(self, too_many: str) -> None:
-        self._too_many = too_many
-        self._visited = 0
-
-    def step(self, base: Path, part: str) -> Iterator[Path]:
-        """The paths that match one part of a pattern."""
-        if part == ANY_DEPTH:
-            waiting = [base]
-            while waiting:
-                here = waiting.pop()
-                yield here
-                waiting += [Path(entry.path) for entry in self._entries(here) if entry.is_dir(follow_symlinks=False)]
-        elif is_pattern(part):
-            fits = re.compile(fnmatch.translate(part)).match
-            yield from (Path(entry.path) for entry in self._entries(base) if fits(entry.name))
-        else:
-            self._count()
-            yield base / part
-
-    def _entries(self, folder: Path) -> list[os.DirEntry[str]]:
-        """The entries of a folder; none if it is not a readable folder."""
-        found = []
-        try:
-            with os.scandir(folder) as entries:
-                for entry in entries:
-                    self._count()
-                    found.append(entry)
-        except OSError:
-            return found
-        return found
-
-    def _count(self) -> None:
-        self._visited += 1
-        if self._visited > VISITED:
-            raise InputError(self._too_many)
 
 
 @dataclass(frozen=True)

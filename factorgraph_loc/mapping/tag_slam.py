@@ -18,8 +18,7 @@ from factorgraph_loc.fusion.graph.marginals import IndeterminateError
 from factorgraph_loc.fusion.graph.problem import Problem
 from factorgraph_loc.fusion.graph.variables import Values, constants_key, landmark_key, pose_key
 from factorgraph_loc.mapping.tag_looks import TagLooks
-from factorgraph_loc.mapping.tag_refinement import of_tags, reach
-from factorgraph_loc.mapping.tag_search import TagPosterior, search
+from factorgraph_loc.mapping.tag_search import TagPosterior, of_tags, reach, search
 from factorgraph_loc.model.belief import LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import TURN

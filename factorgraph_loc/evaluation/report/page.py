@@ -13,7 +13,6 @@ import tomli_w
 from factorgraph_loc.drawing.pages import render
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import plots, tables
-from factorgraph_loc.evaluation.report.cautions import cautions
 from factorgraph_loc.evaluation.report.metrics import DEFAULT, TIMINGS, Metric, metric_of
 from factorgraph_loc.evaluation.report.results import Results, RunFiles, read_runs, score
 from factorgraph_loc.evaluation.report.tables import p_value
@@ -98,7 +97,7 @@ def _compared(results: Results, metrics: Sequence[Metric], baseline: str) -> dic
         "overview": tables.overview(results, best),
         "differences": tables.differences(results, against),
         "by_log": {metric.heading: tables.by_log(results, metric) for metric in metrics},
-        "cautions": cautions(results, best),
+        "cautions": tables.cautions(results, best),
         "seeds": len({row["seed"] for row in results.rows}),
         "failed": sum(row["status"] != "ok" for row in results.rows),
         "failures": tables.failures(results),
