@@ -58,6 +58,7 @@ from factorgraph_loc.model.trajectory3 import Trajectory3 as Trajectory3
 from factorgraph_loc.model.world import World as World
 from factorgraph_loc.sensors.camera.measurement import PixelSightings as PixelSightings
 from factorgraph_loc.sensors.camera.measurement import (
+    CameraImage as CameraImage,
     FeatureStream as FeatureStream,
     ImageStream as ImageStream,
     SightingStream as SightingStream,
@@ -68,7 +69,6 @@ from factorgraph_loc.sensors.landmarks.measurement import (
 )
 from factorgraph_loc.sensors.landmarks.settings import Landmark as Landmark
 from factorgraph_loc.sensors.loops.measurement import LoopStream as LoopStream, Loops as Loops
-from factorgraph_loc.sensors.measurements import Exteroceptive as Exteroceptive, Odometry as Odometry
 from factorgraph_loc.sensors.odometry.measurement import (
     IncrementOdometry as IncrementOdometry,
     IncrementStream as IncrementStream,
@@ -82,5 +82,6 @@ from factorgraph_loc.sensors.rfid.map import Tag as Tag
 from factorgraph_loc.sensors.rfid.stream import RfidScan as RfidScan
 from factorgraph_loc.sensors.rfid.stream import RfidRead as RfidRead
 from factorgraph_loc.sensors.rfid.stream import RfidStream as RfidStream
+from factorgraph_loc.sensors.rfid.stream import scan_of as scan_of
 from factorgraph_loc.vision.frame import CameraFrame as CameraFrame
 from factorgraph_loc.version import __version__ as __version__

@@ -116,8 +116,7 @@ def test_all_that_ours_name_is_there(name):
         assert channel.section in (*sensor.settings, "")
         for place in channel.streams:
             assert callable(load(place).measurements)
-        for place in channel.measurements:
-            measurement = load(place)
+            measurement = load(place).kind
             assert isinstance(measurement.sensor, property) or measurement.sensor == channel.name
             assert isinstance(measurement.is_motion, bool)
     for section in (*sensor.settings.values(), *sensor.layers.values()):

@@ -18,7 +18,7 @@ from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.smoothed import Smoothed
+from factorgraph_loc.sensors.calibrating import Smoothed
 
 Smooth = Callable[[Log], RunResult]
 """Runs the smoother on a log, with the log's rig."""
@@ -96,7 +96,7 @@ def _smoothed(log: Log, smooth: Smooth) -> Smoothed:
             f"{log.name}: the smoother knows the robot's place to {vague:.1f} m only (median), expected {TOO_VAGUE:g} m or less "
             "to learn from it without a reference"
         )
-    doubted = frozenset(result.diagnostics.dead_tags) | frozenset(result.diagnostics.moved_tags)
+    doubted = frozenset[str]().union(*result.diagnostics.doubted.values())
     return Smoothed(replace(log, reference=final), result.learnt.values, doubted)
 
 

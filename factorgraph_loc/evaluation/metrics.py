@@ -259,7 +259,7 @@ def _constants(learnt: Learnt) -> dict[str, float]:
 
 def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
     """Diagnostics as figures: NIS by sensor (median of NIS over its expected median, ideally 1; fraction above the 95 % bound),
-    residuals at the prediction (m, rad), numbers of unused measurements, and tags believed dead or moved with their probability."""
+    residuals at the prediction (m, rad), numbers of unused measurements, and doubted elements of the map with their probability."""
     figures: dict[str, Any] = {}
     for sensor, rows in sorted(diagnostics.nis.items()):
         if rows:
@@ -283,10 +283,9 @@ def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
         counts: dict[str, int] = getattr(diagnostics, kind)
         figures[f"{kind}.total"] = sum(counts.values())
         figures |= {f"{kind}.{reason}": count for reason, count in sorted(counts.items())}
-    for kind in ("dead_tags", "moved_tags"):
-        tags: dict[str, float] = getattr(diagnostics, kind)
-        figures[f"{kind}.total"] = len(tags)
-        figures |= {f"{kind}.{name}": probability for name, probability in sorted(tags.items())}
+    for kind, doubted in diagnostics.doubted.items():
+        figures[f"{kind}.total"] = len(doubted)
+        figures |= {f"{kind}.{name}": probability for name, probability in sorted(doubted.items())}
     figures["events"] = len(diagnostics.events)
     return figures
 

@@ -8,8 +8,8 @@ from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
 from factorgraph_loc.evaluation.pairing import pairs
 from factorgraph_loc.model.belief import Status
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.map_frame import MapFrame
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera.use import MapFrame
 from factorgraph_loc.sensors.registry import detecting
 
 MOSTLY = 0.9  # fraction of the time with estimates
@@ -74,5 +74,5 @@ def never_localized(log: Log, sensors: Sequence[str], status: Sequence[Status], 
     elif len(kinds) > 1:  # an estimator may use only some of them
         why = f"its {names} did not determine the pose"
     else:
-        why = kinds[0].undetected
+        why = f"no {names} of the map were detected"
     return (f"{log.name}: never localized: {why}",)

@@ -223,7 +223,7 @@ def _without_dead(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
         raise InputError(f"{log.name}: has no reads, or no map of tags, expected both to find tags that are dead")
     with stages("smoother") as report:
         result = run(log, RunConfig("smoother", prior=options.prior), lambda share: report(share, 1.0))
-    dead = dict(sorted(result.diagnostics.dead_tags.items(), key=lambda row: -row[1]))
+    dead = dict(sorted(result.diagnostics.doubted.get("dead_tags", {}).items(), key=lambda row: -row[1]))
     world = log.world.model_copy(update={"tags": {n: tag for n, tag in log.world.tags.items() if n not in dead}})
     details = DroppedTags(dead, len(world.tags))
     known = tag_map(log.world, log.rig.of(SurveySettings))

@@ -23,8 +23,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable
-from factorgraph_loc.sensors.binding import bound_sensors
+from factorgraph_loc.sensors.base import Binding, EarlierPose, Link, NewVariable, bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import gaussian_kernels, positive, se2, se2_kernels
 from factors.motion import Increment
@@ -141,9 +140,8 @@ class Ekf(Filter):
         super().__init__(setup, settings, diagnostics)
         self._iterations = settings.iterations
         calibration: Calibration = "all" if settings.self_calibration else "none"
-        self._sensors = bound_sensors(
-            setup, self._motion, self.diagnostics, use=settings.landmarks, calibration=calibration
-        )
+        use = settings.landmarks
+        self._sensors = bound_sensors(Binding(setup, self._motion, self.diagnostics, use=use, calibration=calibration))
         self._blocks = [(MOTION, self._motion.constants), *((n, s.constants) for n, s in self._sensors.items())]
         finders = {name: sensor for name, sensor in self._sensors.items() if sensor.finder is not None}
         at_once = {name: sensor for name, sensor in finders.items() if sensor.finder and sensor.finder.at_once}
@@ -239,7 +237,7 @@ class Ekf(Filter):
 
     def _see(self, m: Measurement) -> None:
         self._step = self._step or self._standstill()
-        sensor, view = self._sensors[m.modality], _View(self)
+        sensor, view = self._sensors[m.source], _View(self)
         for seen in sensor.observe(m, view):
             if isinstance(seen, Link):
                 continue

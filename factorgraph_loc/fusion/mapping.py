@@ -34,12 +34,13 @@ class GraphView:
 class Mapper:
     """Makes variables of points that a sensor sees and no map has. This base class maps nothing.
 
-    ``modality``: of the measurements that it takes, "" for none. ``fewest``: number of sightings that a point of the graph needs.
+    ``sensor``: the name of the one whose measurements it takes, "" for none. ``fewest``: number of sightings that a point of the
+    graph needs.
     ``horizon``: number of recent keyframes that it needs. ``rejected``: why sightings of something else are rejected.
     ``estimates``: whether points become variables. ``knows_scale``: whether their scale comes from elsewhere than the motion.
     """
 
-    modality: str = ""
+    sensor: str = ""
     fewest: int = 0
     horizon: int = 0
     rejected: str = ""

@@ -46,8 +46,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import Link, NewVariable, Observation
-from factorgraph_loc.sensors.binding import bound_sensors
+from factorgraph_loc.sensors.base import Binding, Link, NewVariable, Observation, bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import positive, se2, se2_kernels
 from factors.motion import Increment
@@ -90,7 +89,7 @@ class ParticleFilter(Filter):
         # trajectories are drawn by a generator of their own, whose state is kept: the same ones each time
         (self._smoothing_rng,) = setup.rng.spawn(1)
         calibration: Calibration = "particles" if settings.self_calibration else "none"
-        self._sensors = bound_sensors(setup, self._motion, self.diagnostics, calibration=calibration)
+        self._sensors = bound_sensors(Binding(setup, self._motion, self.diagnostics, calibration=calibration))
         self._blocks = [(MOTION, self._motion.constants), *((n, s.constants) for n, s in self._sensors.items())]
         columns = Layout.of((name, len(constants.names)) for name, constants in self._blocks).columns
         # where they lie in the constants of the particles
@@ -262,7 +261,7 @@ class ParticleFilter(Filter):
             if self._search.look(m, self._odometry):
                 self._state = self._found(self._t) or self._state
             return
-        sensor, view = self._sensors[m.modality], CloudView(self)
+        sensor, view = self._sensors[m.source], CloudView(self)
         for seen in sensor.observe(m, view):
             if isinstance(seen, Link):
                 continue

@@ -69,7 +69,8 @@ def describe(name: str) -> Description:
 
 def _takes(kind: type[Any], channel: Channel) -> bool:
     modalities = getattr(kind, "modalities", EVERY)
-    measured = map(load, channels()[parent_of(channel.name) or channel.name].measurements)
+    streams = channels()[parent_of(channel.name) or channel.name].streams
+    measured = [load(place).kind for place in streams]
     return any(one.is_motion or one.modality in modalities for one in measured)
 
 

@@ -65,7 +65,7 @@ class Refuted(NamedTuple):
 
 
 class Search:
-    """The search; see the module. ``sensors``: by the modality of their measurements. ``space``: where the robot may be, by default
+    """The search; see the module. ``sensors``: by name. ``space``: where the robot may be, by default
     within the bounds of the sensors; ``fewest``: least number of particles; ``work``: of one slice."""
 
     def __init__(
@@ -117,7 +117,7 @@ class Search:
 
     def look(self, m: Any, odometry: ChainState) -> bool:
         """Process a measurement while the pose is unknown; False if it is uninformative."""
-        sensor, finder = self._sensors.get(m.modality), self._finders.get(m.modality)
+        sensor, finder = self._sensors.get(m.source), self._finders.get(m.source)
         if sensor is None:
             return False
         told = finder is not None and finder.look(m, odometry)
@@ -231,12 +231,12 @@ class Search:
             return None
         odometry, pose, covariance = track()
         self._unsure = self.is_unsure(covariance)
-        finder = None if isinstance(m, Tick) else self._finders.get(m.modality)
+        finder = None if isinstance(m, Tick) else self._finders.get(m.source)
         if finder is not None:
             since = finder.refuted_since(m, odometry, pose, covariance)
             if since is not None:
                 before = max((t for t in self._looked if t < since), default=-math.inf)
-                return Refuted(self._sensors[m.modality].lost, since, (before, since))
+                return Refuted(self._sensors[m.source].lost, since, (before, since))
         return self._refuted_by_all(odometry, pose, covariance, pose_at)
 
     def _refuted_by_all(
@@ -314,10 +314,10 @@ class Search:
 
     def _is_due(self, sensor: Sensor, t: float) -> bool:
         """Whether a sensor's last evidence is long enough ago."""
-        last = self._last.get(sensor.modality, -math.inf)
+        last = self._last.get(sensor.name, -math.inf)
         if t <= last or t < last + sensor.evidence_every:
             return False
-        self._last[sensor.modality] = t
+        self._last[sensor.name] = t
         return True
 
 

@@ -21,7 +21,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.binding import bound_sensors
+from factorgraph_loc.sensors.base import Binding, bound_sensors
 from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.registry import sensor_of
 from factors import positive, se2
@@ -59,7 +59,7 @@ class Switching:
         self.diagnostics = Diagnostics()
         self._smooth = settings.smooth
         self._motion = Motion(setup.rig, setup.sensors, Diagnostics())
-        sensors = bound_sensors(setup, self._motion, Diagnostics())
+        sensors = bound_sensors(Binding(setup, self._motion, Diagnostics()))
         self._scanners = {name: sensor for name, sensor in sensors.items() if sensor.gathers}
         scanning = {sensor_of(name).name for name in self._scanners}
         others = {sensor_of(name).name for name in sensors} - scanning
@@ -95,7 +95,7 @@ class Switching:
                 counts.update(once)
             self._motion.add(measurement)
             return
-        scanner = self._scanners.get(measurement.modality)
+        scanner = self._scanners.get(measurement.source)
         if scanner is not None and measurement.t >= self._newest_scan:
             self._newest_scan = measurement.t
             scan = scanner.evidence(measurement)
@@ -106,7 +106,7 @@ class Switching:
             self._active.process(measurement)
             self._record()
         elif scanner is not None:
-            self.diagnostics.ignore(f"{measurement.modality} while no tag is read", measurement.count)
+            self.diagnostics.ignore(f"{measurement.source} while no tag is read", measurement.count)
         else:
             self.diagnostics.ignore("landmarks while tags are read")
 

@@ -43,7 +43,7 @@ class Timeline(ABC):
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics, max_delay: float) -> None:
         self.diagnostics, self._motion, self._max_delay = diagnostics, motion, max_delay
-        self._sensors: dict[str, Sensor] = {}  # by the modality of their measurements
+        self._sensors: dict[str, Sensor] = {}  # by name
         self._t = -math.inf  # the newest time
         self._begun = math.inf  # when the estimator started; infinite before
         self._taken: deque[Taken] = deque()  # the last measurements, in the order in which they were processed
@@ -54,8 +54,8 @@ class Timeline(ABC):
         self._renew(measurement)
         if measurement.is_motion:
             self._motion.add(measurement)
-        elif not (isinstance(measurement, Tick) or self._uses(measurement.modality)):
-            self.diagnostics.ignore(measurement.modality, measurement.count)
+        elif not (isinstance(measurement, Tick) or self._uses(measurement)):
+            self.diagnostics.ignore(measurement.source, measurement.count)
         elif self._begun == math.inf:
             self._begin(measurement)
         elif measurement.t < max(self._t - self._max_delay, self._begun):
@@ -101,9 +101,9 @@ class Timeline(ABC):
         """A measurement arrives: discard what was computed for questions before it."""
         return
 
-    def _uses(self, modality: str) -> bool:
-        """Whether measurements of a modality may update the estimator."""
-        return modality in self._sensors
+    def _uses(self, m: Measurement) -> bool:
+        """Whether a measurement may update the estimator."""
+        return m.source in self._sensors
 
     def _begin(self, m: Measurement) -> None:
         """Process a measurement before the start."""
@@ -171,4 +171,4 @@ class Timeline(ABC):
 
     def _drop_late(self, m: Measurement) -> None:
         if not isinstance(m, Tick):
-            self.diagnostics.drop_late(m.modality, m.count)
+            self.diagnostics.drop_late(m.source, m.count)

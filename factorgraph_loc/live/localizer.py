@@ -5,9 +5,9 @@ from __future__ import annotations
 import copy
 import math
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,20 +21,15 @@ from factorgraph_loc.live.start import prior_of, require_options, usable_sensors
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.map_frame import MapFrame
 from factorgraph_loc.model.measurement import Measurement, Tick, named
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.scoring import Ticks
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import load
-from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.use import MapFrame, frontend_of, uses_images
-from factorgraph_loc.sensors.pushed import checked
 from factorgraph_loc.sensors.registry import channels
-from factorgraph_loc.sensors.rfid.stream import RfidRead, scan_of
-
-if TYPE_CHECKING:
-    from factorgraph_loc.sensors.camera.frontend import LiveFrontend
+from factorgraph_loc.sensors.tables import Intake, checked
 
 LAG = 10.0  # s: default window of the smoother
 HISTORY = 60.0  # s
@@ -75,13 +70,11 @@ class Localizer:
         self._settings = registry.settings_of(estimator, default | dict(settings or {}))
         self._sensors = usable_sensors(rig, sensors)
         setup = model_setup.Setup(rig, self._world, self._sensors, np.random.default_rng(seed))
-        modalities = getattr(registry.estimator_type(estimator), "modalities", ())
-        self._frame = MapFrame.of(setup, modalities, getattr(self._settings, "landmarks", "known"))
+        self._modalities = getattr(registry.estimator_type(estimator), "modalities", ())
+        self._frame = MapFrame.of(setup, self._modalities, getattr(self._settings, "landmarks", "known"))
         self._offsets = {name: rig.time_offset(name) for name in self._sensors}  # s
         self._history, self._seed = history, seed
         self._lock = threading.Lock()
-        self._image_lock = threading.Lock()
-        self._frontend: LiveFrontend | None = None
         self._begin_anew(None, None, Guard(estimator))
 
     def initialize(
@@ -114,7 +107,8 @@ class Localizer:
 
     def push(self, measurement: Measurement) -> None:
         """Process a measurement, in order of arrival. A late one is inserted at its time if it is late by at most the estimator's
-        ``max_delay``; otherwise it is counted and dropped.
+        ``max_delay``; otherwise it is counted and dropped. Features of an image are detected in the calling thread while other
+        measurements are processed, so that it is late by that time.
 
         InputError if a value is invalid, such as NaN; before :meth:`initialize`; if a timestamp is an hour ahead of all others;
         if increments of odometry go back in time. The measurement is then dropped and nothing else changes. RunFailedError if the
@@ -122,37 +116,11 @@ class Localizer:
         tags, antennas and landmarks are no errors: they are counted, see :meth:`diagnostics`.
         """
         own = checked(measurement)
+        intake = self._intakes.get(own.sensor) if own.modality in self._modalities else None
+        if intake is not None:
+            own = intake.measured(own)
         with self._lock:
             self._take(own)
-
-    def push_reads(self, t: float, antennas: Iterable[str], reads: Iterable[RfidRead] = ()) -> None:
-        """Process the reads of inventory rounds that ended at ``t``. ``antennas``: all that were active, including those without
-        reads, as missing reads are informative too. InputError as in :meth:`push`."""
-        self.push(scan_of(t, antennas, reads))
-
-    def push_image(self, t: float, image: object) -> None:
-        """Process an image, (H, W) or (H, W, 3) BGR, with the size of the rig's camera.
-
-        Features are detected in the calling thread while other measurements are processed, so the image arrives late by that
-        time. InputError as in :meth:`push`, or if it is no such array.
-        """
-        t = seconds_of("image", t)
-        if self._rig.find(CameraSettings) is None:
-            raise InputError(f"image at {t:.3f} s: the rig {self._rig.name} has no [camera] with its mounting")
-        modalities = getattr(registry.estimator_type(self._name), "modalities", ())
-        if not uses_images(self._sensors, modalities):
-            with self._lock:
-                self._begun(f"image at {t:.3f} s").diagnostics.ignore("images")
-            return
-        with self._image_lock:
-            if self._frontend is None:
-                # imported here because OpenCV is not needed without images
-                from factorgraph_loc.sensors.camera.frontend import LiveFrontend  # noqa: PLC0415
-
-                camera = self._rig.of(CameraSettings)
-                self._frontend = LiveFrontend(frontend_of(self._rig, self._world), camera.model())
-            frame = self._frontend.frame(t, image)
-        self.push(frame)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """The pose at the newest timestamp of all measurements, or predicted by odometry to ``t`` if that is later.
@@ -206,8 +174,8 @@ class Localizer:
         self._newest = self._tidied = -math.inf
         self._last: PoseEstimate | None = None  # latest estimate, None after a change
         known = channels()
-        self._sequences: dict[str, Any] = {
-            name: load(known[name].sequence)(self._rig, self._world) for name in self._sensors if known[name].sequence
+        self._intakes: dict[str, Intake] = {
+            name: load(known[name].intake)(self._rig, self._world) for name in self._sensors if known[name].intake
         }
 
     def _require_whole(self) -> None:
@@ -263,8 +231,8 @@ class Localizer:
                 f"{named(m)}: is {m.t - self._newest:.0f} s ahead of all others, expected the same clock, or initialize() "
                 f"after a pause"
             )
-        if (sequence := self._sequences.get(m.sensor)) is not None:
-            sequence.require(m)
+        if (intake := self._intakes.get(m.sensor)) is not None:
+            intake.require(m)
 
     def _is_under_way(self, t: float) -> bool:
         """Whether ``t`` is not before the start or the first measurement."""

@@ -4,6 +4,7 @@ __all__ = [
     "belief",
     "diagnostics",
     "log",
+    "map_frame",
     "measurement",
     "planar",
     "pose_path",

@@ -16,9 +16,8 @@ class Diagnostics:
 
     ``residuals``: by sensor and quantity (``bearing_range.range`` in m), measurement minus prediction before the update. ``nis``:
     by sensor, rows of (t, normalised innovation squared, degrees of freedom). ``ignored``, ``rejected``, ``late``: counts by
-    reason. ``events``: (t, description), for example a rebuilt graph. ``dead_tags``: tags of the map that were never read and
-    are believed to be dead, or moved out of sight, with that probability; ``moved_tags``: tags that were read and are believed
-    to be elsewhere.
+    reason. ``events``: (t, description), for example a rebuilt graph. ``doubted``: by kind of doubt (``moved_tags``), elements of
+    the map that are probably not as the map has them, with that probability.
     """
 
     nis: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
@@ -27,8 +26,7 @@ class Diagnostics:
     rejected: dict[str, int] = field(default_factory=dict)
     late: dict[str, int] = field(default_factory=dict)
     events: list[tuple[float, str]] = field(default_factory=list)
-    dead_tags: dict[str, float] = field(default_factory=dict)
-    moved_tags: dict[str, float] = field(default_factory=dict)
+    doubted: dict[str, dict[str, float]] = field(default_factory=dict)
     # all additions since :meth:`record` was called; None if it was not
     added: list[Addition] | None = field(default=None, init=False, repr=False, compare=False)
 
@@ -79,8 +77,7 @@ class Diagnostics:
             dict(self.rejected),
             dict(self.late),
             list(self.events),
-            dict(self.dead_tags),
-            dict(self.moved_tags),
+            {kind: dict(found) for kind, found in self.doubted.items()},
         )
 
     def record(self) -> list[Addition]:

@@ -3,8 +3,9 @@ rows of one sensor of a log."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from itertools import compress, pairwise
 from typing import Any, ClassVar, Protocol, Self
 
@@ -22,7 +23,8 @@ class Measurement(Protocol):
     """A measurement at ``t`` [s], the time of the event with the clock offset applied.
 
     ``sensor``: its channel, as in a log and in ``--sensors``. ``modality``: the kind of sensor, by which estimators declare what
-    they use. ``count``: number of detections. ``is_motion``: whether it measures the robot's motion.
+    they use. ``source``: the name of the sensor, by default its modality. ``count``: number of detections. ``is_motion``: whether
+    it measures the robot's motion.
     """
 
     @property
@@ -31,6 +33,8 @@ class Measurement(Protocol):
     def sensor(self) -> str: ...
     @property
     def modality(self) -> str: ...
+    @property
+    def source(self) -> str: ...
     @property
     def count(self) -> int: ...
     @property
@@ -48,6 +52,7 @@ class Tick:
 
     sensor: ClassVar[str] = "tick"
     modality: ClassVar[str] = "tick"
+    source: ClassVar[str] = "tick"
     count: ClassVar[int] = 0
     is_motion: ClassVar[bool] = False
     t: float
@@ -75,6 +80,10 @@ class Rows:
         return str(self.kind.modality)
 
     @property
+    def source(self) -> str:
+        return str(self.kind.source)
+
+    @property
     def count(self) -> int:
         return len(self.times)
 
@@ -92,8 +101,8 @@ class Stream:
     """The rows of one channel as columns; ``t`` (N,) in seconds from the start of the log, by the sensor's clock.
 
     Rows are in order of arrival; a late row has an older timestamp than the one before. ``rank`` orders rows with equal
-    timestamps. ``kind``: class of the measurements, constructed from a timestamp and
-    the columns. ``joins``: whether consecutive rows, of numbers, can be one measurement
+    timestamps. ``kind``: class of the measurements, constructed from a timestamp and the columns. ``source``: the name of the
+    sensor, "" for its modality. ``joins``: whether consecutive rows, of numbers, can be one measurement
     (:class:`~factorgraph_loc.model.measurement.Rows`).
     """
 
@@ -101,17 +110,23 @@ class Stream:
     joins: ClassVar[bool] = False
     kind: ClassVar[type[Any]]
     t: Array
+    source: str = field(default="", kw_only=True)
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         """One measurement per row; ``offset`` [s] is added to the timestamps."""
-        return map(self.kind, (self.t + offset).tolist(), *(np.asarray(column).tolist() for column in self._columns()))
+        return map(self._made, (self.t + offset).tolist(), *(np.asarray(column).tolist() for column in self._columns()))
 
     def rows(self, offset: float) -> Rows:
         """All rows as one measurement, if the stream ``joins``."""
         return Rows(self.kind, self.t + offset, tuple(np.array(column, dtype=float) for column in self._columns()))
 
+    @property
+    def _made(self) -> Callable[..., Measurement]:
+        """Makes a measurement of a timestamp and the columns."""
+        return partial(self.kind, source=self.source) if self.source else self.kind
+
     def _columns(self) -> Iterator[Any]:
-        return (getattr(self, field.name) for field in fields(self)[1:])
+        return (column for name, column in columns_of(self).items() if name != "t")
 
     def begun_anew(self) -> Self:
         """The stream of a robot that was placed at its first row, without any motion before it."""
@@ -131,14 +146,17 @@ class ScanStream(Stream):
         for i, j in self.scans():
             parts = (column[i:j] for column in self._columns())
             values = (part if isinstance(part, np.ndarray) else tuple(part) for part in parts)
-            yield self.kind(float(self.t[i]) + offset, *values)
+            yield self._made(float(self.t[i]) + offset, *values)
+
+
+def columns_of(stream: Stream) -> dict[str, Any]:
+    """The columns of a stream by name, the timestamps first."""
+    return {f.name: getattr(stream, f.name) for f in fields(stream) if f.name != "source"}
 
 
 def selected(stream: Stream, keep: NDArray[np.bool_]) -> Stream:
-    columns = {f.name: getattr(stream, f.name) for f in fields(stream)}
-    kept: dict[str, Any] = {
-        k: v[keep] if isinstance(v, np.ndarray) else list(compress(v, keep)) for k, v in columns.items()
-    }
+    columns = columns_of(stream).items()
+    kept = {k: v[keep] if isinstance(v, np.ndarray) else list(compress(v, keep)) for k, v in columns}
     return replace(stream, **kept)
 
 
@@ -146,8 +164,9 @@ def joined(first: Stream, second: Stream) -> Stream:
     if type(first) is not type(second):
         kinds = f"{type(first).__name__} and one with {type(second).__name__}"
         raise InputError(f"a log with {kinds} cannot be joined, expected tables of the same kind")
-    columns = {f.name: (getattr(first, f.name), getattr(second, f.name)) for f in fields(first)}
-    both: dict[str, Any] = {
-        k: np.concatenate((a, b)) if isinstance(a, np.ndarray) else [*a, *b] for k, (a, b) in columns.items()
+    others = columns_of(second)
+    both = {
+        k: np.concatenate((v, others[k])) if isinstance(v, np.ndarray) else [*v, *others[k]]
+        for k, v in columns_of(first).items()
     }
     return replace(first, **both)

@@ -4,16 +4,19 @@ constants that are estimated, and the base class."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 
 import numpy as np
 from pydantic import AfterValidator, Field
 
 from factorgraph_loc.files.models import FileModel, InUnit
 from factors.se2 import Array
+
+if TYPE_CHECKING:
+    from factorgraph_loc.model.world import World
 
 Angle = Annotated[float, Field(ge=-math.pi, le=math.pi), InUnit("rad")]
 Offset = Annotated[float, Field(ge=-10.0, le=10.0), InUnit("m")]
@@ -92,6 +95,11 @@ class SensorSettings(FileModel):
     def estimated(self) -> Estimated:
         """The constants that are estimated."""
         return Estimated.of(self.constants, getattr(self, "uncertainty", None))
+
+    def map_error(self, world: World) -> Callable[[Array], Array] | None:
+        """The error of a map that the sensor is localized in: covariances (N, 3, 3) of (x, y, heading) of its frame at poses (N,
+        3); None if the map is exact."""
+        return None
 
     def placed(self, folder: Path) -> Self:
         """A copy whose file references are relative to ``folder``, which holds the rig's file."""

@@ -25,7 +25,7 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.planning.robot import ProximitySensor
-from factorgraph_loc.sensors.binding import bound_sensors
+from factorgraph_loc.sensors.base import Binding, bound_sensors
 from factorgraph_loc.sensors.motion import Motion
 from factors.se2 import Array
 
@@ -56,7 +56,7 @@ class ActiveMcl:
     def __init__(self, setup: Setup, particles: int, space: FreeSpace) -> None:
         self.diagnostics = Diagnostics()
         self._motion = Motion(setup.rig, setup.sensors, self.diagnostics)
-        sensors = bound_sensors(setup, self._motion, self.diagnostics, calibration="none")
+        sensors = bound_sensors(Binding(setup, self._motion, self.diagnostics, calibration="none"))
         self._search = Search(sensors, self._motion, setup.rng, space, particles, math.inf)
         self._t = -math.inf
         self._records: list[PoseEstimate] = []

@@ -2,19 +2,15 @@
 
 __all__ = [
     "base",
-    "binding",
     "calibrating",
     "camera",
     "interfaces",
     "known_position",
     "landmarks",
     "loops",
-    "measurements",
     "motion",
     "odometry",
-    "pushed",
     "registry",
     "rfid",
-    "smoothed",
     "tables",
 ]

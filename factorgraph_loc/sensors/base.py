@@ -19,12 +19,16 @@ from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
+from factorgraph_loc.sensors.registry import functions
 from factors import se2_kernels
 from factors.graph import Factor
 from factors.marginal import Marginalized
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
 from factors.update import CONVERGED, Correction, SightingFactor, update_state
+
+Blocks = Mapping[str, Array]  # values of blocks by name, or their covariances
+Columns = Mapping[str, slice]  # columns of blocks in an error state
 
 
 @dataclass(frozen=True)
@@ -68,12 +72,7 @@ class Observation(Protocol):
         """Names of all blocks that the terms depend on."""
 
     def correct(
-        self,
-        pose: Array,
-        covariance: Array,
-        values: Mapping[str, Array],
-        columns: Mapping[str, slice],
-        iterations: int = 1,
+        self, pose: Array, covariance: Array, values: Blocks, columns: Columns, iterations: int = 1
     ) -> Correction:
         """The correction of a Gaussian with mean ``pose`` (3,) and ``values`` of the blocks by name.
 
@@ -81,11 +80,11 @@ class Observation(Protocol):
         ``columns``: those of each block; others are corrected by their correlation. ``iterations``: number of linearisations.
         """
 
-    def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
+    def log_likelihood(self, poses: Array, values: Blocks) -> Array:
         """Log-likelihood (N,) up to a constant for ``poses`` (N, 3) and block ``values`` (N, P); other blocks have the rig's
         values."""
 
-    def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Observation:
+    def on_pose(self, values: Blocks, spreads: Blocks) -> Observation:
         """The observation as a function of the pose only, with the blocks fixed at ``values``; their covariances ``spreads`` are
         added to the noise."""
 
@@ -105,11 +104,11 @@ class NewVariable:
     name: str
     mean: Array
     by_pose: Array
-    by_block: Mapping[str, Array]
+    by_block: Blocks
     noise: Array
     sightings: tuple[tuple[float, Observation], ...]
 
-    def joint(self, covariance: Array, columns: Mapping[str, slice]) -> tuple[Array, Array]:
+    def joint(self, covariance: Array, columns: Columns) -> tuple[Array, Array]:
         """Its covariance (d, S) with an error state of ``covariance`` (S, S), and its own covariance (d, d). ``columns``:
         components of each block in the error state; missing blocks are exact."""
         jacobian = np.zeros((len(self.mean), len(covariance)))
@@ -145,8 +144,8 @@ class Link:
 class Binding:
     """What a sensor is bound to: a run, the robot's ``motion`` and the diagnostics.
 
-    ``use``: how landmarks of the map are used, ``points``: how its points are used; ``calibration``: which uncertain constants
-    the estimator learns.
+    ``name``: of the sensor, "" for its modality. ``use``: how landmarks of the map are used, ``points``: how its points are
+    used; ``calibration``: which uncertain constants the estimator learns.
     """
 
     setup: Setup
@@ -155,6 +154,13 @@ class Binding:
     use: MapUse = "known"
     points: MapUse = "known"
     calibration: Calibration = "all"
+    name: str = ""
+
+
+def bound_sensors(binding: Binding) -> dict[str, Sensor]:
+    """The exteroceptive sensors of a run by name."""
+    sensors = [bind(binding) for _, bind in functions("bind")]
+    return {sensor.name: sensor for sensor in sensors if sensor is not None}
 
 
 class View(Protocol):
@@ -183,7 +189,7 @@ class View(Protocol):
     def spread(self, name: str) -> Array:
         """The covariance (d, d) of an existing block."""
 
-    def joint(self) -> tuple[Array, Mapping[str, slice]]:
+    def joint(self) -> tuple[Array, Columns]:
         """The covariance (S, S) of the error state, and the columns of its blocks."""
 
     def poses_at(self, times: Array) -> Array:
@@ -240,11 +246,11 @@ class Finder(Protocol):
 class Sensor:
     """A sensor of the robot's surroundings, bound to one run. The defaults are those of a sensor without the feature in question.
 
-    ``modality``: of its measurements. ``constants``: those that are estimated, as a block named after the modality;
-    ``follows_constants``: whether their covariance is needed during the run. ``finder``: localizes without a prediction.
-    ``bounds`` (2, 2) [m]: lower and upper corner of the area where the robot may be, for a sensor that can only weigh poses.
-    ``work``: of taking a measurement into a graph, about, where that of a tag is 1.
-    ``evidence_every`` [s]: interval of informative measurements in a search. ``lost``: reason why a track is given up.
+    ``modality``: of its measurements; ``name``: of this sensor, by default the modality. ``constants``: those that are
+    estimated, as a block with this name; ``follows_constants``: whether their covariance is needed during the run.
+    ``finder``: localizes without a prediction. ``bounds`` (2, 2) [m]: lower and upper corner of the area where the robot may
+    be, for a sensor that can only weigh poses. ``work``: of taking a measurement into a graph, about, where that of a tag is
+    1. ``evidence_every`` [s]: interval of informative measurements in a search. ``lost``: reason why a track is given up.
 
     For graphs: ``keyframe_every`` [s]: interval between keyframes; ``gathers``: whether the observations on a pose are merged
     when the next pose begins; ``solve_every`` [s]: longest delay of a solver update; ``links``: whether its factors are on two
@@ -263,6 +269,9 @@ class Sensor:
     solve_every: float = 0.0
     finder: Finder | None = None
     bounds: Array | None = None
+
+    def __init__(self, name: str = "") -> None:
+        self.name = name or self.modality
 
     def observe(self, m: Any, view: View) -> Iterator[Observation | NewVariable | Link]:
         """The observations of a measurement; each is applied before the next is requested."""
@@ -353,18 +362,8 @@ class ResidualObservation:
         """The factors of the terms."""
         return [cast(SightingFactor, term.factor) for term in self.terms]
 
-    @property
-    def dof(self) -> int:
-        """Number of measured values."""
-        return sum(factor.dof() for factor in self.factors)
-
     def correct(
-        self,
-        pose: Array,
-        covariance: Array,
-        values: Mapping[str, Array],
-        columns: Mapping[str, slice],
-        iterations: int = 1,
+        self, pose: Array, covariance: Array, values: Blocks, columns: Columns, iterations: int = 1
     ) -> Correction:
         size = max((3, *(columns[name].stop for name in self.blocks)))
 
@@ -381,16 +380,17 @@ class ResidualObservation:
                 parts.append((residual, jacobian))
             return np.concatenate([r for r, _ in parts]), np.concatenate([j for _, j in parts])
 
-        return update_state(linearize, covariance, self.factors[0].weight, iterations, self.dof, self.settled)
+        dof = sum(factor.dof() for factor in self.factors)
+        return update_state(linearize, covariance, self.factors[0].weight, iterations, dof, self.settled)
 
-    def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
+    def log_likelihood(self, poses: Array, values: Blocks) -> Array:
         costs = [
             sum(term.factor.cost([pose, *(values[name][i] for name in term.blocks)]) for term in self.terms)
             for i, pose in enumerate(poses)
         ]
         return -np.array(costs)
 
-    def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Observation:
+    def on_pose(self, values: Blocks, spreads: Blocks) -> Observation:
         if not self.blocks:
             return self
         terms = []

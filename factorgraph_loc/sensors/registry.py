@@ -23,26 +23,26 @@ from factorgraph_loc.text import quoted
 class Channel:
     """A name in ``--sensors`` and of a log's streams.
 
-    ``streams``, ``measurements``: the classes of its streams and measurements. Both are empty for an optional column of the
-    sensor's first channel, as ``rssi`` and ``phase`` are of ``rfid``. ``section``: the rig's section with the ``time_offset``.
+    ``streams``: the classes of its streams, whose ``kind`` is the class of their measurements. There are none for an optional
+    column of the sensor's first channel, as ``rssi`` and ``phase`` are of ``rfid``. ``section``: the rig's section with the
+    ``time_offset``.
 
     ``tables``: the descriptions (:class:`~factorgraph_loc.files.columns.Table`) of its tables in a log; ``described``: of further
     tables, for measurements that differ from those. If stream fields are not columns: ``assemble``: ``(rows by table, reading) ->
     stream`` and ``disassemble``: ``(stream, writing) -> columns by table``, see :mod:`factorgraph_loc.sensors.tables`. For pushed
-    measurements whose fields are not columns: ``check``: ``(measurement, where) -> validated fields``. ``sequence``: a class made
-    of (rig, world) whose ``require(measurement)`` raises InputError if a measurement does not fit the previous ones.
+    measurements whose fields are not columns: ``check``: ``(measurement, where) -> validated fields``. ``intake``: the class of an
+    :class:`~factorgraph_loc.sensors.tables.Intake`, made of (rig, world).
     """
 
     name: str
     streams: tuple[Place, ...] = ()
-    measurements: tuple[Place, ...] = ()
     section: str = ""
     tables: tuple[Place, ...] = ()
     described: tuple[Place, ...] = ()
     assemble: Place = ""
     disassemble: Place = ""
     check: Place = ""
-    sequence: Place = ""
+    intake: Place = ""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class SensorType:
     """A sensor: its ``channels``, its ``settings`` (sections of the rig), its ``layers`` of the world, and the places of its
     functions, "" for none. :func:`functions` returns those of all sensors.
 
-    ``detects``: the layer of the world whose elements it detects, "" for none; ``undetected``: the warning that none was detected.
+    ``detects``: the layer of the world whose elements it detects, "" for none.
 
     ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.interfaces.Summary`, for ``fgloc info``; ``draw``: ``(log) ->``
     :class:`~factorgraph_loc.sensors.interfaces.Marks`, for plots and viewers. ``bind``: ``(binding) ->``
@@ -75,7 +75,6 @@ class SensorType:
     layers: Mapping[str, Layer] = field(default_factory=dict)
     simulation: Mapping[str, Section] = field(default_factory=dict)
     detects: str = ""
-    undetected: str = ""
     bind: Place = ""
     summarize: Place = ""
     draw: Place = ""

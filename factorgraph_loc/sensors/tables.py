@@ -7,23 +7,26 @@ A sensor whose stream fields are columns needs only a description, a :class:`~fa
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.columns import STAMP, Column, Table
+from factorgraph_loc.files.columns import SECONDS, STAMP, Column, Table
 from factorgraph_loc.files.tables import TableRows
-from factorgraph_loc.model.measurement import Stream
-from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.files.values import names, numbers, seconds_of, within
+from factorgraph_loc.model.measurement import Measurement, Stream
 from factorgraph_loc.plugins import load
 from factorgraph_loc.sensors.registry import Channel, SensorType, channels, sensors
 from factors.se2 import Array, Integers
+
+if TYPE_CHECKING:
+    from factorgraph_loc.model.rig import Rig
 
 Columns = Mapping[str, Array | Integers | Sequence[str]]
 
@@ -154,3 +157,90 @@ def columns_of(channel: Channel, stream: Stream) -> Iterator[Column]:
     for table in (*tables_of(channel), *(load(place) for place in channel.described)):
         if table.stream == f"{type(stream).__module__}:{type(stream).__qualname__}":
             yield from (column.measured for column in table.columns if column.kind == "number")
+
+
+M = TypeVar("M", bound=Measurement)
+
+
+class Intake:
+    """What a channel does with measurements that a program pushes, one after the other."""
+
+    def measured(self, m: Measurement) -> Measurement:
+        """The measurement that estimators take, such as the features of an image. Called in any thread."""
+        return m
+
+    def require(self, m: Measurement) -> None:
+        """InputError if a measurement does not fit the previous ones."""
+
+
+@cache
+def kinds() -> Mapping[type[Any], Channel]:
+    """The measurement classes, each with its channel."""
+    return {load(place).kind: channel for channel in channels().values() for place in channel.streams}
+
+
+def channel_of(kind: type[Any]) -> Channel:
+    """The channel of a measurement's class; InputError if it is not one."""
+    if kind not in kinds():
+        known = ", ".join(one.__name__ for one in kinds())
+        raise InputError(f"{kind.__name__} is not a measurement, expected one of {known}")
+    return kinds()[kind]
+
+
+def checked(m: M) -> M:
+    """A validated copy of a measurement, or itself if it consists of valid floats, which nobody can change; InputError names the
+    first invalid field, its value and the expected values."""
+    if (floats := _floats_of(type(m))) is not None:
+        for name, low, high in floats:
+            value = getattr(m, name)
+            if type(value) is not float or not low <= value <= high:
+                break
+        else:
+            return m
+    channel = channel_of(type(m))
+    t = seconds_of(type(m).__name__, m.t)
+    where = f"{type(m).__name__} at {t:.3f} s"
+    if not isinstance(m.source, str):
+        raise bad_field(where, "source", m.source, "the name of a sensor")
+    found = load(channel.check)(m, where) if channel.check else dict(_described(m, where, channel))
+    copy: M = replace(m, t=t, **found)  # type: ignore[type-var]
+    return copy
+
+
+@cache
+def _floats_of(kind: type[Measurement]) -> tuple[tuple[str, float, float], ...] | None:
+    """Name and inclusive bounds of each field of a class with numbers only, as rows of odometry have; None for others.
+    InputError if it is no class of measurements."""
+    channel = channel_of(kind)
+    if channel.check:
+        return None
+    table = _table_of(kind, channel)
+    columns = [column.measured for column in table.columns[1:]]
+    if table.rows_of_one_stamp == "one measurement" or any(c.kind != "number" or c.may_lack for c in columns):
+        return None
+    return ("t", SECONDS.low, SECONDS.high), *((c.name, c.low, c.high) for c in columns)
+
+
+def _described(m: Measurement, where: str, channel: Channel) -> Iterator[tuple[str, Any]]:
+    """The fields of a measurement that match the columns of a table: numbers, or names and arrays (K,) if it has several rows."""
+    table = _table_of(type(m), channel)
+    count: int | None = None
+    for column in table.columns[1:]:
+        if column.kind == "name":
+            yield f"{column.name}s", (found := names(where, f"{column.name}s", getattr(m, f"{column.name}s")))
+            count = len(found)
+        else:
+            value = getattr(m, column.measured.name)
+            if count is None and table.rows_of_one_stamp == "one measurement":
+                count = numbers(where, column.name, value).size
+            yield column.measured.name, within(where, column, value, () if count is None else (count,))
+
+
+@cache
+def _table_of(kind: type[Any], channel: Channel) -> Table:
+    there = {field.name for field in fields(kind)}
+    return next(
+        table
+        for table in tables_of(channel)
+        if all((f"{c.name}s" if c.kind == "name" else c.measured.name) in there for c in table.columns[1:])
+    )

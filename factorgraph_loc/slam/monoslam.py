@@ -20,12 +20,14 @@ from pydantic import Field
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion.filter import Filter, FilterSettings
 from factorgraph_loc.model.belief import Learnt, LearntPoint, PoseEstimate, PosePrior
+from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera.known_points import CAMERAS, Pixels
+from factorgraph_loc.sensors.camera.known_points import CAMERAS
+from factorgraph_loc.sensors.camera.measurement import Pixels
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.turn_check import TurnCheck
+from factorgraph_loc.sensors.camera.use import TurnCheck
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.slam.monoslam_invariance import carried
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
@@ -185,8 +187,8 @@ class Monoslam(Filter):
         self._state = self._state.moved(self._step)
         self._predicted = self._kept(self._state)
 
-    def _uses(self, modality: str) -> bool:
-        return modality in self.modalities
+    def _uses(self, m: Measurement) -> bool:
+        return m.modality in self.modalities
 
     def _see(self, m: Pixels) -> None:
         eye = self._looker.eye

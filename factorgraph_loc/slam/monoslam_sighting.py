@@ -10,7 +10,8 @@ from factorgraph_loc.maps.common_error import without_common
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import MapUse, Setup
-from factorgraph_loc.sensors.camera.known_points import DISAGREES, EXACT, MOST, Pixels
+from factorgraph_loc.sensors.camera.known_points import DISAGREES, EXACT, MOST
+from factorgraph_loc.sensors.camera.measurement import Pixels
 from factorgraph_loc.slam.monoslam_motion import PLANAR
 from factorgraph_loc.slam.monoslam_search import agreeing
 from factorgraph_loc.slam.monoslam_state import Eye, Innovation, Sights, SlamState
@@ -49,7 +50,7 @@ class Match:
 
 
 class FeatureMatcher:
-    """Matches features; ``use`` of the map as of :class:`~factorgraph_loc.sensors.landmarks.known_landmarks.KnownLandmarks`."""
+    """Matches features; ``use`` of the map as of :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`."""
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics, use: MapUse) -> None:
         self._diagnostics = diagnostics

@@ -11,7 +11,7 @@ from factorgraph_loc.fusion.mapping import GraphView, Mapper
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.base import Sensor
-from factorgraph_loc.sensors.camera.known_points import Pixels
+from factorgraph_loc.sensors.camera.measurement import Pixels
 from factorgraph_loc.sensors.camera.sensor import CameraSensor
 from factorgraph_loc.slam.frame_pairs import FramePairs
 from factorgraph_loc.slam.keyframe_cameras import HORIZON
@@ -35,7 +35,7 @@ class PointMapper(Mapper):
     def __init__(
         self, camera: CameraSensor, model: CameraModel, diagnostics: Diagnostics, settings: GraphSettings
     ) -> None:
-        self._camera, self.modality = camera, camera.modality
+        self._camera, self.sensor = camera, camera.name
         self._interval = KEYFRAME_INTERVAL if settings.keyframe_interval is None else settings.keyframe_interval
         self._unknown: UnknownPoints | None = None
         if settings.landmarks != "known":
@@ -122,8 +122,8 @@ class PointMapper(Mapper):
 
 def bind(sensors: Mapping[str, Sensor], diagnostics: Diagnostics, settings: GraphSettings) -> Mapper:
     """The mapper of a run."""
-    camera = sensors.get(CameraSensor.modality)
-    if not isinstance(camera, CameraSensor) or camera.points.model is None:
+    camera = next((sensor for sensor in sensors.values() if isinstance(sensor, CameraSensor)), None)
+    if camera is None:
         return Mapper()
     if settings.landmarks == "known" and not settings.visual_odometry:
         return Mapper()

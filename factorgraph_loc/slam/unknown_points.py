@@ -17,7 +17,8 @@ from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING, Estimated
-from factorgraph_loc.sensors.camera.known_points import ITERATIONS, SETTLED, Pixels, lifted
+from factorgraph_loc.sensors.camera.known_points import ITERATIONS, SETTLED, lifted
+from factorgraph_loc.sensors.camera.measurement import Pixels
 from factorgraph_loc.slam.keyframe_cameras import HORIZON, SLACK, KeyframeCameras
 from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints
 from factorgraph_loc.slam.moving_things import MovingThings

@@ -27,6 +27,7 @@ class CameraFrame:
     sizes: Array
     descriptors: NDArray[Any]
     tracks: NDArray[np.int64]
+    source: str = modality
 
     @property
     def frame(self) -> "CameraFrame":

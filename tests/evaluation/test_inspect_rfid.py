@@ -8,6 +8,7 @@ import pytest
 
 from factorgraph_loc.evaluation.inspect import inspect
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import columns_of
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
@@ -53,7 +54,7 @@ def stream_of(log: Log) -> RfidStream:
 def only(keep: np.ndarray) -> dict[str, object]:
     """The columns of the rows to keep."""
     stream = stream_of(make_log())
-    columns = {field.name: np.asarray(getattr(stream, field.name))[keep] for field in dataclasses.fields(stream)}
+    columns = {name: np.asarray(column)[keep] for name, column in columns_of(stream).items()}
     return {name: column.tolist() if name in {"antenna", "epc"} else column for name, column in columns.items()}
 
 

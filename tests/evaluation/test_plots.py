@@ -100,7 +100,7 @@ def test_a_log_that_never_tells_the_pose_is_run_and_plotted(track, estimator, re
     arguments = ["run", tmp_path / "log", "-e", estimator, "-o", tmp_path / "out", "--prior", "unknown"]
     result = CliRunner().invoke(app, [str(argument) for argument in arguments])
     assert result.exit_code == 0, result.output
-    assert "warning: log: never localized: no landmark of the map was seen" in result.stderr
+    assert "warning: log: never localized: no landmarks of the map were detected" in result.stderr
     assert [path.name for path in (tmp_path / "out/plots").iterdir()] == ["log-trajectories.png"]
 
 

@@ -90,14 +90,14 @@ def test_why_a_start_stayed_unknown_is_told_by_the_sensors_that_were_used(blank,
         result = run(log, RunConfig("smoother", sensors=("odometry", *sensors), prior="unknown"))
         return result.warnings[-1].removeprefix("straight: never localized: ")
 
-    assert why(with_points(blank, 2), "camera") == "no point of the map was found in an image"
-    assert why(with_points(blank, 2), "bearing_range", "camera") == "no point of the map was found in an image"
+    assert why(with_points(blank, 2), "camera") == "no points of the map were detected"
+    assert why(with_points(blank, 2), "bearing_range", "camera") == "no points of the map were detected"
     assert why(blank, "bearing_range") == "the map has nothing that its sensors could find"
     both = with_points(replace(blank, world=log.world), 2)
-    assert why(both, "camera") == "no point of the map was found in an image"
+    assert why(both, "camera") == "no points of the map were detected"
     unseen = replace(log.streams["bearing_range"], landmark=["x", "y"] * 4)
     both = replace(both, streams=dict(both.streams) | {"bearing_range": unseen})
-    assert why(both, "bearing_range") == "no landmark of the map was seen"
+    assert why(both, "bearing_range") == "no landmarks of the map were detected"
     assert why(both, "bearing_range", "camera") == "its landmarks and points did not determine the pose"
 
 

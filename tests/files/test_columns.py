@@ -8,7 +8,7 @@ import pytest
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.columns import POINTS, POSES
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
-from factorgraph_loc.sensors.odometry.tables import VELOCITIES
+from factorgraph_loc.sensors.odometry.measurement import VELOCITIES
 from factorgraph_loc.sensors.tables import all_tables
 
 COLUMNS = [

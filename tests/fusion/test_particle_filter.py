@@ -104,7 +104,7 @@ def test_nothing_seen(log, tmp_path):
     result = run(only(log, ()), UNKNOWN)
     assert set(result.status) == {"unlocalized"}
     assert len(result.final) == 0
-    assert result.warnings == ("simulated: never localized: no landmark of the map was seen",)
+    assert result.warnings == ("simulated: never localized: no landmarks of the map were detected",)
     scores = write_run(result, log, tmp_path / "out")
     assert scores["final.position_rmse"] is None
 

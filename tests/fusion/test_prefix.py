@@ -1,8 +1,7 @@
 """What an estimator says at a time is the same whether the log goes on or not: every estimator on every sensor."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
-from itertools import compress
 
 import cv2
 import numpy as np
@@ -15,6 +14,7 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import ESTIMATORS
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import cut
+from factorgraph_loc.model.measurement import selected
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.measurement import ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
@@ -35,9 +35,7 @@ def prefix(log, end):
 
     def until(name, stream):
         keep = np.maximum.accumulate(stream.t + log.rig.time_offset(name)) <= end
-        columns = {f.name: getattr(stream, f.name) for f in fields(stream)}
-        kept = {k: v[keep] if isinstance(v, np.ndarray) else list(compress(v, keep)) for k, v in columns.items()}
-        return replace(stream, **kept)
+        return selected(stream, keep)
 
     return replace(log, streams={name: until(name, stream) for name, stream in log.streams.items()})
 

@@ -56,7 +56,6 @@ def calls():
     many = st.lists(value(2.0, 0.3), max_size=3).map(np.array) | value(None)
     pixels = count.flatmap(lambda n: value(*(size * np.ones((n, 2)) for size in (100.0, 200.0, -9.0))))
     looks = count.flatmap(lambda n: value(np.zeros((n, 64), np.float32), np.zeros((n, 32), np.uint8)))
-    read = st.builds(fgloc.RfidRead, value("1", "2"), value(*log.world.tags), value(None, 1.0), value(-60.0))
     covariance = value(None, np.eye(3), np.zeros((3, 3)), -np.eye(3), 1e18 * np.eye(3))
     antennas = value(("1", "2"), ("1",), ("1", "1"))
     made = st.one_of(
@@ -72,11 +71,11 @@ def calls():
     )
     pose = st.tuples(value(10.0), value(6.0), value(0.5)) | value(log.start.pose)
     given_up = st.tuples(st.just("initialize"), st.tuples(pose, covariance, value(None, 0.0)))
-    reads = st.tuples(st.just("push_reads"), st.tuples(t, antennas, st.lists(read, max_size=3) | value(())))
-    images = st.tuples(st.just("push_image"), st.tuples(t, value(np.zeros((480, 640), np.uint8), np.zeros((2, 2)))))
+    images = st.builds(fgloc.CameraImage, t, value(np.zeros((480, 640), np.uint8), np.zeros((2, 2))))
+    images = images.map(lambda image: ("push", (image,)))
     pushed = made.map(lambda m: ("push", (m,)))
     asked = st.sampled_from([(name, ()) for name in QUERIES]) | t.map(lambda t: ("estimate", (t,)))
-    return st.one_of(pushed, pushed, pushed, pushed, asked, asked, reads, images, given_up)
+    return st.one_of(pushed, pushed, pushed, pushed, asked, asked, images, given_up)
 
 
 def play(estimator, settings, calls, *, ask):

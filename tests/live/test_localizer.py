@@ -4,7 +4,7 @@ import gc
 import math
 import threading
 import tracemalloc
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,11 +19,13 @@ from factorgraph_loc import (
     RunFailedError,
     VelocityOdometry,
     YawRate,
+    scan_of,
 )
 from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.ekf import Ekf
 from factorgraph_loc.model.log import cut
+from factorgraph_loc.model.measurement import columns_of
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factors import se2
 
@@ -36,8 +38,7 @@ def log():
     changes = {"drive": {"duration": 20.0}, "world": {"tags": 12, "landmarks": 6}}
     log = fgloc.simulate("office", 3, changes=changes)
     streams = cut(log, 0.0, 19.97).streams
-    last = {"t": 19.97} | dict.fromkeys((f.name for f in fields(streams["odometry"]) if f.name != "t"), 0.0)
-    columns = {name: np.append(getattr(streams["odometry"], name), value) for name, value in last.items()}
+    columns = {k: np.append(v, 19.97 if k == "t" else 0.0) for k, v in columns_of(streams["odometry"]).items()}
     return replace(log, streams={**streams, "odometry": replace(streams["odometry"], **columns)})
 
 
@@ -230,8 +231,8 @@ def test_foreign_tags_antennas_and_sensors_are_counted(log):
     localizer = started(log, sensors=("odometry", "rfid"))
     antenna = next(iter(log.rig.rfid.all_antennas()))
     localizer.push(IncrementOdometry(0.2, 0.0, 0.0, 0.0))
-    localizer.push_reads(0.3, [antenna], [RfidRead(antenna, "a passer-by's badge", t=0.25, rssi=-60.0)])
-    localizer.push_reads(0.4, ["on another robot"])
+    localizer.push(scan_of(0.3, [antenna], [RfidRead(antenna, "a passer-by's badge", t=0.25, rssi=-60.0)]))
+    localizer.push(scan_of(0.4, ["on another robot"], []))
     localizer.push(YawRate(0.5, 0.1))
     ignored = localizer.diagnostics().ignored
     assert ignored["tag not in the map"] == 1

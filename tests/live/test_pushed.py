@@ -120,7 +120,7 @@ def test_a_start_that_cannot_be_is_refused(log, given, message):
 def test_reads_of_an_antenna_that_did_not_listen_are_refused(log):
     localizer = started(log)
     with pytest.raises(InputError, match="antenna is 'left', expected one of the active antennas: front, back"):
-        localizer.push_reads(1.0, ["front", "back"], [RfidRead("left", "e1")])
+        localizer.push(scan_of(1.0, ["front", "back"], [RfidRead("left", "e1")]))
 
 
 def reads_of(antennas, reads):
@@ -157,6 +157,6 @@ def test_reads_are_those_of_a_scan(log):
     one, other = (started(log, sensors=("odometry", "rfid")) for _ in range(2))
     for localizer in (one, other):
         localizer.push(IncrementOdometry(0.1, 0.0, 0.0, 0.0))
-    one.push_reads(0.5, [antenna], [RfidRead(antenna, tag, t=0.4)])
+    one.push(scan_of(0.5, [antenna], [RfidRead(antenna, tag, t=0.4)]))
     other.push(RfidScan(0.5, (antenna,), np.zeros(1, dtype=np.int64), (tag,), np.array((0.5 - 0.4,)), nan, nan, nan))
     assert np.array_equal(one.estimate().pose, other.estimate().pose)

@@ -14,6 +14,7 @@ import factorgraph_loc as fgloc
 from factorgraph_loc import (
     BearingRange,
     CameraFrame,
+    CameraImage,
     IncrementOdometry,
     InputError,
     Localizer,
@@ -25,12 +26,12 @@ from factorgraph_loc import (
     YawRate,
 )
 from factorgraph_loc.live.start import prior_of
-from factorgraph_loc.sensors.camera.tables import FEATURES
-from factorgraph_loc.sensors.camera.tables import PAIRS as PIXELS
+from factorgraph_loc.sensors.camera.measurement import FEATURES
+from factorgraph_loc.sensors.camera.measurement import PAIRS as PIXELS
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
-from factorgraph_loc.sensors.odometry.tables import IMU, INCREMENTS, VELOCITIES
-from factorgraph_loc.sensors.pushed import checked
+from factorgraph_loc.sensors.odometry.measurement import IMU, INCREMENTS, VELOCITIES
 from factorgraph_loc.sensors.rfid.stream import READS, scan_of
+from factorgraph_loc.sensors.tables import checked
 
 ONE = np.ones(1)
 SOUND = [
@@ -163,7 +164,7 @@ def test_times_of_estimates_and_images():
     localizer.initialize((0.0, 0.0, 0.0))
     for value in ABSURD:
         outcome(lambda value=value: localizer.estimate(value))
-        outcome(lambda value=value: localizer.push_image(value, np.zeros((4, 4), np.uint8)))
+        outcome(lambda value=value: localizer.push(CameraImage(value, np.zeros((4, 4), np.uint8))))
 
 
 def test_descriptors_of_another_length_are_refused():

@@ -18,9 +18,10 @@ from factorgraph_loc.sensors.registry import channels, sensors
 
 PACKAGE = ROOT / "factorgraph_loc"
 APART = ("sensors", "io", "builtin.py")  # the last lists what there is
-PLACES = [place for channel in channels().values() for place in (*channel.streams, *channel.measurements)]
-TYPES = {place.partition(":")[2] for place in PLACES} | {"Odometry", "Exteroceptive"}  # the latter: unions of some
-HELD = {field.name for place in PLACES for field in fields(load(place))} - {"t"}
+STREAMS = [load(place) for channel in channels().values() for place in channel.streams]
+CLASSES = [*STREAMS, *(stream.kind for stream in STREAMS)]
+TYPES = {kind.__name__ for kind in CLASSES}
+HELD = {field.name for kind in CLASSES for field in fields(kind)} - {"t", "source"}
 SECTIONS = {name for sensor in sensors().values() for name in sensor.settings}
 # landmarks are what estimators may learn, too, and a survey is none of a sensor alone
 NAMES = {*channels(), *sensors(), *SECTIONS} - {"landmarks", "survey"}

@@ -16,7 +16,7 @@ from package_tables import FACES, HEIGHT, MODULES, ROOT, imported, named, names_
 EXCEPTIONS: set[tuple[str, str]] = set()
 
 # what estimators and sensors know of each other
-CONTRACT = {f"factorgraph_loc.sensors.{name}" for name in ("base", "binding", "known_position", "motion", "registry")}
+CONTRACT = {f"factorgraph_loc.sensors.{name}" for name in ("base", "known_position", "motion", "registry")}
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -12,7 +12,7 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log, StartPose
-from factorgraph_loc.model.measurement import Stream
+from factorgraph_loc.model.measurement import Stream, columns_of
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.landmarks.settings import Landmark
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
@@ -89,7 +89,7 @@ def with_stream(log: Log, name: str, **columns) -> Log:
 def rows(log: Log, name: str, kept) -> Log:
     """The log with these rows (M,) of a stream."""
     stream = log.streams[name]
-    columns = {f.name: getattr(stream, f.name) for f in fields(stream)}
+    columns = columns_of(stream)
     return with_stream(
         log, name, **{k: v[kept] if isinstance(v, np.ndarray) else [v[i] for i in kept] for k, v in columns.items()}
     )

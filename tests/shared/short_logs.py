@@ -1,6 +1,6 @@
 """Short logs of every sensor, of an office and of a room, and a recorded one of ranges."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,6 +9,7 @@ from camera_world import with_frames
 
 from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import cut
+from factorgraph_loc.model.measurement import columns_of
 from factorgraph_loc.sensors.odometry.measurement import YawRateStream
 from factorgraph_loc.sensors.odometry.settings import ImuSettings
 from factorgraph_loc.sensors.rfid.settings import PhaseSettings, RssiSettings
@@ -45,7 +46,7 @@ def late(log, sensor):
     stream = log.streams[sensor]
     looks = np.unique(stream.t, return_inverse=True)[1]
     order = np.lexsort((np.arange(len(looks)), looks ^ 1))
-    columns = {f.name: getattr(stream, f.name) for f in fields(stream)}
+    columns = columns_of(stream)
     moved = {k: v[order] if isinstance(v, np.ndarray) else [v[i] for i in order] for k, v in columns.items()}
     return replace(log, streams=log.streams | {sensor: replace(stream, **moved)})
 

@@ -34,7 +34,7 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.plugins import MAPPERS
-from factorgraph_loc.sensors.binding import bound_sensors
+from factorgraph_loc.sensors.base import Binding, bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2
@@ -72,14 +72,8 @@ class Smoother(Timeline):
         calibration: Calibration = "all" if settings.self_calibration else "none"
         motion = Motion(setup.rig, setup.sensors, diagnostics, self_calibration=settings.self_calibration)
         super().__init__(motion, diagnostics, settings.max_delay)
-        self._sensors = sensors = bound_sensors(
-            setup,
-            self._motion,
-            self.diagnostics,
-            use=settings.landmarks,
-            points=settings.landmarks,
-            calibration=calibration,
-        )
+        use = settings.landmarks
+        self._sensors = sensors = bound_sensors(Binding(setup, motion, diagnostics, use, use, calibration))
         mapper: Mapper = MAPPERS["points"](sensors, self.diagnostics, settings)
         self._graph = Graph(self._motion, sensors, mapper, self.diagnostics)
         self._search = self._seeking = Search(sensors, self._motion, setup.rng)
@@ -240,7 +234,7 @@ class Smoother(Timeline):
         work = REPLAYED
         while self._behind and work > 0:
             m = self._behind.popleft()
-            work -= TICK if isinstance(m, Tick) else self._graph.sensors[m.modality].work
+            work -= TICK if isinstance(m, Tick) else self._graph.sensors[m.source].work
             self._take(m)
 
 

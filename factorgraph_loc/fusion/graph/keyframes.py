@@ -108,7 +108,7 @@ class Builder:
 
     def take(self, m: Measurement, odometry: ChainState) -> bool:
         """Take a measurement, with the ``odometry`` at its time; False where it is too late."""
-        graph, sensor = self._graph, self._graph.sensors[m.modality]
+        graph, sensor = self._graph, self._graph.sensors[m.source]
         graph.t = max(graph.t, m.t)
         if self._needs_keyframe(m, sensor):
             self._add_keyframe(odometry, None if sensor.gathers else m)
@@ -138,7 +138,7 @@ class Builder:
             elif self._settings.landmarks != "known":
                 interval = MAPPING_KEYFRAME_INTERVAL
         mapper = self._graph.mapper
-        return since >= interval or (since > 0.0 and m.modality == mapper.modality and mapper.is_due(m))
+        return since >= interval or (since > 0.0 and m.source == mapper.sensor and mapper.is_due(m))
 
     def gather(self) -> list[Node]:
         """What waits on the newest keyframe becomes factors of it."""
@@ -152,7 +152,7 @@ class Builder:
         if self._gatherer is None:
             return []
         terms = self._gatherer.gathered(self._waiting)
-        return [self._graph.node(self._graph.newest, term, self._gatherer.modality) for term in terms]
+        return [self._graph.node(self._graph.newest, term, self._gatherer.name) for term in terms]
 
     def clear(self) -> None:
         """A new track begins: nothing waits."""
@@ -197,7 +197,7 @@ class Builder:
                 self._waiting.append(seen)
             else:
                 for term in seen.terms:
-                    addition.hang(view.keyframe, self._graph.node(view.keyframe, term, sensor.modality))
+                    addition.hang(view.keyframe, self._graph.node(view.keyframe, term, sensor.name))
             if view.newest:
                 self._search.expect(sensor, here, odometry, view)
                 evidence = partial(laplace_evidence, here, view.pose, view.covariance, correction)
@@ -234,7 +234,7 @@ class Builder:
         The guess is where the graph linearises first, and what the robust weights are computed at. Without one the keyframe is an
         older one: what is not yet in the graph stays out, and the innovation is that of its causal estimate.
         """
-        graph, sensor = self._graph, self._graph.sensors[m.modality]
+        graph, sensor = self._graph, self._graph.sensors[m.source]
         expected = keyframe.causal if guess is None else guess
         assert expected is not None
         view = _KeyframeView(graph, self._backend, keyframe, expected, offset, newest=guess is not None)
@@ -242,14 +242,14 @@ class Builder:
         if guess is None:
             return None
         guess = view.pose, view.covariance
-        if m.modality == graph.mapper.modality and keyframe is graph.newest and m.t == keyframe.t:
+        if m.source == graph.mapper.sensor and keyframe is graph.newest and m.t == keyframe.t:
             guess = graph.mapper.take(m, keyframe, guess, self._graph_view(sensor), addition, is_new=is_new)
         return guess
 
     def _add_link(self, link: Link, sensor: Sensor, keyframe: Keyframe, addition: Addition) -> None:
         """A factor on a keyframe and an earlier one, which waits for the final problem if that has left the solver."""
         earlier = self._graph.before(link.earlier)
-        node = Node((keyframe.key, earlier.key), link.factor, link.rows, sensor=sensor.modality)
+        node = Node((keyframe.key, earlier.key), link.factor, link.rows, sensor=sensor.name)
         keyframe.nodes.append(node)
         if self._backend.is_open(earlier.index):
             addition.nodes.append(node)
@@ -261,7 +261,7 @@ class Builder:
             return graph.recalibrated(graph.motion.relative(first.odometry, last.odometry))
 
         estimates = graph.values, graph.spreads, backend.current, backend.is_open
-        key = graph.keys.get(sensor.modality)
+        key = graph.keys.get(sensor.name)
         shared = () if key is None else (key,)
         constants = None if key is None else graph.values[key]
         motion = between, graph.motion.slip, graph.motion.twist
@@ -277,4 +277,4 @@ class Builder:
         for t, seen in new.sightings:
             keyframe = self._graph.before(t)
             if keyframe.t <= t and self._backend.is_open(keyframe.index):
-                addition.hang(keyframe, *(self._graph.node(keyframe, term, sensor.modality) for term in seen.terms))
+                addition.hang(keyframe, *(self._graph.node(keyframe, term, sensor.name) for term in seen.terms))

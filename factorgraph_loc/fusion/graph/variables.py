@@ -94,7 +94,7 @@ def index_of(key: int) -> int:
 @dataclass(frozen=True)
 class Node:
     """A factor of the graph on the variables ``keys``: one of ours with ``rows`` residuals, GTSAM's own (``native``),
-    or both, which are the same. ``sensor``: the modality of what told it."""
+    or both, which are the same. ``sensor``: the name of the sensor that it comes from."""
 
     keys: tuple[int, ...]
     factor: Factor | None = None

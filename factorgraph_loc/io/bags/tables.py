@@ -24,7 +24,7 @@ from factorgraph_loc.io.bags.topics import LIST, Fields, TopicRows, TopicSetting
 from factorgraph_loc.maps.markers import corner_names
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Axes, Turned
-from factorgraph_loc.sensors.camera.tables import SIGHTINGS
+from factorgraph_loc.sensors.camera.measurement import SIGHTINGS
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
 from factorgraph_loc.sensors.rfid import tables as native_rfid
 from factorgraph_loc.sensors.rfid.stream import RFID, RfidStream

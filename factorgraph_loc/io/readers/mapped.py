@@ -27,9 +27,9 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Turned, about_z, on_floor, rotations_of
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera.tables import make_images
-from factorgraph_loc.sensors.odometry.tables import IMU, INCREMENTS, VELOCITIES, WAYS
-from factorgraph_loc.sensors.odometry.tables import WHEELS as WHEEL_COLUMNS
+from factorgraph_loc.sensors.camera.measurement import make_images
+from factorgraph_loc.sensors.odometry.measurement import IMU, INCREMENTS, VELOCITIES, WAYS
+from factorgraph_loc.sensors.odometry.measurement import WHEELS as WHEEL_COLUMNS
 from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, ReadsByRound, read_rounds
 from factorgraph_loc.sensors.tables import Reading, native_tables
 from factorgraph_loc.text import listed

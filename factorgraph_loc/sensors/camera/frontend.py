@@ -330,12 +330,11 @@ class LiveFrontend:
 
         InputError if it is no such array, or has another size than the camera is calibrated for.
         """
-        pixels = as_image(image, f"image at {t:.3f} s")
+        pixels = as_image(image, f"CameraImage at {t:.3f} s")
         height, width = pixels.shape[:2]
         if (width, height) != (self._camera.width, self._camera.height):
-            raise InputError(
-                f"image at {t:.3f} s: has {width} x {height} px, expected {self._camera.width} x {self._camera.height}"
-            )
+            expected = f"{self._camera.width} x {self._camera.height}"
+            raise InputError(f"CameraImage at {t:.3f} s: has {width} x {height} px, expected {expected}")
         found = decode(encode(*self._extractor.detectAndCompute(pixels)))
         numbers = self._follow(found)
         return CameraFrame(t, self._feature, found.pixels, found.sizes, found.descriptors, numbers)

@@ -15,7 +15,8 @@ from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.model.setup import MapUse, Setup
-from factorgraph_loc.sensors.camera.measurement import PixelSightings
+from factorgraph_loc.sensors.camera.measurement import Pixels, PixelSightings
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
@@ -29,7 +30,6 @@ from factors.camera.floor import TiltScale
 from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel
 from factors.motion import Increment, propagate
 from factors.se2 import Array
-from factors.update import Correction
 
 DISAGREES = "camera: does not agree with the others"  # reason of a rejection
 CAMERAS = ("camera", "sightings")  # channels that use the rig's camera: features, and named points
@@ -44,7 +44,6 @@ EXACT = 0.1  # a map is treated as exact if its errors are below this share of a
 ITERATIONS, SETTLED = 8, 1e-3  # m, rad: convergence limit of a step
 
 NOT_DISPLACED: Mapping[str, tuple[Array, Array]] = MappingProxyType({})
-Pixels = PixelSightings | CameraFrame  # measurements of a camera
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class KnownPoints:
     """Turns camera measurements into factors. Points that map or rig lack are counted as ignored, outliers as rejected.
 
     ``estimated``: the camera's constants that are estimated. ``use``: see
-    :class:`~factorgraph_loc.sensors.landmarks.known_landmarks.KnownLandmarks`.
+    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`.
     """
 
     def __init__(
@@ -71,12 +70,13 @@ class KnownPoints:
         diagnostics: Diagnostics,
         estimated: Estimated,
         use: MapUse = "known",
+        name: str = PixelSightings.modality,
     ) -> None:
-        used = any(sensor in setup.sensors for sensor in CAMERAS)
-        settings = setup.rig.camera if used else None
-        self.model: CameraModel | None = None if settings is None else replace(settings.model(), tempering=1.0)
-        self.floor = None if self.model is None else TiltScale.guessed(self.model.tilt)
-        self._tempering = 1.0 if settings is None else settings.tempering  # for matched points
+        settings = setup.rig.of(CameraSettings)
+        self.name = name
+        self.model: CameraModel = replace(settings.model(), tempering=1.0)
+        self.floor = TiltScale.guessed(self.model.tilt)
+        self._tempering = settings.tempering  # for matched points
         self.map = PointMap.of((), np.empty((0, 3)))
         if setup.world.points is not None and use != "unknown":
             self.map = without_common(setup.world.points)
@@ -86,22 +86,17 @@ class KnownPoints:
         self._estimated = estimated
         self._diagnostics = diagnostics
         self.associator: Associator | None = None
-        if self.model is not None and "camera" in setup.sensors and len(self.map.owners):
+        if "camera" in setup.sensors and len(self.map.owners):
             self.associator = Associator(self.map, self.model)
         self.missed = False  # whether points of the map were missing in the last image
         self._map_matters = False
         self._inexact = np.zeros(len(self.map), dtype=bool)
-        if settings is not None and len(self.map):
+        if len(self.map):
             variances = np.trace(self.map.covariances, axis1=1, axis2=2)
             worst = float(variances.max())
             pixel = settings.pixel_sigma / settings.fx
             self._map_matters = worst > (EXACT * pixel) ** 2
             self._inexact = variances > 3.0 * (settings.exact_survey * NEAR * pixel) ** 2
-
-    @property
-    def known(self) -> bool:
-        """Whether the camera is used and the map has points."""
-        return self.model is not None and len(self.map) > 0
 
     @property
     def needs_twist(self) -> bool:
@@ -112,7 +107,7 @@ class KnownPoints:
         """What is seen that was surveyed with an error. By name, of a point or of a marker, that of each of its points and the
         covariance (3, 3) of their common displacement."""
         found: dict[str, tuple[list[str], Array]] = {}
-        if self.model is None or not isinstance(m, PixelSightings) or not self._inexact.any():
+        if not isinstance(m, PixelSightings) or not self._inexact.any():
             return found
         for name in dict.fromkeys(m.points):
             place = self.map.index.get(name, -1)
@@ -123,9 +118,6 @@ class KnownPoints:
 
     def named(self, m: PixelSightings) -> ReprojectionFactor | None:
         """All named points of the map without outlier rejection, on the pose at their time."""
-        if self.model is None:
-            self._diagnostics.ignore("camera", len(m.pixels))
-            return None
         places = [self.map.index.get(name, -1) for name in m.points]
         pixels = m.pixels
         if -1 in places:
@@ -187,7 +179,7 @@ class KnownPoints:
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
         """The pose of an image without a prediction, or None, and the number of points that it seemed to show."""
         model = self.model
-        if model is None or not self.known:
+        if not len(self.map):
             return None, 0
         if isinstance(m, PixelSightings):
             rows = [i for i, name in enumerate(m.points) if name in self.map.index]
@@ -203,13 +195,6 @@ class KnownPoints:
         camera = CameraPose(position, rotation, covariance)
         return on_floor(model, camera, self.map.positions[seen.points], pixels, spreads), seen.expected
 
-    def report(self, t: float, factor: ReprojectionFactor, update: Correction) -> None:
-        """Record the innovation of an update at time ``t``."""
-        self._diagnostics.innovation("camera", t, update.nis, update.dof)
-        u, v = (-factor.model.sigma * update.residual.T).tolist()
-        self._diagnostics.add_residuals("camera.u", u)
-        self._diagnostics.add_residuals("camera.v", v)
-
     def _factor(self, model: CameraModel, points: list[int], pixels: Array) -> ReprojectionFactor:
         spreads = self.map.covariances[points] if self._map_matters else None
         return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=spreads)
@@ -217,12 +202,12 @@ class KnownPoints:
     def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
         """A factor without points yet; None if features cannot be matched with the map."""
         self.names = ()
-        if self.model is None or self.associator is None:
-            if self.model is None or not self._others_matter:
-                self._diagnostics.ignore("camera", len(m.pixels))
+        if self.associator is None:
+            if not self._others_matter:
+                self._diagnostics.ignore(self.name, len(m.pixels))
             return None
         if m.feature != self.map.feature:
-            self._diagnostics.ignore("camera: features of another kind than the map's", len(m.pixels))
+            self._diagnostics.ignore(f"{self.name}: features of another kind than the map's", len(m.pixels))
             return None
         return self._factor(replace(self.model, tempering=self._tempering), [], np.empty((0, 2)))
 
@@ -258,7 +243,6 @@ class KnownPoints:
         tilt, spread = pixel_kernels.leaning(here.packed(), pose, covariance)
         if math.hypot(*tilt) > STEEPEST:
             return None
-        assert self.floor is not None
         self.floor, sigma = self.floor.learnt(tilt, spread, float(here.model.tilt))
         return replace(factor, model=replace(factor.model, tilt=sigma))
 

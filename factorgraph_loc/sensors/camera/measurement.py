@@ -1,16 +1,27 @@
 """Measurements of cameras: named points in images, and the streams of these, of images and of their features."""
 
-from collections.abc import Iterator, Sequence
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files import checks, values
+from factorgraph_loc.files.bounded import NoFileNameError, copy_file
+from factorgraph_loc.files.columns import LARGEST_PIXEL, PIXELS, PURE, STAMP, Column, Table, named, number, within
+from factorgraph_loc.files.models import inside
+from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.model.measurement import Measurement, Stream
+from factorgraph_loc.sensors.tables import Columns, Reading, Writing
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.se2 import Array
+
+if TYPE_CHECKING:
+    pass
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +35,7 @@ class PixelSightings:
     t: float
     points: tuple[str, ...]
     pixels: Array
+    source: str = modality
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -36,10 +48,27 @@ class PixelSightings:
         return len(self.pixels)
 
 
+@dataclass(frozen=True, slots=True)
+class CameraImage:
+    """An image that a program pushes. ``pixels``: (H, W) or (H, W, 3) BGR, see :func:`factorgraph_loc.vision.images.as_image`."""
+
+    sensor: ClassVar[str] = "camera"
+    modality: ClassVar[str] = "camera"
+    is_motion: ClassVar[bool] = False
+    count: ClassVar[int] = 1
+    t: float
+    pixels: Any
+    source: str = modality
+
+
+Pixels = PixelSightings | CameraFrame  # measurements of a camera that estimators take
+
+
 @dataclass(frozen=True)
 class SightingStream(Stream):
     """Rows of named points in images: name and pixel (``u``, ``v``) [px]. Rows with equal timestamps form one measurement."""
 
+    kind: ClassVar[type[Any]] = PixelSightings
     point: Sequence[str]
     u: Array
     v: Array
@@ -47,13 +76,15 @@ class SightingStream(Stream):
     def measurements(self, offset: float) -> Iterator[Measurement]:
         for i, j in self.scans():
             pixels = np.column_stack((self.u[i:j], self.v[i:j]))
-            yield PixelSightings(float(self.t[i]) + offset, tuple(self.point[i:j]), pixels)
+            source = self.source or PixelSightings.modality
+            yield PixelSightings(float(self.t[i]) + offset, tuple(self.point[i:j]), pixels, source)
 
 
 @dataclass(frozen=True)
 class ImageStream(Stream):
     """Image files (N,). :mod:`factorgraph_loc.sensors.camera.frontend` turns them into features."""
 
+    kind: ClassVar[type[Any]] = CameraImage
     file: Sequence[Path]
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
@@ -64,8 +95,139 @@ class ImageStream(Stream):
 class FeatureStream(Stream):
     """Features of images: ``frame`` (N,), whose own timestamps are ignored."""
 
+    kind: ClassVar[type[Any]] = CameraFrame
     frame: Sequence[CameraFrame]
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         for t, frame in zip((self.t + offset).tolist(), self.frame, strict=True):
-            yield replace(frame, t=t)
+            yield replace(frame, t=t, source=self.source or frame.source)
+
+
+CAMERA = Table("camera", (STAMP, named("file", "the name of an image", "file")), "one each")
+SIGHTINGS = Table(
+    "sightings",
+    (
+        STAMP,
+        named("landmark", "the name of a landmark", field="point"),
+        within("u", PIXELS, LARGEST_PIXEL, "to the right; may lie outside of the image"),
+        within("v", PIXELS, LARGEST_PIXEL, "down"),
+    ),
+    "one measurement",
+    stream="factorgraph_loc.sensors.camera.measurement:SightingStream",
+)
+# features of images, as pushed by a program
+FEATURES = Table(
+    "features",
+    (
+        STAMP,
+        within("pixels", PIXELS, LARGEST_PIXEL, "position of the feature"),
+        number("sizes", PIXELS, 1e-3, LARGEST_PIXEL, "size of the feature"),
+        within("descriptors", PURE, 1e6, "descriptor of the feature"),
+        Column("tracks", "whole", PURE, -(2.0**53), 2.0**53, False, "number of the track that the feature belongs to"),
+    ),
+    "one measurement",
+)
+
+
+FOLDER = "camera"
+
+
+def make_images(table: TableRows, t0_ns: int, warnings: list[str], folder: Path | None = None) -> ImageStream:
+    """The existing images in order of arrival; of several with one timestamp the last. They are in ``folder``, which must be
+    validated, by default that of the native format.
+
+    InputError if a path leaves the folder or is no regular file, or a timestamp is late by more than 0.5 s.
+    """
+    latest = checks.last_in_order(table.path, table.rows, table.t_ns, warnings).tolist()
+    within = inside(table.path.parent, FOLDER, table.path) if folder is None else folder
+    named = zip(table.rows.tolist(), table.names["file"], strict=True)
+    paths = [_image(within, f"{table.path}:{row}", name) for row, name in named]
+    keep = [i for i in latest if paths[i] is not None]
+    if missing := [i for i in latest if paths[i] is None]:
+        first = f"{table.names['file'][missing[0]]} of row {table.rows[missing[0]]}"
+        warnings.append(
+            f"{table.path}: {len(missing)} of {len(latest)} images are missing and skipped, the first is {first}"
+        )
+    t = checks.seconds(table.t_ns[keep], t0_ns)
+    return ImageStream(t, [path for path in (paths[i] for i in keep) if path is not None])
+
+
+def assemble(rows: Mapping[str, TableRows], reading: Reading) -> ImageStream:
+    """The images in a log's folder."""
+    return make_images(rows["camera"], reading.t0_ns, reading.warnings)
+
+
+def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
+    """The rows of images, which are copied to the folder; InputError for features, which cannot be written."""
+    if not isinstance(stream, ImageStream):
+        raise InputError(f"{writing.log}: camera holds features, expected the images they were computed from")
+    return {
+        "camera": {"t_ns": checks.absolute(stream.t, writing.t0_ns), "file": write_images(stream.file, writing.folder)}
+    }
+
+
+def write_images(files: Sequence[Path], folder: Path) -> list[str]:
+    """Copy the images into the new folder ``camera`` in ``folder``, numbered, and return their names. InputError if one is
+    missing."""
+    target = folder / FOLDER
+    target.mkdir()
+    names = [f"{i:06d}{file.suffix}" for i, file in enumerate(files)]
+    for file, name in zip(files, names, strict=True):
+        _copy(file, target / name)
+    return names
+
+
+def _copy(file: Path, target: Path) -> None:
+    try:
+        copy_file(file, target)
+    except OSError as error:
+        raise InputError(f"{file}: cannot be copied into {target.parent}: {error.strerror}") from error
+
+
+def _image(folder: Path, source: str, name: str) -> Path | None:
+    """The path of an image in ``folder``, or None if there is no such file."""
+    try:
+        path = inside(folder, name, source)
+    except NoFileNameError:
+        return None
+    return path if path.is_file() else None
+
+
+PAIRS = replace(SIGHTINGS["u"], name="pixels")
+BYTE = replace(FEATURES["descriptors"], kind="whole", low=0.0, high=255.0)
+
+
+def check_sightings(m: PixelSightings, where: str) -> dict[str, Any]:
+    """The fields of named points; InputError names the first invalid one."""
+    points = values.names(where, "points", m.points)
+    return {"points": points, "pixels": values.within(where, PAIRS, m.pixels, (len(points), 2))}
+
+
+def check_frame(m: CameraFrame | CameraImage, where: str) -> dict[str, Any]:
+    """The fields of an image's features; InputError names the first invalid one. Pixels of images are checked later."""
+    if isinstance(m, CameraImage):
+        return {}
+    pixels = values.numbers(where, "pixels", m.pixels)
+    if pixels.ndim != 2:
+        raise InputError(f"{where}: pixels has shape {pixels.shape}, expected (K, 2)")
+    if not isinstance(m.feature, str):
+        raise bad_field(where, "feature", m.feature, "the name of a feature")
+    count = len(pixels)
+    return {
+        "pixels": values.within(where, FEATURES["pixels"], pixels, (count, 2)),
+        "sizes": values.within(where, FEATURES["sizes"], m.sizes, (count,)),
+        "descriptors": _descriptors(where, m.descriptors, count, m.feature),
+        "tracks": values.integers(where, FEATURES["tracks"], m.tracks, count),
+    }
+
+
+def _descriptors(where: str, value: object, count: int | None, feature: str) -> Any:
+    """Descriptors (K, D); bytes for a binary feature."""
+    rows = values.numbers(where, "descriptors", value)
+    if rows.ndim != 2 or len(rows) != count:
+        raise InputError(f"{where}: descriptors has shape {rows.shape}, expected ({count}, D)")
+    binary = feature == "orb"
+    column = BYTE if binary else FEATURES["descriptors"]
+    if (bad := column.outside(rows)).any():
+        raise bad_field(where, "descriptors", float(rows[bad][0]), column.expected)
+    return rows.astype(np.uint8 if binary else np.float32)

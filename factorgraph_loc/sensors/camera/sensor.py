@@ -8,7 +8,7 @@ are predicted. If the start position is known, an image must agree with it.
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
@@ -17,17 +17,11 @@ import numpy as np
 from factorgraph_loc.model.belief import Mode, PosePrior
 from factorgraph_loc.model.measurement import GOING_BACK
 from factorgraph_loc.model.settings import NOTHING, Estimated
-from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
-from factorgraph_loc.sensors.camera.known_points import (
-    CAMERAS,
-    ITERATIONS,
-    SETTLED,
-    KnownPoints,
-    Pixels,
-    Predicted,
-)
+from factorgraph_loc.sensors.base import Binding, Blocks, Columns, NewVariable, ResidualObservation, Sensor, Term, View
+from factorgraph_loc.sensors.camera.known_points import CAMERAS, ITERATIONS, SETTLED, KnownPoints, Predicted
+from factorgraph_loc.sensors.camera.measurement import Pixels
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.turn_check import TurnCheck
+from factorgraph_loc.sensors.camera.use import TurnCheck
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.vision.relocalization import FoundOnFloor
@@ -65,12 +59,7 @@ class PixelObservation(ResidualObservation):
         return cls(t, (Term(seen, blocks, seen.dof()),), seen, expected)
 
     def correct(
-        self,
-        pose: Array,
-        covariance: Array,
-        values: Mapping[str, Array],
-        columns: Mapping[str, slice],
-        iterations: int = ITERATIONS,
+        self, pose: Array, covariance: Array, values: Blocks, columns: Columns, iterations: int = ITERATIONS
     ) -> Correction:
         if self.held is not None:
             size = 3 + len(self.held[0])
@@ -81,7 +70,7 @@ class PixelObservation(ResidualObservation):
         at, places = [values[name] for name in self.blocks], [columns[name] for name in self.blocks]
         return image_update(self.seen, pose, covariance, iterations, self.settled, at, places)
 
-    def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
+    def log_likelihood(self, poses: Array, values: Blocks) -> Array:
         factor, spreads = self.seen, None
         _, by_pose, by_point, by_constants = reprojection.linearize(factor.model, self.expected, factor.points)
         tilts = reprojection.by_tilt(factor.model, by_constants)
@@ -98,7 +87,7 @@ class PixelObservation(ResidualObservation):
                 spreads = spreads + len(common) * common
         return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, tilts, spreads)
 
-    def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
+    def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
         """The observation on the pose only; the uncertainty of the camera's constants and of points is added to the noise."""
         if not self.blocks:
             return self
@@ -124,17 +113,18 @@ class CameraSensor(Sensor):
     follows_constants = True  # matching depends on them
 
     def __init__(self, binding: Binding, constants: Estimated) -> None:
-        setup, motion, diagnostics, use = binding.setup, binding.motion, binding.diagnostics, binding.points
+        super().__init__(binding.name)
+        motion, self._diagnostics = binding.motion, binding.diagnostics
         self._uncertain, self._motion = constants, motion
         self.constants = constants if binding.calibration == "all" else NOTHING
         self._carries = binding.calibration != "particles"  # too many for particles
-        self.points = KnownPoints(setup, diagnostics, constants, use)
-        self._check = TurnCheck(self.points.model, motion, diagnostics, constants)
+        self.points = KnownPoints(binding.setup, self._diagnostics, constants, binding.points, self.name)
+        self._check = TurnCheck(self.points.model, motion, self._diagnostics, constants)
         # times [s] of recent looks at what was surveyed with an error and is not estimated
         self._looks: dict[str, list[float]] = defaultdict(list)
-        self._before: deque[tuple[float, TiltScale | None]] = deque()  # what was known of the floor before an image
-        self._shared = (self.modality,) if constants.names else ()
-        if self.points.known:
+        self._before: deque[tuple[float, TiltScale]] = deque()  # what was known of the floor before an image
+        self._shared = (self.name,) if constants.names else ()
+        if len(self.points.map):
             self.finder = PixelFinder(self.points, motion)
             # pixels of known points determine the pose so well that the graph need not be solved for each image, unless the
             # camera's mounting is estimated
@@ -155,7 +145,7 @@ class CameraSensor(Sensor):
             predicted = replace(predicted, constants=values[name], spread=spreads[name])
         displaced, blocks = {}, {}
         for name, (points, survey) in self.points.inexact(m).items():
-            block = f"{self.modality}/{name}"
+            block = f"{self.name}/{name}"
             if self._carries and view.value(block) is None:
                 yield NewVariable(block, np.zeros(3), np.zeros((3, 3)), {}, survey, ())
             by, spread = view.value(block), survey
@@ -194,7 +184,10 @@ class CameraSensor(Sensor):
         self._looks.clear()
 
     def judge(self, observation: PixelObservation, correction: Correction, view: View) -> bool:
-        self.points.report(observation.t, observation.seen, correction)
+        self._diagnostics.innovation(self.name, observation.t, correction.nis, correction.dof)
+        u, v = (-observation.seen.model.sigma * correction.residual.T).tolist()
+        self._diagnostics.add_residuals(f"{self.name}.u", u)
+        self._diagnostics.add_residuals(f"{self.name}.v", v)
         return True
 
 

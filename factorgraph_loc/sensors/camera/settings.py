@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from factorgraph_loc.files.models import FileModel, InUnit
+from factorgraph_loc.maps.common_error import CommonError
 from factorgraph_loc.model.settings import Angle, Hertz, Metres, Offset, SensorSettings, Share
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
+from factors.se2 import Array
+
+if TYPE_CHECKING:
+    from factorgraph_loc.model.world import World
 
 Focal = Annotated[float, Field(gt=1.0, le=1e5), InUnit("px")]
 Pixel = Annotated[float, Field(ge=-1e5, le=1e5), InUnit("px")]
@@ -112,6 +119,13 @@ class CameraSettings(SensorSettings):
             robust=self.robust,
             tempering=self.tempering,
         )
+
+    def map_error(self, world: World) -> Callable[[Array], Array] | None:
+        common = None if world.points is None else CommonError.of(world.points)
+        if common is None:
+            return None
+        ahead = self.model().rotation[:, 2]
+        return partial(common.at, looking=math.atan2(ahead[1], ahead[0]))
 
 
 class PixelSettings(FileModel):

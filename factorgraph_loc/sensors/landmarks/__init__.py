@@ -11,7 +11,6 @@ SENSOR = SensorType(
         Channel(
             "bearing_range",
             streams=("factorgraph_loc.sensors.landmarks.measurement:BearingRangeStream",),
-            measurements=("factorgraph_loc.sensors.landmarks.measurement:BearingRange",),
             tables=("factorgraph_loc.sensors.landmarks.measurement:BEARING_RANGE",),
             section="bearing_range",
         ),
@@ -20,11 +19,10 @@ SENSOR = SensorType(
     layers={
         "landmarks": Layer(
             "factorgraph_loc.sensors.landmarks.settings:Landmark",
-            read="factorgraph_loc.sensors.landmarks.map:read_layer",
+            read="factorgraph_loc.sensors.landmarks.settings:read_layer",
         ),
     },
     detects="landmarks",
-    undetected="no landmark of the map was seen",
     bind="factorgraph_loc.sensors.landmarks.sensor:bind",
     summarize="factorgraph_loc.sensors.landmarks.summary:summarize",
     check="factorgraph_loc.sensors.landmarks.summary:check",

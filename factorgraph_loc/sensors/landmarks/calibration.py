@@ -11,9 +11,9 @@ from scipy.optimize import minimize
 
 from factorgraph_loc.fitting.robust import Constant, Integers, spread
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.sensors.calibrating import REFERENCE_GAP
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
-from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
 from factors.landmarks import model as bearing_range
 from factors.se2 import Array
 

@@ -11,16 +11,16 @@ from __future__ import annotations
 
 import bisect
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.model.belief import Mode, PosePrior, Status
+from factorgraph_loc.model.belief import Mode, PosePrior
 from factorgraph_loc.sensors.base import View
 from factorgraph_loc.sensors.known_position import KnownPosition
-from factorgraph_loc.sensors.landmarks.known_landmarks import KnownLandmarks
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factorgraph_loc.sensors.landmarks.window import Sighting, SightingWindow
 from factorgraph_loc.sensors.motion import Motion
@@ -68,36 +68,61 @@ class Hypothesis(Mode):
     landmarks: int
 
 
-class Relocalizer:
-    """Hypotheses of the present pose from recent sightings; see the module. ``positions`` (L, 2): of the map's landmarks."""
+class LandmarkFinder:
+    """A :class:`~factorgraph_loc.sensors.base.Finder`; see the module.
 
-    def __init__(self, motion: Motion, positions: Array) -> None:
-        self._motion = motion
+    ``factor``: the factor of the map's landmarks in a measurement, on the pose at its time. ``positions`` (L, 2): of the landmarks.
+    ``hypotheses``: of the last search, most likely first; ``best``: the pose at the last sighting if one hypothesis is
+    unambiguous, else None.
+    """
+
+    at_once = False
+
+    def __init__(
+        self, factor: Callable[[BearingRange], BearingRangeFactor | None], motion: Motion, positions: Array
+    ) -> None:
+        self._factor, self._motion = factor, motion
         extent = np.ptp(positions, axis=0) if len(positions) else np.zeros(2)
         self._log_volume = math.log(2.0 * math.pi * np.prod(extent + 2.0 * MARGIN))
         self._model = BearingRangeModel()
         self._sightings: dict[tuple[float, float], list[Sighting]] = {}
         self._window: SightingWindow | None = None
-        self._hypotheses: tuple[Hypothesis, ...] = ()
-        self._best: PosePrior | None = None
-        self.start: KnownPosition | None = None  # known start position while the heading is sought
+        self._monitor = TrackMonitor()
+        self.hypotheses: tuple[Hypothesis, ...] = ()
+        self.best: PosePrior | None = None
+        self.start: KnownPosition | None = None
+        self.newest: ChainState | None = None
 
     @property
-    def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """The hypotheses of the last search, most likely first."""
-        return self._hypotheses
+    def suspicious_since(self) -> float | None:
+        """The time since which most landmarks are not where they are predicted."""
+        return self._monitor.suspicious_since
 
-    @property
-    def best(self) -> PosePrior | None:
-        """The pose at the last sighting if one hypothesis is unambiguous, else None."""
-        return self._best
+    def look(self, m: BearingRange, odometry: ChainState) -> bool:
+        seen = self._factor(m)
+        if seen is None:
+            return False
+        self.add(odometry, seen)
+        self.search()
+        self.newest = odometry
+        return True
 
-    @property
-    def status(self) -> Status:
-        """``unlocalized`` without hypotheses, ``localized`` if one is unambiguous, else ``ambiguous``."""
-        if self._best is not None:
-            return "localized"
-        return "ambiguous" if self._hypotheses else "unlocalized"
+    def follow(self, observation: Any, odometry: ChainState, view: View) -> None:
+        seen = observation.on_pose({name: np.asarray(view.value(name)) for name in observation.blocks}, {}).measured
+        self.add(odometry, seen)
+        self._monitor.add(observation.t, seen, view.pose, view.covariance)
+
+    def refuted_since(self, m: BearingRange, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
+        since = self._monitor.suspicious_since
+        if since is None or (self.newest is not None and odometry.t < self.newest.t + SEARCH_INTERVAL):
+            return None
+        self.forget(since)
+        self.search()
+        self.newest = odometry
+        return since if self.refutes(pose, covariance) else None
+
+    def clear(self) -> None:
+        self._monitor.clear()
 
     def add(self, odometry: ChainState, seen: BearingRangeFactor) -> None:
         """Add landmarks seen at ``odometry``; late and repeated sightings are accepted."""
@@ -118,8 +143,8 @@ class Relocalizer:
     def search(self) -> None:
         """Find the hypotheses at the time of the last sighting."""
         rows = sorted((r for rows in self._sightings.values() for r in rows), key=lambda r: r.odometry.t)[-ROWS:]
-        earlier, before = self._hypotheses, self._window
-        self._hypotheses, self._best, self._window = (), None, None
+        earlier, before = self.hypotheses, self._window
+        self.hypotheses, self.best, self._window = (), None, None
         if not rows:
             return
         window = self._window = SightingWindow(self._model, rows, self._motion, self.start)
@@ -137,15 +162,15 @@ class Relocalizer:
         logs = -geman_mcclure_loss(squared, self._model.robust).sum(axis=1) + self._log_prior(
             window, poses, covariances
         )
-        self._hypotheses = self._weighed(window, poses, covariances, squared, logs)
-        self._best = self._clear(window)
+        self.hypotheses = self._weighed(window, poses, covariances, squared, logs)
+        self.best = self._clear(window)
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Poses (N, 3) at the last sighting, sampled from the hypotheses; those too wide to be Gaussian are replaced by samples
         from the likelihood of that sighting (sensor resetting: Lenser, Veloso, ICRA 2000). None before the first search."""
         if self._window is None:
             return np.empty((0, 3))
-        narrow = [h for h in self._hypotheses if np.linalg.eigvalsh(h.covariance[:2, :2])[-1] < WIDE**2]
+        narrow = [h for h in self.hypotheses if np.linalg.eigvalsh(h.covariance[:2, :2])[-1] < WIDE**2]
         weights = np.array([h.weight for h in narrow])
         counts = rng.multinomial(count, np.append(weights, max(0.0, 1.0 - weights.sum())))
         poses = [self._window.drawn(rng, int(counts[-1]))]
@@ -158,13 +183,13 @@ class Relocalizer:
         """Whether a track's ``pose`` (3,) at the last sighting, with body-frame ``covariance`` (3, 3), must be wrong: an
         unambiguous hypothesis explains nearly all sightings, and far more than the track. Wrongly mapped landmarks may also
         agree on a pose, but the others contradict it."""
-        if self._best is None or self._window is None:
+        if self.best is None or self._window is None:
             return False
-        if self._hypotheses[0].share < REFUTING_SHARE or self._hypotheses[0].landmarks < REFUTING_LANDMARKS:
+        if self.hypotheses[0].share < REFUTING_SHARE or self.hypotheses[0].landmarks < REFUTING_LANDMARKS:
             return False
         window, scale = self._window, self._model.robust
         track = geman_mcclure_loss(window.squared(pose[None], window.whitener(covariance)), scale).sum()
-        other = geman_mcclure_loss(window.squared(self._best.pose[None], window.whitener()), scale).sum()
+        other = geman_mcclure_loss(window.squared(self.best.pose[None], window.whitener()), scale).sum()
         return bool(track - other > REFUTED * 0.5 * scale**2 * len(window.points))
 
     def _log_prior(self, window: SightingWindow, poses: Array, covariances: Array) -> Array:
@@ -201,9 +226,9 @@ class Relocalizer:
 
     def _clear(self, window: SightingWindow) -> PosePrior | None:
         """The most likely hypothesis if it is unambiguous, with the moments of the joint solution of its sightings."""
-        if not self._hypotheses:
+        if not self.hypotheses:
             return None
-        best = self._hypotheses[0]
+        best = self.hypotheses[0]
         if best.weight < CLEAR_WEIGHT or best.share <= 0.5:
             return None
         # a single landmark may be misidentified, unless the start agrees
@@ -269,17 +294,12 @@ def _distance(pose: Array, other: Array, covariance: Array) -> float:
 class TrackMonitor:
     """Detects that most landmarks of the last timestamps are far outside the gate.
 
-    That is only a suspicion, because a wrong map looks the same. A :class:`Relocalizer` tells whether there is a better pose.
+    That is only a suspicion, because a wrong map has the same effect. A search decides whether there is a better pose.
     """
 
     def __init__(self) -> None:
         self._stamps: list[tuple[float, int, int]] = []
-        self._since: float | None = None
-
-    @property
-    def suspicious_since(self) -> float | None:
-        """The time since which most landmarks are outside, or None."""
-        return self._since
+        self.suspicious_since: float | None = None  # s, since which most landmarks are outside
 
     def add(self, t: float, seen: BearingRangeFactor, pose: Array, covariance: Array) -> None:
         """Add the landmarks of a timestamp, with the predicted ``pose`` (3,) and its body-frame ``covariance`` (3, 3)."""
@@ -290,15 +310,13 @@ class TrackMonitor:
         self._stamps.append((t, beyond, len(seen.points)))
         counts = tuple(zip(*self._last(), strict=True))
         share = sum(counts[1]) / max(1, sum(counts[2])) if counts else 0.0
-        if share > SHARE or (self._since is not None and share >= SHARE / 2.0):
-            self._since = self._beginning()
-        else:
-            self._since = None
+        lasts = share > SHARE or (self.suspicious_since is not None and share >= SHARE / 2.0)
+        self.suspicious_since = self._beginning() if lasts else None
 
     def clear(self) -> None:
         """Forget the history: a new track starts."""
         self._stamps.clear()
-        self._since = None
+        self.suspicious_since = None
 
     def _beginning(self) -> float:
         """The change point: it maximises the number of landmarks outside after and inside before it."""
@@ -311,65 +329,3 @@ class TrackMonitor:
             if self._stamps[i][0] <= self._stamps[-1][0] - MONITORED:
                 return self._stamps[i:]
         return []
-
-
-class LandmarkFinder:
-    """A :class:`~factorgraph_loc.sensors.base.Finder`: hypotheses from the sightings of the last minute, and a track monitor."""
-
-    at_once = False
-
-    def __init__(self, landmarks: KnownLandmarks, motion: Motion, positions: Array) -> None:
-        self._landmarks = landmarks
-        self._relocalizer = Relocalizer(motion, positions)
-        self._monitor = TrackMonitor()
-        self.newest: ChainState | None = None
-
-    @property
-    def start(self) -> KnownPosition | None:
-        return self._relocalizer.start
-
-    @start.setter
-    def start(self, start: KnownPosition | None) -> None:
-        self._relocalizer.start = start
-
-    @property
-    def hypotheses(self) -> tuple[Hypothesis, ...]:
-        return self._relocalizer.hypotheses
-
-    @property
-    def best(self) -> PosePrior | None:
-        return self._relocalizer.best
-
-    @property
-    def suspicious_since(self) -> float | None:
-        """The time since which most landmarks are not where they are predicted."""
-        return self._monitor.suspicious_since
-
-    def look(self, m: BearingRange, odometry: ChainState) -> bool:
-        seen = self._landmarks.factor(m)
-        if seen is None:
-            return False
-        self._relocalizer.add(odometry, seen)
-        self._relocalizer.search()
-        self.newest = odometry
-        return True
-
-    def sample(self, rng: np.random.Generator, count: int) -> Array:
-        return self._relocalizer.sample(rng, count)
-
-    def follow(self, observation: Any, odometry: ChainState, view: View) -> None:
-        seen = observation.on_pose({name: np.asarray(view.value(name)) for name in observation.blocks}, {}).measured
-        self._relocalizer.add(odometry, seen)
-        self._monitor.add(observation.t, seen, view.pose, view.covariance)
-
-    def refuted_since(self, m: BearingRange, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
-        since = self._monitor.suspicious_since
-        if since is None or (self.newest is not None and odometry.t < self.newest.t + SEARCH_INTERVAL):
-            return None
-        self._relocalizer.forget(since)
-        self._relocalizer.search()
-        self.newest = odometry
-        return since if self._relocalizer.refutes(pose, covariance) else None
-
-    def clear(self) -> None:
-        self._monitor.clear()

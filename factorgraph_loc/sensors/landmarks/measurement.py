@@ -44,6 +44,7 @@ class BearingRange:
     landmarks: tuple[str, ...]
     range: Array
     bearing: Array
+    source: str = modality
 
     @property
     def count(self) -> int:

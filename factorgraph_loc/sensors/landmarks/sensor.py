@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self, cast
 
@@ -12,17 +12,156 @@ import numpy as np
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import GOING_BACK
 from factorgraph_loc.model.settings import Estimated
-from factorgraph_loc.sensors.base import Binding, NewVariable, ResidualObservation, Sensor, Term, View
+from factorgraph_loc.model.setup import MapUse
+from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.base import Binding, Blocks, Columns, NewVariable, ResidualObservation, Sensor, Term, View
 from factorgraph_loc.sensors.landmarks.finder import LandmarkFinder
-from factorgraph_loc.sensors.landmarks.known_landmarks import KnownLandmarks, together
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
 from factors import positive
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor, landmark_update
-from factors.landmarks.model import PARAMETERS, TIME_OFFSET
+from factors.landmarks.model import PARAMETERS, TIME_OFFSET, packed
+from factors.landmarks.update_kernels import innovations
+from factors.motion import Increment
 from factors.se2 import Array
 from factors.update import GATE, Correction
+
+
+class KnownLandmarks:
+    """Turns measurements into factors. Landmarks that map or rig lack are counted as ignored.
+
+    ``use`` of the map: ``known`` uses its landmarks and ignores others, ``extended`` also estimates the others, ``unknown``
+    estimates all landmarks without the map. ``estimated``: indices of the sensor's constants that are estimated. ``carries``:
+    whether the estimator estimates landmarks with an inexact survey; otherwise the survey's covariance is added to the noise.
+    """
+
+    def __init__(
+        self,
+        settings: BearingRangeSettings,
+        world: World,
+        diagnostics: Diagnostics,
+        use: MapUse = "known",
+        estimated: tuple[int, ...] = (),
+        *,
+        carries: bool = False,
+    ) -> None:
+        self._model = settings.model()
+        landmarks = {} if use == "unknown" else world.landmarks
+        self._positions = {name: np.array((m.x, m.y)) for name, m in landmarks.items()}
+        limit = 2.0 * (settings.exact_survey * settings.range_sigma) ** 2
+        spreads = {name: m.spread() for name, m in landmarks.items()}
+        self._surveys = {name: spread for name, spread in spreads.items() if np.trace(spread) > limit}
+        self._carries = carries
+        self._maps_others = use != "known"
+        self._estimated = estimated
+        self._diagnostics = diagnostics
+
+    def factor(
+        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
+    ) -> BearingRangeFactor | None:
+        """The factor of the known landmarks, on the pose at the measurement's time or on one that lies ``offset`` before it.
+
+        ``twist`` (3,): the robot's velocity at that time, needed if the sensor's time offset is estimated.
+        """
+        known = [i for i, name in enumerate(m.landmarks) if name in self._positions]
+        measured = _measured(m)
+        rows = [i for i in known if measured[i]]
+        if len(known) < len(m.landmarks) and not self._maps_others:
+            self._diagnostics.ignore("landmark not in the map", len(m.landmarks) - len(known))
+        if len(rows) < len(known):
+            self._diagnostics.ignore("neither range nor bearing", len(known) - len(rows))
+        if self._carries and self._surveys:
+            rows = [i for i in rows if m.landmarks[i] not in self._surveys]
+        if not rows:
+            return None
+        points = np.array([self._positions[m.landmarks[i]] for i in rows])
+        factor = self._of_rows(m, rows, points, offset, twist)
+        if self._surveys and any(m.landmarks[i] in self._surveys for i in rows):
+            spreads = np.array([self._surveys.get(m.landmarks[i], np.zeros((2, 2))) for i in rows])
+            factor = replace(factor, point_covariances=spreads)
+        return factor
+
+    def surveyed(
+        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
+    ) -> list[tuple[str, BearingRangeFactor]]:
+        """The landmarks with an inexact survey by name, each with a factor on the pose and its position."""
+        if not self._carries or not self._surveys:
+            return []
+        measured = _measured(m)
+        rows = [i for i, name in enumerate(m.landmarks) if name in self._surveys and measured[i]]
+        return [(m.landmarks[i], self._free(m, i, offset, twist)) for i in rows]
+
+    def survey(self, name: str) -> tuple[Array, Array]:
+        """Position (2,) and covariance (2, 2) of a landmark in the map."""
+        return self._positions[name], self._surveys[name]
+
+    def others(
+        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
+    ) -> list[tuple[str, BearingRangeFactor]]:
+        """The landmarks to be estimated by name, each with a factor on the pose and its position (the last value)."""
+        found = []
+        for i, name in enumerate(m.landmarks) if self._maps_others else ():
+            if name in self._positions:
+                continue
+            if np.isnan(m.range[i]) or np.isnan(m.bearing[i]):
+                self._diagnostics.ignore("unknown landmark without range and bearing")
+            else:
+                found.append((name, self._free(m, i, offset, twist)))
+        return found
+
+    def _free(self, m: BearingRange, row: int, offset: Increment | None, twist: Array | None) -> BearingRangeFactor:
+        """The factor of one landmark on the pose and its position."""
+        return replace(self._of_rows(m, [row], np.zeros((1, 2)), offset, twist), free=True)
+
+    def _of_rows(
+        self, m: BearingRange, rows: list[int], points: Array, offset: Increment | None, twist: Array | None
+    ) -> BearingRangeFactor:
+        everything = len(rows) == len(m.landmarks)
+        return BearingRangeFactor(
+            self._model,
+            points,
+            m.range if everything else m.range[rows],
+            m.bearing if everything else m.bearing[rows],
+            None if offset is None else offset.delta,
+            None if offset is None else offset.covariance,
+            estimated=self._estimated,
+            twist=twist,
+            in_look=None if offset is None else self._count(m),
+        )
+
+    def _count(self, m: BearingRange) -> int:
+        """Number of usable landmarks: those of the map with either value, others with both."""
+        lacks = zip(m.landmarks, np.isnan(m.range).tolist(), np.isnan(m.bearing).tolist(), strict=True)
+        return sum(
+            not (no_range and no_bearing)
+            if name in self._positions
+            else self._maps_others and not (no_range or no_bearing)
+            for name, no_range, no_bearing in lacks
+        )
+
+
+def _measured(m: BearingRange) -> list[bool]:
+    """Whether the range or the bearing of each landmark was measured."""
+    return [r == r or b == b for r, b in zip(m.range.tolist(), m.bearing.tolist(), strict=True)]  # noqa: PLR0124 - not NaN
+
+
+def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
+    """Merge the factors of one measurement on one pose."""
+    first, *others = factors
+    if not others:
+        return first
+    covariances = [
+        np.zeros((len(f.points), 2, 2)) if f.point_covariances is None else f.point_covariances for f in factors
+    ]
+    return replace(
+        first,
+        points=np.concatenate([f.points for f in factors]),
+        ranges=np.concatenate([f.ranges for f in factors]),
+        bearings=np.concatenate([f.bearings for f in factors]),
+        point_covariances=np.concatenate(covariances),
+    )
+
 
 SURVEYED_ITERATIONS = 4
 WORK = 8  # of a landmark, for one of many poses that are weighed by a compiled call
@@ -51,12 +190,7 @@ class LandmarkObservation(ResidualObservation):
         return together([cast(BearingRangeFactor, term.factor) for term in self.terms])
 
     def correct(
-        self,
-        pose: Array,
-        covariance: Array,
-        values: Mapping[str, Array],
-        columns: Mapping[str, slice],
-        iterations: int = 1,
+        self, pose: Array, covariance: Array, values: Blocks, columns: Columns, iterations: int = 1
     ) -> Correction:
         term = self.terms[0]
         if len(self.terms) == 1 and len(covariance) <= SMALL:
@@ -67,7 +201,7 @@ class LandmarkObservation(ResidualObservation):
                 return found
         return super().correct(pose, covariance, values, columns, iterations)
 
-    def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
+    def log_likelihood(self, poses: Array, values: Blocks) -> Array:
         total = np.zeros(len(poses))
         for term in self.terms:
             factor, at, parameters = cast(BearingRangeFactor, term.factor), poses, None
@@ -94,7 +228,7 @@ class LandmarkObservation(ResidualObservation):
             self, terms=(replace(self.terms[0], factor=replace(factor, offset=None, offset_covariance=None)),)
         )
 
-    def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
+    def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
         """The observation on the pose only: constants are fixed, other landmarks have covariances ``spreads``."""
         if len(self.terms) == 1 and not self.terms[0].blocks:
             return self
@@ -136,30 +270,31 @@ class NewLandmarks:
 
 class LandmarkSensor(Sensor):
     """Identified landmarks. For ``use`` of the map see :class:`KnownLandmarks`. A landmark that is not in the map becomes a block
-    ``bearing_range/NAME`` once two sightings agree on its position."""
+    ``SENSOR/NAME`` once two sightings agree on its position."""
 
     modality = "bearing_range"
     lost = "landmarks were not where they were expected"
 
-    def __init__(self, binding: Binding, constants: Estimated) -> None:
-        setup, motion, diagnostics, use = binding.setup, binding.motion, binding.diagnostics, binding.use
-        self.constants, self._motion = constants, motion
-        self._landmarks = KnownLandmarks(setup, diagnostics, use, constants.indices, carries=True)
+    def __init__(self, binding: Binding, settings: BearingRangeSettings, constants: Estimated) -> None:
+        super().__init__(binding.name)
+        world, motion, use = binding.setup.world, binding.motion, binding.use
+        self.constants, self._motion, self._diagnostics = constants, motion, binding.diagnostics
+        self._landmarks = KnownLandmarks(settings, world, self._diagnostics, use, constants.indices, carries=True)
         # sightings before the start are counted when they are used there
-        self._sought = KnownLandmarks(setup, Diagnostics())
-        self._shared = (self.modality,) if constants.names else ()
+        self._sought = KnownLandmarks(settings, world, Diagnostics())
+        self._shared = (self.name,) if constants.names else ()
         self._new: NewLandmarks = NewLandmarks()
         self._before: deque[tuple[float, NewLandmarks]] = deque()
         self._finder: LandmarkFinder | None = None
-        if use == "known" and self._landmarks.known:
-            self.finder = self._finder = LandmarkFinder(self._sought, motion, setup.world.positions())
+        if use == "known" and world.landmarks:
+            self.finder = self._finder = LandmarkFinder(self._sought.factor, motion, world.positions())
 
     def observe(self, m: BearingRange, view: View) -> Iterator[LandmarkObservation | NewVariable]:
         twist = self._motion.twist(m.t) if TIME_OFFSET in self.constants.indices else None
         known = self._landmarks.factor(m, view.offset, twist)
         terms = [] if known is None else [Term(known, self._shared, 2 * len(known.points))]
         for name, factor in self._landmarks.surveyed(m, view.offset, twist):
-            block, (position, spread) = f"{self.modality}/{name}", self._landmarks.survey(name)
+            block, (position, spread) = f"{self.name}/{name}", self._landmarks.survey(name)
             if view.value(block) is None:
                 yield NewVariable(block, position, np.zeros((2, 3)), {}, spread, ())
             if view.value(block) is None:  # the estimator does not estimate it
@@ -170,7 +305,7 @@ class LandmarkSensor(Sensor):
         surveyed = any(term.blocks != self._shared for term in terms)
         met: list[tuple[str, Term]] = []
         for name, factor in self._landmarks.others(m, view.offset, twist):
-            block = f"{self.modality}/{name}"
+            block = f"{self.name}/{name}"
             term = Term(factor, (*self._shared, block), 2)
             if view.value(block) is None:
                 met.append((block, term))
@@ -197,7 +332,11 @@ class LandmarkSensor(Sensor):
         return None if earlier is None else replace(new, sightings=(earlier, here))
 
     def judge(self, observation: LandmarkObservation, correction: Correction, view: View) -> bool:
-        self._landmarks.report(observation.t, observation.measured, correction)
+        factor = observation.measured
+        self._diagnostics.innovation(self.name, observation.t, correction.nis, correction.dof)
+        ranges, bearings = innovations(packed(factor.model), correction.residual, factor.ranges, factor.bearings)
+        self._diagnostics.add_residuals(f"{self.name}.range", ranges.tolist())
+        self._diagnostics.add_residuals(f"{self.name}.bearing", bearings.tolist())
         return True
 
     @property
@@ -231,4 +370,4 @@ def bind(binding: Binding) -> LandmarkSensor | None:
         return None
     names = PARAMETERS[:TIME_OFFSET] if binding.calibration == "particles" else PARAMETERS
     uncertainty = None if binding.calibration == "none" else settings.uncertainty
-    return LandmarkSensor(binding, Estimated.of(names, uncertainty))
+    return LandmarkSensor(binding, settings, Estimated.of(names, uncertainty))

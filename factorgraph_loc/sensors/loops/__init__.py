@@ -11,17 +11,16 @@ SENSOR = SensorType(
         Channel(
             "loops",
             streams=("factorgraph_loc.sensors.loops.measurement:LoopStream",),
-            measurements=("factorgraph_loc.sensors.loops.measurement:Loops",),
             tables=(
                 "factorgraph_loc.sensors.loops.measurement:LOOPS",
                 "factorgraph_loc.sensors.loops.measurement:LOOPS_BY_STAMP",
             ),
-            assemble="factorgraph_loc.sensors.loops.tables:assemble",
-            check="factorgraph_loc.sensors.loops.tables:check",
+            assemble="factorgraph_loc.sensors.loops.measurement:assemble",
+            check="factorgraph_loc.sensors.loops.measurement:check",
             section="loops",
         ),
     ),
-    settings={"loops": Section("factorgraph_loc.sensors.loops.settings:LoopSettings")},
-    summarize="factorgraph_loc.sensors.loops.summary:summarize",
+    settings={"loops": Section("factorgraph_loc.sensors.loops.measurement:LoopSettings")},
+    summarize="factorgraph_loc.sensors.loops.sensor:summarize",
     bind="factorgraph_loc.sensors.loops.sensor:bind",
 )

@@ -1,8 +1,13 @@
 """Measurements of loops, their stream, and their tables: with the age of the earlier pose, or with its own timestamp."""
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar
 
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.columns import (
     ANGLE,
     DURATION,
@@ -17,8 +22,31 @@ from factorgraph_loc.files.columns import (
     Table,
     number,
 )
-from factorgraph_loc.model.measurement import ScanStream
+from factorgraph_loc.files.models import InUnit
+from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.files.values import numbers, within
+from factorgraph_loc.model.measurement import ScanStream, Stream
+from factorgraph_loc.model.settings import SensorSettings
+from factorgraph_loc.sensors.tables import Reading, stream_of
 from factors.se2 import Array
+
+
+class LoopSettings(SensorSettings):
+    """Loops found by another program. A loop of score s has standard deviations 1/s times as large as these, and is given up at
+    sqrt(s) times the distance; a rig without the section has the defaults."""
+
+    sigma_position: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("m")] = 0.1
+    """standard deviation of a relative position, in each coordinate"""
+    sigma_heading: Annotated[float, Field(ge=1e-4, le=3.0), InUnit("rad")] = 0.05
+    """standard deviation of a relative heading"""
+    sigma_place: Annotated[float, Field(ge=1e-3, le=100.0), InUnit("m")] = 0.5
+    """standard deviation, in each coordinate, of the distance between two poses at one place, for loops without a relative
+    pose"""
+    least_score: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """loops with a lower score are not used"""
+    robust: Annotated[float, Field(ge=0.01, le=100.0)] = 3.0
+    """scale of the Geman-McClure loss of a loop of score 1, in standard deviations"""
+
 
 LEAST_AGE = 1e-6  # s
 _TOLD = (
@@ -63,6 +91,7 @@ class Loops:
     y: Array
     heading: Array
     score: Array
+    source: str = modality
 
     @property
     def count(self) -> int:
@@ -80,3 +109,38 @@ class LoopStream(ScanStream):
     y: Array
     heading: Array
     score: Array
+
+
+POSE = ("x", "y", "heading")
+
+
+def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
+    """The loops of a log. InputError for an earlier pose that is not earlier, and for a part of a relative pose."""
+    (table,) = rows.values()
+    columns = dict(table.numbers)
+    if "before_ns" in columns:
+        stamps = columns.pop("before_ns")
+        LOOPS_BY_STAMP["before_ns"].require(table.path, table.rows, stamps)
+        columns["age"] = (table.t_ns - np.rint(stamps).astype(np.int64)) / 1e9
+        if len(bad := np.flatnonzero(columns["age"] < LEAST_AGE)):
+            i = int(bad[0])
+            expected = f"an earlier time than that of the row, {int(table.t_ns[i])} ns"
+            raise bad_field(table.path, "before_ns", f"{stamps[i]:.0f} ns", expected, row=int(table.rows[i]))
+    for name in (*POSE, "score"):
+        columns.setdefault(name, np.full(len(table.rows), np.nan))
+    known = np.isfinite([columns[name] for name in POSE])
+    if len(bad := np.flatnonzero(known.any(axis=0) & ~known.all(axis=0))):
+        i = int(bad[0])
+        lacking = next(name for name in POSE if np.isnan(columns[name][i]))
+        raise bad_field(table.path, lacking, "", "x, y and heading, or none of them", row=int(table.rows[i]))
+    return stream_of(LOOPS, replace(table, numbers=columns), reading.t0_ns, reading.warnings)
+
+
+def check(m: Loops, where: str) -> dict[str, Any]:
+    """The validated fields of a pushed measurement, copied; InputError names the first invalid one."""
+    count = numbers(where, "age", m.age).size
+    found = {name: within(where, LOOPS[name], getattr(m, name), (count,)) for name in ("age", *POSE, "score")}
+    known = np.isfinite([found[name] for name in POSE])
+    if (known.any(axis=0) & ~known.all(axis=0)).any():
+        raise InputError(f"{where}: a loop has a part of a relative pose, expected x, y and heading, or none of them")
+    return found

@@ -5,14 +5,15 @@ from typing import cast
 
 import numpy as np
 
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.base import Binding, Link, Sensor, View
-from factorgraph_loc.sensors.loops.measurement import Loops
-from factorgraph_loc.sensors.loops.settings import LoopSettings
+from factorgraph_loc.sensors.interfaces import Paragraph, Summary
+from factorgraph_loc.sensors.loops.measurement import Loops, LoopSettings, LoopStream
 from factors.graph import Factor
 from factors.loops.factor import LoopFactor
 from factors.se2 import Array
 
-UNKNOWN = "loops: the earlier pose is not kept"
+UNKNOWN = "the earlier pose is not kept"
 LEAST_SCORE = 0.01  # scores below count as this
 
 
@@ -24,6 +25,7 @@ class LoopSensor(Sensor):
     links = True
 
     def __init__(self, binding: Binding, settings: LoopSettings) -> None:
+        super().__init__(binding.name)
         self._settings, self._diagnostics = settings, binding.diagnostics
 
     def observe(self, m: Loops, view: View) -> Iterator[Link]:
@@ -32,11 +34,11 @@ class LoopSensor(Sensor):
         scores = np.where(np.isnan(m.score), 1.0, m.score)
         for age, x, y, heading, score in zip(m.age, m.x, m.y, m.heading, scores.tolist(), strict=True):
             if score < settings.least_score:
-                self._diagnostics.ignore("loops: lower score than the rig's least_score")
+                self._diagnostics.ignore(f"{self.name}: lower score than the rig's least_score")
                 continue
             earlier = view.earlier(m.t - float(age))
             if earlier is None:
-                self._diagnostics.ignore(UNKNOWN)
+                self._diagnostics.ignore(f"{self.name}: {UNKNOWN}")
                 continue
             wider, measured = 1.0 / max(score, LEAST_SCORE), None
             sigmas = np.array((settings.sigma_place,))
@@ -61,3 +63,28 @@ def bind(binding: Binding) -> LoopSensor | None:
     if LoopSensor.modality not in binding.setup.sensors:
         return None
     return LoopSensor(binding, binding.setup.rig.find(LoopSettings) or LoopSettings())
+
+
+NEAR = 1.0  # m: farther from each other two poses are not at one place
+GAP = 5.0  # s between poses of the reference
+
+
+def summarize(log: Log) -> Summary:
+    """The number of loops, of those with a relative pose, and of those that join places near to each other in the reference."""
+    stream = log.streams.get("loops")
+    if not isinstance(stream, LoopStream) or not len(stream.t):
+        return Summary()
+    placed = int(np.count_nonzero(np.isfinite(stream.x)))
+    found: dict[str, float] = {"count": len(stream.t), "with_pose": placed}
+    line = f"{len(stream.t)} loops, {placed} of them with a relative pose"
+    if log.reference is not None:
+        t = stream.t + log.rig.time_offset("loops")
+        here, there = (log.reference.at(at, max_gap=GAP)[:, :2] for at in (t, t - stream.age))
+        apart = np.linalg.norm(here - there, axis=1)
+        told = np.hypot(np.nan_to_num(stream.x), np.nan_to_num(stream.y))
+        known = np.isfinite(apart)
+        near = np.abs(apart[known] - told[known]) < NEAR
+        found |= {"compared": int(np.count_nonzero(known)), "near": int(np.count_nonzero(near))}
+        if known.any():
+            line += f"; of {len(near)} within the reference {np.mean(near):.0%} are right to {NEAR:g} m"
+    return Summary({"loops": found}, text=[Paragraph(line)])

@@ -3,7 +3,7 @@
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
-__all__ = ["SENSOR", "calibration", "measurement", "settings", "simulation", "tables"]
+__all__ = ["SENSOR", "calibration", "measurement", "settings", "simulation"]
 
 SENSOR = SensorType(
     "odometry",
@@ -14,27 +14,22 @@ SENSOR = SensorType(
                 "factorgraph_loc.sensors.odometry.measurement:VelocityStream",
                 "factorgraph_loc.sensors.odometry.measurement:IncrementStream",
             ),
-            measurements=(
-                "factorgraph_loc.sensors.odometry.measurement:VelocityOdometry",
-                "factorgraph_loc.sensors.odometry.measurement:IncrementOdometry",
-            ),
             tables=(
-                "factorgraph_loc.sensors.odometry.tables:VELOCITIES",
-                "factorgraph_loc.sensors.odometry.tables:INCREMENTS",
+                "factorgraph_loc.sensors.odometry.measurement:VELOCITIES",
+                "factorgraph_loc.sensors.odometry.measurement:INCREMENTS",
             ),
             described=(
-                "factorgraph_loc.sensors.odometry.tables:WAYS",
-                "factorgraph_loc.sensors.odometry.tables:WHEELS",
+                "factorgraph_loc.sensors.odometry.measurement:WAYS",
+                "factorgraph_loc.sensors.odometry.measurement:WHEELS",
             ),
-            assemble="factorgraph_loc.sensors.odometry.tables:assemble",
-            sequence="factorgraph_loc.sensors.odometry.measurement:Increments",
+            assemble="factorgraph_loc.sensors.odometry.measurement:assemble",
+            intake="factorgraph_loc.sensors.odometry.measurement:Increments",
             section="odometry",
         ),
         Channel(
             "imu",
             streams=("factorgraph_loc.sensors.odometry.measurement:YawRateStream",),
-            measurements=("factorgraph_loc.sensors.odometry.measurement:YawRate",),
-            tables=("factorgraph_loc.sensors.odometry.tables:IMU",),
+            tables=("factorgraph_loc.sensors.odometry.measurement:IMU",),
             section="imu",
         ),
     ),

@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import checks
+from factorgraph_loc.files.columns import (
+    ANGLE,
+    FASTEST,
+    FASTEST_TURN,
+    LENGTH,
+    LONGEST_WAY,
+    MOST_TURNED,
+    RATE,
+    SPEED,
+    STAMP,
+    Table,
+    within,
+)
+from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.model.measurement import FLOOR, TURN, Measurement, Stream, named
+from factorgraph_loc.sensors.tables import Intake, Reading, stream_of
 from factors.se2 import Array
 
 if TYPE_CHECKING:
@@ -23,6 +40,7 @@ class VelocityOdometry:
 
     sensor: ClassVar[str] = "odometry"
     modality: ClassVar[str] = "odometry"
+    source: ClassVar[str] = "odometry"
     is_motion: ClassVar[bool] = True
     count: ClassVar[int] = 1
     t: float
@@ -36,6 +54,7 @@ class IncrementOdometry:
 
     sensor: ClassVar[str] = "odometry"
     modality: ClassVar[str] = "odometry"
+    source: ClassVar[str] = "odometry"
     is_motion: ClassVar[bool] = True
     count: ClassVar[int] = 1
     t: float
@@ -50,6 +69,7 @@ class YawRate:
 
     sensor: ClassVar[str] = "imu"
     modality: ClassVar[str] = "imu"
+    source: ClassVar[str] = "imu"
     is_motion: ClassVar[bool] = True
     count: ClassVar[int] = 1
     t: float
@@ -92,16 +112,77 @@ class YawRateStream(Stream):
     w: Array
 
 
-class Increments:
+class Increments(Intake):
     """Checks that increments are in order of time."""
 
     def __init__(self, rig: Rig, world: World) -> None:
         self._newest = -math.inf
 
     def require(self, m: Measurement) -> None:
-        """InputError for an increment that goes back in time."""
         if not isinstance(m, IncrementOdometry):
             return
         if m.t < self._newest:
             raise InputError(f"{named(m)}: follows one at {self._newest:.3f} s, expected increments in order of time")
         self._newest = m.t
+
+
+VELOCITIES = Table(
+    "odometry",
+    (
+        STAMP,
+        within("v", SPEED, FASTEST, "forward speed, held until the next row"),
+        within("w", RATE, FASTEST_TURN, "turn rate, held until the next row"),
+    ),
+    "one each",
+    stream="factorgraph_loc.sensors.odometry.measurement:VelocityStream",
+)
+INCREMENTS = Table(
+    "odometry",
+    (
+        STAMP,
+        within("dx", LENGTH, LONGEST_WAY, "forward motion since the row before"),
+        within("dy", LENGTH, LONGEST_WAY, "motion to the left since the row before"),
+        within("dtheta", ANGLE, MOST_TURNED, "rotation since the row before"),
+    ),
+    "one each",
+    stream="factorgraph_loc.sensors.odometry.measurement:IncrementStream",
+)
+IMU = Table(
+    "imu",
+    (STAMP, within("w", RATE, FASTEST_TURN, "turn rate of a gyro")),
+    "one each",
+    stream="factorgraph_loc.sensors.odometry.measurement:YawRateStream",
+)
+# wheel counters, which are converted to increments
+WAYS = Table(
+    "odometry",
+    (
+        STAMP,
+        *(
+            within(side, LENGTH, 1e9, "distance of that wheel so far; counters have 32 bits")
+            for side in ("left", "right")
+        ),
+    ),
+    "one each",
+)
+# wheels of which speeds or turns are told, which are converted to velocities or increments
+WHEELS = Table(
+    "odometry",
+    (
+        STAMP,
+        *(within(f"{side}_speed", SPEED, FASTEST, "speed of that wheel") for side in ("left", "right")),
+        *(within(f"{side}_angle", ANGLE, 1e9, "how far that wheel turned") for side in ("left", "right")),
+        *(within(f"{side}_rate", RATE, 1e4, "how fast that wheel turns") for side in ("left", "right")),
+    ),
+    "one each",
+)
+
+
+def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
+    """The stream of velocities or increments; rows with equal timestamps are merged."""
+    told = rows["odometry"]
+    if "dx" not in told.numbers:
+        return stream_of(VELOCITIES, told, reading.t0_ns, reading.warnings)
+    moves = np.column_stack([told.numbers[column.name] for column in INCREMENTS.columns[1:]])
+    t_ns, moves = checks.increments_in_order(told.path, told.rows, told.t_ns, moves, reading.warnings)
+    return IncrementStream(checks.seconds(t_ns, reading.t0_ns), *np.ascontiguousarray(moves.T))

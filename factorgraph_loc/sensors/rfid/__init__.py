@@ -20,7 +20,6 @@ SENSOR = SensorType(
         Channel(
             "rfid",
             streams=("factorgraph_loc.sensors.rfid.stream:RfidStream",),
-            measurements=("factorgraph_loc.sensors.rfid.stream:RfidScan",),
             tables=(
                 "factorgraph_loc.sensors.rfid.stream:RFID",
                 "factorgraph_loc.sensors.rfid.stream:INVENTORIES",
@@ -48,7 +47,6 @@ SENSOR = SensorType(
         )
     },
     detects="tags",
-    undetected="no tag of the map was read",
     bind="factorgraph_loc.sensors.rfid.sensor:bind",
     summarize="factorgraph_loc.sensors.rfid.summary:summarize",
     review="factorgraph_loc.sensors.rfid.summary:review",

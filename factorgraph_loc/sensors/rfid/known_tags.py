@@ -198,11 +198,10 @@ class KnownTags:
         self.forget(math.nextafter(self.states.heard, math.inf))
 
     def _tell(self) -> None:
-        dead, moved = self._diagnostics.dead_tags, self._diagnostics.moved_tags
-        dead.clear()
-        moved.clear()
+        dead, moved = dict[str, float](), dict[str, float]()
         for i, p in self.states.suspects.items():
             (moved if self.states.was_read(i) else dead)[self.map.names[i]] = p
+        self._diagnostics.doubted |= {"dead_tags": dead, "moved_tags": moved}
 
     def _listening(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
         """The active antennas: row of each, -1 if the rig lacks it; antenna index and number of rounds of each row. Cached, because

@@ -128,8 +128,9 @@ class TagSensor(Sensor):
     evidence_every = 0.0
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics, constants: Estimated = NOTHING) -> None:
+        super().__init__()
         self.constants = constants
-        self._blocks = (self.modality,) if constants.names else ()
+        self._blocks = (self.name,) if constants.names else ()
         self.tags = KnownTags(setup, diagnostics)
         self.bounds = None
         if self.tags.likelihood is not None:
@@ -217,7 +218,7 @@ class TagSensor(Sensor):
         """The parameters (2 M,) of the detection models as they are estimated to be."""
         assert self.tags.likelihood is not None
         nominal = self.tags.likelihood.parameters
-        value = view.value(self.modality) if self._blocks else None
+        value = view.value(self.name) if self._blocks else None
         if value is None:
             return nominal
         out = nominal.copy()

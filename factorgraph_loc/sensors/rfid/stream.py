@@ -84,6 +84,7 @@ class RfidScan:
     rssi: Array
     phase: Array
     frequency: Array
+    source: str = modality
 
     @property
     def count(self) -> int:
@@ -100,6 +101,7 @@ class RfidStream(Stream):
     [rad], ``frequency`` (N,) [Hz]: NaN if unknown.
     """
 
+    kind: ClassVar[type[Any]] = RfidScan
     round: NDArray[np.int64]
     antenna: Sequence[str]
     epc: Sequence[str]

@@ -18,12 +18,12 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.reliability import Reliability
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.calibrating import REFERENCE_GAP, possible_poses
 from factorgraph_loc.sensors.interfaces import Ending, Marks, Paragraph, Review, Summary, Use
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.monitor import BAND, BLOCK, DIFFERENT, FEWEST, POSSIBLE, ReadGroups
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, possible_poses
 from factorgraph_loc.text import listed, quoted
 from factors.rfid.detection import ExpectedReads, RfidLikelihood
 from factors.rfid.kernels import MOST_CERTAIN, rate_of
@@ -194,14 +194,11 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
         what = f"none of the {len(tags)} tags of the map is read" if tags else "reads are of no use without a map"
         yield f"{log.name}: {what}"
         return
-    for suspects, why in (
-        (diagnostics.dead_tags, "are believed dead, as they were not read from where they should have been"),
-        (
-            diagnostics.moved_tags,
-            "are believed to have moved, as they were read from elsewhere than they should have been",
-        ),
+    for kind, why in (
+        ("dead_tags", "are believed dead, as they were not read from where they should have been"),
+        ("moved_tags", "are believed to have moved, as they were read from elsewhere than they should have been"),
     ):
-        if suspects:
+        if suspects := diagnostics.doubted.get(kind):
             yield f"{log.name}: {len(suspects)} of {len(tags)} tags of the map {why}: {suspected(suspects)}"
     settings = log.rig.find(RfidSettings)
     if settings is not None:
@@ -264,7 +261,7 @@ def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Traje
         return None
     if not log.world.tags or len(final) < 2 or final.covariances is None or "rfid" not in use.modalities:
         return None
-    doubted = diagnostics.dead_tags.keys() | diagnostics.moved_tags.keys()
+    doubted = set[str]().union(*diagnostics.doubted.values())
     kept = [name for name in log.world.tags if name not in doubted]
     looks = _looks(use, stream, settings, learnt, final, kept)
     if looks is None:

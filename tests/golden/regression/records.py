@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from factorgraph_loc.fusion.base import Estimator
 from factorgraph_loc.model.belief import Belief, Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import columns_of
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.planning.closed_loop import ActiveRun
@@ -98,13 +99,12 @@ def record_log(log: Log) -> Record:
     numbers: dict[str, Array] = {}
     for name, stream in log.streams.items():
         exact[f"{name}.rows"] = len(stream.t)
-        for column in fields(stream):
-            values = getattr(stream, column.name)
+        for column, values in columns_of(stream).items():
             if isinstance(values, np.ndarray):
                 known = values[np.isfinite(values)]
-                numbers[f"{name}.{column.name}.sums"] = np.array([len(known), known.sum(), np.square(known).sum()])
+                numbers[f"{name}.{column}.sums"] = np.array([len(known), known.sum(), np.square(known).sum()])
             elif all(isinstance(value, str) for value in values):
-                exact[f"{name}.{column.name}.names"] = len(set(values))
+                exact[f"{name}.{column}.names"] = len(set(values))
     if log.reference is not None:
         numbers["reference.poses"] = log.reference.poses[_some(len(log.reference), 4)]
     return Record(exact, numbers)
@@ -198,15 +198,15 @@ def _of_diagnostics(diagnostics: Diagnostics) -> tuple[dict[str, Any], dict[str,
         "residuals": {name: len(values) for name, values in sorted(diagnostics.residuals.items())},
         **{name: dict(sorted(getattr(diagnostics, name).items())) for name in ("ignored", "rejected", "late")},
         "events": [what for _, what in diagnostics.events],
-        "dead_tags": sorted(diagnostics.dead_tags),
+        "dead_tags": sorted(dead := diagnostics.doubted.get("dead_tags", {})),
     }
     numbers = {
         "events.t": np.array([t for t, _ in diagnostics.events]),
-        "dead_tags.probabilities": np.array([p for _, p in sorted(diagnostics.dead_tags.items())]),
+        "dead_tags.probabilities": np.array([p for _, p in sorted(dead.items())]),
     }
-    if diagnostics.moved_tags:
-        exact["moved_tags"] = sorted(diagnostics.moved_tags)
-        numbers["moved_tags.probabilities"] = np.array([p for _, p in sorted(diagnostics.moved_tags.items())])
+    if moved := diagnostics.doubted.get("moved_tags"):
+        exact["moved_tags"] = sorted(moved)
+        numbers["moved_tags.probabilities"] = np.array([p for _, p in sorted(moved.items())])
     for sensor, rows in sorted(diagnostics.nis.items()):
         table = np.array([(t, nis) for t, nis, _ in rows])
         which = _some(len(table), SUMS)

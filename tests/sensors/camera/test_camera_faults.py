@@ -190,4 +190,4 @@ def test_a_place_that_no_image_shows(name, log):
     assert set(result.status) == {"unlocalized"}
     assert (result.final.t.shape, result.final.poses.shape) == ((0,), (0, 3))
     assert result.final.covariances.shape == (0, 3, 3)
-    assert result.warnings == ("room: never localized: no point of the map was found in an image",)
+    assert result.warnings == ("room: never localized: no points of the map were detected",)

@@ -27,8 +27,8 @@ def test_tracks_are_those_of_a_log(picture, feature):
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (np.zeros((10, 10), dtype=np.uint8), "image at 2.000 s: has 10 x 10 px, expected 160 x 120"),
-        ("photo.png", "image at 2.000 s: is str, expected an array of pixels"),
+        (np.zeros((10, 10), dtype=np.uint8), "CameraImage at 2.000 s: has 10 x 10 px, expected 160 x 120"),
+        ("photo.png", "CameraImage at 2.000 s: is str, expected an array of pixels"),
     ],
 )
 def test_what_is_no_image_of_the_camera_is_refused(image, message):

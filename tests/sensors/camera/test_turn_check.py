@@ -13,7 +13,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.turn_check import TurnCheck
+from factorgraph_loc.sensors.camera.use import TurnCheck
 from factorgraph_loc.sensors.motion import whole_motion
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2

@@ -8,10 +8,9 @@ from landmark_world import dirty, simulate, swapped, with_sightings
 from recorded_logs import recorded_log
 
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.landmarks.finder import Relocalizer, TrackMonitor, _apart, _insert, _thinned
-from factorgraph_loc.sensors.landmarks.known_landmarks import KnownLandmarks
+from factorgraph_loc.sensors.landmarks.finder import LandmarkFinder, TrackMonitor, _apart, _insert, _thinned
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
+from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks
 from factorgraph_loc.sensors.landmarks.window import Sighting
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2
@@ -27,11 +26,10 @@ class Seeker:
     """Feeds a relocalizer with the sightings of a log from ``start`` on."""
 
     def __init__(self, log, start=0.0):
-        setup = Setup(log.rig, log.world, log.rig.sensors, np.random.default_rng(0))
         self.log, diagnostics = log, Diagnostics()
         self.motion = Motion(log.rig, log.rig.sensors, diagnostics)
-        self.landmarks = KnownLandmarks(setup, diagnostics)
-        self.relocalizer = Relocalizer(self.motion, log.world.positions())
+        self.landmarks = KnownLandmarks(log.rig.bearing_range, log.world, diagnostics)
+        self.relocalizer = LandmarkFinder(self.landmarks.factor, self.motion, log.world.positions())
         self.measurements = (m for m in log.measurements(log.rig.sensors) if m.t >= start - 3.0)
         self.start = start
 
@@ -95,9 +93,9 @@ def test_bearing_alone(log):
 def test_one_landmark_is_ambiguous(log):
     s = log.streams["bearing_range"]
     lone = with_sightings(log, np.array(s.landmark) == "b")
-    assert Relocalizer(Seeker(log).motion, log.world.positions()).status == "unlocalized"
     relocalizer = Seeker(lone).stamps(1)
-    assert (relocalizer.status, relocalizer.best) == ("ambiguous", None)
+    assert relocalizer.hypotheses
+    assert relocalizer.best is None
     drawn = relocalizer.sample(np.random.default_rng(0), 2000)
     distance = np.hypot(*(drawn[:, :2] - log.world.position("b")).T)
     truth = np.hypot(*(log.reference.at(s.t[:1])[0, :2] - log.world.position("b")))
@@ -119,10 +117,10 @@ def test_late_and_repeated_sightings_change_nothing(log):
 
 def test_nothing_is_left_to_search(log):
     relocalizer = Seeker(log).stamps(12)
-    assert relocalizer.status == "localized"
+    assert relocalizer.best is not None
     relocalizer.forget(np.inf)
     relocalizer.search()
-    assert (relocalizer.status, relocalizer.hypotheses) == ("unlocalized", ())
+    assert (relocalizer.best, relocalizer.hypotheses) == (None, ())
 
 
 def test_nowhere_to_search_is_no_hypothesis():

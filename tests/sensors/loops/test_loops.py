@@ -13,11 +13,10 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.loops.measurement import Loops, LoopStream
-from factorgraph_loc.sensors.loops.settings import LoopSettings
+from factorgraph_loc.sensors.loops.measurement import Loops, LoopSettings, LoopStream
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
-from factorgraph_loc.sensors.pushed import checked
+from factorgraph_loc.sensors.tables import checked
 from factors import se2
 
 SIDE, SPEED, STEP, ROUNDS = 12.0, 0.5, 0.5, 3  # m, m/s, s

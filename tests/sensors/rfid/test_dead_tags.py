@@ -52,7 +52,7 @@ def test_hardly_worse_than_who_is_told(estimator: str) -> None:
                 for r in (result, told)
             ]
         )
-        named = set(result.diagnostics.dead_tags)
+        named = set(result.diagnostics.doubted["dead_tags"])
         assert named <= dead
         assert len(named) >= 8  # of 12, some of which the robot hardly passes
         assert score(result, log)["dead_tags.total"] == len(named)
@@ -92,7 +92,7 @@ def test_live_is_as_a_run(estimator: str) -> None:
             localizer.estimate()
     found += [localizer.estimate(float(t)).pose for t in ticks]
     assert np.array_equal(np.array(found), result.poses)
-    assert localizer.diagnostics().dead_tags == result.diagnostics.dead_tags
+    assert localizer.diagnostics().doubted["dead_tags"] == result.diagnostics.doubted["dead_tags"]
 
 
 def robot(estimator: str, **settings: float) -> fgloc.Localizer:
@@ -117,10 +117,10 @@ def test_a_tag_is_given_up_and_taken_back(estimator: str) -> None:
     for i in range(1, 8):
         live.push(scan(0.1 * i))
     # seven silences of 0.1 each, from odds of 3 to 97
-    assert live.diagnostics().dead_tags.keys() == {"ahead"}
-    assert live.diagnostics().dead_tags["ahead"] > 0.9
+    assert live.diagnostics().doubted["dead_tags"].keys() == {"ahead"}
+    assert live.diagnostics().doubted["dead_tags"]["ahead"] > 0.9
     live.push(scan(0.8, ("aside", "ahead")))
-    assert not live.diagnostics().dead_tags
+    assert not live.diagnostics().doubted["dead_tags"]
 
 
 @pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
@@ -128,7 +128,7 @@ def test_a_tag_that_comes_back_is_no_reason_to_doubt_the_place(estimator: str) -
     live = robot(estimator)
     for i in range(1, 40):
         live.push(scan(0.1 * i))
-    assert live.diagnostics().dead_tags.keys() == {"ahead"}
+    assert live.diagnostics().doubted["dead_tags"].keys() == {"ahead"}
     for i in range(40, 50):
         live.push(scan(0.1 * i, ("aside", "ahead")))
         assert live.estimate().status == "localized"
@@ -143,8 +143,8 @@ def test_a_late_scan_counts_once(estimator: str) -> None:
         in_time.push(scan(t))
     for k in (1, 0, 3, 2, 5, 4):
         late.push(scan(stamps[k]))
-    expected = in_time.diagnostics().dead_tags["ahead"]
-    assert late.diagnostics().dead_tags["ahead"] == pytest.approx(expected, abs=0.02)
+    expected = in_time.diagnostics().doubted["dead_tags"]["ahead"]
+    assert late.diagnostics().doubted["dead_tags"]["ahead"] == pytest.approx(expected, abs=0.02)
     assert not late.diagnostics().late
 
 
@@ -154,4 +154,4 @@ def test_what_a_lost_track_made_of_the_tags_is_taken_back() -> None:
     carried = join(cut(log, 0.0, 30.0), cut(log, 50.0, 80.0))
     result = run(carried, RunConfig("smoother"))
     assert any(what.startswith("lost") for _, what in result.diagnostics.events)
-    assert len(result.diagnostics.dead_tags) <= 1
+    assert len(result.diagnostics.doubted["dead_tags"]) <= 1

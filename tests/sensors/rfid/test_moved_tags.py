@@ -40,8 +40,8 @@ def test_hardly_worse_than_with_the_right_map(estimator: str, seeds: tuple[int, 
         errors.append([one["causal.position_rmse"] ** 2 for one in figures])
         sure.append(figures[0]["causal.anees"])
         moved |= {(seed, name) for name in log.metadata["misplaced"].split(", ")}
-        named |= {(seed, name) for name in found.diagnostics.moved_tags}
-        assert figures[0]["moved_tags.total"] == len(found.diagnostics.moved_tags) > 0
+        named |= {(seed, name) for name in found.diagnostics.doubted["moved_tags"]}
+        assert figures[0]["moved_tags.total"] == len(found.diagnostics.doubted["moved_tags"]) > 0
         assert any("tags of the map are believed to have moved" in warning for warning in found.warnings)
     found_rms, told_rms = np.sqrt(np.mean(errors, axis=0))
     assert found_rms < 1.3 * told_rms
@@ -52,7 +52,7 @@ def test_hardly_worse_than_with_the_right_map(estimator: str, seeds: tuple[int, 
 
 def test_in_a_right_map_no_tag_has_moved() -> None:
     result = with_the_right_map("smoother", 12)
-    assert not result.diagnostics.moved_tags
+    assert not result.diagnostics.doubted["moved_tags"]
     assert not any("moved" in warning for warning in result.warnings)
 
 
@@ -60,7 +60,7 @@ def test_an_error_of_the_pose_is_no_evidence_that_tags_have_moved() -> None:
     """With a third of the tags dead the robot is off by 0.3 m, for long, before it knows which. Without the wider average three
     tags were believed moved at the end."""
     log = simulate(preset("office", {"drive": {"duration": 90.0}, "faults": {"dead": 0.3}}), 1)
-    assert len(run(log, RunConfig("smoother")).diagnostics.moved_tags) <= 1
+    assert len(run(log, RunConfig("smoother")).diagnostics.doubted["moved_tags"]) <= 1
 
 
 def test_what_a_lost_track_made_of_the_tags_is_taken_back() -> None:
@@ -69,4 +69,4 @@ def test_what_a_lost_track_made_of_the_tags_is_taken_back() -> None:
     carried = join(cut(log, 0.0, 40.0), cut(log, 70.0, 110.0))
     result = run(carried, RunConfig("smoother"))
     assert any(what.startswith("lost") for _, what in result.diagnostics.events)
-    assert len(result.diagnostics.moved_tags) <= 1
+    assert len(result.diagnostics.doubted["moved_tags"]) <= 1

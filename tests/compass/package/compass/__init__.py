@@ -9,7 +9,6 @@ SENSOR = SensorType(
         Channel(
             "compass",
             streams=("compass.stream:HeadingStream",),
-            measurements=("compass.stream:Heading",),
             tables=("compass.stream:HEADINGS",),
             section="compass",
         ),

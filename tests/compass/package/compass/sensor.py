@@ -72,6 +72,7 @@ class CompassSensor(Sensor):
     modality = "compass"
 
     def __init__(self, binding: Binding, settings: CompassSettings) -> None:
+        super().__init__(binding.name)
         self.constants = NOTHING if binding.calibration == "none" else settings.estimated()
         self._settings, self._diagnostics = settings, binding.diagnostics
 
@@ -79,11 +80,11 @@ class CompassSensor(Sensor):
         """The heading as one factor."""
         learns = bool(self.constants.names)
         factor = HeadingFactor(m.heading - self._settings.bias, self._settings.sigma, view.offset, learns)
-        yield HeadingObservation(m.t, (Term(factor, (self.modality,) if learns else (), 1),))
+        yield HeadingObservation(m.t, (Term(factor, (self.name,) if learns else (), 1),))
 
     def judge(self, observation: HeadingObservation, correction: Correction, view: View) -> bool:
         """Report the innovation."""
-        self._diagnostics.innovation(self.modality, observation.t, correction.nis, correction.dof)
+        self._diagnostics.innovation(self.name, observation.t, correction.nis, correction.dof)
         return True
 
     def evidence(self, m: Heading) -> HeadingObservation:

@@ -25,6 +25,7 @@ class Heading:
     count: ClassVar[int] = 1
     t: float
     heading: float
+    source: str = modality
 
 
 @dataclass(frozen=True)
