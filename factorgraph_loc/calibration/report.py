@@ -5,9 +5,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from factorgraph_loc.calibration.calibrate import Calibration, Scores, estimator_for
-from factorgraph_loc.calibration.learn import calibrators
 from factorgraph_loc.drawing.pages import Part, Rows, sectioned
+from factorgraph_loc.files.settings import settings_in
 from factorgraph_loc.fitting.constants import FittedConstant
+from factorgraph_loc.model.sections import sections
+from factorgraph_loc.plugins import load
 from factorgraph_loc.text import number
 from factors.se2 import Array
 
@@ -201,6 +203,6 @@ def _estimator(calibration: Calibration) -> str:
 
 
 def _label(c: FittedConstant) -> str:
-    units = {name: unit for one in calibrators().values() for name, unit in one.units.items()}
-    unit = f" [{units[c.name]}]" if c.name in units else ""
-    return f"{c.sensor}.{c.name}{unit}"
+    settings = settings_in(load(sections()[c.sensor].kind))
+    unit = next((one.unit for one in settings if one.key == c.name), "")
+    return f"{c.sensor}.{c.name} [{unit}]" if unit else f"{c.sensor}.{c.name}"

@@ -18,7 +18,7 @@ from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import Smoothed
+from factorgraph_loc.sensors.smoothed import Smoothed
 
 Smooth = Callable[[Log], RunResult]
 """Runs the smoother on a log, with the log's rig."""

@@ -123,7 +123,8 @@ class Stream:
     @property
     def _made(self) -> Callable[..., Measurement]:
         """Makes a measurement of a timestamp and the columns."""
-        return partial(self.kind, source=self.source) if self.source else self.kind
+        make: Callable[..., Measurement] = self.kind
+        return partial(make, source=self.source) if self.source else make
 
     def _columns(self) -> Iterator[Any]:
         return (column for name, column in columns_of(self).items() if name != "t")
@@ -155,8 +156,9 @@ def columns_of(stream: Stream) -> dict[str, Any]:
 
 
 def selected(stream: Stream, keep: NDArray[np.bool_]) -> Stream:
-    columns = columns_of(stream).items()
-    kept = {k: v[keep] if isinstance(v, np.ndarray) else list(compress(v, keep)) for k, v in columns}
+    kept: dict[str, Any] = {
+        k: v[keep] if isinstance(v, np.ndarray) else list(compress(v, keep)) for k, v in columns_of(stream).items()
+    }
     return replace(stream, **kept)
 
 
@@ -165,7 +167,7 @@ def joined(first: Stream, second: Stream) -> Stream:
         kinds = f"{type(first).__name__} and one with {type(second).__name__}"
         raise InputError(f"a log with {kinds} cannot be joined, expected tables of the same kind")
     others = columns_of(second)
-    both = {
+    both: dict[str, Any] = {
         k: np.concatenate((v, others[k])) if isinstance(v, np.ndarray) else [*v, *others[k]]
         for k, v in columns_of(first).items()
     }

@@ -12,5 +12,6 @@ __all__ = [
     "odometry",
     "registry",
     "rfid",
+    "smoothed",
     "tables",
 ]

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.columns import SECONDS, STAMP, Column, Table
-from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.files.values import names, numbers, seconds_of, within
 from factorgraph_loc.model.measurement import Measurement, Stream
 from factorgraph_loc.plugins import load
@@ -26,6 +25,7 @@ from factorgraph_loc.sensors.registry import Channel, SensorType, channels, sens
 from factors.se2 import Array, Integers
 
 if TYPE_CHECKING:
+    from factorgraph_loc.files.tables import TableRows
     from factorgraph_loc.model.rig import Rig
 
 Columns = Mapping[str, Array | Integers | Sequence[str]]

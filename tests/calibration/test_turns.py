@@ -11,8 +11,8 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.learning import run_and_learn
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.sensors.calibrating import pooled
 from factorgraph_loc.sensors.rfid.settings import BeamSettings, RfidSettings
+from factorgraph_loc.sensors.smoothed import pooled
 from factorgraph_loc.simulation import preset, simulate
 
 

@@ -14,13 +14,14 @@ from factorgraph_loc.files import checks, values
 from factorgraph_loc.files.bounded import NoFileNameError, copy_file
 from factorgraph_loc.files.columns import LARGEST_PIXEL, PIXELS, PURE, STAMP, Column, Table, named, number, within
 from factorgraph_loc.files.models import inside
-from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.model.measurement import Measurement, Stream
 from factorgraph_loc.sensors.tables import Columns, Reading, Writing
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.se2 import Array
 
 if TYPE_CHECKING:
+    from factorgraph_loc.files.tables import TableRows
+
     pass
 
 

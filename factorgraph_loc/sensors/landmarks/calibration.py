@@ -1,19 +1,36 @@
-"""Calibration of constants and noise of a landmark sensor, from sightings at reference poses."""
+"""Calibration of constants and noise of a landmark sensor, from sightings at reference poses and the EKF's errors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from factorgraph_loc.fitting.robust import Constant, Integers, spread
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
+from factorgraph_loc.drawing.pages import Part, Picture
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.fitting.constants import FittedConstant
+from factorgraph_loc.fitting.robust import Constant, Fit, Integers, folds, gains, spread
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.calibrating import REFERENCE_GAP
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.calibrating import (
+    BLOCKS,
+    ConstantsCalibrator,
+    ConstantsFound,
+    Settled,
+    Told,
+    Unit,
+    upper_bounds,
+)
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, BearingRangeUncertainty
+from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
+from factorgraph_loc.text import number, plain
 from factors.landmarks import model as bearing_range
 from factors.se2 import Array
 
@@ -43,8 +60,7 @@ class Sightings:
 
     def halves(self) -> tuple[Sightings, Sightings]:
         """The first and the second half in time."""
-        half = len(self.t) // 2
-        early = np.arange(len(self.t)) < half
+        early = np.arange(len(self.t)) < len(self.t) // 2
         return self._part(early), self._part(~early)
 
     def residuals(self, settings: BearingRangeSettings) -> Array:
@@ -80,7 +96,7 @@ class Correlation:
 
 
 def sightings_of(log: Log) -> Sightings:
-    """The sightings of mapped landmarks within the reference, with a margin for clock offsets."""
+    """The sightings of mapped landmarks within the reference, with a margin for clock offsets; InputError if there are too few."""
     stream = log.streams["bearing_range"]
     assert isinstance(stream, BearingRangeStream)
     assert log.reference is not None
@@ -90,6 +106,9 @@ def sightings_of(log: Log) -> Sightings:
     good &= (stream.t > log.reference.t[0] + MAX_OFFSET) & (stream.t < log.reference.t[-1] - MAX_OFFSET)
     bearings = stream.bearing if log.reference.has_heading else np.full_like(stream.bearing, np.nan)
     good &= np.isfinite(stream.range) | np.isfinite(bearings)
+    if (count := np.count_nonzero(good)) < MIN_SIGHTINGS:
+        found = f"has {count} sightings of mapped landmarks within the reference"
+        raise InputError(f"{log.name}: {found}, expected {MIN_SIGHTINGS} or more")
     points = log.world.positions()[track[good]]
     return Sightings(log, stream.t[good], points, stream.range[good], bearings[good], track[good])
 
@@ -99,28 +118,15 @@ def constants_of(seen: Sequence[Sightings], settings: BearingRangeSettings) -> t
     has_range = any(np.isfinite(one.ranges).any() for one in seen)
     has_bearing = any(np.isfinite(one.bearings).any() for one in seen)
     has_heading = all(one.log.reference is not None and one.log.reference.has_heading for one in seen)
-    found = []
-    if has_heading:
-        found += [Constant("x", settings.x, 0.05, -10.0, 10.0), Constant("y", settings.y, 0.05, -10.0, 10.0)]
-    if has_bearing:
-        found += [Constant("bearing_bias", settings.bearing_bias, 0.02, -np.pi, np.pi)]
-    if has_range:
-        found += [Constant("range_scale", settings.range_scale, 0.02, 0.2, 5.0)]
-    if settings.range_kind == "depth":
-        found += [Constant("depth_axis", settings.depth_axis, 0.02, -np.pi, np.pi)]
-    if has_heading:
-        found += [Constant("time_offset", settings.time_offset, 0.05, -MAX_OFFSET, MAX_OFFSET)]
-    return tuple(found)
-
-
-def could_be_depths(seen: Sequence[Sightings]) -> bool:
-    """Whether distances and depths can be distinguished, which requires bearings and ranges."""
-    return any(np.any(np.isfinite(one.ranges) & np.isfinite(one.bearings)) for one in seen)
-
-
-def range_spread(seen: Sequence[Sightings], settings: BearingRangeSettings) -> float:
-    """Robust standard deviation of the range residuals [m]."""
-    return float(spread(np.concatenate([one.errors(settings) for one in seen]))[0])
+    candidates = (
+        (has_heading, "x", 0.05, -10.0, 10.0),
+        (has_heading, "y", 0.05, -10.0, 10.0),
+        (has_bearing, "bearing_bias", 0.02, -np.pi, np.pi),
+        (has_range, "range_scale", 0.02, 0.2, 5.0),
+        (settings.range_kind == "depth", "depth_axis", 0.02, -np.pi, np.pi),
+        (has_heading, "time_offset", 0.05, -MAX_OFFSET, MAX_OFFSET),
+    )
+    return tuple(Constant(name, getattr(settings, name), *scale) for use, name, *scale in candidates if use)
 
 
 def with_scatter(seen: Sequence[Sightings], settings: BearingRangeSettings) -> BearingRangeSettings:
@@ -131,8 +137,7 @@ def with_scatter(seen: Sequence[Sightings], settings: BearingRangeSettings) -> B
     errors = np.concatenate([one.errors(settings) for one in seen])
     ranges = np.concatenate([one.ranges for one in seen])
     found: dict[str, float] = {}
-    measured = np.isfinite(errors[:, 0])
-    if measured.any():
+    if (measured := np.isfinite(errors[:, 0])).any():
         constant, relative = _range_scatter(errors[measured, 0], ranges[measured])
         found |= {"range_sigma": constant, "range_sigma_relative": relative}
     bearings = errors[np.isfinite(errors[:, 1]), 1]
@@ -157,20 +162,18 @@ def correlation(seen: Sightings, settings: BearingRangeSettings) -> Correlation:
         for step in range(1, min(NEIGHBOURS, len(rows))):
             product = values[step:] * values[:-step]
             bins = np.searchsorted(LAGS, t[step:] - t[:-step]) - 1
-            good = np.isfinite(product) & ((bins >= 0) & (bins < count))[:, None]
-            for column in range(2):
-                use = good[:, column]
-                np.add.at(products[:, column], bins[use], product[use, column])
-                np.add.at(pairs[:, column], bins[use], 1.0)
+            inside, known = (bins >= 0) & (bins < count), np.isfinite(product)
+            np.add.at(products, bins[inside], np.nan_to_num(product[inside]))
+            np.add.at(pairs, bins[inside], known[inside])
             if step == 1:
                 neighbour += np.nansum(product, axis=0)
-                neighbours += np.isfinite(product).sum(axis=0)
+                neighbours += known.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = np.nansum(whitened**2, axis=0) / np.isfinite(whitened).sum(axis=0)
         function = np.where(pairs >= MIN_PAIRS, products / pairs, np.nan) / variance
         next_one = np.where(neighbours >= MIN_PAIRS, neighbour / neighbours, np.nan) / variance
     lags = 0.5 * (LAGS[1:] + LAGS[:-1])
-    return Correlation(next_one, np.array([_falls(lags, function[:, i]) for i in range(2)]), lags, function)
+    return Correlation(next_one, np.array([_falls(lags, values) for values in function.T]), lags, function)
 
 
 def _falls(lags: Array, function: Array) -> float:
@@ -178,15 +181,11 @@ def _falls(lags: Array, function: Array) -> float:
     known = np.flatnonzero(np.isfinite(function))
     if not len(known):
         return float("nan")
-    below = known[function[known] < np.exp(-1.0)]
+    below = known[function[known] < np.exp(-1.0)][:1]
     if not len(below):
         return float(lags[known[-1]])
-    before = known[known < below[0]]
-    if not len(before):
-        return float(lags[below[0]])
-    i, j = int(before[-1]), int(below[0])
-    share = (function[i] - np.exp(-1.0)) / (function[i] - function[j])
-    return float(lags[i] + share * (lags[j] - lags[i]))
+    rows = [*below, *known[known < below][-1:]]
+    return float(np.interp(np.exp(-1.0), function[rows], lags[rows]))
 
 
 def _range_scatter(errors: Array, ranges: Array) -> tuple[float, float]:
@@ -203,3 +202,199 @@ def _range_scatter(errors: Array, ranges: Array) -> tuple[float, float]:
         start = np.log((max(constant, 1e-3), max(relative, 0.01)))
         constant, relative = np.exp(minimize(cost, start, method="Nelder-Mead").x).tolist()
     return float(np.clip(constant, 1e-3, 10.0)), 0.0 if relative < 1e-3 else min(relative, 1.0)
+
+
+MIN_SIGHTINGS = 100
+MOST_SIGHTINGS = 12000  # per log in fits
+BETTER_KIND = 0.9  # share of the spread below which ranges are of the other kind, distance or depth
+ROUNDS = 2  # of fitting constants and scatter in turn
+RANGE_KIND = "range_kind"
+SIGMAS = {"range_sigma": "m", "range_sigma_relative": "m per m", "bearing_sigma": "rad"}
+FIRST = BearingRangeSettings(range_sigma=0.1)  # settings of an unknown sensor
+SCATTER = Unit("bearing_range", tuple(SIGMAS))
+_SHOWN = 3000  # dots per log and panel
+_VIEW = 5.0  # robust standard deviations; larger residuals are drawn at the edge
+
+
+@dataclass(frozen=True)
+class SensorFit(ConstantsFound):
+    """The parts are thinned from all sightings ``seen``. ``settings``: with all constants and the scatter, for the kind of ranges
+    that fits best."""
+
+    settings: BearingRangeSettings = FIRST
+    seen: tuple[Sightings, ...] = ()
+
+
+class LandmarkCalibrator(ConstantsCalibrator):
+    """The calibrator of a landmark sensor."""
+
+    section, channel, is_consistent = "bearing_range", "bearing_range", True
+    noise = (SCATTER,)
+    uncertain = upper_bounds(BearingRangeUncertainty)
+    together = (("x", "y"),)
+    first = FIRST
+
+    def learn(self, logs: Sequence[Log], rig: Rig, _grids: Path | None, _like: Any) -> SensorFit | None:
+        """The constants of the sensor, from logs with sightings."""
+        if self.channel not in logs[0].streams:
+            return None
+        seen, before = tuple(map(sightings_of, logs)), self.settings(rig)
+        thinned = [one.thinned(MOST_SIGHTINGS) for one in seen]
+        everything, settings = self._fit_and_scatter(thinned, before)
+        if any(np.any(np.isfinite(one.ranges) & np.isfinite(one.bearings)) for one in thinned):
+            other = before.model_copy(update={RANGE_KIND: "distance" if before.range_kind == "depth" else "depth"})
+            found, changed = self._fit_and_scatter(thinned, other)
+            new, old = (spread(np.concatenate([one.errors(s) for one in thinned]))[0] for s in (changed, settings))
+            if new < BETTER_KIND * old:
+                everything, settings = found, changed
+        gain = gains(everything, folds([one.t for one in thinned], BLOCKS))
+        return SensorFit(tuple(thinned), everything, gain, everything.as_dict(), (), settings, seen)
+
+    def _fit_and_scatter(
+        self, seen: Sequence[Sightings], before: BearingRangeSettings
+    ) -> tuple[Fit, BearingRangeSettings]:
+        """Fit all constants and the scatter in turn."""
+        constants = constants_of(seen, before)
+        start = {c.name: c.neutral for c in constants}
+        settings = with_scatter(seen, before)
+        for _ in range(ROUNDS):
+            everything = self.fit(None, seen, settings, constants, start)
+            start = everything.as_dict()
+            settings = with_scatter(seen, self.changed(settings, start))
+        return everything, settings
+
+    def base(self, found: SensorFit, rig: Rig, accepted: Collection[str] | None) -> BearingRangeSettings:
+        """The settings with the scatter of all constants, for the accepted kind of ranges."""
+        settings = found.settings.model_copy(update={c.name: c.neutral for c in found.everything.constants})
+        if accepted is None or f"{self.section}.{RANGE_KIND}" in accepted:
+            return settings
+        return settings.model_copy(update={RANGE_KIND: self.settings(rig).range_kind})
+
+    def finished(
+        self,
+        found: SensorFit,
+        _logs: Sequence[Log],
+        rig: Rig,
+        base: BearingRangeSettings,
+        learnt: Sequence[FittedConstant],
+        *,
+        by_log: bool,
+    ) -> Settled:
+        """The result with the remaining scatter and the autocorrelation of errors."""
+        settings = with_scatter(found.parts, base)
+        before, notes = rig.bearing_range, []
+        if before is not None and settings.range_kind != before.range_kind:
+            notes.append(f"The ranges fit better as the {settings.range_kind} than as the {before.range_kind}.")
+        correlations = tuple(correlation(one, settings) for one in found.seen if by_log)
+        return Settled({self.section: settings}, learnt, notes, correlations)
+
+    def constant_units(
+        self, found: SensorFit, kept: Sequence[FittedConstant], learnt: Rig, start: Rig
+    ) -> dict[Unit, float]:
+        """The units; constants of another kind of ranges are left out."""
+        if learnt.bearing_range.range_kind == self.settings(start).range_kind:
+            return super().constant_units(found, kept, learnt, start)
+        return {Unit(self.section, (*(c.name for c in kept), RANGE_KIND)): float("inf")}
+
+    def inflated(self, rig: Rig, factor: float) -> Rig:
+        """The rig with the sensor's standard deviations multiplied, limited to their bounds."""
+        settings = rig.bearing_range
+        update = {name: factor * getattr(settings, name) for name in SIGMAS}
+        return rig.model_copy(update={self.section: settings.model_copy(update=update)})
+
+    def document(self, told: Told) -> dict[str, Any]:
+        """The factor on the noise, and the autocorrelation of errors."""
+        return {
+            "noise_factor": None if told.trial is None else told.trial.factor,
+            "correlation": {
+                log: {"next": c.next_one.tolist(), "time": c.time.tolist()}
+                for log, c in zip(told.logs, told.details or (), strict=False)
+            },
+        }
+
+    def report(self, told: Told) -> dict[str, Sequence[Part]]:
+        """The scatter and the noise in the rig; the residuals of the sightings and their autocorrelation."""
+        scatter, settings, trial = told.learnt.bearing_range, told.rig.bearing_range, told.trial
+        if told.found is None or scatter is None or settings is None:
+            return {}
+        out: list[Part] = []
+        if SCATTER not in told.accepted:
+            out.append("The noise of the sightings is rejected: the rig keeps that of the input.")
+        rows: list[tuple[str, ...]] = [
+            (f"{n} [{unit}]", number(getattr(scatter, n)), number(getattr(settings, n))) for n, unit in SIGMAS.items()
+        ]
+        out.append((("noise of the sightings", "scatter", "in the rig"), rows))
+        if trial is not None and SCATTER in told.accepted:
+            out.append(
+                f"The scatter was multiplied by {trial.factor:.2f} to make the EKF consistent "
+                f"(ANEES over its ideal value: {trial.causal:.2f} causal, {trial.final:.2f} final)."
+            )
+        explained = (
+            "Estimators assume independent errors. If the correlation is far above 0, many sightings contain little more "
+            "information than one, and the noise in the rig must be larger than the scatter."
+        )
+        header = ("log", "range: next sighting", "falls to 1/e in [s]", "bearing: next sighting", "falls to 1/e in [s]")
+        rows = [
+            (log, number(c.next_one[0], 2), number(c.time[0], 1), number(c.next_one[1], 2), number(c.time[1], 1))
+            for log, c in zip(told.logs, told.details, strict=True)
+        ]
+        return {
+            "Noise": out,
+            "Correlation of consecutive errors": [explained, (header, rows)],
+            "Residuals of the sightings": [
+                sightings_figure(told.found.seen, told.learnt.bearing_range),
+                correlation_figure(told.found.seen, told.details),
+            ],
+        }
+
+
+CALIBRATOR = LandmarkCalibrator()
+
+
+def sightings_figure(seen: Sequence[Sightings], settings: BearingRangeSettings) -> Picture:
+    """Residuals of range and bearing: their distribution, over range, and over time."""
+    errors = [one.errors(settings) for one in seen]
+    rows = [(0, "range", "m"), (1, "bearing", "rad")]
+    rows = [row for row in rows if any(np.isfinite(e[:, row[0]]).any() for e in errors)]
+    figure, axes = grid(len(rows), 3, 4.0 * len(rows))
+    for panels, (column, what, unit) in zip(axes, rows, strict=True):
+        typical = np.concatenate([bearing_range.sigmas(settings.model(), one.ranges)[:, column] for one in seen])
+        limit = _VIEW * float(np.median(typical))
+        edges = np.linspace(-limit, limit, 61)
+        for i, (one, error) in enumerate(zip(seen, errors, strict=True)):
+            values = np.clip(error[:, column], -limit, limit)
+            dots = slice(None, None, max(1, len(values) // _SHOWN))
+            style = {"color": COLOURS[i % len(COLOURS)], "label": one.log.name}
+            panels[0].hist(values[np.isfinite(values)], edges, density=True, histtype="step", linewidth=1.5, **style)
+            panels[1].plot(one.ranges[dots], values[dots], ".", markersize=2, **style)
+            panels[2].plot(one.t[dots], values[dots], ".", markersize=2, **style)
+        density = np.mean(np.exp(-0.5 * (edges[:, None] / typical) ** 2) / (typical * np.sqrt(2.0 * np.pi)), axis=1)
+        panels[0].plot(edges, density, color="0.3", linestyle="--", label="fitted scatter")
+        far = np.nanmax(np.concatenate([one.ranges for one in seen]))
+        distance = np.linspace(0.0, far, 50) if np.isfinite(far) else np.zeros(0)
+        scatter = bearing_range.sigmas(settings.model(), distance)[:, column]
+        for sign in (-2.0, 2.0):
+            panels[1].plot(distance, sign * scatter, color="0.3", linestyle="--", label="2 sigma of the scatter")
+        panels[0].set(xlabel=f"{what} residual [{unit}]", ylabel=f"density [1/{unit}]")
+        panels[1].set(xlabel="measured range [m]", ylabel=f"{what} residual [{unit}]")
+        panels[2].set(xlabel="time [s]", ylabel=f"{what} residual [{unit}]")
+    legend(figure, axes.flat, markers=3.0)
+    return png(figure)
+
+
+def correlation_figure(seen: Sequence[Sightings], correlations: Sequence[Correlation]) -> Picture:
+    """Autocorrelation of the residuals of one landmark, for each log."""
+    columns = [(0, "range"), (1, "bearing")]
+    columns = [c for c in columns if any(np.isfinite(one.function[:, c[0]]).any() for one in correlations)]
+    figure, axes = grid(1, max(1, len(columns)), 4.0)
+    for axis, (column, what) in zip(axes[0], columns, strict=False):
+        for i, (one, of) in enumerate(zip(correlations, seen, strict=True)):
+            known, colour = np.isfinite(one.function[:, column]), COLOURS[i % len(COLOURS)]
+            label = plain(of.log.name.lstrip("_"), 40) or "log"
+            axis.plot(one.lags[known], one.function[known, column], "o-", color=colour, label=label)
+        axis.axhline(np.exp(-1.0), color="0.3", linestyle="--", label="1/e")
+        axis.axhline(0.0, color="0.5", linewidth=0.8)
+        time = "time between two sightings of a landmark [s]"
+        axis.set(xscale="log", xlabel=time, ylabel=f"correlation of {what} residuals")
+    legend(figure, axes.flat, markers=3.0)
+    return png(figure)

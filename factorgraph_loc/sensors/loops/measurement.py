@@ -1,8 +1,10 @@
 """Measurements of loops, their stream, and their tables: with the age of the earlier pose, or with its own timestamp."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -23,12 +25,14 @@ from factorgraph_loc.files.columns import (
     number,
 )
 from factorgraph_loc.files.models import InUnit
-from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.files.values import numbers, within
 from factorgraph_loc.model.measurement import ScanStream, Stream
 from factorgraph_loc.model.settings import SensorSettings
 from factorgraph_loc.sensors.tables import Reading, stream_of
 from factors.se2 import Array
+
+if TYPE_CHECKING:
+    from factorgraph_loc.files.tables import TableRows
 
 
 class LoopSettings(SensorSettings):

@@ -16,10 +16,10 @@ from scipy.optimize import minimize
 
 from factorgraph_loc.fitting.robust import Constant, Fit, blocks, fit, loss, spread
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.calibrating import REFERENCE_GAP
 from factorgraph_loc.sensors.motion import odometry_model
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 from factorgraph_loc.sensors.odometry.settings import OdometrySettings
+from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
 from factors import chi_squared, se2
 from factors.motion import ChainState
 from factors.odometry.chain import OdometryChain

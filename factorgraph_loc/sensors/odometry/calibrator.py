@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,15 @@ from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.fitting.robust import Constant, Fit, folds, gains
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import BLOCKS, ConstantsCalibrator, ConstantsFound, Settled, Told, Unit
+from factorgraph_loc.sensors.calibrating import (
+    BLOCKS,
+    ConstantsCalibrator,
+    ConstantsFound,
+    Settled,
+    Told,
+    Unit,
+    upper_bounds,
+)
 from factorgraph_loc.sensors.motion import odometry_model
 from factorgraph_loc.sensors.odometry import calibration as odometry
 from factorgraph_loc.sensors.odometry.calibration import (
@@ -27,7 +35,12 @@ from factorgraph_loc.sensors.odometry.calibration import (
     odometry_of,
 )
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
-from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
+from factorgraph_loc.sensors.odometry.settings import (
+    GrowthSettings,
+    OdometryNoise,
+    OdometrySettings,
+    OdometryUncertainty,
+)
 from factorgraph_loc.text import number
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array
@@ -52,17 +65,8 @@ class OdometryCalibrator(ConstantsCalibrator):
 
     section, channel, senses = "odometry", "odometry", False
     noise = (NOISE,)
-    uncertain = dict.fromkeys(("scale_distance", "scale_rotation", "heading_rate_bias", "heading_drift"), 1.0)
+    uncertain = upper_bounds(OdometryUncertainty)
     together = (("delay", "lag"),)
-    units: ClassVar[Mapping[str, str]] = {
-        "speed_bias": "m/s",
-        "heading_rate_bias": "rad/s",
-        "heading_drift": "rad/m",
-        "direction": "rad",
-        "delay": "s",
-        "lag": "s",
-        "turn_slowdown": "m/rad",
-    }
 
     def check_alike(self, first: Log, log: Log) -> None:
         """InputError if one log reports velocities and the other increments."""

@@ -24,12 +24,12 @@ from factorgraph_loc.files.columns import (
     Table,
     within,
 )
-from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.model.measurement import FLOOR, TURN, Measurement, Stream, named
 from factorgraph_loc.sensors.tables import Intake, Reading, stream_of
 from factors.se2 import Array
 
 if TYPE_CHECKING:
+    from factorgraph_loc.files.tables import TableRows
     from factorgraph_loc.model.rig import Rig
     from factorgraph_loc.model.world import World
 

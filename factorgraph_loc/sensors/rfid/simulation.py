@@ -169,7 +169,7 @@ def rfid_stream(
     t = _jumped(times, faults.clock_jump)[n]
     labels = [*epcs, ""]
     read = tag < len(epcs)
-    columns = {name: np.full(len(n), np.nan) for name in ("rssi", "phase", "frequency")}
+    columns: dict[str, Any] = {name: np.full(len(n), np.nan) for name in ("rssi", "phase", "frequency")}
     for name, values in signals.items():
         columns[name][read] = values[n[read], a[read], tag[read]]
     return RfidStream(

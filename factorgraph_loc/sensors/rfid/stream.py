@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -84,7 +84,7 @@ class RfidScan:
     rssi: Array
     phase: Array
     frequency: Array
-    source: str = modality
+    source: str = field(default=modality, kw_only=True)
 
     @property
     def count(self) -> int:

@@ -18,12 +18,12 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.reliability import Reliability
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.calibrating import REFERENCE_GAP, possible_poses
 from factorgraph_loc.sensors.interfaces import Ending, Marks, Paragraph, Review, Summary, Use
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.monitor import BAND, BLOCK, DIFFERENT, FEWEST, POSSIBLE, ReadGroups
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, possible_poses
 from factorgraph_loc.text import listed, quoted
 from factors.rfid.detection import ExpectedReads, RfidLikelihood
 from factors.rfid.kernels import MOST_CERTAIN, rate_of

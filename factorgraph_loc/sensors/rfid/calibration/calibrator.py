@@ -9,13 +9,14 @@ from factorgraph_loc.drawing.pages import Part, Rows
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import Calibrator, Settled, Smoothed, State, Told, Unit
+from factorgraph_loc.sensors.calibrating import Calibrator, Settled, State, Told, Unit
 from factorgraph_loc.sensors.rfid.calibration import report
 from factorgraph_loc.sensors.rfid.calibration.learn import RfidKnowledge, learn_rfid
 from factorgraph_loc.sensors.rfid.calibration.rounds import distinct
 from factorgraph_loc.sensors.rfid.calibration.smoothed import relearn_rfid, with_priors
 from factorgraph_loc.sensors.rfid.calibration.tempering import tempered
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, default_models
+from factorgraph_loc.sensors.smoothed import Smoothed
 
 PLACES, MODEL, STRENGTH = Unit("rfid", ("places",)), Unit("rfid", ("models",)), Unit("rfid", ("rssi",))
 TOO_SHORT = "rejected: the logs are too short to judge it"

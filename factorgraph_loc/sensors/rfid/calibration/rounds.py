@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.calibrating import REFERENCE_GAP
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
 from factors import se2
 from factors.rfid.detection import TagArray
 from factors.se2 import Array

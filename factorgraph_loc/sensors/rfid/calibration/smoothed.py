@@ -1,7 +1,7 @@
 """Detection models learnt from logs without a reference, along the trajectories that the smoother found.
 
 The likelihood of the reads is averaged over the poses that the smoother thinks possible
-(:func:`~factorgraph_loc.sensors.calibrating.possible_poses`). Tags that are probably not where the map has them are left out. A
+(:func:`~factorgraph_loc.sensors.smoothed.possible_poses`). Tags that are probably not where the map has them are left out. A
 beam is fitted in all its parameters, and a logistic model in all its coefficients; a grid keeps its shape, and changes as
 estimators change it on the way (:mod:`factors.rfid.kernels`).
 """
@@ -15,7 +15,7 @@ import numpy as np
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import REFERENCE_GAP, Corrections, Settled, Smoothed, pooled, possible_poses
+from factorgraph_loc.sensors.calibrating import Settled
 from factorgraph_loc.sensors.rfid.calibration.fit import Floor
 from factorgraph_loc.sensors.rfid.calibration.learn import CALIBRATED, floor_of, written
 from factorgraph_loc.sensors.rfid.calibration.pairs import BLOCKS, TagPairs, modelled, pairs_of
@@ -23,6 +23,7 @@ from factorgraph_loc.sensors.rfid.calibration.refit import Refit, refit_beam, re
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, rounds_of
 from factorgraph_loc.sensors.rfid.calibration.tempering import bursts
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings
+from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, Corrections, Smoothed, pooled, possible_poses
 from factorgraph_loc.text import quoted
 from factors.rfid.kernels import MOST_CERTAIN, PARAMETERS, rate_of
 from factors.rfid.model import FEATURES, BeamModel, DetectionModel, GridModel, LogisticModel
