@@ -8,7 +8,7 @@ import pytest
 from factorgraph_loc.calibration.calibrate import check
 from factorgraph_loc.calibration.learn import learn
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.sensors.landmarks.calibration import correlation, sightings_of
+from factorgraph_loc.sensors.landmarks.calibrator import correlation, sightings_of
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factors import se2
 

@@ -34,5 +34,5 @@ SENSOR = SensorType(
     looks="factorgraph_loc.sensors.landmarks.simulation:looks",
     on_robot="factorgraph_loc.sensors.landmarks.simulation:on_robot",
     forecast="factorgraph_loc.sensors.landmarks.simulation:forecast",
-    calibrator="factorgraph_loc.sensors.landmarks.calibration:CALIBRATOR",
+    calibrator="factorgraph_loc.sensors.landmarks.calibrator:CALIBRATOR",
 )
