@@ -50,7 +50,7 @@ def _simulations() -> list[str]:
 
 
 def _active() -> list[str]:
-    return ["## Active robots", "", *_table(known_policies().settings)]
+    return ["## Active robots", "", *_table(known_policies()[0].settings)]
 
 
 def _table(settings: Sequence[Setting]) -> list[str]:

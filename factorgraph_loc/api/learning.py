@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from factorgraph_loc.api.given import LogLike, Progress, RigLike, Settings, WorldLike, every, one
+from factorgraph_loc.api.given import LogLike, Progress, RigLike, Settings, WorldLike, every
 from factorgraph_loc.api.running import run
 from factorgraph_loc.calibration import calibrate as calibration
 from factorgraph_loc.calibration import report as rig_report
@@ -15,6 +15,7 @@ from factorgraph_loc.experiments import maps, output
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.temporary import of_system, temporary_folder, writing
 from factorgraph_loc.io.native.rig_file import write_rig
+from factorgraph_loc.io.readers import read_log
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.plugins import FEATURES, MAP_ESTIMATORS
@@ -75,7 +76,7 @@ def build_map(
     """
     maps.picture_beside(Path(out), overwrite=overwrite)
     options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead, points or {})
-    made = maps.make_map(one(log, rig, world), options, stages)
+    made = maps.make_map(read_log(log, rig=rig, world=world), options, stages)
     made.write(Path(out), overwrite=overwrite)
     return made
 

@@ -5,18 +5,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from factorgraph_loc.api.given import LogLike, Progress, RigLike, Settings, WorldLike, every, one
+from factorgraph_loc.api.given import LogLike, Progress, RigLike, Settings, WorldLike, every
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.inspect import Inspection, inspect
 from factorgraph_loc.evaluation.plots import overview
-from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.experiments.run import run
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import temporary_folder, writing
 from factorgraph_loc.io.bags.manifest import BagManifest, manifest_of_bag
 from factorgraph_loc.io.native.native import require_new, write_native
-from factorgraph_loc.io.readers import Dataset, describe
+from factorgraph_loc.io.readers import Dataset, describe, read_log
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.scoring import RunConfig
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.sensors.rfid.recorded import RecordedLooks
 from factorgraph_loc.simulation import SimulationSettings, named_settings, recorded_looks, with_images
@@ -32,7 +33,7 @@ def info(
     log: LogLike, *, rig: RigLike | None = None, world: WorldLike | None = None, out: str | Path | None = None
 ) -> Inspection:
     """Summarize a log, with warnings about its content. ``out``: a picture (PNG) of the log from above to write."""
-    loaded = one(log, rig, world)
+    loaded = read_log(log, rig=rig, world=world)
     if out is not None:
         draw([loaded], Path(out))
     return inspect(loaded)
@@ -63,7 +64,7 @@ def convert(
 
     ``overwrite`` replaces a log that ``out`` is.
     """
-    write_native(one(log, rig, world), out, format, overwrite=overwrite)
+    write_native(read_log(log, rig=rig, world=world), out, format, overwrite=overwrite)
 
 
 def manifest(bag: str | Path, out: str | Path | None = None, *, overwrite: bool = False) -> BagManifest:
@@ -116,7 +117,7 @@ def simulate(
             _write_with_images(log, settings, seed, folder, progress)
         else:
             write_native(log, folder)
-    return one(folder) if images else log
+    return read_log(folder) if images else log
 
 
 def _write_with_images(log: Log, settings: SimulationSettings, seed: int, folder: Path, progress: Progress) -> None:

@@ -26,12 +26,15 @@ ADVICE = "`fgloc sensors NAME` prints all keys of a sensor, with bounds."
 
 
 @dataclass(frozen=True)
-class ReaderDescription:
-    """A reader of logs: one sentence on its format, and its options."""
+class Choice:
+    """A reader of logs, a preset of simulations or a policy of active robots, with one sentence ``about`` it.
+
+    ``settings``: the options of a reader, the settings of a preset without those of its rig, or those that all policies share.
+    """
 
     name: str
     about: str
-    options: tuple[Setting, ...]
+    settings: tuple[Setting, ...]
 
 
 @dataclass(frozen=True)
@@ -46,37 +49,20 @@ class SensorDescription:
     rig: Mapping[str, tuple[Setting, ...]]
 
 
-@dataclass(frozen=True)
-class PresetDescription:
-    """A preset of simulations: one sentence on it, and its settings except those of its rig."""
-
-    name: str
-    about: str
-    settings: tuple[Setting, ...]
-
-
-@dataclass(frozen=True)
-class PoliciesDescription:
-    """A sentence on each policy of active robots, and the settings that they share."""
-
-    policies: Mapping[str, str]
-    settings: tuple[Setting, ...]
-
-
 def known_estimators() -> list[Description]:
     """The estimators, each with the sensors that it takes and its settings."""
     return [describe(name) for name in ESTIMATORS]
 
 
-def known_readers() -> list[ReaderDescription]:
+def known_readers() -> list[Choice]:
     """The readers of logs, each with its options."""
     return [describe_reader(name) for name in READERS]
 
 
-def describe_reader(name: str) -> ReaderDescription:
+def describe_reader(name: str) -> Choice:
     """The description of a reader; InputError for an unknown one."""
     found = reader(name)
-    return ReaderDescription(name, found.about, tuple(settings_in(found.options)))
+    return Choice(name, found.about, tuple(settings_in(found.options)))
 
 
 def known_sensors() -> list[SensorDescription]:
@@ -96,20 +82,21 @@ def describe_sensor(name: str) -> SensorDescription:
     )
 
 
-def known_presets() -> list[PresetDescription]:
+def known_presets() -> list[Choice]:
     """The presets of simulations, each with its settings."""
     return [describe_preset(name) for name in PRESETS]
 
 
-def describe_preset(name: str) -> PresetDescription:
+def describe_preset(name: str) -> Choice:
     """The description of a preset of simulations; InputError for an unknown one."""
     settings = settings_in(SimulationSettings, default=preset(name))
-    return PresetDescription(name, PRESETS[name], tuple(s for s in settings if not s.key.startswith("rig.")))
+    return Choice(name, PRESETS[name], tuple(s for s in settings if not s.key.startswith("rig.")))
 
 
-def known_policies() -> PoliciesDescription:
-    """The policies of active robots, and the settings of their runs."""
-    return PoliciesDescription(POLICIES, tuple(settings_in(ActiveSettings)))
+def known_policies() -> list[Choice]:
+    """The policies of active robots, each with the settings of their runs."""
+    settings = tuple(settings_in(ActiveSettings))
+    return [Choice(name, about, settings) for name, about in POLICIES.items()]
 
 
 def known_rigs() -> dict[str, Rig]:
@@ -119,12 +106,9 @@ def known_rigs() -> dict[str, Rig]:
 
 def sources_of_rigs() -> dict[str, tuple[str, Callable[[], Rig]]]:
     """The rigs by name: whose each is, and how it is made."""
-    found: dict[str, tuple[str, Callable[[], Rig]]] = {"default": ("logs without a rig", lambda: DEFAULT_RIG)}
-    for name, file in shipped().items():
-        found[name] = "a known log", partial(read_rig, file)
-    for name in PRESETS:
-        found[name] = "fgloc simulate", partial(_of_preset, name)
-    return found
+    default: dict[str, tuple[str, Callable[[], Rig]]] = {"default": ("logs without a rig", lambda: DEFAULT_RIG)}
+    recorded = {name: ("a known log", partial(read_rig, file)) for name, file in shipped().items()}
+    return default | recorded | {name: ("fgloc simulate", partial(_of_preset, name)) for name in PRESETS}
 
 
 def _of_preset(name: str) -> Rig:

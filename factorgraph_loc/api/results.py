@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from factorgraph_loc.api.given import LogLike, RigLike, WorldLike, one
+from factorgraph_loc.api.given import LogLike, RigLike, WorldLike
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.trajectories.page import check_free, write_score
 from factorgraph_loc.evaluation.trajectories.score import TrajectoryScore, score_paths
@@ -15,6 +15,7 @@ from factorgraph_loc.exports.ros import write_mcap
 from factorgraph_loc.exports.runs import StoredRun, find_runs, is_results, read_runs
 from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write_g2o, write_trajectory
 from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.io.readers import read_log
 from factorgraph_loc.io.trajectories import read_trajectory
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.pose_path import PosePath
@@ -43,7 +44,7 @@ def view(
     listens on, without credentials; only this machine reaches the default one. InputError if ``rerun-sdk`` is not installed, the
     viewer does not start, or the file cannot be written.
     """
-    log, runs = stored(_listed(results), lambda name: one(name, rig, world))
+    log, runs = stored(_listed(results), lambda name: read_log(name, rig=rig, world=world))
     show(log, runs, None if rrd is None else Path(rrd), bind)
 
 
@@ -60,7 +61,7 @@ def export(
     ``results``: as for :func:`view`. ``out``: its suffix selects the format: .mcap, .tum, .kitti, .g2o or .ply.
     """
     require_format(Path(out))
-    log, runs = stored(_listed(results), lambda name: one(name, rig, world))
+    log, runs = stored(_listed(results), lambda name: read_log(name, rig=rig, world=world))
     return write(log, runs, Path(out))
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from factorgraph_loc.api.given import LogLike, RigLike, Settings, WorldLike, every, one
+from factorgraph_loc.api.given import LogLike, RigLike, Settings, WorldLike, every
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.evaluation.plots import write_plots
@@ -13,11 +13,11 @@ from factorgraph_loc.experiments import compare as comparing
 from factorgraph_loc.experiments import output
 from factorgraph_loc.experiments import run as running
 from factorgraph_loc.experiments.learning import run_and_learn
-from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.fitting.constants import FittedConstant
 from factorgraph_loc.fusion.registry import for_final_only
+from factorgraph_loc.io.readers import read_log
 from factorgraph_loc.model.result import RunResult
-from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
+from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment, RunConfig
 from factorgraph_loc.text import listed
 
 
@@ -56,7 +56,7 @@ def run(
 ) -> Run:
     """Run one estimator on one log and score the result.
 
-    For the arguments see :class:`~factorgraph_loc.experiments.run.RunConfig`. ``learn``: learn the rig from the log itself, for
+    For the arguments see :class:`~factorgraph_loc.model.scoring.RunConfig`. ``learn``: learn the rig from the log itself, for
     the final trajectory alone. ``final_only``: make no causal estimates. ``align``: also score after this alignment with the
     reference. ``out``: folder for the files that ``fgloc run`` writes.
     """
@@ -64,7 +64,7 @@ def run(
         output.check_free(Path(out), overwrite=overwrite)
     given = {estimator: settings or {}}
     chosen = (for_final_only(given) if final_only else given)[estimator]
-    loaded = one(log, rig, world)
+    loaded = read_log(log, rig=rig, world=world)
     config = RunConfig(estimator, chosen, None if sensors is None else tuple(sensors), prior, seed, max_gap, tick_gap)
     learnt: tuple[FittedConstant, ...] = ()
     if learn:

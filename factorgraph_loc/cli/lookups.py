@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -12,7 +12,7 @@ from factorgraph_loc.cli.options import Json
 from factorgraph_loc.plugins import PRESETS
 
 if TYPE_CHECKING:
-    from factorgraph_loc.api.lookups import SensorDescription
+    from factorgraph_loc.api.lookups import Choice, SensorDescription
     from factorgraph_loc.files.columns import Column
     from factorgraph_loc.files.settings import Setting
     from factorgraph_loc.fusion.registry import Description
@@ -32,15 +32,11 @@ def estimators(name: Annotated[str | None, _name("settings", completion.estimato
         rows = [(e.name, _estimates(e), e.about, ", ".join(e.sensors)) for e in known]
         _print_list(json, known, ("name", "estimates", "what it is", "sensors"), rows, ("what it is", "sensors"))
         return
-    estimator = describe(name)
-    if json:
-        show.document(estimator)
-        return
-    about = {"estimator": name, "what it is": estimator.about, "estimates": _estimates(estimator)}
-    show.fields(about | {"sensors": ", ".join(estimator.sensors)})
-    show.line()
-    first = estimator.settings[0].key if estimator.settings else ""
-    _print_settings(estimator.settings, f"to change one: fgloc run LOG -e {name} --set {name}.{first}=VALUE")
+    chosen = describe(name)
+    about = {"estimator": name, "what it is": chosen.about, "estimates": _estimates(chosen)}
+    first = chosen.settings[0].key if chosen.settings else ""
+    hint = f"to change one: fgloc run LOG -e {name} --set {name}.{first}=VALUE"
+    _print_one(json, chosen, about | {"sensors": ", ".join(chosen.sensors)}, hint)
 
 
 def readers(name: Annotated[str | None, _name("options", completion.reader)] = None, json: Json = False) -> None:
@@ -51,14 +47,9 @@ def readers(name: Annotated[str | None, _name("options", completion.reader)] = N
         known = known_readers()
         _print_list(json, known, ("name", "format"), [(r.name, r.about) for r in known], ("format",))
         return
-    reader = describe_reader(name)
-    if json:
-        show.document(reader)
-        return
-    show.fields({"reader": name, "format": reader.about})
-    show.line()
+    chosen = describe_reader(name)
     hint = "options are in [options] of a manifest, or --reader-option KEY=VALUE"
-    _print_settings(reader.options, hint, "option")
+    _print_one(json, chosen, {"reader": name, "format": chosen.about}, hint, "option")
 
 
 def sensors(
@@ -86,14 +77,11 @@ def presets(name: Annotated[str | None, _name("settings", completion.preset)] = 
         known = [{"name": name, "about": about} for name, about in PRESETS.items()]
         _print_list(json, known, ("name", "world"), [*PRESETS.items()], ("world",))
         return
-    preset = describe_preset(name)
-    if json:
-        show.document(preset)
-        return
-    show.fields({"preset": name, "world": preset.about, "rig": f"fgloc rigs show {name}; --set rig.KEY=VALUE"})
-    show.line()
-    hint = f"to change one: fgloc simulate {name} --set drive.duration=VALUE, or a file of settings"
-    _print_settings(preset.settings, hint)
+    chosen = describe_preset(name)
+    about = {"preset": name, "world": chosen.about, "rig": f"fgloc rigs show {name}; --set rig.KEY=VALUE"}
+    _print_one(
+        json, chosen, about, f"to change one: fgloc simulate {name} --set drive.duration=VALUE, or a file of settings"
+    )
 
 
 def policies(json: Json = False) -> None:
@@ -101,11 +89,11 @@ def policies(json: Json = False) -> None:
     from factorgraph_loc.api.lookups import known_policies
 
     known = known_policies()
-    _print_list(json, known, ("policy", "next path"), [*known.policies.items()], ("next path",))
+    _print_list(json, known, ("policy", "next path"), [(policy.name, policy.about) for policy in known], ("next path",))
     if not json:
         show.line()
         hint = "to change one: fgloc active WORLD --set policy.horizon=VALUE; settings of the world as in fgloc presets WORLD"
-        _print_settings(known.settings, hint)
+        _print_settings(known[0].settings, hint)
 
 
 def _print_list(
@@ -115,6 +103,17 @@ def _print_list(
         show.document(document)
     else:
         show.table(header, rows, wrapped)
+
+
+def _print_one(
+    json: bool, choice: Choice | Description, about: Mapping[str, str], hint: str, word: str = "setting"
+) -> None:
+    if json:
+        show.document(choice)
+        return
+    show.fields(about)
+    show.line()
+    _print_settings(choice.settings, hint, word)
 
 
 def _summary(sensor: SensorDescription) -> dict[str, Any]:

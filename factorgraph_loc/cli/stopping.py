@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, NoReturn, TextIO
+from typing import Any, TextIO
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.errors import InputError
@@ -100,30 +100,27 @@ class _Output(io.TextIOWrapper):
         try:
             return super().write(text) if text != "" else 0  # libraries write "" to probe the stream
         except OSError as error:
-            _give_up(error)
+            self.give_up(error)
+        return len(text)
 
     def flush(self) -> None:
         try:
             super().flush()
         except OSError as error:
-            _give_up(error)
+            self.give_up(error)
+
+    def give_up(self, error: OSError) -> None:
+        _discard(1)
+        if isinstance(error, BrokenPipeError):
+            raise SystemExit(PIPE_CLOSED) from error
+        raise OutputError(f"standard output: cannot be written: {told(error)}") from error
 
 
-class _Messages(io.TextIOWrapper):
+class _Messages(_Output):
     """Standard error; failures to write are ignored, because they cannot be reported."""
 
-    def write(self, text: str, /) -> int:
-        try:
-            return super().write(text)
-        except OSError:
-            _discard(2)
-            return len(text)
-
-    def flush(self) -> None:
-        try:
-            super().flush()
-        except OSError:
-            _discard(2)
+    def give_up(self, _: OSError) -> None:
+        _discard(2)
 
 
 @contextmanager
@@ -154,13 +151,6 @@ def _replaced(stream: TextIO | None, number: int, kind: type[io.TextIOWrapper], 
         return kind(os.fdopen(number, "wb", closefd=False), "utf-8", errors)
     encoding, unbuffered, by_line = stream.encoding, stream.write_through, stream.line_buffering
     return kind(stream.detach(), encoding, errors, line_buffering=by_line, write_through=unbuffered)
-
-
-def _give_up(error: OSError) -> NoReturn:
-    _discard(1)
-    if isinstance(error, BrokenPipeError):
-        raise SystemExit(PIPE_CLOSED) from error
-    raise OutputError(f"standard output: cannot be written: {told(error)}") from error
 
 
 def _discard(number: int) -> None:

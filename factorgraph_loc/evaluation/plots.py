@@ -35,32 +35,22 @@ _FILES = (
 def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path, name: str) -> list[Path]:
     """Write the plots of a log, for estimators by name, into ``folder`` and return their paths.
 
-    Those of :func:`plot_run` for each estimator, with all trajectories in one plot; with a reference also
-    ``NAME-error-distribution.png``.
+    ``NAME-trajectories.png``, and for several estimators with a reference ``NAME-error-distribution.png``. For each with a
+    trajectory: ``NAME-consistency-ESTIMATOR.png``, with a reference or innovations; with a reference
+    ``NAME-errors-ESTIMATOR.png``; with tags ``NAME-reliability-ESTIMATOR.png``.
     """
     figures = {"trajectories": trajectories(log, tracks)}
-    if log.reference is not None:
+    if log.reference is not None and len(tracks) > 1:
         figures["error-distribution"] = error_distribution(log, log.reference, tracks)
     for estimator, track in tracks.items():
         figures |= _of_one(log, estimator, track)
     return _write(figures, folder, name)
 
 
-def plot_run(log: Log, estimator: str, track: Track, folder: Path, name: str) -> list[Path]:
-    """Write the plots of one run into ``folder`` and return their paths.
-
-    ``NAME-trajectories.png``; ``NAME-consistency-ESTIMATOR.png``, with a reference or innovations; with a reference
-    ``NAME-errors-ESTIMATOR.png``; with tags ``NAME-reliability-ESTIMATOR.png``. Without a trajectory only the first.
-    """
-    figures = {"trajectories": trajectories(log, {estimator: track}), **_of_one(log, estimator, track)}
-    return _write(figures, folder, name)
-
-
 def write_plots(result: RunResult, log: Log, out: Path) -> None:
     """Write the plots of a run into ``out/plots``, replacing those of a previous one."""
-    folder = out / "plots"
-    remove_plots(folder)
-    plot_run(log, str(result.config["estimator"]), Track.of(result), folder, file_name(log.name))
+    remove_plots(out / "plots")
+    plot_log(log, {str(result.config["estimator"]): Track.of(result)}, out / "plots", file_name(log.name))
 
 
 def remove_plots(folder: Path) -> None:

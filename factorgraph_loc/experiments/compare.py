@@ -2,7 +2,8 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -166,7 +167,7 @@ def _plot(log: Log, prepared: Prepared, folder: Path) -> None:
     for run in prepared.runs:
         store = prepared.store
         if run.log == log.name and run.label not in tracks and store.state(run.key) == "ok":
-            tracks[run.label] = replace(store.track(run.key, log.t0_ns), max_gap=run.max_gap)
+            tracks[run.label] = Track.read(partial(store.read, run.key), log.t0_ns, run.max_gap)
     if tracks:
         plot_log(log, tracks, folder, file_name(log.name))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -61,10 +60,6 @@ class Prepared:
         """The runs to be made; with ``again`` also the failed ones."""
         done = ("ok",) if again else ("ok", "failed")
         return [run for run in self.runs if self.states[run.key] not in done]
-
-    def counts(self) -> Counter[State]:
-        """Number of runs that are ok, failed, missing and damaged."""
-        return Counter(self.states[run.key] for run in self.runs)
 
 
 @dataclass(frozen=True)
@@ -139,9 +134,13 @@ def run_experiment(
         for run in todo:  # an interrupt may come between a run's end and its outcome
             if states[run.key] not in ("ok", "failed"):
                 states[run.key] = prepared.store.state(run.key, thorough=True)
-        rows = _write_rows(prepared, states)
+        finished = [run for run in prepared.runs if states[run.key] in ("ok", "failed")]
+        rows = _write_rows(finished, prepared)
     found = rows.to_dicts()
-    return Done(rows, [_failure(row) for row in found if row["status"] == "failed"], lines(found))
+    failures = [
+        f"{run.shown}: {row['reason']}" for run, row in zip(finished, found, strict=True) if row["status"] == "failed"
+    ]
+    return Done(rows, failures, lines(found))
 
 
 def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
@@ -166,16 +165,9 @@ def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
     return sum(run.duration * pace(run) for run in runs)
 
 
-def _write_rows(prepared: Prepared, states: dict[str, State]) -> pl.DataFrame:
+def _write_rows(runs: Sequence[PlannedRun], prepared: Prepared) -> pl.DataFrame:
     from factorgraph_loc.experiments.result_table import collect, write_index  # noqa: PLC0415
 
-    rows = collect((run for run in prepared.runs if states[run.key] in ("ok", "failed")), prepared.store)
+    rows = collect(runs, prepared.store)
     write_index(rows, prepared.folder)
     return rows
-
-
-def _failure(row: dict[str, Any]) -> str:
-    swept = "".join(
-        f", {k.removeprefix('sweep.')} {v}" for k, v in row.items() if k.startswith("sweep.") and v is not None
-    )
-    return f"{row['log']}, {row['label']}{swept}, seed {row['seed']}: {row['reason']}"

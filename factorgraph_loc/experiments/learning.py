@@ -9,10 +9,11 @@ from time import perf_counter
 
 from factorgraph_loc.calibration.turns import TURNS, Turns, learn_by_turns
 from factorgraph_loc.experiments.preparation import used_sensors
-from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.experiments.run import run
 from factorgraph_loc.files.temporary import of_system, temporary_folder
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
+from factorgraph_loc.model.scoring import RunConfig
 
 SMOOTHER = "smoother"
 

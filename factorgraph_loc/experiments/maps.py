@@ -15,18 +15,18 @@ from factorgraph_loc.drawing.figures import save
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import beside
 from factorgraph_loc.experiments.preparation import first_odometry, resolve_prior
-from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.experiments.run import run
 from factorgraph_loc.files.models import parse_model, replacing
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.io.native.world_file import write_world
 from factorgraph_loc.mapping import map_figure, mapping, tag_mapping
-from factorgraph_loc.mapping.camera_poses import posed_frames
 from factorgraph_loc.mapping.mapping import LandmarkMap
-from factorgraph_loc.mapping.point_mapping import PointReport, PointSettings, map_points
+from factorgraph_loc.mapping.point_mapping import PointReport, PointSettings, map_points, posed_frames
 from factorgraph_loc.mapping.point_maps import merged, thinned
 from factorgraph_loc.mapping.tag_mapping import MadeTags
 from factorgraph_loc.model.belief import EXACT_SIGMA, PosePrior
 from factorgraph_loc.model.log import Log, StartPose
+from factorgraph_loc.model.scoring import RunConfig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import MAP_ESTIMATORS
 from factorgraph_loc.sensors.camera.frontend import with_features

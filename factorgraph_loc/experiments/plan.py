@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.experiment_file import (
@@ -24,11 +24,8 @@ from factorgraph_loc.experiments.keys import Facts, FileDigests, load_planned, r
 from factorgraph_loc.experiments.log_source import LogSource, RecordedSource, SimulatedSource, recorded_sources
 from factorgraph_loc.files.data_root import named_path
 from factorgraph_loc.files.models import nearest, set_key
-from factorgraph_loc.model.scoring import Alignment
+from factorgraph_loc.model.scoring import RunConfig
 from factorgraph_loc.text import quoted
-
-if TYPE_CHECKING:
-    from factorgraph_loc.experiments.run import RunConfig
 
 MOST_RUNS = 100_000
 # limits of what is simulated before the first run, each about a quarter of an hour of computing
@@ -36,13 +33,12 @@ MOST_SECONDS = 2_000_000  # of simulated driving
 MOST_LOOKS = 2_000_000_000  # simulated observations of tags, landmarks and points
 
 
-@dataclass(frozen=True)
-class PlannedRun:
+@dataclass(frozen=True, kw_only=True)
+class PlannedRun(RunConfig):
     """One run, as plain data that can be sent to other processes.
 
     ``source``: of the log, whose content has the digest ``log_digest``; ``log``: its name; ``duration`` [s] of it. ``label``: of
-    the ``estimator`` with these ``settings``; ``max_gap`` [s] and ``align``: of scoring; ``tick_gap`` [s]: of the estimates;
-    ``sweep``: swept settings by dotted name. ``key``: of its results.
+    the estimator with these settings; ``sweep``: swept settings by dotted name. ``key``: of its results.
     """
 
     source: LogSource
@@ -50,14 +46,6 @@ class PlannedRun:
     log: str
     duration: float
     label: str
-    estimator: str
-    settings: Mapping[str, Any]
-    sensors: tuple[str, ...] | None
-    prior: str | None
-    seed: int
-    max_gap: float
-    tick_gap: float
-    align: Alignment
     key: str
     sweep: Mapping[str, Any] = field(default_factory=dict)
 
@@ -67,13 +55,6 @@ class PlannedRun:
         swept = "".join(f", {key} {value}" for key, value in self.sweep.items())
         return f"{self.log}, {self.label}{swept}, seed {self.seed}"
 
-    @property
-    def config(self) -> RunConfig:
-        """The configuration of the run."""
-        from factorgraph_loc.experiments.run import RunConfig  # noqa: PLC0415 - the plan needs no estimator
-
-        return RunConfig(**{one.name: getattr(self, one.name) for one in fields(RunConfig)})
-
     def make(self) -> dict[str, bytes]:
         """The files of the run. Raises VanishedError if the log differs from the planned one, FglocError if the run fails."""
         from factorgraph_loc.experiments.output import run_files  # noqa: PLC0415
@@ -81,7 +62,7 @@ class PlannedRun:
 
         started = perf_counter()
         log = load_planned(self.source, self.log_digest)
-        return run_files(run(log, self.config), log, started, self.align)
+        return run_files(run(log, self), log, started, self.align)
 
 
 @dataclass(frozen=True)
@@ -221,19 +202,25 @@ def _runs(
         estimator = facts.estimator(entry.name, settings)
     for sensors in experiment.sensors:
         for seed in experiment.seeds[:1] if estimator.deterministic else experiment.seeds:
-            config: dict[str, Any] = {
-                "estimator": entry.name,
-                "settings": settings,
-                "sensors": sensors,
-                "prior": experiment.prior,
-                "seed": seed,
-                "max_gap": experiment.max_gap,
-                "tick_gap": experiment.tick_gap,
-                "align": experiment.align,
-            }
-            key = run_key(log.digest, config | {"settings": estimator.effective})
+            config = RunConfig(
+                entry.name,
+                settings,
+                sensors,
+                experiment.prior,
+                seed,
+                experiment.max_gap,
+                experiment.tick_gap,
+                experiment.align,
+            )
             yield PlannedRun(
-                log.source, log.digest, log.name, log.duration, entry.shown, key=key, sweep=point, **config
+                **vars(config),
+                source=log.source,
+                log_digest=log.digest,
+                log=log.name,
+                duration=log.duration,
+                label=entry.shown,
+                key=run_key(log.digest, vars(config) | {"settings": estimator.effective}),
+                sweep=point,
             )
 
 

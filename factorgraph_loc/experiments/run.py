@@ -3,11 +3,11 @@
 import importlib.metadata
 import math
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.map_frame import MapFrame
 from factorgraph_loc.model.measurement import TURN
 from factorgraph_loc.model.result import RunResult
-from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment, Ticks, check_max_gap, check_tick_gap
+from factorgraph_loc.model.scoring import RunConfig, Ticks, check_max_gap, check_tick_gap
 from factorgraph_loc.sensors.camera.use import PreparedLog, prepare
 from factorgraph_loc.sensors.interfaces import Ending, Use
 from factorgraph_loc.sensors.registry import detecting, functions, moving
@@ -42,27 +42,6 @@ from factorgraph_loc.version import __version__
 
 _REHEARSAL = 2.0  # s from the first observation
 _REHEARSED: set[tuple[str, tuple[str, ...]]] = set()  # estimators with their sensors, in this process
-
-
-@dataclass(frozen=True)
-class RunConfig:
-    """The configuration of a run on a log.
-
-    ``estimator``: its registered name; ``settings``: overrides of its settings. ``sensors``: names of the streams it may use,
-    None for those of the rig; ``rssi`` and ``phase`` are optional parts of the reads of ``rfid``. ``prior``: see
-    :func:`~factorgraph_loc.experiments.preparation.resolve_prior`. ``seed``: of the estimator's random generator. ``max_gap``
-    [s]: the largest interval between estimates that is interpolated for scoring. ``tick_gap`` [s]: there are no estimates inside
-    longer gaps between measurements. ``align``: also score after this alignment with the reference. Scoring changes no estimate.
-    """
-
-    estimator: str
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    sensors: tuple[str, ...] | None = None
-    prior: str | None = None
-    seed: int = 0
-    max_gap: float = MAX_GAP
-    tick_gap: float = TICK_GAP
-    align: Alignment = "none"
 
 
 def run(

@@ -15,7 +15,7 @@ import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -24,9 +24,6 @@ from factorgraph_loc.evaluation.warned import row_of
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files.temporary import sweep
 from factorgraph_loc.model.scoring import Alignment
-
-if TYPE_CHECKING:
-    from factorgraph_loc.evaluation.figures import Track
 
 Whole = Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63)]  # as in tables
 Figure = Whole | Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
@@ -186,33 +183,6 @@ class Store:
             return bounded.read_bytes(path, bounded.DATA)
         except InputError as error:
             raise DamagedError(f"{error}{_AGAIN}") from error
-
-    def track(self, key: str, t0_ns: int | None = None) -> Track:
-        """The causal trajectory from the first localized estimate on, and the final one, with covariances; innovations and events.
-        Times [s] are from ``t0_ns`` on, by default from the first estimate."""
-        import numpy as np  # noqa: PLC0415
-        import polars as pl  # noqa: PLC0415
-
-        from factorgraph_loc.evaluation.figures import Track  # noqa: PLC0415
-        from factorgraph_loc.files.tables import parse_parquet  # noqa: PLC0415
-        from factorgraph_loc.io.results import (  # noqa: PLC0415
-            ESTIMATES,
-            EVENTS,
-            INNOVATIONS,
-            by_kind,
-            parse_estimates,
-            parse_events,
-            trajectory_of,
-        )
-
-        table = parse_estimates(self.read(key, ESTIMATES), ESTIMATES)
-        begin = t0_ns if t0_ns is not None else int(table["t_ns"].to_numpy().min(initial=np.iinfo(np.int64).max))
-        causal, final = (trajectory_of(rows, begin) for rows in by_kind(table).values())
-        updates = parse_parquet(self.read(key, INNOVATIONS), INNOVATIONS)
-        updates = updates.select("sensor", (pl.col("t_ns") - begin) / 1e9, "nis", "dof")
-        nis = {str(s): rows.drop("sensor").to_numpy() for (s,), rows in updates.group_by("sensor", maintain_order=True)}
-        events = parse_events(self.read(key, EVENTS), EVENTS, begin)
-        return Track(causal if len(causal) else None, final, nis, events)
 
     def put(self, key: str, files: Mapping[str, bytes]) -> None:
         """Write the files of a run atomically, replacing existing ones; its claim must be held."""

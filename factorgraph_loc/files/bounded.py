@@ -5,7 +5,6 @@ checked before memory is allocated. libpng and libjpeg ignore OpenCV's log level
 """
 
 import errno
-import fcntl
 import os
 import shutil
 import stat
@@ -33,7 +32,6 @@ LARGEST_POINTER = 1024  # bytes, as its specification says
 
 _limited = threading.Event()  # whether this process limits the memory that reading a file takes
 POINTER = b"version https://git-lfs.github.com/spec/v1"  # first line of what Git LFS leaves in place of a file
-_FICLONE = 0x40049409  # Linux ioctl: share the content of another file until either is written
 _KINDS = {
     stat.S_IFREG: "a file",
     stat.S_IFDIR: "a folder",
@@ -109,13 +107,10 @@ def read_bytes(path: Path, limit: int) -> bytes:
 
 
 def copy_file(source: Path, target: Path) -> None:
-    """Copy the regular file ``source`` to the new file ``target``; they share storage until either is written, if the file system
-    supports that. InputError if ``source`` cannot be read, OSError if ``target`` cannot be written."""
+    """Copy the regular file ``source`` to the new file ``target``. InputError if ``source`` cannot be read, OSError if ``target``
+    cannot be written."""
     with opened(source, sys.maxsize) as file, target.open("xb") as copy:
-        try:
-            fcntl.ioctl(copy.fileno(), _FICLONE, file.fileno())
-        except OSError:  # another file system, or one without shared storage
-            shutil.copyfileobj(file, copy, 2**20)
+        shutil.copyfileobj(file, copy, 2**20)
 
 
 @contextmanager

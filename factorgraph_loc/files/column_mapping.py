@@ -201,7 +201,7 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
         first_row, first = next(chosen, body[0])
         header = _numbers(len(first))
     _require_columns(path, mapping, needed, header, first_row)
-    kept = [(row, parts) for row, parts in body if _is_chosen(parts, header, where)]
+    kept = [(row, parts) for row, parts in body if _is_chosen(parts, header, where)] if where else body
     rows, columns = rows_of_length(path, header, kept)
     return _mapped(path, rows, columns, mapping, header, unwanted=len(body) - len(kept))
 
@@ -213,7 +213,7 @@ def _numbers(count: int) -> list[str]:
 
 def _is_chosen(parts: Sequence[str], header: Sequence[str], where: Mapping[str, set[str]]) -> bool:
     """Whether a row has one of the values of ``where`` in each of its columns."""
-    cells = dict(zip(header, parts, strict=False)) if where else {}
+    cells = dict(zip(header, parts, strict=False))
     return all(cells.get(name) in values for name, values in where.items())
 
 

@@ -5,6 +5,7 @@ import io
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -13,6 +14,7 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.bounded import CELLS, DATA, foreign, limited_memory, quiet, read_bytes, require_size
@@ -69,8 +71,7 @@ class Cells:
         if isinstance(cells, np.ndarray):
             values, is_empty = cells, np.isnan(cells)
         else:
-            values = np.array(self._converted(name, self._number, "a number"), dtype=float)
-            is_empty = np.array([not cell for cell in cells], dtype=bool)
+            values, is_empty = self._floats(name, cells)
         in_file, factor = column.in_unit(self.units.get(name, 1.0), self.path)
         for i in np.flatnonzero(~(np.isfinite(values) | is_empty)).tolist():
             raise self.invalid(name, i, "a finite number")
@@ -116,8 +117,17 @@ class Cells:
             raise self.invalid(name, len(out), expected) from None
         return out
 
-    def _number(self, text: str) -> float:
-        return float(text.replace(self.decimal, ".")) if text else np.nan
+    def _floats(self, name: str, texts: Sequence[str]) -> tuple[Array, NDArray[np.bool_]]:
+        """The numbers (N,) in ``texts`` of a field, NaN if empty; and whether each is empty (N,)."""
+        if self.decimal == ".":
+            with suppress(ValueError):  # all are numbers: several times as fast
+                return np.array(list(map(float, texts)), dtype=float), np.zeros(len(texts), dtype=bool)
+
+        def number(text: str) -> float:
+            return float(text.replace(self.decimal, ".")) if text else np.nan
+
+        values = np.array(self._converted(name, number, "a number"), dtype=float)
+        return values, np.array([not text for text in texts], dtype=bool)
 
     def _scaled(self, text: str, power: int) -> int:
         """A decimal number times ten to the ``power``, rounded, without floating-point errors."""

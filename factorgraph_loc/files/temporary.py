@@ -1,17 +1,19 @@
 """Temporary files and folders next to their targets; checks and errors of commands that write results.
 
-Their names consist of a dot, the target's name, :data:`MARK` and eight digits. The creating process holds a lock, which the system
-releases when the process ends. Unlocked ones are removed when a command that writes to the same folder starts.
+Their names consist of a dot, the target's name, :data:`MARK`, the machine, the number of the process and eight digits. Those of
+processes that have ended are removed when a command that writes to the same folder starts.
 """
 
-import errno
 import fcntl
 import os
 import re
 import secrets
 import shutil
+import socket
 import sys
 import tempfile
+import time
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,9 +22,10 @@ from factorgraph_loc.errors import InputError, unencodable
 from factorgraph_loc.text import told
 
 MARK = ".fgloc-"
-_NAME = re.compile(rf"\..*{re.escape(MARK)}[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
+_NAME = re.compile(rf"\..*{re.escape(MARK)}([0-9a-f]{{8}})-([1-9][0-9]*)-[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
 _NAMED, _SUFFIX = 150, 60  # bytes used of a name and of a suffix; file systems allow 255 in total
-ATTEMPTS = 20  # to create a file whose name another process may take or remove at that moment
+_MACHINE = f"{zlib.crc32(socket.gethostname().encode()):08x}"
+OLD = 7 * 86_400.0  # s after which a file of another machine, whose processes are unknown, is removed
 _swept: set[Path] = set()  # folders that this process has cleaned up
 _own: set[Path] = set()  # paths created by this process and not yet removed
 
@@ -50,9 +53,29 @@ def sweep(folder: Path) -> None:
     """Remove this user's temporary files in ``folder`` that belong to no running process."""
     with suppress(OSError):  # the folder does not exist
         for entry in os.scandir(folder):
-            if _NAME.fullmatch(entry.name):
-                with suppress(OSError):  # locked, or removed by another process
-                    _remove_unheld(folder / entry.name)
+            with suppress(OSError):  # removed by another process
+                if _is_left(entry):
+                    _remove(folder / entry.name)
+
+
+def _is_left(entry: os.DirEntry[str]) -> bool:
+    """Whether an entry of a folder is a temporary file or folder of a process that has ended."""
+    name = _NAME.fullmatch(entry.name)
+    regular = entry.is_file(follow_symlinks=False) or entry.is_dir(follow_symlinks=False)
+    if name is None or not regular or entry.stat(follow_symlinks=False).st_uid != os.geteuid():
+        return False
+    machine, process = name[1], int(name[2])
+    if machine != _MACHINE:
+        return time.time() - entry.stat(follow_symlinks=False).st_mtime > OLD
+    if process == os.getpid():
+        return entry.name not in {path.name for path in _own}
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return True
+    except PermissionError:  # of another user
+        pass
+    return False
 
 
 def remove_own() -> None:
@@ -68,9 +91,13 @@ def _held(path: Path, name: str, suffix: str, *, folder: bool) -> Iterator[Path]
         sweep(path.parent)
     start = "." + os.fsencode(name)[:_NAMED].decode(sys.getfilesystemencoding(), errors="ignore") + MARK
     ending = suffix if len(os.fsencode(suffix)) <= _SUFFIX else ""
-    names = (path.parent / f"{start}{secrets.token_hex(4)}{ending}" for _ in range(ATTEMPTS))
-    made, handle = _make_one(names, path, folder=folder)
+    made = path.parent / f"{start}{_MACHINE}-{os.getpid()}-{secrets.token_hex(4)}{ending}"
+    _own.add(made)
     try:
+        if folder:
+            made.mkdir(mode=0o700)
+        else:
+            os.close(os.open(made, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600))
         yield made
     except OSError as error:
         if error.errno is not None and str(error.filename) in ("None", str(made)):
@@ -78,37 +105,6 @@ def _held(path: Path, name: str, suffix: str, *, folder: bool) -> Iterator[Path]
         raise
     finally:
         _remove(made)
-        os.close(handle)
-
-
-def _make_one(names: Iterable[Path], target: Path, *, folder: bool) -> tuple[Path, int]:
-    """The first of ``names`` that could be made, a file or a folder, with a handle on it. OSError that names the ``target`` if none
-    could."""
-    failure: OSError = FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(target))
-    for path in names:
-        _own.add(path)
-        try:
-            handle = _make(path, folder=folder)
-        except OSError as error:
-            _own.discard(path)
-            failure = OSError(error.errno, error.strerror, str(target))
-            # the name exists, or another process removed it before it was locked; or the folder does not exist
-            if not isinstance(error, FileExistsError | FileNotFoundError):
-                break
-            continue
-        if _lock(handle) is not False and _is(handle, path):
-            return path, handle
-        os.close(handle)
-        _remove(path)
-    raise failure
-
-
-def _make(path: Path, *, folder: bool) -> int:
-    """A handle on a new file or folder."""
-    if not folder:
-        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-    path.mkdir(mode=0o700)
-    return os.open(path, os.O_RDONLY)
 
 
 @contextmanager
@@ -119,33 +115,6 @@ def locked(path: Path) -> Iterator[None]:
         with suppress(OSError):
             fcntl.flock(handle, fcntl.LOCK_EX)
         yield
-    finally:
-        os.close(handle)
-
-
-def _lock(handle: int) -> bool | None:
-    """Whether the lock was acquired; None if the file system does not support locks."""
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return None
-    return True
-
-
-def _is(handle: int, path: Path) -> bool:
-    """Whether the path refers to the handle's file."""
-    with suppress(OSError):
-        return os.path.samestat(os.fstat(handle), path.lstat())
-    return False
-
-
-def _remove_unheld(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    try:
-        if os.fstat(handle).st_uid == os.geteuid() and _lock(handle) and _is(handle, path):
-            _remove(path)
     finally:
         os.close(handle)
 

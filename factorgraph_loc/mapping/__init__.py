@@ -1,7 +1,6 @@
 """Maps made from logs: landmarks, tags, and 3-D points from images."""
 
 __all__ = [
-    "camera_poses",
     "map_figure",
     "mapping",
     "point_mapping",

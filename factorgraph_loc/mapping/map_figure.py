@@ -14,6 +14,7 @@ from factorgraph_loc.maps.points import PointMap
 from factors.se2 import Array
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 CORNERS = 60  # vertices of the polygon of an ellipse
@@ -49,20 +50,13 @@ def dropped_figure(
 ) -> Figure:
     """Plot tags at their ``places`` (2,) by EPC, those that are ``dead`` crossed out, and the trajectory ``poses`` (N, 3)."""
     kept = np.array([place for name, place in places.items() if name not in dead]).reshape(-1, 2)
-    everything = np.concatenate((np.array(list(places.values())), poses[:, :2]))
-    width, depth = np.maximum(np.ptp(everything, axis=0), 1.0)
-    out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), f"{log}: dead tags of the map")
-    axis = axes[0, 0]
-    for x1, y1, x2, y2 in walls:
-        axis.plot((x1, x2), (y1, y2), color="0.4", linewidth=2.0, label="wall", zorder=1)
+    out, axis = _from_above(f"{log}: dead tags of the map", (np.array(list(places.values())), poses[:, :2]), walls)
     axis.plot(*poses[:, :2].T, color="0.75", linewidth=1.0, label="trajectory", zorder=1)
     axis.plot(*kept.T, "+", color=COLOURS[0], markersize=9, label="kept", zorder=3)
     for name in dead:
         x, y = places[name]
         axis.plot(x, y, "x", color=COLOURS[1], markersize=9, label="believed dead, dropped", zorder=4)
         axis.annotate(name[-LABEL:], (x, y), (7, 7), textcoords="offset points", fontsize=12, zorder=5)
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.set(xlabel="x [m]", ylabel="y [m]")
     legend(out, [axis])
     return out
 
@@ -72,10 +66,7 @@ def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
     given = np.array([e.given for e in made.entries if e.given is not None and _is_in_frame(made, e.verdict)])
     learnt = [e for e in made.entries if e.learnt is not None]
     places = np.array([e.learnt.position for e in learnt if e.learnt is not None]).reshape(-1, 2)
-    everything = np.concatenate((given.reshape(-1, 2), places, poses[:, :2]))
-    width, depth = np.maximum(np.ptp(everything, axis=0), 1.0)
-    out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), f"{log}: map")
-    axis = axes[0, 0]
+    out, axis = _from_above(f"{log}: map", (given.reshape(-1, 2), places, poses[:, :2]))
     axis.plot(*poses[:, :2].T, color="0.75", linewidth=1.0, label="trajectory", zorder=1)
     if len(given):
         axis.plot(*given.T, "k^", markersize=9, markerfacecolor="none", label="given map", zorder=3)
@@ -89,8 +80,6 @@ def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
         axis.annotate(entry.landmark[-label:], (x, y), (7, 7), textcoords="offset points", fontsize=12, zorder=5)
         if entry.flagged and entry.given is not None:
             axis.plot(*np.stack((entry.given, entry.learnt.position)).T, ":", color=colour, zorder=2)
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.set(xlabel="x [m]", ylabel="y [m]")
     legend(out, [axis])
     return out
 
@@ -100,19 +89,24 @@ def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tup
     off = np.abs(points.positions - np.median(points.positions, axis=0))
     # a few distant points would shrink all others
     shown = points.positions[np.all(off <= np.maximum(FAR * np.median(off, axis=0), 1.0), axis=1)]
-    everything = np.concatenate((shown[:, :2], cameras[:, :2]))
-    width, depth = np.maximum(np.ptp(everything, axis=0), 1.0)
-    out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), f"{log}: map of {len(points)} points")
-    axis = axes[0, 0]
-    for x1, y1, x2, y2 in walls:
-        axis.plot((x1, x2), (y1, y2), color="0.4", linewidth=2.0, label="wall", zorder=1)
+    out, axis = _from_above(f"{log}: map of {len(points)} points", (shown[:, :2], cameras[:, :2]), walls)
     axis.plot(*cameras[:, :2].T, color=COLOURS[1], linewidth=1.0, label="camera", zorder=3)
-    dots = axis.scatter(*shown[:, :2].T, c=shown[:, 2], s=6.0, cmap="viridis", label="point", zorder=2)
+    dots = axis.scatter(shown[:, 0], shown[:, 1], c=shown[:, 2], s=6.0, cmap="viridis", label="point", zorder=2)
     out.colorbar(dots, ax=axis, label="height [m]")
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.set(xlabel="x [m]", ylabel="y [m]")
     legend(out, [axis])
     return out
+
+
+def _from_above(title: str, places: Sequence[Array], walls: Sequence[tuple[float, ...]] = ()) -> tuple[Figure, Axes]:
+    """A figure in the shape of all ``places`` (N, 2), with walls, and its only axes."""
+    width, depth = np.maximum(np.ptp(np.concatenate(places), axis=0), 1.0)
+    out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), title)
+    axis: Axes = axes[0, 0]
+    for x1, y1, x2, y2 in walls:
+        axis.plot((x1, x2), (y1, y2), color="0.4", linewidth=2.0, label="wall", zorder=1)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set(xlabel="x [m]", ylabel="y [m]")
+    return out, axis
 
 
 def _is_in_frame(made: LandmarkMap, verdict: str) -> bool:

@@ -1,11 +1,12 @@
-"""The settings of scoring, and the ticks of a run: a grid of 10 Hz from its start, except in long gaps between measurements.
+"""The configuration of a run, and its ticks: a grid of 10 Hz from its start, except in long gaps between measurements.
 
 Importable without numerical libraries.
 """
 
 import math
-from collections.abc import Iterable, Iterator
-from typing import Literal
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 from factorgraph_loc.errors import InputError
 
@@ -19,6 +20,27 @@ RATE = 10  # Hz
 TICK_GAP = 60.0  # s; gaps without measurements above this length have no ticks
 SHORTEST, LONGEST = 1.0, 86400.0  # s; bounds of the setting
 TOLERANCE = 1e-6  # fraction of a tick, for rounding at the last measurement
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """The configuration of a run on a log.
+
+    ``estimator``: its registered name; ``settings``: overrides of its settings. ``sensors``: names of the streams it may use,
+    None for those of the rig; ``rssi`` and ``phase`` are optional parts of the reads of ``rfid``. ``prior``: see
+    :func:`~factorgraph_loc.experiments.preparation.resolve_prior`. ``seed``: of the estimator's random generator. ``max_gap``
+    [s]: the largest interval between estimates that is interpolated for scoring. ``tick_gap`` [s]: there are no estimates inside
+    longer gaps between measurements. ``align``: also score after this alignment with the reference. Scoring changes no estimate.
+    """
+
+    estimator: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    sensors: tuple[str, ...] | None = None
+    prior: str | None = None
+    seed: int = 0
+    max_gap: float = MAX_GAP
+    tick_gap: float = TICK_GAP
+    align: Alignment = "none"
 
 
 def check_max_gap(max_gap: float) -> None:

@@ -61,15 +61,15 @@ def test_a_sensor_has_columns_with_units_and_the_keys_of_the_rig(fgloc):
 @pytest.mark.parametrize("name", READERS)
 def test_every_option_of_a_reader_is_told(fgloc, name):
     found = json.loads(fgloc("readers", name, "--json").stdout)
-    assert {one["key"].partition(".")[0] for one in found["options"]} == set(reader(name).options.model_fields)
-    assert all(one["meaning"] for one in found["options"])
+    assert {one["key"].partition(".")[0] for one in found["settings"]} == set(reader(name).options.model_fields)
+    assert all(one["meaning"] for one in found["settings"])
     assert fgloc("readers", name).exit_code == 0
 
 
 def test_policies_and_what_is_set_of_active_runs(fgloc):
     found = json.loads(fgloc("policies", "--json").stdout)
-    assert list(found["policies"]) == list(POLICIES)
+    assert [one["name"] for one in found] == list(POLICIES)
     printed = fgloc("policies").stdout
-    assert all(about in printed for about in found["policies"].values())
+    assert all(one["about"] in printed for one in found)
     assert "policy.horizon" in printed
     assert "above 0 to 100 m" in printed

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from factorgraph_loc.cli.app import app
 from factorgraph_loc.evaluation.figures import Track
-from factorgraph_loc.evaluation.plots import error_bands, plot_log, plot_run, trajectories
+from factorgraph_loc.evaluation.plots import error_bands, plot_log, trajectories
 from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
@@ -74,14 +74,14 @@ def test_without_reference(track, tmp_path):
     paths = plot_log(log, {"ekf": track}, tmp_path, "log")
     assert {path.name for path in paths} == {"log-trajectories.png"}
     told = replace(track, nis={"bearing_range": np.array([(1.0, 2.0, 2.0)])})
-    paths = plot_run(log, "ekf", told, tmp_path, "log")
+    paths = plot_log(log, {"ekf": told}, tmp_path, "log")
     assert {path.name for path in paths} == {"log-trajectories.png", "log-consistency-ekf.png"}
 
 
 def test_a_run_that_nothing_told_the_pose(track, tmp_path):
     """Its log is plotted, with an empty line; one that found its place stands beside it."""
     nowhere = Track(None, Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3))))
-    paths = plot_run(log_of(track), "ekf", nowhere, tmp_path, "log")
+    paths = plot_log(log_of(track), {"ekf": nowhere}, tmp_path, "log")
     assert [path.name for path in paths] == ["log-trajectories.png"]
     paths = plot_log(log_of(track), {"ekf": nowhere, "batch": track}, tmp_path, "log")
     assert {path.name for path in paths if "ekf" in path.name or "errors" in path.name} == {"log-errors-batch.png"}

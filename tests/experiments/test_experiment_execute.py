@@ -3,12 +3,15 @@
 import dataclasses
 import shutil
 import subprocess
+from collections import Counter
+from functools import partial
 
 import numpy as np
 import pytest
 from computed_here import Here, run_planned
 
 from factorgraph_loc.errors import FglocError
+from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.experiments import keys
 from factorgraph_loc.experiments.execute import execute
 from factorgraph_loc.experiments.experiment import prepare, run_experiment
@@ -53,9 +56,8 @@ def test_a_run_gives_what_fgloc_run_gives_but_for_times(planned, out, tmp_path):
     store = Store(out)
     (log,) = load(str(tmp_path / "log"))
     result = run(log, RunConfig("ekf"))
-    track = store.track(one.key)
-    first = result.t[0]
-    np.testing.assert_allclose(track.final.t, result.final.t - first, atol=1e-9)
+    track = Track.read(partial(store.read, one.key), log.t0_ns)
+    np.testing.assert_allclose(track.final.t, result.final.t, atol=1e-9)
     np.testing.assert_array_equal(track.final.poses, result.final.poses)
     np.testing.assert_array_equal(track.causal.covariances, result.causal().covariances)
     row = store.row(one.key)
@@ -182,7 +184,7 @@ def test_a_damaged_result_is_found_and_done_again(experiment, out):
     key = first["key"][1]
     (Store(out).path(key) / "estimates.parquet").write_bytes(b"")
     prepared = experiment()
-    assert prepared.counts() == {"ok": 1, "damaged": 1}
+    assert Counter(prepared.states.values()) == {"ok": 1, "damaged": 1}
     assert [one.key for one in prepared.todo()] == [key]
     second = run_experiment(prepared, executor=Here()).rows
     times = [name for name in first.columns if name.startswith("timing.")]
@@ -207,7 +209,7 @@ def test_an_experiment_ends_with_one_line_when_the_disk_is_full_and_goes_on_when
     text = "estimators = ['particle_filter']\nseeds = '0:20'"
     with pytest.raises(StoreError, match="No space left on device"):
         run_experiment(experiment(text, folder=disk), executor=Here())
-    counts = experiment(text, folder=disk, verify=True).counts()
+    counts = Counter(experiment(text, folder=disk, verify=True).states.values())
     assert 0 < counts["ok"] < 20
     assert set(counts) == {"ok", "missing"}
     subprocess.run(["mount", "-o", "remount,size=10M", disk], check=True)

@@ -74,14 +74,20 @@ def test_what_a_killed_process_has_left_is_swept_and_what_a_living_one_holds_is_
 
 
 def test_files_of_others_are_left_alone(tmp_path):
-    names = [".a.fgloc-1234567", ".a.fgloc-1234567g", "a.fgloc-12345678", ".a.12345678", ".a.fgloc-12345678.b.c"]
+    machine, gone = temporary._MACHINE, 2**22 + 1  # more than Linux gives
+    names = [f".a.fgloc-{machine}-{gone}-1234567", f"a.fgloc-{machine}-{gone}-12345678", ".a.fgloc-12345678"]
+    names += [f".a.fgloc-{machine}-{os.getppid()}-12345678", f".a.fgloc-{machine}-{gone}-12345678.b.c"]
+    names += [f".a.fgloc-00000000-{gone}-12345678"]
     for name in names:
         (tmp_path / name).write_text("mine")
     (tmp_path / "target").mkdir()
-    (tmp_path / ".link.fgloc-12345678").symlink_to(tmp_path / "target")
-    os.mkfifo(tmp_path / ".pipe.fgloc-12345678")
+    (link := tmp_path / f".link.fgloc-{machine}-{gone}-12345678").symlink_to(tmp_path / "target")
+    os.mkfifo(tmp_path / f".pipe.fgloc-{machine}-{gone}-12345678")
     sweep(tmp_path)
-    assert {*names, ".link.fgloc-12345678"} <= {path.name for path in tmp_path.iterdir()}
+    assert {*names, link.name} <= {path.name for path in tmp_path.iterdir()}
+    os.utime(tmp_path / names[-1], (0.0, 0.0))  # of a machine that has forgotten it
+    sweep(tmp_path)
+    assert not (tmp_path / names[-1]).exists()
     sweep(tmp_path / "target" / "no such folder")
 
 
@@ -132,24 +138,6 @@ def test_a_folder_that_holds_no_files_is_told_by_the_name_of_the_target(make, pa
     with pytest.raises(FileNotFoundError) as caught, make(Path(path)):
         pass
     assert caught.value.filename == path
-
-
-@pytest.mark.parametrize("failure", [FileExistsError, FileNotFoundError])
-def test_a_name_that_another_process_takes_or_removes_is_replaced_by_another(tmp_path, monkeypatch, failure):
-    names = []
-
-    def make(path, *, folder):
-        names.append(path)
-        if len(names) < 3:
-            raise failure(2, "raced", str(path))
-        return make_one(path, folder=folder)
-
-    make_one = temporary._make
-    monkeypatch.setattr(temporary, "_make", make)
-    with temporary_file(tmp_path / "a.txt") as file:
-        assert file == names[2]
-    assert len(set(names)) == 3
-    assert temporary._own == set()
 
 
 def test_an_error_without_a_file_gets_the_name_of_the_target(tmp_path):

@@ -9,8 +9,7 @@ from scipy.stats import chi2
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.mapping.bundle import pose3
-from factorgraph_loc.mapping.camera_poses import PosedFrames, posed_frames
-from factorgraph_loc.mapping.point_mapping import PointSettings, map_points
+from factorgraph_loc.mapping.point_mapping import PointSettings, PosedFrames, map_points, posed_frames
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory

@@ -6,11 +6,10 @@ import pytest
 
 from factorgraph_loc.evaluation.features.feature_evaluation import (
     Feature,
-    RankedMatches,
     evaluate,
     feature,
+    match_scores,
     mutual_matches,
-    rank,
 )
 from factorgraph_loc.evaluation.features.sequences import SCALE, Sequence, find_sequences, project
 from factorgraph_loc.vision.features import Keypoints, extractor
@@ -36,13 +35,6 @@ def made(points, descriptors, seen, seen_descriptors):
     """A feature that finds ``points`` first (twice: once to warm up) and ``seen`` then."""
     answers = iter([(points, descriptors)] * 2 + [(seen, seen_descriptors)])
     return Feature("made", lambda _: next(answers))
-
-
-def test_average_precision_of_known_matches():
-    ranked = RankedMatches(np.array((0.1, 0.2, 0.3, 0.4)), np.array((True, False, True, False)), possible=4, features=4)
-    assert ranked.average_precision() == pytest.approx((1.0 + 2.0 / 3.0) / 4.0)
-    nothing = RankedMatches(np.empty(0), np.empty(0, dtype=bool), possible=0, features=0)
-    assert nothing.average_precision() == 0.0
 
 
 def test_mutual_matches_of_known_vectors():
@@ -93,12 +85,12 @@ def test_a_perfect_feature_scores_one():
     vectors = rng.normal(size=(60, 16)).astype(np.float32)
     (scores,) = evaluate(pair(), made(points, vectors, seen, vectors))
     row = scores.row()
-    perfect = ("repeatability", "strict", "matching_score", "precision", "average_precision")
+    perfect = ("repeatability", "strict", "matching_score", "precision")
     assert {name: row[name] for name in perfect} == pytest.approx(dict.fromkeys(perfect, 1.0))
     assert (row["features"], row["regions"], row["matches"], row["image"], row["amount"]) == (60, 60, 60, 2, 2.0)
 
 
-def test_wrong_matches_cost_precision_and_recall():
+def test_wrong_matches_cost_precision():
     rng = np.random.default_rng(2)
     grid = [(x, y) for x in range(60, 600, 90) for y in range(60, 450, 90)]
     points, n = keypoints(grid), len(grid)
@@ -113,9 +105,8 @@ def test_wrong_matches_cost_precision_and_recall():
 def test_matches_out_of_the_common_part_are_wrong():
     first, second = keypoints([(100.0, 100.0), (320.0, 240.0)]), keypoints([(5.0, 5.0), (240.0, 180.0)], 3.0)
     both = np.array((0, 1))
-    ranked = rank(first, second, (both, both, np.array((0.1, 0.2))), HALF, (SHAPE, SHAPE))
-    assert ranked.right.tolist() == [False, True]
-    assert (ranked.possible, ranked.features) == (1, 1)
+    found = match_scores(first, second, (both, both, np.array((0.1, 0.2))), HALF, (SHAPE, SHAPE))
+    assert (found.matching_score, found.precision) == (1.0, 0.5)
 
 
 def test_detectors_have_no_matching_scores():

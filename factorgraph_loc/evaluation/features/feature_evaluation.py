@@ -1,6 +1,6 @@
 """Evaluation of features on image sequences with known homographies: repeatability and matching.
 
-Matching score and recall over 1 - precision: Mikolajczyk, Schmid, "A Performance Evaluation of Local Descriptors", PAMI 27, 2005,
+Matching score and precision: Mikolajczyk, Schmid, "A Performance Evaluation of Local Descriptors", PAMI 27, 2005,
 section 3; a match is correct if the regions of its points overlap (:mod:`~factorgraph_loc.evaluation.features.repeatability`).
 """
 
@@ -12,8 +12,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.features.competitors import DETECTORS
@@ -21,9 +19,7 @@ from factorgraph_loc.evaluation.features.repeatability import (
     OVERLAP_ERROR,
     Repeatability,
     Shapes,
-    Truths,
     common,
-    overlaps,
     pair_errors,
     repeatability,
 )
@@ -51,14 +47,13 @@ class MatchScores:
     """Matching scores of a pair of images; NaN for detectors without descriptors.
 
     ``matching_score``: correct mutual matches over the smaller number of features in the common part; ``matches``: mutual ones
-    with a ratio below :data:`~factorgraph_loc.vision.matching.RATIO`, ``precision``: fraction of correct ones;
-    ``average_precision``: area below precision over recall. Without matches the scores are 0.
+    with a ratio below :data:`~factorgraph_loc.vision.matching.RATIO`, ``precision``: fraction of correct ones. Without matches
+    the scores are 0.
     """
 
     matches: int = 0
     matching_score: float = np.nan
     precision: float = np.nan
-    average_precision: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -82,26 +77,6 @@ class PairScores:
         """The scores by name, as a row of a table."""
         content = asdict(self)
         return {**content, **content.pop("found"), **content.pop("matched")}
-
-
-@dataclass(frozen=True, eq=False)
-class RankedMatches:
-    """Mutual nearest neighbours of a pair of images, by increasing ratio.
-
-    ``ratio`` (M,): of the distances to the nearest and the second nearest; ``right`` (M,): whether the match is correct;
-    ``possible``: the number of correct matches of a perfect matcher; ``features``: the smaller number of features in the common
-    part.
-    """
-
-    ratio: Array
-    right: Truths
-    possible: int
-    features: int
-
-    def average_precision(self) -> float:
-        """Sum of the precision at each correct match, over ``possible``; 0 if nothing could be matched."""
-        precision = np.cumsum(self.right) / np.arange(1, len(self.right) + 1)
-        return float(np.sum(precision[self.right]) / max(self.possible, 1))
 
 
 def feature(name: str, count: int) -> Feature:
@@ -128,7 +103,7 @@ def evaluate(sequence: Sequence, what: Feature, progress: Callable[[], None] = l
             matched = MatchScores()
             if descriptors is not None and others_described is not None:
                 matches = mutual_matches(descriptors, others_described)
-                matched = match_scores(rank(keypoints, others, matches, homography, shapes))
+                matched = match_scores(keypoints, others, matches, homography, shapes)
             about = (what.name, sequence.name, sequence.change, k + 2, sequence.amounts[k])
             yield PairScores(*about, len(others), milliseconds, again, matched)
             progress()
@@ -154,29 +129,17 @@ def mutual_matches(first: Descriptors, second: Descriptors) -> Matched:
     return i, j, np.divide(best, runner_up, out=np.ones(len(i)), where=there.alone[i] & back.alone[j])
 
 
-def rank(first: Keypoints, second: Keypoints, matches: Matched, homography: Array, shapes: Shapes) -> RankedMatches:
-    """Mark correct matches: both points lie in the common part of the images, and their regions overlap."""
+def match_scores(
+    first: Keypoints, second: Keypoints, matches: Matched, homography: Array, shapes: Shapes
+) -> MatchScores:
+    """The scores of matches; one is correct if both points lie in the common part of the images, and their regions overlap."""
     i, j, ratio = matches
     in_first, in_second = common(first, second, homography, shapes)
     right = in_first[i] & in_second[j] & (pair_errors(first[i], second[j], homography) < OVERLAP_ERROR)
-    pairs = overlaps(first[in_first], second[in_second], homography)
-    close = pairs.error < OVERLAP_ERROR
-    size = (int(np.count_nonzero(in_first)), int(np.count_nonzero(in_second)))
-    graph = csr_array((np.ones(int(np.count_nonzero(close))), (pairs.first[close], pairs.second[close])), shape=size)
-    possible = int(np.count_nonzero(maximum_bipartite_matching(graph) >= 0)) if min(size) else 0
-    order = np.argsort(ratio, kind="stable")
-    return RankedMatches(ratio[order], right[order], possible, min(size))
-
-
-def match_scores(ranked: RankedMatches) -> MatchScores:
-    """The scores of the matches of a pair of images."""
-    clear = ranked.right[ranked.ratio < RATIO]
-    return MatchScores(
-        len(clear),
-        int(np.count_nonzero(ranked.right)) / max(ranked.features, 1),
-        int(np.count_nonzero(clear)) / max(len(clear), 1),
-        ranked.average_precision(),
-    )
+    features = min(int(np.count_nonzero(in_first)), int(np.count_nonzero(in_second)))
+    clear = right[ratio < RATIO]
+    correct, clear_and_correct = int(np.count_nonzero(right)), int(np.count_nonzero(clear))
+    return MatchScores(len(clear), correct / max(features, 1), clear_and_correct / max(len(clear), 1))
 
 
 def _timed(what: Feature, image: Image) -> tuple[tuple[Keypoints, Descriptors | None], float]:

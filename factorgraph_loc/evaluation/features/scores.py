@@ -32,7 +32,6 @@ COLUMNS = {
     "strict": ("strict", 3),
     "matching score": ("matching_score", 3),
     f"precision at {RATIO:g}": ("precision", 3),
-    "average precision": ("average_precision", 3),
     "time [ms]": ("milliseconds", 1),
 }
 _MARKERS = ("o", "s", "^", "v", "D", "P", "X")

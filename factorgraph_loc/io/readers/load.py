@@ -62,7 +62,7 @@ class _Source:
 
 
 def load(
-    log: str | Path,
+    log: Log | str | Path,
     *,
     data_root: str | Path | None = None,
     reader: str | None = None,
@@ -72,12 +72,16 @@ def load(
 ) -> list[Log]:
     """The logs that ``log`` refers to.
 
-    ``log``: a manifest, a folder in the native format or its ``run.toml``, a name in ``manifests()``, or any path with
-    ``reader``.
+    ``log``: a manifest, a folder in the native format or its ``run.toml``, a name in ``manifests()``, any path with ``reader``, or
+    a log.
     ``options``: of the reader, overriding those of a manifest; a list, or text with commas, gives one log per value. ``rig`` and
     ``world``, values or files, replace those of the log. ``data_root``: a folder that a manifest may lead to besides its own, by
     default the environment's FGLOC_DATA. InputError describes what is invalid in one line.
     """
+    new_rig = read_rig(rig) if isinstance(rig, str | Path) else rig
+    new_world = read_world(world) if isinstance(world, str | Path) else world
+    if isinstance(log, Log):
+        return [replace(log, rig=new_rig or log.rig, world=new_world or log.world)]
     given = dict(options or {})
     given_files = [what for what, file in (("rig", rig), ("world", world)) if file is not None]
     source = _find(str(log), data_root, reader, given_files)
@@ -97,11 +101,7 @@ def load(
         for key, values in choices.items()
         if (key in given or len(values) > 1) and not any(isinstance(value, Mapping) for value in values)
     ]
-    replaced = replace(
-        source,
-        rig=read_rig(rig) if isinstance(rig, str | Path) else rig or source.rig,
-        world=read_world(world) if isinstance(world, str | Path) else world or source.world,
-    )
+    replaced = replace(source, rig=new_rig or source.rig, world=new_world or source.world)
     return [
         _read(replaced, dict(zip(choices, values, strict=True)), naming)
         for values in itertools.product(*choices.values())
@@ -109,7 +109,7 @@ def load(
 
 
 def read_log(
-    log: str | Path,
+    log: Log | str | Path,
     *,
     data_root: str | Path | None = None,
     reader: str | None = None,

@@ -3,6 +3,7 @@
 Poses are quaternions in TUM and EuRoC files, and 3x4 matrices in KITTI files.
 """
 
+import io
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -118,7 +119,7 @@ def _format(first: str) -> Format | None:
 
 
 def _first_row(path: Path) -> tuple[int, str]:
-    for row, line in enumerate(read_text(path).splitlines(), start=1):
+    for row, line in enumerate(io.StringIO(read_text(path)), start=1):
         if line.strip() and not line.lstrip().startswith("#"):
             return row, line.strip()
     raise InputError(f"{path}: contains no poses, expected at least one row")
