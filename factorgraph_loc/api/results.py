@@ -9,7 +9,6 @@ from factorgraph_loc.api.given import LogLike, RigLike, WorldLike
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.trajectories.page import check_free, write_score
 from factorgraph_loc.evaluation.trajectories.score import TrajectoryScore, score_paths
-from factorgraph_loc.exports.points import write_ply
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 from factorgraph_loc.exports.ros import write_mcap
 from factorgraph_loc.exports.runs import StoredRun, find_runs, is_results, read_runs
@@ -17,6 +16,7 @@ from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.io.readers import read_log
 from factorgraph_loc.io.trajectories import read_trajectory
+from factorgraph_loc.maps.points import write_ply
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.scoring import MAX_DIFF, MAX_GAP, Alignment, Association

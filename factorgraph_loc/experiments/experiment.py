@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -51,10 +52,6 @@ class Prepared:
     def damaged(self) -> list[PlannedRun]:
         """The runs with damaged results."""
         return [run for run in self.runs if self.states[run.key] == "damaged"]
-
-    def verified(self) -> Prepared:
-        """The same, with all checksums verified."""
-        return replace(self, states={key: self.store.state(key, thorough=True) for key in self.states})
 
     def todo(self, *, again: bool = False) -> list[PlannedRun]:
         """The runs to be made; with ``again`` also the failed ones."""
@@ -144,25 +141,15 @@ def run_experiment(
 
 
 def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
-    """Estimated sum of the run times [s], from stored runs of the same estimator and the duration of the log, else a default."""
+    """Estimated sum of the run times [s], from stored runs of the same label and the duration of the log, else a default."""
     from factorgraph_loc.experiments.result_table import load_results  # noqa: PLC0415
 
-    try:
-        rows = load_results(folder).to_dicts()
-    except InputError:
-        rows = []
-    paces: dict[tuple[str, str], list[float]] = {}
-    for row in rows:
-        seconds, duration = row.get("timing.run_seconds"), row.get("duration")
-        if isinstance(seconds, float) and isinstance(duration, float) and duration > 0.0:
-            for like in ((row["label"], row["log"]), (row["label"], ""), (row["estimator"], "")):
-                paces.setdefault(like, []).append(seconds / duration)
-
-    def pace(run: PlannedRun) -> float:
-        keys = ((run.label, run.log), (run.label, ""), (run.estimator, ""))
-        return median(next((paces[key] for key in keys if key in paces), [1.0 / PACE]))
-
-    return sum(run.duration * pace(run) for run in runs)
+    paces: dict[str, list[float]] = {}
+    with suppress(InputError):  # there are no results yet
+        for row in load_results(folder).to_dicts():
+            if (seconds := row.get("timing.run_seconds")) is not None and row["duration"] > 0.0:
+                paces.setdefault(row["label"], []).append(seconds / row["duration"])
+    return sum(run.duration * median(paces.get(run.label, [1.0 / PACE])) for run in runs)
 
 
 def _write_rows(runs: Sequence[PlannedRun], prepared: Prepared) -> pl.DataFrame:

@@ -32,7 +32,7 @@ def report_experiment(prepared: Prepared, out: Path | None = None) -> Report:
     All results are compared with their checksums; damaged ones are named and excluded. Scenes of the logs are kept in the store.
     Raises InputError without any results, or if the page cannot be written.
     """
-    prepared = prepared.verified()
+    prepared = Prepared.of(prepared.experiment, prepared.folder, prepared.runs, verify=True)
     damaged = [run.shown for run in prepared.damaged()]
     rows = collect((run for run in prepared.runs if prepared.states[run.key] in ("ok", "failed")), prepared.store)
     runs = {run.key: run for run in prepared.runs}

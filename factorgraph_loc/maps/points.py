@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.columns import POINTS
+from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.tables import read_parquet, text_column, write_parquet
+from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.text import listed
+from factors.positive import worst_sigma
 from factors.se2 import Array
 
 POINTS_SUFFIX = ".points.parquet"
@@ -26,6 +29,17 @@ COMMON = ("cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh")
 Feature = Literal["colour", "sift", "orb"]
 KINDS: tuple[str, ...] = get_args(Feature)
 LARGEST_VALUE = 1e6  # largest absolute value of a descriptor
+PLY = """ply
+format ascii 1.0
+comment points of a map in metres; sigma: standard deviation in the worst direction; views: stored views of a point
+element vertex {count}
+property double x
+property double y
+property double z
+property double sigma
+property int views
+end_header
+"""
 ROUNDING = 1e-9  # rounding error of an eigenvalue, relative to the largest
 
 
@@ -217,3 +231,14 @@ def _descriptors(table: pl.DataFrame, rows: NDArray[np.int64], feature: str, pat
     if len(bad := np.flatnonzero(~(np.abs(values) <= LARGEST_VALUE).all(axis=1))):
         raise bad_field(path, "descriptor", "values that are none", "finite numbers", row=int(rows[bad[0]]) + 1)
     return values
+
+
+def write_ply(points: PointMap, path: Path) -> None:
+    """Write a PLY file (G. Turk, "The PLY polygon file format", 1994), which viewers of point clouds read: positions, the standard
+    deviation in the worst direction [m] and the number of views."""
+    sigma = worst_sigma(points.covariances)
+    views = np.bincount(points.owners, minlength=len(points))
+    rows = zip(points.positions.tolist(), sigma.tolist(), views.tolist(), strict=True)
+    body = "".join(f"{x:.6f} {y:.6f} {z:.6f} {s:.6f} {count}\n" for (x, y, z), s, count in rows)
+    with writing(path):
+        write_text(path, PLY.format(count=len(points)) + body)
