@@ -20,8 +20,7 @@ import numpy as np
 
 from factorgraph_loc.experiments.preparation import REFERENCE_HEADING_SIGMA, REFERENCE_POSITION_SIGMA
 from factorgraph_loc.files.models import replacing
-from factorgraph_loc.mapping.point_mapping import posed_frames
-from factorgraph_loc.mapping.point_mapping import map_points
+from factorgraph_loc.mapping.point_mapping import map_points, posed_frames
 from factorgraph_loc.maps.points import PointMap, read_points, write_points
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory

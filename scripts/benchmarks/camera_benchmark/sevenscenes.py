@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from camera_benchmark.options import CameraOptions
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.mapping.point_mapping import PosedFrames
-from factorgraph_loc.mapping.point_mapping import MadePoints, PointSettings, map_points
+from factorgraph_loc.mapping.point_mapping import MadePoints, PointSettings, PosedFrames, map_points
 from factorgraph_loc.mapping.triangulation import Cameras
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
