@@ -26,7 +26,7 @@ ADVICE = "`fgloc sensors NAME` prints all keys of a sensor, with bounds."
 
 
 @dataclass(frozen=True)
-class Choice:
+class NamedSettings:
     """A reader of logs, a preset of simulations or a policy of active robots, with one sentence ``about`` it.
 
     ``settings``: the options of a reader, the settings of a preset without those of its rig, or those that all policies share.
@@ -54,15 +54,15 @@ def known_estimators() -> list[Description]:
     return [describe(name) for name in ESTIMATORS]
 
 
-def known_readers() -> list[Choice]:
+def known_readers() -> list[NamedSettings]:
     """The readers of logs, each with its options."""
     return [describe_reader(name) for name in READERS]
 
 
-def describe_reader(name: str) -> Choice:
+def describe_reader(name: str) -> NamedSettings:
     """The description of a reader; InputError for an unknown one."""
     found = reader(name)
-    return Choice(name, found.about, tuple(settings_in(found.options)))
+    return NamedSettings(name, found.about, tuple(settings_in(found.options)))
 
 
 def known_sensors() -> list[SensorDescription]:
@@ -82,21 +82,21 @@ def describe_sensor(name: str) -> SensorDescription:
     )
 
 
-def known_presets() -> list[Choice]:
+def known_presets() -> list[NamedSettings]:
     """The presets of simulations, each with its settings."""
     return [describe_preset(name) for name in PRESETS]
 
 
-def describe_preset(name: str) -> Choice:
+def describe_preset(name: str) -> NamedSettings:
     """The description of a preset of simulations; InputError for an unknown one."""
     settings = settings_in(SimulationSettings, default=preset(name))
-    return Choice(name, PRESETS[name], tuple(s for s in settings if not s.key.startswith("rig.")))
+    return NamedSettings(name, PRESETS[name], tuple(s for s in settings if not s.key.startswith("rig.")))
 
 
-def known_policies() -> list[Choice]:
+def known_policies() -> list[NamedSettings]:
     """The policies of active robots, each with the settings of their runs."""
     settings = tuple(settings_in(ActiveSettings))
-    return [Choice(name, about, settings) for name, about in POLICIES.items()]
+    return [NamedSettings(name, about, settings) for name, about in POLICIES.items()]
 
 
 def known_rigs() -> dict[str, Rig]:

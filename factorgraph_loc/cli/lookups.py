@@ -12,7 +12,7 @@ from factorgraph_loc.cli.options import Json
 from factorgraph_loc.plugins import PRESETS
 
 if TYPE_CHECKING:
-    from factorgraph_loc.api.lookups import Choice, SensorDescription
+    from factorgraph_loc.api.lookups import NamedSettings, SensorDescription
     from factorgraph_loc.files.columns import Column
     from factorgraph_loc.files.settings import Setting
     from factorgraph_loc.fusion.registry import Description
@@ -106,7 +106,7 @@ def _print_list(
 
 
 def _print_one(
-    json: bool, choice: Choice | Description, about: Mapping[str, str], hint: str, word: str = "setting"
+    json: bool, choice: NamedSettings | Description, about: Mapping[str, str], hint: str, word: str = "setting"
 ) -> None:
     if json:
         show.document(choice)
