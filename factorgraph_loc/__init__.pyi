@@ -67,7 +67,7 @@ from factorgraph_loc.sensors.landmarks.measurement import (
     BearingRange as BearingRange,
     BearingRangeStream as BearingRangeStream,
 )
-from factorgraph_loc.sensors.landmarks.settings import Landmark as Landmark
+from factorgraph_loc.sensors.landmarks.measurement import Landmark as Landmark
 from factorgraph_loc.sensors.loops.measurement import LoopStream as LoopStream, Loops as Loops
 from factorgraph_loc.sensors.odometry.measurement import (
     IncrementOdometry as IncrementOdometry,

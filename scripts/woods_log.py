@@ -11,8 +11,7 @@ from factorgraph_loc.io.native.rig_file import read_rig
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream, Landmark
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
 

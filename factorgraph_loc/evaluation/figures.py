@@ -31,8 +31,7 @@ from factorgraph_loc.io.results import (
     trajectory_of,
 )
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.reliability import Reliability
-from factorgraph_loc.model.result import RunResult
+from factorgraph_loc.model.result import Reliability, RunResult
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory
 from factors import chi_squared

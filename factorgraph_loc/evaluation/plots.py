@@ -13,8 +13,7 @@ from factorgraph_loc.evaluation.figures import Track, consistency, mark_events, 
 from factorgraph_loc.evaluation.metrics import Errors, errors
 from factorgraph_loc.files.models import file_name
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.reliability import Reliability
-from factorgraph_loc.model.result import RunResult
+from factorgraph_loc.model.result import Reliability, RunResult
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.interfaces import Marks, marks
 from factors.se2 import Array

@@ -284,7 +284,7 @@ class Ekf(Filter):
         self._step = _Step(self._state.pose, np.zeros((3, len(covariance))), body)
 
     def _estimate(self) -> PoseEstimate:
-        doubted = any(s.silent or s.inconsistent for s in self._sensors.values())
+        doubted = any(s.unreliable for s in self._sensors.values())
         doubted = doubted or self._search.is_unsure(self._state.covariance[:3, :3])
         status: Status = "ambiguous" if doubted else "localized"
         return world_estimate(self._t, self._state.pose, self._state.covariance, status)

@@ -25,9 +25,9 @@ from pydantic import Field
 
 from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion import kld
-from factorgraph_loc.fusion.changes import Change, is_known
 from factorgraph_loc.fusion.cloud import (
     Cloud,
+    CloudView,
     Corrected,
     corrected,
     finished,
@@ -35,11 +35,10 @@ from factorgraph_loc.fusion.cloud import (
     systematic,
     vector_moments,
 )
-from factorgraph_loc.fusion.cloud_view import CloudView
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, twin
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
-from factorgraph_loc.fusion.search import Search, Tracked
+from factorgraph_loc.fusion.search import Change, Search, Tracked, is_known
 from factorgraph_loc.fusion.timeline import Taken
 from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph_loc.fusion.ancestors import draw_ancestors
-from factorgraph_loc.fusion.changes import Change
 from factorgraph_loc.fusion.cloud import Cloud, pose_moments, systematic
+from factorgraph_loc.fusion.search import Change
 from factors import positive, se2
 from factors.motion import ChainState, Increment
 from factors.se2 import Array

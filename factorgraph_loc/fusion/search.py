@@ -11,17 +11,18 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factorgraph_loc.fusion.changes import Change
 from factorgraph_loc.fusion.population import FEWEST, Evidence, Population
 from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.model.belief import Mode, PosePrior
 from factorgraph_loc.model.measurement import Tick
+from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.sensors.base import Finder, Observation, Sensor, View
 from factorgraph_loc.sensors.known_position import START_KEPT, KnownPosition
 from factorgraph_loc.sensors.motion import Motion
@@ -29,6 +30,22 @@ from factors import positive, se2
 from factors.motion import ChainState
 from factors.se2 import Array
 from factors.update import Correction
+
+# s: the last time at which a robot that was carried away was at the old place, -inf if it never was there, and the first at the new
+# one. Between them its place is unknown: the final trajectory has no poses there, so that scoring, which goes across no gap of more
+# than MAX_GAP, makes up none.
+Change = tuple[float, float]
+SPARE = 1e-3  # s: a gap is longer than what scoring goes across by so much
+
+
+def is_known(t: Array, changes: Iterable[Change]) -> NDArray[np.bool_]:
+    """At which of the times ``t`` (N,) the robot's place is told."""
+    known = np.ones(len(t), dtype=bool)
+    for before, after in changes:
+        more = 0.5 * max(MAX_GAP + SPARE - (after - before), 0.0)
+        known &= (t <= before - more) | (t >= after + more)
+    return known
+
 
 DURATION = 60.0  # s of observations that are kept
 REFUTING = 8.0  # log-odds by which a track must lose: kidnappings are rare
@@ -199,7 +216,7 @@ class Search:
     @property
     def doubts(self) -> bool:
         """Whether a track, or a sensor, is under suspicion."""
-        return any(s.suspicious_since is not None or s.silent or s.inconsistent for s in self._sensors.values())
+        return any(s.suspicious_since is not None or s.unreliable for s in self._sensors.values())
 
     def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
         """Record an observation that is about to be applied to a track."""

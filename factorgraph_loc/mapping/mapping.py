@@ -23,7 +23,7 @@ from factorgraph_loc.evaluation.pairing import align_points
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import Landmark
 from factors import positive, se2
 from factors.se2 import Array
 

@@ -20,7 +20,7 @@ from factorgraph_loc.model.belief import EXACT_SIGMA, LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import Landmark
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factors import se2

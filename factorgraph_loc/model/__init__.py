@@ -8,7 +8,6 @@ __all__ = [
     "measurement",
     "planar",
     "pose_path",
-    "reliability",
     "result",
     "rig",
     "scoring",

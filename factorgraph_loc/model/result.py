@@ -1,6 +1,6 @@
 """The result of a run: causal estimates, final trajectory, diagnostics and timings."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -8,10 +8,27 @@ import numpy as np
 
 from factorgraph_loc.model.belief import Learnt, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.reliability import Reliability
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory
 from factors.se2 import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """Detections of one sensor that were observed and predicted, in G groups of measurements.
+
+    ``what``: plural of the detections; ``groups`` (G,): their names; ``observed``, ``predicted`` and ``spread`` (G,): counts, and
+    the standard deviation of the observed one for a correct model, with the correlation of successive measurements. ``together``:
+    number of successive measurements that are worth one independent one. ``doubts``: what does not agree, one line each.
+    """
+
+    what: str
+    groups: Sequence[str]
+    observed: Array
+    predicted: Array
+    spread: Array
+    together: float
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

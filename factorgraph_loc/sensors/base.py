@@ -291,13 +291,9 @@ class Sensor:
         return None
 
     @property
-    def silent(self) -> bool:
-        """Whether nothing is detected although something should be."""
-        return False
-
-    @property
-    def inconsistent(self) -> bool:
-        """Whether what is detected is not as the sensor's model says, so that covariances are not to be believed."""
+    def unreliable(self) -> bool:
+        """Whether nothing is detected although something should be, or detections contradict the sensor's model, so that
+        covariances are too small."""
         return False
 
     def accept(self) -> None:

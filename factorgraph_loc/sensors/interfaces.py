@@ -13,7 +13,7 @@ from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Measurement, Stream
-from factorgraph_loc.model.reliability import Reliability
+from factorgraph_loc.model.result import Reliability
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import Landmark
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.simulation.settings import WorldSettings
 from factors.se2 import Array

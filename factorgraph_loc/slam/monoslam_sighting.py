@@ -20,9 +20,9 @@ from factorgraph_loc.vision import consensus
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths
 from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.keypoints import spread_out
 from factorgraph_loc.vision.matching import match_guided
 from factorgraph_loc.vision.relocalization import located
-from factorgraph_loc.vision.spread import spread_out
 from factors.camera import inverse_depth
 from factors.se2 import Array, Integers
 

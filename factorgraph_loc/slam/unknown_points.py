@@ -28,7 +28,7 @@ from factorgraph_loc.slam.point_looks import PointLooks
 from factorgraph_loc.slam.slipping import moved_since, unless_slipped
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
-from factorgraph_loc.vision.spread import spread_out
+from factorgraph_loc.vision.keypoints import spread_out
 from factors import positive, se2
 from factors.camera import model as reprojection
 from factors.camera import update_kernels as pixel_kernels

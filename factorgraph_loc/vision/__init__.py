@@ -6,7 +6,6 @@ __all__ = [
     "feature_cache",
     "features",
     "fiducials",
-    "found",
     "frame",
     "frame_motion",
     "images",
@@ -14,6 +13,5 @@ __all__ = [
     "matching",
     "relocalization",
     "settings",
-    "spread",
     "tracks",
 ]

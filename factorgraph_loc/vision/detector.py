@@ -20,9 +20,8 @@ from factorgraph_loc.vision.kernels import (
     refined_peaks,
     structure_tensor,
 )
-from factorgraph_loc.vision.keypoints import Keypoints
+from factorgraph_loc.vision.keypoints import PARTS, Keypoints, spread_out
 from factorgraph_loc.vision.scale_space import SCALES, SIGMAS, STEP, Octave, ScaleSpace, blur, more_blur
-from factorgraph_loc.vision.spread import PARTS, spread_out
 from factors.se2 import Array
 
 INTEGRATION = 0.8  # integration over characteristic scale; derivatives are taken one scale below

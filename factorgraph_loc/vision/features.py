@@ -12,8 +12,7 @@ from factorgraph_loc.files.models import nearest
 from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.colour_features import ColourExtractor
 from factorgraph_loc.vision.images import as_image, as_mask, is_blank
-from factorgraph_loc.vision.keypoints import Descriptors, Extractor, Integers, Keypoints
-from factorgraph_loc.vision.spread import PARTS, spread_out
+from factorgraph_loc.vision.keypoints import PARTS, Descriptors, Extractor, Integers, Keypoints, spread_out
 
 __all__ = ["EXTRACTORS", "Descriptors", "Extractor", "Integers", "Keypoints", "OpenCvExtractor", "extractor"]
 

@@ -5,7 +5,7 @@ import pytest
 from factorgraph_loc.calibration.consistency import make_consistent
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.landmarks.calibrator import CALIBRATOR
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 
 RIG = Rig(bearing_range=BearingRangeSettings(range_sigma=0.1, range_sigma_relative=0.02, bearing_sigma=0.01))
 

@@ -13,7 +13,7 @@ from factorgraph_loc.calibration.held_out import Fold
 from factorgraph_loc.calibration.selection import Bench
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import Unit
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factorgraph_loc.sensors.rfid.settings import BeamSettings, SurveySettings
 
 SECONDS = 100.0

@@ -21,7 +21,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.measurement import ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import Landmark
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors import se2

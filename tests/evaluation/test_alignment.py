@@ -15,7 +15,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import Landmark
 from factors import se2
 
 FRAME = np.array((4.0, -3.0, 2.5))  # of the world in the estimate's frame

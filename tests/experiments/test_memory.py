@@ -10,8 +10,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, Landmark
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
 from factors.landmarks import model as bearing_range

@@ -15,8 +15,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.measurement import ImageStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, Landmark
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.stream import RfidStream

@@ -18,8 +18,7 @@ from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeUncertainty
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream, BearingRangeUncertainty
 from factors import se2
 
 UNKNOWN = RunConfig("particle_filter", {"particles": 1000}, prior="unknown")

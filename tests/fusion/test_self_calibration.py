@@ -14,8 +14,12 @@ from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, BearingRangeUncertainty, Landmark
+from factorgraph_loc.sensors.landmarks.measurement import (
+    BearingRange,
+    BearingRangeSettings,
+    BearingRangeUncertainty,
+    Landmark,
+)
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
 from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,

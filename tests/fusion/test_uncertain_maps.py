@@ -13,7 +13,7 @@ from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.maps.markers import Marker, corner_names, corner_points
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factorgraph_loc.sensors.rfid.known_tags import trust
 from factors.camera.model import predict

@@ -10,7 +10,7 @@ from factorgraph_loc.io.native.rig_file import read_rig, write_rig
 from factorgraph_loc.io.native.world_file import read_world, write_world
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, Landmark
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, Landmark
 from factorgraph_loc.sensors.odometry.settings import ImuSettings, OdometrySettings
 from factorgraph_loc.sensors.rfid.map import Tag
 

@@ -25,7 +25,7 @@ from factorgraph_loc import (
     VelocityOdometry,
     YawRate,
 )
-from factorgraph_loc.live.start import prior_of
+from factorgraph_loc.live.localizer import prior_of
 from factorgraph_loc.sensors.camera.measurement import FEATURES
 from factorgraph_loc.sensors.camera.measurement import PAIRS as PIXELS
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE

@@ -13,8 +13,7 @@ from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, Landmark
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
 from factors import se2
 
 FRAME = np.array((3.0, -2.0, 2.0))  # of the run in the map

@@ -14,8 +14,12 @@ from factorgraph_loc.model.measurement import Rows
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, Landmark
+from factorgraph_loc.sensors.landmarks.measurement import (
+    BearingRange,
+    BearingRangeSettings,
+    BearingRangeStream,
+    Landmark,
+)
 from factorgraph_loc.sensors.odometry.measurement import (
     IncrementOdometry,
     IncrementStream,

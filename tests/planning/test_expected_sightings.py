@@ -11,7 +11,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.information import FINEST, expected_covariance, expected_gain, gaussian_entropy
 from factorgraph_loc.planning.paths import primitives
 from factorgraph_loc.planning.sensors import Sensors
-from factorgraph_loc.sensors.landmarks.settings import Landmark, SightingSettings
+from factorgraph_loc.sensors.landmarks.measurement import Landmark, SightingSettings
 from factorgraph_loc.simulation.settings import RACKHAM_RIG
 from factors.landmarks import model as bearing_range
 

@@ -21,7 +21,7 @@ from factorgraph_loc.planning.paths import Path, primitives
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.sensors.camera.settings import PixelSettings
 from factorgraph_loc.sensors.camera.simulation import CameraForecast
-from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import Landmark
 from factorgraph_loc.sensors.landmarks.simulation import LandmarkForecast
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.simulation.settings import RACKHAM_RIG

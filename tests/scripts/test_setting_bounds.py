@@ -12,7 +12,7 @@ from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.calibrator import CALIBRATOR
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factorgraph_loc.sensors.motion import odometry_model
 from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,

@@ -13,8 +13,7 @@ from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.measurement import Stream, columns_of
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream, Landmark
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
 from factors import se2

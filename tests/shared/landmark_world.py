@@ -8,8 +8,12 @@ from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, BearingRangeUncertainty, Landmark
+from factorgraph_loc.sensors.landmarks.measurement import (
+    BearingRangeSettings,
+    BearingRangeStream,
+    BearingRangeUncertainty,
+    Landmark,
+)
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,

@@ -8,7 +8,7 @@ import pytest
 from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.settings import Landmark, SightingSettings
+from factorgraph_loc.sensors.landmarks.measurement import Landmark, SightingSettings
 from factorgraph_loc.sensors.landmarks.simulation import sighting_stream
 from factorgraph_loc.simulation import PRESETS, read_settings, simulate
 from factors import se2

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder
-from factorgraph_loc.vision.found import decode, encode
+from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder, decode, encode
 from factorgraph_loc.vision.keypoints import Keypoints
 
 

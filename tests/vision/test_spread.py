@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorgraph_loc.vision.spread import spread_out
+from factorgraph_loc.vision.keypoints import spread_out
 
 
 @given(st.integers(1, 60), st.integers(1, 40), st.integers(0, 1000))

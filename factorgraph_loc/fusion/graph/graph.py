@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.fusion.changes import Change, is_known
 from factorgraph_loc.fusion.graph.marginals import blamed, damped
 from factorgraph_loc.fusion.graph.variables import (
     Keyframe,
@@ -27,6 +26,7 @@ from factorgraph_loc.fusion.graph.variables import (
 )
 from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.mapping import Mapper
+from factorgraph_loc.fusion.search import Change, is_known
 from factorgraph_loc.model.belief import Learnt, PosePrior, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import Estimated

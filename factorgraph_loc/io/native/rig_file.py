@@ -12,7 +12,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import parse_model, read_toml, write_toml
 from factorgraph_loc.files.settings import Setting, settings_in
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factors import se2
 
 # for formats that do not describe the robot

@@ -19,8 +19,7 @@ from factorgraph_loc.model.log import NOT_READ, Log
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
-from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE, Landmark
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.tables import stream_of
 from factorgraph_loc.text import listed

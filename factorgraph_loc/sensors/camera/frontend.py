@@ -25,10 +25,9 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.processes import ProcessDiedError, run_each
 from factorgraph_loc.sensors.camera.measurement import FeatureStream, ImageStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder
+from factorgraph_loc.vision.feature_cache import FeatureCache, ImageFeatures, cache_folder, decode, encode
 from factorgraph_loc.vision.features import Extractor, extractor
 from factorgraph_loc.vision.fiducials import find_markers
-from factorgraph_loc.vision.found import ImageFeatures, decode, encode
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.images import as_image, read_image
 from factorgraph_loc.vision.keypoints import Integers
@@ -43,13 +42,12 @@ FEATURE_CODE = (
     "colour_features.py",
     "descriptor.py",
     "detector.py",
+    "feature_cache.py",
     "features.py",
-    "found.py",
     "images.py",
     "kernels.py",
     "keypoints.py",
     "scale_space.py",
-    "spread.py",
     "weights.npz",
 )
 TRACK_CODE = ("matching.py", "tracks.py")

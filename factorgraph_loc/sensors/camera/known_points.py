@@ -20,8 +20,8 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
+from factorgraph_loc.vision.keypoints import spread_out
 from factorgraph_loc.vision.relocalization import FoundOnFloor, found_on_floor, on_floor
-from factorgraph_loc.vision.spread import spread_out
 from factors import se2
 from factors.camera import model as reprojection
 from factors.camera import update_kernels as pixel_kernels

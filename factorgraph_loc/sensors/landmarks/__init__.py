@@ -3,7 +3,7 @@
 from factorgraph_loc.model.sections import Layer, Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
-__all__ = ["SENSOR", "measurement", "settings", "summary"]
+__all__ = ["SENSOR", "measurement", "summary"]
 
 SENSOR = SensorType(
     "landmarks",
@@ -15,11 +15,11 @@ SENSOR = SensorType(
             section="bearing_range",
         ),
     ),
-    settings={"bearing_range": Section("factorgraph_loc.sensors.landmarks.settings:BearingRangeSettings")},
+    settings={"bearing_range": Section("factorgraph_loc.sensors.landmarks.measurement:BearingRangeSettings")},
     layers={
         "landmarks": Layer(
-            "factorgraph_loc.sensors.landmarks.settings:Landmark",
-            read="factorgraph_loc.sensors.landmarks.settings:read_layer",
+            "factorgraph_loc.sensors.landmarks.measurement:Landmark",
+            read="factorgraph_loc.sensors.landmarks.measurement:read_layer",
         ),
     },
     detects="landmarks",
@@ -28,7 +28,7 @@ SENSOR = SensorType(
     check="factorgraph_loc.sensors.landmarks.summary:check",
     draw="factorgraph_loc.sensors.landmarks.summary:draw",
     simulation={
-        "sightings": Section("factorgraph_loc.sensors.landmarks.settings:SightingSettings", always=True),
+        "sightings": Section("factorgraph_loc.sensors.landmarks.measurement:SightingSettings", always=True),
     },
     simulate="factorgraph_loc.sensors.landmarks.simulation:simulate",
     looks="factorgraph_loc.sensors.landmarks.simulation:looks",

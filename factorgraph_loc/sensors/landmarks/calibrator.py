@@ -27,8 +27,11 @@ from factorgraph_loc.sensors.calibrating import (
     Unit,
     upper_bounds,
 )
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, BearingRangeUncertainty
+from factorgraph_loc.sensors.landmarks.measurement import (
+    BearingRangeSettings,
+    BearingRangeStream,
+    BearingRangeUncertainty,
+)
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
 from factorgraph_loc.text import number, plain
 from factors.landmarks import model as bearing_range

@@ -2,10 +2,30 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
 
-from factorgraph_loc.files.columns import ANGLE, FULL_TURN, LENGTH, LONGEST_RANGE, NEAREST, STAMP, Table, named, number
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
+from factorgraph_loc.files.columns import (
+    ANGLE,
+    FULL_TURN,
+    LENGTH,
+    LONGEST_RANGE,
+    NEAREST,
+    STAMP,
+    Table,
+    named,
+    number,
+    within,
+)
+from factorgraph_loc.files.models import FARTHEST, Coordinate, FileModel, InUnit, inside, parse_model
+from factorgraph_loc.files.tables import rows_by_name
 from factorgraph_loc.model.measurement import ScanStream
+from factorgraph_loc.model.settings import Angle, Covariance, Hertz, Metres, Offset, SensorSettings, spread_of
+from factors.landmarks.model import PARAMETERS, BearingRangeModel
 from factors.se2 import Array
 
 BEARING_RANGE = Table(
@@ -60,3 +80,124 @@ class BearingRangeStream(ScanStream):
     landmark: Sequence[str]
     range: Array
     bearing: Array
+
+
+class BearingRangeUncertainty(FileModel):
+    """Standard deviations of constants that differ between robots or runs; those above 0 are estimated."""
+
+    x: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
+    """standard deviation of the constant"""
+    y: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
+    """standard deviation of the constant"""
+    bearing_bias: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] = 0.0
+    """standard deviation of the constant"""
+    range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """standard deviation of the constant, relative"""
+    depth_axis: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] = 0.0
+    """standard deviation of the constant"""
+    time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] = 0.0
+    """standard deviation of the constant"""
+
+
+class BearingRangeSettings(SensorSettings):
+    """A sensor of identified landmarks. See :class:`factors.landmarks.model.BearingRangeModel` for the model."""
+
+    constants: ClassVar[tuple[str, ...]] = PARAMETERS
+    x: Offset = 0.0
+    """position of the sensor on the robot, forward"""
+    y: Offset = 0.0
+    """position of the sensor on the robot, to the left"""
+    heading: Angle = 0.0
+    """direction of the sensor on the robot"""
+    bearing_bias: Angle = 0.0
+    """reported minus true bearing"""
+    range_scale: Annotated[float, Field(ge=0.2, le=5.0)] = 1.0
+    """reported divided by true range"""
+    range_kind: Literal["distance", "depth"] = "distance"
+    """distance, or depth along one axis, as a camera measures it by the size of a marker"""
+    depth_axis: Angle = 0.0
+    """direction of that axis, in the sensor frame"""
+    range_sigma: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("m")]
+    """standard deviation of a range; that of a range r is the root of range_sigma^2 + (range_sigma_relative r)^2"""
+    range_sigma_relative: Annotated[float, Field(ge=0.0, le=1.0), InUnit("m per m")] = 0.0
+    """part of it that grows with the range"""
+    bearing_sigma: Annotated[float, Field(ge=1e-5, le=0.5), InUnit("rad")] = 0.05
+    """standard deviation of a bearing"""
+    robust: Annotated[float, Field(ge=0.01, le=100.0)] = 4.0
+    """scale of the Geman-McClure loss, in standard deviations"""
+    exact_survey: Annotated[float, Field(ge=0.0, le=10.0)] = 0.2
+    """landmarks whose survey has a sigma below this share of range_sigma are exact, others are estimated"""
+    uncertainty: BearingRangeUncertainty = BearingRangeUncertainty()
+    """standard deviations of constants; those above 0 are estimated"""
+
+    def model(self) -> BearingRangeModel:
+        return BearingRangeModel(
+            mounting=(self.x, self.y, self.heading),
+            bearing_bias=self.bearing_bias,
+            range_scale=self.range_scale,
+            depth=self.range_kind == "depth",
+            depth_axis=self.depth_axis,
+            range_sigma=self.range_sigma,
+            range_sigma_relative=self.range_sigma_relative,
+            bearing_sigma=self.bearing_sigma,
+            robust=self.robust,
+        )
+
+
+class SightingSettings(FileModel):
+    """Visibility of landmarks, not through walls."""
+
+    rate: Hertz = 2.0
+    """measurements per second"""
+    max_range: Metres = 6.0
+    """distance up to which landmarks are seen"""
+    field_of_view: Annotated[float, Field(ge=0.01, le=6.3), InUnit("rad")] = 6.3
+    """angle about the sensor's axis within which they are seen"""
+
+
+class Landmark(FileModel):
+    """A point landmark: position [m] in the world frame and its uncertainty.
+
+    ``sigma``: standard deviation of the survey in x and y [m]. ``covariance``: (xx, xy, yy) [m^2], instead of ``sigma``.
+    """
+
+    x: Coordinate
+    y: Coordinate
+    sigma: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
+    covariance: Covariance | None = None
+
+    def spread(self) -> Array:
+        """The covariance (2, 2) of the position [m^2]."""
+        return spread_of(self.sigma, self.covariance)
+
+
+SIGMAS = ("sigma", "sigma_x", "sigma_y")
+LANDMARKS = Table(
+    "landmarks",
+    (
+        named("landmark", "the name of a landmark"),
+        within("x", LENGTH, FARTHEST, "position in the world"),
+        within("y", LENGTH, FARTHEST, "position in the world"),
+        *(number(name, LENGTH, 0.0, 100.0, "standard deviation of the survey", may_lack=True) for name in SIGMAS),
+    ),
+    "one each",
+)
+
+
+def read_layer(content: Any, source: object, folder: Path) -> Any:
+    """The landmarks of a world file: inline, or in a foreign table with a mapping."""
+    if not isinstance(content, dict) or not isinstance(content.get("file"), str):
+        return content
+    mapping = parse_model(ColumnMapping, content, f"{source} [landmarks]")
+    return read_landmarks(inside(folder, mapping.file, source), mapping)
+
+
+def read_landmarks(path: Path, mapping: ColumnMapping) -> dict[str, Landmark]:
+    """Read a foreign table with the fields landmark, x, y and optionally sigma, or sigma_x and sigma_y, of which the larger one is
+    used. InputError names file, row and field of an invalid value, or of a duplicate name."""
+    position = ("landmark", "x", "y")
+    mapped = read_mapped(path, mapping, (position, (*position, "sigma"), (*position, "sigma_x", "sigma_y")))
+    numbers = {name: mapped.numbers(name, LANDMARKS[name]) for name in mapped.columns if name != "landmark"}
+    if "sigma_x" in numbers:
+        numbers["sigma"] = np.fmax(numbers.pop("sigma_x"), numbers.pop("sigma_y"))
+    return rows_by_name(Landmark, path, mapped.rows, LANDMARKS["landmark"], mapped.texts("landmark"), numbers)

@@ -16,8 +16,7 @@ from factorgraph_loc.model.setup import MapUse
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.base import Binding, Blocks, Columns, NewVariable, ResidualObservation, Sensor, Term, View
 from factorgraph_loc.sensors.landmarks.finder import LandmarkFinder
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeSettings
 from factors import positive
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor, landmark_update

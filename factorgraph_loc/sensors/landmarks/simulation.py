@@ -14,8 +14,12 @@ from factorgraph_loc.maps.free_space import crosses
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.interfaces import Array32, Places, Ride, Simulated
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings, SightingSettings
+from factorgraph_loc.sensors.landmarks.measurement import (
+    BearingRange,
+    BearingRangeSettings,
+    BearingRangeStream,
+    SightingSettings,
+)
 from factors import se2
 from factors.compiled import compiled
 from factors.landmarks import model as bearing_range

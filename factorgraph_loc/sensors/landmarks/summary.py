@@ -20,8 +20,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors import interfaces
 from factorgraph_loc.sensors.interfaces import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP, Marks, Summary, Use
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream
 from factors import se2
 from factors.landmarks import model as bearing_range
 from factors.landmarks.model import located, sigmas

@@ -16,7 +16,7 @@ import numpy as np
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.reliability import Reliability
+from factorgraph_loc.model.result import Reliability
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.interfaces import Ending, Marks, Paragraph, Review, Summary, Use
 from factorgraph_loc.sensors.rfid.known_tags import tag_map

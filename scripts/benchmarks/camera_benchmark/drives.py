@@ -29,8 +29,8 @@ from factorgraph_loc.sensors.camera.measurement import FeatureStream, ImageStrea
 from factorgraph_loc.simulation import film, preset, simulate, with_images
 from factorgraph_loc.simulation.filming import JPEG
 from factorgraph_loc.simulation.settings import SimulationSettings
+from factorgraph_loc.vision.feature_cache import decode, encode
 from factorgraph_loc.vision.features import extractor
-from factorgraph_loc.vision.found import decode, encode
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.tracks import follow
 

@@ -20,8 +20,7 @@ from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.landmarks.settings import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream, Landmark
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 from factorgraph_loc.sensors.odometry.simulation import wheel_odometry
 from factors import se2

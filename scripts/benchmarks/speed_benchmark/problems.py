@@ -11,8 +11,7 @@ import numpy as np
 
 from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.landmarks.settings import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeSettings
 from factorgraph_loc.sensors.motion import odometry_model, whole_motion
 from factorgraph_loc.sensors.odometry.settings import OdometrySettings
 from factorgraph_loc.simulation import preset, simulate
