@@ -6,8 +6,7 @@ fit a moving object too. Features without a match are also compared with the las
 """
 
 import math
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,50 +22,51 @@ EPIPOLAR = 1.5  # px from the epipolar line
 CONFIDENCE, DRAWS = 0.99, 300  # samples of five pairs
 FEWEST = 16  # pairs needed for a meaningful consensus
 ALIKE = 0.5  # share of the other pairs that agree, if they are of another body and not wrong
-THREADS = 2
 
 
-def follow(
-    pixels: Sequence[Array], descriptors: Sequence[Descriptors], camera: CameraModel, *, binary: bool
-) -> list[Integers]:
-    """Track numbers (K,) of the features of each of N images in order of time.
+class _Image(NamedTuple):
+    """Directions (K, 2), descriptors (K, D) and track numbers (K,) of the features of one image."""
 
-    ``pixels``: N times (K, 2) of the ``camera``; ``descriptors``: N times (K, D), ``binary`` or not. A number occurs at most once
-    per image; a feature seen only once has a number of its own.
-    """
-    count = len(pixels)
-    directions = [undistorted(camera, p) for p in pixels]
+    directions: Array
+    descriptors: Descriptors
+    numbers: Integers
 
-    def matched(i: int, j: int, first: Integers, second: Integers) -> Integers:
-        """Pairs (M, 2) of features among ``first`` of image i and ``second`` of image j."""
-        found = pairs(
-            (directions[i][first], descriptors[i][first]),
-            (directions[j][second], descriptors[j][second]),
-            camera,
-            binary=binary,
-        )
-        return np.column_stack((first[found[:, 0]], second[found[:, 1]]))
 
-    every = [np.arange(len(p)) for p in pixels]
-    with ThreadPoolExecutor(THREADS) as pool:  # numpy and OpenCV release the interpreter lock
-        steps = range(1, count)
-        near = list(pool.map(lambda j: matched(j - 1, j, every[j - 1], every[j]), steps))
-        missed = [np.setdiff1d(every[j], near[j][:, 0]) for j in range(count - 1)]  # of image j, not in the next
-        new = [np.setdiff1d(every[j], near[j - 1][:, 1]) for j in steps]  # of image j
-        far = list(pool.map(lambda j: matched(j - 2, j, missed[j - 2], new[j - 1]), range(2, count)))
-    tracks: list[Integers] = []
-    following = 0
-    for j in range(count):
-        numbers = np.full(len(every[j]), -1, dtype=np.int64)
-        if j >= 1:
-            numbers[near[j - 1][:, 1]] = tracks[j - 1][near[j - 1][:, 0]]
-        if j >= 2:
-            numbers[far[j - 2][:, 1]] = tracks[j - 2][far[j - 2][:, 0]]
+class Tracker:
+    """Numbers the tracks of features, image by image in order of time, keeping the last two images. Not thread-safe."""
+
+    def __init__(self, camera: CameraModel, *, binary: bool) -> None:
+        self._camera, self._binary = camera, binary
+        self._last: _Image | None = None
+        self._before: _Image | None = None  # the last but one, with the features that the last one did not match
+        self._count = 0  # of tracks
+
+    def follow(self, pixels: Array, descriptors: Descriptors) -> Integers:
+        """Track numbers (K,) of the features of the next image, with ``pixels`` (K, 2) and ``descriptors`` (K, D).
+
+        A number occurs at most once per image; a feature seen only once has a number of its own.
+        """
+        numbers = np.full(len(pixels), -1, dtype=np.int64)
+        image = _Image(undistorted(self._camera, pixels), descriptors, numbers)
+        missed = None
+        if self._last is not None:
+            missed = self._continued(self._last, image)
+            if self._before is not None:
+                self._continued(self._before, image)
         fresh = np.flatnonzero(numbers < 0)
-        numbers[fresh] = following + np.arange(len(fresh))
-        following += len(fresh)
-        tracks.append(numbers)
-    return tracks
+        numbers[fresh] = self._count + np.arange(len(fresh))
+        self._count += len(fresh)
+        self._last, self._before = image, missed
+        return numbers
+
+    def _continued(self, earlier: _Image, image: _Image) -> _Image:
+        """Continue tracks of an earlier image in the features without a number; the rest of the earlier image is returned."""
+        rows = np.flatnonzero(image.numbers < 0)
+        here = image.directions[rows], image.descriptors[rows]
+        found = pairs(earlier[:2], here, self._camera, binary=self._binary)
+        image.numbers[rows[found[:, 1]]] = earlier.numbers[found[:, 0]]
+        missed = np.setdiff1d(np.arange(len(earlier.numbers)), found[:, 0])
+        return _Image(earlier.directions[missed], earlier.descriptors[missed], earlier.numbers[missed])
 
 
 def pairs(

