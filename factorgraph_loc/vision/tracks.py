@@ -32,7 +32,7 @@ class _Image(NamedTuple):
     numbers: Integers
 
 
-class Tracker:
+class FeatureTracker:
     """Numbers the tracks of features, image by image in order of time, keeping the last two images. Not thread-safe."""
 
     def __init__(self, camera: CameraModel, *, binary: bool) -> None:

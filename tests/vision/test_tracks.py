@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.vision import tracks as tracking
-from factorgraph_loc.vision.tracks import Tracker, pairs
+from factorgraph_loc.vision.tracks import FeatureTracker, pairs
 from factors.camera.model import CameraModel, project, undistorted
 
 pytestmark = pytest.mark.kernels
@@ -29,7 +29,7 @@ def view(points, place, turn=0.0, noise=0.0, rng=None):
 
 
 def followed(images, binary=False):
-    tracker = Tracker(CAMERA, binary=binary)
+    tracker = FeatureTracker(CAMERA, binary=binary)
     return [tracker.follow(pixels, looks) for pixels, looks in images]
 
 

@@ -31,7 +31,7 @@ from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.images import as_image, read_image
 from factorgraph_loc.vision.keypoints import Integers
 from factorgraph_loc.vision.settings import FrontendSettings
-from factorgraph_loc.vision.tracks import Tracker
+from factorgraph_loc.vision.tracks import FeatureTracker
 from factors.camera.model import CameraModel
 
 # what features depend on, and what tracks depend on in addition
@@ -198,7 +198,7 @@ def _tracks(
     if stored is not None and len(stored) == 4 * sum(counts):
         numbers = np.frombuffer(stored, dtype="<i4").astype(np.int64)
     else:
-        tracker = Tracker(camera, binary=_extractor(settings).binary)
+        tracker = FeatureTracker(camera, binary=_extractor(settings).binary)
         lists = [tracker.follow(found[i].pixels, found[i].descriptors) for i in order]
         numbers = np.concatenate([*lists, np.empty(0, dtype=np.int64)])
         kept.write(key, numbers.astype("<i4").tobytes())
@@ -304,7 +304,7 @@ class LiveFrontend:
     def __init__(self, settings: FrontendSettings, camera: CameraModel) -> None:
         self._feature, self._camera = settings.feature, camera
         self._extractor = extractor(settings.feature, settings.count, everywhere=settings.everywhere)
-        self._tracker = Tracker(camera, binary=self._extractor.binary)
+        self._tracker = FeatureTracker(camera, binary=self._extractor.binary)
 
     def frame(self, t: float, image: object) -> CameraFrame:
         """The features of an image taken at ``t`` [s], an array as in :func:`~factorgraph_loc.vision.images.as_image`.

@@ -32,7 +32,7 @@ from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.vision.feature_cache import decode, encode
 from factorgraph_loc.vision.features import extractor
 from factorgraph_loc.vision.frame import CameraFrame
-from factorgraph_loc.vision.tracks import Tracker
+from factorgraph_loc.vision.tracks import FeatureTracker
 
 TAGS = 20
 RATE, MAP_RATE = 5.0, 2.0  # images/s
@@ -157,7 +157,7 @@ def _write_features(drive: Drive, path: Path) -> None:
         before = perf_counter()
     found = [decode(content) for content in contents]
     before = perf_counter()
-    tracker = Tracker(settings.rig.camera.model(), binary=finder.binary)
+    tracker = FeatureTracker(settings.rig.camera.model(), binary=finder.binary)
     tracks = [tracker.follow(f.pixels, f.descriptors) for f in found]
     seconds = np.array((render, find, perf_counter() - before))
     with replacing(path) as temporary, temporary.open("wb") as file:
