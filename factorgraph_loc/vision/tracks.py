@@ -24,7 +24,7 @@ FEWEST = 16  # pairs needed for a meaningful consensus
 ALIKE = 0.5  # share of the other pairs that agree, if they are of another body and not wrong
 
 
-class _Image(NamedTuple):
+class _TrackedImage(NamedTuple):
     """Directions (K, 2), descriptors (K, D) and track numbers (K,) of the features of one image."""
 
     directions: Array
@@ -37,8 +37,8 @@ class FeatureTracker:
 
     def __init__(self, camera: CameraModel, *, binary: bool) -> None:
         self._camera, self._binary = camera, binary
-        self._last: _Image | None = None
-        self._before: _Image | None = None  # the last but one, with the features that the last one did not match
+        self._last: _TrackedImage | None = None
+        self._before: _TrackedImage | None = None  # the last but one, with the features that the last one did not match
         self._count = 0  # of tracks
 
     def follow(self, pixels: Array, descriptors: Descriptors) -> Integers:
@@ -47,7 +47,7 @@ class FeatureTracker:
         A number occurs at most once per image; a feature seen only once has a number of its own.
         """
         numbers = np.full(len(pixels), -1, dtype=np.int64)
-        image = _Image(undistorted(self._camera, pixels), descriptors, numbers)
+        image = _TrackedImage(undistorted(self._camera, pixels), descriptors, numbers)
         missed = None
         if self._last is not None:
             missed = self._continued(self._last, image)
@@ -59,14 +59,14 @@ class FeatureTracker:
         self._last, self._before = image, missed
         return numbers
 
-    def _continued(self, earlier: _Image, image: _Image) -> _Image:
+    def _continued(self, earlier: _TrackedImage, image: _TrackedImage) -> _TrackedImage:
         """Continue tracks of an earlier image in the features without a number; the rest of the earlier image is returned."""
         rows = np.flatnonzero(image.numbers < 0)
         here = image.directions[rows], image.descriptors[rows]
         found = pairs(earlier[:2], here, self._camera, binary=self._binary)
         image.numbers[rows[found[:, 1]]] = earlier.numbers[found[:, 0]]
         missed = np.setdiff1d(np.arange(len(earlier.numbers)), found[:, 0])
-        return _Image(earlier.directions[missed], earlier.descriptors[missed], earlier.numbers[missed])
+        return _TrackedImage(earlier.directions[missed], earlier.descriptors[missed], earlier.numbers[missed])
 
 
 def pairs(
