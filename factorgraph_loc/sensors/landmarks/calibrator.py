@@ -160,9 +160,8 @@ def correlation(seen: Sightings, settings: BearingRangeSettings) -> Correlation:
     products, pairs = np.zeros((count, 2)), np.zeros((count, 2))
     neighbour, neighbours = np.zeros(2), np.zeros(2)
     for track in np.unique(seen.track):
-        rows = np.flatnonzero(seen.track == track)
-        t, values = seen.t[rows], whitened[rows]
-        for step in range(1, min(NEIGHBOURS, len(rows))):
+        t, values = seen.t[seen.track == track], whitened[seen.track == track]
+        for step in range(1, min(NEIGHBOURS, len(t))):
             product = values[step:] * values[:-step]
             bins = np.searchsorted(LAGS, t[step:] - t[:-step]) - 1
             inside, known = (bins >= 0) & (bins < count), np.isfinite(product)
@@ -243,19 +242,17 @@ class LandmarkCalibrator(ConstantsCalibrator):
             return None
         seen, before = tuple(map(sightings_of, logs)), self.settings(rig)
         thinned = [one.thinned(MOST_SIGHTINGS) for one in seen]
-        everything, settings = self._fit_and_scatter(thinned, before)
+        everything, settings = self._fitted(thinned, before)
         if any(np.any(np.isfinite(one.ranges) & np.isfinite(one.bearings)) for one in thinned):
             other = before.model_copy(update={RANGE_KIND: "distance" if before.range_kind == "depth" else "depth"})
-            found, changed = self._fit_and_scatter(thinned, other)
+            found, changed = self._fitted(thinned, other)
             new, old = (spread(np.concatenate([one.errors(s) for one in thinned]))[0] for s in (changed, settings))
             if new < BETTER_KIND * old:
                 everything, settings = found, changed
         gain = gains(everything, folds([one.t for one in thinned], BLOCKS))
         return SensorFit(tuple(thinned), everything, gain, everything.as_dict(), (), settings, seen)
 
-    def _fit_and_scatter(
-        self, seen: Sequence[Sightings], before: BearingRangeSettings
-    ) -> tuple[Fit, BearingRangeSettings]:
+    def _fitted(self, seen: Sequence[Sightings], before: BearingRangeSettings) -> tuple[Fit, BearingRangeSettings]:
         """Fit all constants and the scatter in turn."""
         constants = constants_of(seen, before)
         start = {c.name: c.neutral for c in constants}
