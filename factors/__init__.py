@@ -2,25 +2,22 @@
 files."""
 
 __all__ = [
-    "between",
     "camera",
     "chain",
     "chi_squared",
     "compiled",
     "compressed",
-    "gaussian_kernels",
+    "gaussian",
     "graph",
     "landmarks",
     "least_squares",
     "loops",
-    "marginal",
     "motion",
     "odometry",
     "positive",
     "rfid",
     "robust",
     "se2",
-    "se2_kernels",
-    "small_kernels",
+    "sighting",
     "update",
 ]

@@ -11,10 +11,10 @@ depends on, by the next one, and by the parameters.
 
 import numpy as np
 
-from factors import small_kernels
+from factors import gaussian
 from factors.compiled import compiled
+from factors.gaussian import inverse, product, product_by_transpose, put
 from factors.se2 import Array, Integers
-from factors.small_kernels import inverse, product, product_by_transpose, put
 
 POSE = 3
 LEAST = 1e-11  # smallest share of a diagonal element that elimination may leave; less is a rounding error
@@ -128,7 +128,7 @@ def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
         right = np.empty((shared, 1))
         for k in range(shared):
             right[k, 0] = -left[k, shared]
-        right, _ = small_kernels.solved(left[:shared, :shared].copy(), right)
+        right, _ = gaussian.solved(left[:shared, :shared].copy(), right)
         for k in range(shared):
             step[k] = right[k, 0]
         for i in range(len(poses) - 1, -1, -1):

@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from factors.compiled import compiled
-from factors.gaussian_kernels import root
+from factors.gaussian import cholesky
 from factors.se2 import Array
 
 RELATIVE_RIDGE = 1e-9  # of the mean curvature, against division by zero
@@ -43,14 +43,14 @@ def _compressed(nll: float, gradient: Array, information: Array) -> tuple[Array,
         trace += curvature[i, i]
     for i in range(size):
         curvature[i, i] += RELATIVE_RIDGE * trace / size + RIDGE
-    lower, _ = root(curvature)
+    lower, _ = cholesky(curvature)
     squared, floor = _whitened(lower, gradient, residual), max(2.0 * nll, LEAST)
     if squared > floor:
         raised = 1.0 / floor - 1.0 / squared
         for i in range(size):
             for j in range(size):
                 curvature[i, j] += raised * gradient[i] * gradient[j]
-        lower, _ = root(curvature)
+        lower, _ = cholesky(curvature)
         squared = _whitened(lower, gradient, residual)
     residual[size] = math.sqrt(max(2.0 * nll - squared, 0.0))
     for i in range(size):

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from factors import gaussian_kernels
+from factors import gaussian
 from factors.compiled import compiled
 from factors.se2 import Array
 
@@ -47,7 +47,7 @@ def is_clear(covariance: Array) -> bool:
             return False
         for j in range(i + 1):
             shares[i, j] = covariance[i, j] / math.sqrt(covariance[i, i]) / math.sqrt(covariance[j, j])
-    lower, exists = gaussian_kernels.root(shares)
+    lower, exists = gaussian.cholesky(shares)
     determinant = 1.0
     for i in range(size):
         determinant *= lower[i, i] * lower[i, i]
@@ -98,6 +98,25 @@ def squared(errors: Array, covariances: Array) -> Array:
         return np.asarray(np.sum(errors * np.linalg.solve(covariances, errors[..., None])[..., 0], axis=-1))
     except np.linalg.LinAlgError:
         return np.asarray(np.sum((_whitener(covariances) @ errors[..., None])[..., 0] ** 2, axis=-1))
+
+
+def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, later: Array) -> tuple[Array, Array]:
+    """One backward step of the smoother of Rauch, Tung and Striebel (1965): the correction (S,) of a state, and its smoothed
+    covariance (S, S). Arguments as of :func:`factors.gaussian.smoothed`. Where that fails, the covariance is a sum that is as
+    positive as its parts, for any gain."""
+    arrays = (np.ascontiguousarray(part, dtype=float) for part in (covariance, transition, noise, change, later))
+    try:
+        correction, after = gaussian.smoothed(*arrays)
+        return correction, after
+    except np.linalg.LinAlgError:
+        rows, full, later = len(transition), np.eye(len(change)), later.copy()
+    full[:rows] = transition
+    later[:rows, :rows] += noise
+    predicted = full @ covariance @ full.T
+    predicted[:rows, :rows] += noise
+    gain = solve(nearest(predicted), full @ covariance).T
+    left = np.eye(len(change)) - gain @ full
+    return gain @ change, nearest(left @ covariance @ left.T + gain @ later @ gain.T)
 
 
 def worst_sigma(covariances: Array) -> Array:

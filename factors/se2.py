@@ -4,20 +4,22 @@ A pose is ``(x, y, heading)``: metres, metres, radians counter-clockwise. A tang
 ``(rho_x, rho_y, phi)``, applied on the right: ``pose * exp(xi)``. This is also GTSAM's convention for ``Pose2``.
 Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, appendix A (eqs. 153 to 166).
 
-All functions broadcast over leading axes, ``(..., 3)``.
+Functions of arrays broadcast over leading axes, ``(..., 3)``. The compiled functions take numbers (``_scalars``), one pose
+(``_one``), or many poses; compiled code calls them, and so do filters, for which NumPy is too slow.
 """
 
 import math
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-Integers = NDArray[np.int64]
+from factors.compiled import compiled
 
+Array, Integers = NDArray[np.float64], NDArray[np.int64]
 
-Array = NDArray[np.float64]
-
-_SMALL_ANGLE = 1e-4
+SMALL = 1e-4  # rad; smaller angles use series, against cancellation
+SHORT = 0.5  # rad; of many poses smaller angles use longer series, in less time
 
 
 def wrap(angle: Array) -> Array:
@@ -25,6 +27,7 @@ def wrap(angle: Array) -> Array:
     return np.pi - np.mod(np.pi - np.asarray(angle, dtype=float), 2.0 * np.pi)
 
 
+@register_jitable
 def wrap_scalar(angle: float) -> float:
     """One angle in radians, wrapped to (-pi, pi]."""
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
@@ -34,7 +37,7 @@ def compose(a: Array, b: Array) -> Array:
     """The pose ``a * b``: ``b``, given in the frame of ``a``, expressed in the frame of ``a``'s parent."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if a.ndim == b.ndim == 1:
-        return np.array(_compose_one(*a.tolist(), *b.tolist()))
+        return np.array(compose_scalars(*a.tolist(), *b.tolist()))
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     out[..., 0] = a[..., 0] + c * b[..., 0] - s * b[..., 1]
@@ -47,7 +50,7 @@ def inverse(a: Array) -> Array:
     """The pose ``a^-1``."""
     a = np.asarray(a, dtype=float)
     if a.ndim == 1:
-        return np.array(_inverse_one(*a.tolist()))
+        return np.array(between_scalars(*a.tolist(), 0.0, 0.0, 0.0))
     out = np.empty_like(a)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     out[..., 0] = -c * a[..., 0] - s * a[..., 1]
@@ -60,7 +63,7 @@ def between(a: Array, b: Array) -> Array:
     """The pose of ``b`` in the frame of ``a``: ``a^-1 * b``."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if a.ndim == b.ndim == 1:
-        return np.array(_compose_one(*_inverse_one(*a.tolist()), *b.tolist()))
+        return np.array(between_scalars(*a.tolist(), *b.tolist()))
     return compose(inverse(a), b)
 
 
@@ -68,9 +71,7 @@ def exp(xi: Array) -> Array:
     """The pose reached by following the twist ``xi`` for unit time: an arc of a circle."""
     xi = np.asarray(xi, dtype=float)
     if xi.ndim == 1:
-        x, y, phi = xi.tolist()
-        p, q = arc_coefficients(phi)
-        return np.array((p * x - q * y, q * x + p * y, wrap_scalar(phi)))
+        return np.array(exp_scalars(*xi.tolist()))
     out = np.empty_like(xi)
     a, b = _arc_coefficients(xi[..., 2])
     out[..., 0] = a * xi[..., 0] - b * xi[..., 1]
@@ -83,11 +84,7 @@ def log(pose: Array) -> Array:
     """The twist that leads from the origin to ``pose`` in unit time; the inverse of :func:`exp` for |heading| < pi."""
     pose = np.asarray(pose, dtype=float)
     if pose.ndim == 1:
-        x, y, heading = pose.tolist()
-        phi_one = wrap_scalar(heading)
-        p, q = arc_coefficients(phi_one)
-        d = p * p + q * q
-        return np.array(((p * x + q * y) / d, (p * y - q * x) / d, phi_one))
+        return np.array(log_scalars(*pose.tolist()))
     out = np.empty_like(pose)
     phi = wrap(pose[..., 2])
     a, b = _arc_coefficients(phi)
@@ -101,15 +98,8 @@ def log(pose: Array) -> Array:
 def adjoint(pose: Array) -> Array:
     """The adjoint matrix ``(..., 3, 3)``: ``pose * exp(xi) = exp(adjoint(pose) xi) * pose``."""
     pose = np.asarray(pose, dtype=float)
-    if pose.ndim == 1:
-        x, y, heading = pose.tolist()
-        cos, sin = math.cos(heading), math.sin(heading)
-        return np.array(((cos, -sin, y), (sin, cos, -x), (0.0, 0.0, 1.0)))
-    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-    out = np.zeros((*pose.shape[:-1], 3, 3))
-    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = c, -s, pose[..., 1]
-    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = s, c, -pose[..., 0]
-    out[..., 2, 2] = 1.0
+    out = _rotation3(pose[..., 2])
+    out[..., 0, 2], out[..., 1, 2] = pose[..., 1], -pose[..., 0]
     return out
 
 
@@ -117,13 +107,10 @@ def right_jacobian(xi: Array) -> Array:
     """Right Jacobian ``(..., 3, 3)`` of :func:`exp`: ``exp(xi + d) ~ exp(xi) * exp(right_jacobian(xi) d)``."""
     xi = np.asarray(xi, dtype=float)
     if xi.ndim == 1:
-        x, y, angle = xi.tolist()
-        p, q = arc_coefficients(angle)
-        r, s = (angle / 6.0, 0.5 - angle**2 / 24.0) if abs(angle) < _SMALL_ANGLE else ((1.0 - p) / angle, q / angle)
-        return np.array(((p, q, r * x - s * y), (-q, p, s * x + r * y), (0.0, 0.0, 1.0)))
+        return right_jacobian_one(np.array(xi))
     phi = xi[..., 2]
     a, b = _arc_coefficients(phi)
-    small = np.abs(phi) < _SMALL_ANGLE
+    small = np.abs(phi) < SMALL
     safe = np.where(small, 1.0, phi)
     # (1 - a) / phi and b / phi, with their series at zero
     c = np.where(small, phi / 6.0, (1.0 - a) / safe)
@@ -169,32 +156,22 @@ def world_to_body(pose: Array, covariance: Array) -> Array:
     return rotation.mT @ covariance @ rotation
 
 
+@register_jitable
 def arc_coefficients(phi: float) -> tuple[float, float]:
-    """``sin(phi) / phi`` and ``(1 - cos(phi)) / phi`` of one angle."""
-    if abs(phi) < _SMALL_ANGLE:
+    """``sin(phi) / phi`` and ``(1 - cos(phi)) / phi`` of one angle, for compiled code too."""
+    if abs(phi) < SMALL:
         return 1.0 - phi * phi / 6.0, phi / 2.0
     return math.sin(phi) / phi, 2.0 * math.sin(phi / 2.0) ** 2 / phi
 
 
 def _arc_coefficients(phi: Array) -> tuple[Array, Array]:
     """:func:`arc_coefficients` of arrays."""
-    small = np.abs(phi) < _SMALL_ANGLE
+    small = np.abs(phi) < SMALL
     safe = np.where(small, 1.0, phi)
     a = np.where(small, 1.0 - phi**2 / 6.0, np.sin(safe) / safe)
     # 1 - cos(phi) by the half angle, against cancellation
     b = np.where(small, phi / 2.0, 2.0 * np.sin(safe / 2.0) ** 2 / safe)
     return a, b
-
-
-def _compose_one(ax: float, ay: float, ah: float, bx: float, by: float, bh: float) -> tuple[float, float, float]:
-    # single poses are composed hundreds of thousands of times per run, for which numpy is ten times slower
-    c, s = math.cos(ah), math.sin(ah)
-    return ax + c * bx - s * by, ay + s * bx + c * by, wrap_scalar(ah + bh)
-
-
-def _inverse_one(x: float, y: float, heading: float) -> tuple[float, float, float]:
-    c, s = math.cos(heading), math.sin(heading)
-    return -c * x - s * y, s * x - c * y, wrap_scalar(-heading)
 
 
 def _rotation3(heading: Array) -> Array:
@@ -207,3 +184,167 @@ def _rotation3(heading: Array) -> Array:
     out[..., 1, 0], out[..., 1, 1] = s, c
     out[..., 2, 2] = 1.0
     return out
+
+
+@compiled(inline="always")
+def _arc_of_many(angle: float) -> tuple[float, float]:
+    """:func:`arc_coefficients` to 1e-12."""
+    if abs(angle) > SHORT:
+        return math.sin(angle) / angle, 2.0 * math.sin(angle / 2.0) ** 2 / angle
+    z = angle * angle
+    p = 1.0 - z / 6 * (1.0 - z / 20 * (1.0 - z / 42 * (1.0 - z / 72 * (1.0 - z / 110))))
+    q = angle / 2 * (1.0 - z / 12 * (1.0 - z / 30 * (1.0 - z / 56 * (1.0 - z / 90 * (1.0 - z / 132)))))
+    return p, q
+
+
+@compiled(inline="always")
+def _wrapped_of_many(angle: float) -> float:
+    return angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
+
+
+@compiled
+def exp_scalars(x: float, y: float, angle: float) -> tuple[float, float, float]:
+    p, q = arc_coefficients(angle)
+    return p * x - q * y, q * x + p * y, wrap_scalar(angle)
+
+
+@compiled
+def log_scalars(x: float, y: float, heading: float) -> tuple[float, float, float]:
+    angle = wrap_scalar(heading)
+    p, q = arc_coefficients(angle)
+    scale = 1.0 / (p * p + q * q)
+    return scale * (p * x + q * y), scale * (p * y - q * x), angle
+
+
+@compiled
+def compose_scalars(
+    x: float, y: float, heading: float, dx: float, dy: float, turned: float
+) -> tuple[float, float, float]:
+    """The pose (dx, dy, turned) in the frame of another one."""
+    c, s = math.cos(heading), math.sin(heading)
+    return x + c * dx - s * dy, y + s * dx + c * dy, wrap_scalar(heading + turned)
+
+
+@compiled
+def between_scalars(
+    x: float, y: float, heading: float, to_x: float, to_y: float, to: float
+) -> tuple[float, float, float]:
+    """The pose (to_x, to_y, to) as seen from another one."""
+    c, s, dx, dy = math.cos(heading), math.sin(heading), to_x - x, to_y - y
+    return c * dx + s * dy, c * dy - s * dx, wrap_scalar(to - heading)
+
+
+@compiled
+def moved(pose: Array, twist: Array) -> Array:
+    """The pose (3,) moved by a twist in its own frame, of which the first three components are read."""
+    x, y, turned = exp_scalars(twist[0], twist[1], twist[2])
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrap_scalar(pose[2] + turned)))
+
+
+@compiled
+def twist_to(pose: Array, other: Array) -> Array:
+    """The twist (3,) in the frame of a pose (3,) that leads from it to another: the inverse of :func:`moved`."""
+    x, y, turned = between_scalars(pose[0], pose[1], pose[2], other[0], other[1], other[2])
+    return np.array(log_scalars(x, y, turned))
+
+
+@compiled
+def compose_one(a: Array, b: Array) -> Array:
+    """:func:`compose` of two poses (3,)."""
+    return np.array(compose_scalars(a[0], a[1], a[2], b[0], b[1], b[2]))
+
+
+@compiled
+def between_one(a: Array, b: Array) -> Array:
+    """:func:`between` of two poses (3,)."""
+    return np.array(between_scalars(a[0], a[1], a[2], b[0], b[1], b[2]))
+
+
+@compiled
+def adjoint_one(pose: Array) -> Array:
+    """:func:`adjoint` of one pose (3,)."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array(((c, -s, pose[1]), (s, c, -pose[0]), (0.0, 0.0, 1.0)))
+
+
+@compiled
+def right_jacobian_one(xi: Array) -> Array:
+    """:func:`right_jacobian` of one twist (3,)."""
+    angle = xi[2]
+    p, q = arc_coefficients(angle)
+    r, s = (angle / 6.0, 0.5 - angle * angle / 24.0) if abs(angle) < SMALL else ((1.0 - p) / angle, q / angle)
+    return np.array(((p, q, r * xi[0] - s * xi[1]), (-q, p, s * xi[0] + r * xi[1]), (0.0, 0.0, 1.0)))
+
+
+@compiled
+def inverse_right_jacobian(xi: Array) -> Array:
+    """The inverse (3, 3) of :func:`right_jacobian_one`."""
+    j = right_jacobian_one(xi)
+    p, q, u, v = j[0, 0], j[0, 1], j[0, 2], j[1, 2]
+    scale = 1.0 / (p * p + q * q)
+    first = scale * p, -scale * q, -scale * (p * u - q * v)
+    return np.array((first, (scale * q, scale * p, -scale * (q * u + p * v)), (0.0, 0.0, 1.0)))
+
+
+@compiled
+def body_to_world_one(pose: Array, covariance: Array) -> Array:
+    """:func:`body_to_world` of one pose (3,), and of the first three components of a covariance (S, S), of which the
+    upper triangle is read: the result is symmetric to the last bit."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    out = np.empty((3, 3))
+    a, b, e = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    p, q, r, t = c * a - s * b, c * b - s * e, s * a + c * b, s * b + c * e
+    out[0, 0], out[1, 1], out[2, 2] = p * c - q * s, r * s + t * c, covariance[2, 2]
+    out[0, 1] = out[1, 0] = p * s + q * c
+    out[0, 2] = out[2, 0] = c * covariance[0, 2] - s * covariance[1, 2]
+    out[1, 2] = out[2, 1] = s * covariance[0, 2] + c * covariance[1, 2]
+    return out
+
+
+@compiled(error_model="numpy", fastmath={"arcp", "contract", "reassoc"})
+def all_moved(poses: Array, delta: Array, twists: Array) -> Array:
+    """Poses (N, 3) composed with ``delta`` (3,), and each then moved by a twist (N, 3) in its own frame."""
+    out, cd, sd = np.empty_like(poses), math.cos(delta[2]), math.sin(delta[2])
+    for n in range(len(poses)):
+        c, s = math.cos(poses[n, 2]), math.sin(poses[n, 2])
+        p, q = _arc_of_many(twists[n, 2])
+        x, y = p * twists[n, 0] - q * twists[n, 1], q * twists[n, 0] + p * twists[n, 1]
+        dx, dy = delta[0] + cd * x - sd * y, delta[1] + sd * x + cd * y
+        out[n, 0], out[n, 1] = poses[n, 0] + c * dx - s * dy, poses[n, 1] + s * dx + c * dy
+        out[n, 2] = _wrapped_of_many(poses[n, 2] + delta[2] + twists[n, 2])
+    return out
+
+
+@compiled(error_model="numpy", fastmath={"arcp", "contract", "reassoc"})
+def twists_to(pose: Array, others: Array) -> Array:
+    """The twists (N, 3) in the frame of a pose (3,) that lead from it to others (N, 3)."""
+    out, c, s = np.empty_like(others), math.cos(pose[2]), math.sin(pose[2])
+    for n in range(len(others)):
+        dx, dy = others[n, 0] - pose[0], others[n, 1] - pose[1]
+        angle = _wrapped_of_many(others[n, 2] - pose[2])
+        p, q = _arc_of_many(angle)
+        x, y, scale = c * dx + s * dy, c * dy - s * dx, 1.0 / (p * p + q * q)
+        out[n, 0], out[n, 1], out[n, 2] = scale * (p * x + q * y), scale * (p * y - q * x), angle
+    return out
+
+
+@compiled(error_model="numpy", fastmath={"reassoc", "contract"})
+def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
+    """Weighted mean (3,), circular in heading, and covariance (3, 3) of poses (N, 3) in the world's frame."""
+    x = y = cosine = sine = 0.0
+    for n in range(len(poses)):
+        x, y = x + weights[n] * poses[n, 0], y + weights[n] * poses[n, 1]
+        cosine, sine = cosine + weights[n] * math.cos(poses[n, 2]), sine + weights[n] * math.sin(poses[n, 2])
+    heading, covariance = math.atan2(sine, cosine), np.zeros((3, 3))
+    xx = xy = xh = yy = yh = hh = 0.0
+    for n in range(len(poses)):
+        dx, dy, dh = poses[n, 0] - x, poses[n, 1] - y, _wrapped_of_many(poses[n, 2] - heading)
+        wx, wy, wh = weights[n] * dx, weights[n] * dy, weights[n] * dh
+        xx, xy, xh = xx + wx * dx, xy + wx * dy, xh + wx * dh
+        yy, yh, hh = yy + wy * dy, yh + wy * dh, hh + wh * dh
+    covariance[0, 0], covariance[1, 1], covariance[2, 2] = xx, yy, hh
+    covariance[0, 1] = covariance[1, 0] = xy
+    covariance[0, 2] = covariance[2, 0] = xh
+    covariance[1, 2] = covariance[2, 1] = yh
+    return np.array((x, y, heading)), covariance

@@ -1,36 +1,22 @@
 """The robust, iterated Kalman update in information form.
 
 Robust, because an outlier must neither dominate nor be rejected by a wrong prediction. Landmarks of a map have a compiled version
-(:mod:`factors.landmarks.update_kernels`), because an EKF updates so often that calls of NumPy would take most of its time.
+(:mod:`factors.landmarks.kernels`), because an EKF updates so often that calls of NumPy would take most of its time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
-from factors import gaussian_kernels, positive
+from factors import gaussian, positive
 from factors.se2 import Array
 
 CONVERGED = 1e-6  # m and rad; convergence limit of an iterated update
 GATE = 9.21  # 99 % of chi-square with two degrees of freedom
 GATES = {1: 6.63, 2: GATE, 3: 11.34}  # by degrees of freedom
-
-
-class SightingFactor(Protocol):
-    """A factor of K sightings with g coordinates each, such as :class:`~factors.landmarks.factor.BearingRangeFactor`."""
-
-    def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (K, g) and its Jacobian (K, g, d) by each value."""
-
-    def weight(self, squared: Array) -> Array:
-        """The robust weight of squared whitened residuals."""
-
-    def dof(self) -> int:
-        """Number of measured coordinates."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +92,7 @@ def _iterated(
     zero = np.zeros(len(covariance))
     residual, blocks = map(np.ascontiguousarray, linearize(zero))  # compiled code is compiled anew for others
     size = blocks.shape[2]
-    squared = gaussian_kernels.normalised(residual, blocks, np.arange(size), np.ascontiguousarray(covariance))
+    squared = gaussian.normalised(residual, blocks, np.arange(size), np.ascontiguousarray(covariance))
     widening = np.maximum(1.0, squared / GATES[blocks.shape[1]])
     delta, updated = first_solve(blocks, residual, np.ones(len(residual)), zero[:size])
     # by the matrix inversion lemma
@@ -131,7 +117,7 @@ def _informed(prior: Array) -> _Solver:
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         information = prior.copy()
-        pull = gaussian_kernels.inform(residual, blocks, np.arange(len(at)), weight, at, information)
+        pull = gaussian.inform(residual, blocks, np.arange(len(at)), weight, at, information)
         updated = np.asarray(np.linalg.inv(information), dtype=float)
         return updated[:, : len(at)] @ pull, updated
 

@@ -14,7 +14,7 @@ from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.model.belief import Mode
 from factorgraph_loc.sensors.base import EarlierPose
-from factors import positive, se2, se2_kernels
+from factors import positive, se2
 from factors.motion import ChainState
 from factors.se2 import Array
 
@@ -65,7 +65,7 @@ class Cloud:
 
     def _errors(self) -> tuple[Array, Array, Array]:
         """Of each particle the pose's body-frame perturbation from the mean pose, and the constants: (N, 3+P), with moments."""
-        errors = np.concatenate((se2_kernels.twists_to(self.moments[0], self.poses), self.constants), axis=1)
+        errors = np.concatenate((se2.twists_to(self.moments[0], self.poses), self.constants), axis=1)
         return errors, *vector_moments(errors, self.weights)
 
     def with_block(self, name: str, mean: Array, covariance: Array, rng: np.random.Generator) -> Cloud:
@@ -117,7 +117,7 @@ class Cloud:
         shrunk = mean + np.sqrt(1.0 - renewed) * (errors[:, :3] - mean[:3]) @ by_pose
         cloud = replace(
             self,
-            poses=se2_kernels.all_moved(np.tile(middle, (len(shrunk), 1)), NOWHERE, shrunk),
+            poses=se2.all_moved(np.tile(middle, (len(shrunk), 1)), NOWHERE, shrunk),
             constants=shrunk[:, 3:],
         )
         kernel = _inflated(explained, lost / renewed) - (1.0 - renewed) * explained
@@ -128,7 +128,7 @@ class Cloud:
         noise = positive.draws(kernel, len(rows), rng)
         return replace(
             self,
-            poses=se2_kernels.all_moved(self.poses[rows], NOWHERE, noise),
+            poses=se2.all_moved(self.poses[rows], NOWHERE, noise),
             constants=self.constants[rows] + noise[:, 3:],
             log_weights=np.full(len(rows), -np.log(len(rows))),
         )
@@ -284,7 +284,7 @@ def silverman(count: int, size: int) -> float:
 
 def pose_moments(poses: Array, weights: Array) -> tuple[Array, Array]:
     """Weighted mean (3,), circular in heading, and covariance (3, 3) of poses (N, 3) in the world's frame."""
-    mean, covariance = se2_kernels.moments(poses, weights)
+    mean, covariance = se2.moments(poses, weights)
     return mean, covariance + np.diag(np.full(3, MINIMUM_VARIANCE))
 
 

@@ -13,7 +13,6 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
-from scipy.linalg.lapack import dpotrf
 
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
@@ -25,7 +24,7 @@ from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import Binding, EarlierPose, Link, NewVariable, bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
-from factors import gaussian_kernels, positive, se2, se2_kernels
+from factors import positive, se2
 from factors.motion import Increment
 from factors.se2 import Array
 
@@ -34,7 +33,6 @@ MOST = 150  # components of the error state from which on positions of the map w
 # A filter begins with a heading of this many times the standard deviation with which it was found: as the same measurements are
 # processed again, a 16th of their information counts twice. Without any heading it would be linearised far from the truth.
 HEADING_WIDENED = 4.0
-SKEW = 1e-7  # of two standard deviations: more asymmetry is not one of a few roundings
 
 
 class EkfSettings(FilterSettings):
@@ -58,7 +56,7 @@ class _State(NamedTuple):
     layout: Layout
 
     def plus(self, delta: Array, covariance: Array) -> _State:
-        return _State(se2_kernels.moved(self.pose, delta), self.rest + delta[POSE:], covariance, self.layout)
+        return _State(se2.moved(self.pose, delta), self.rest + delta[POSE:], covariance, self.layout)
 
     def first(self, size: int) -> _State:
         """The first ``size`` components of the error state: without blocks that came later."""
@@ -84,10 +82,6 @@ class _Step(NamedTuple):
     pose: Array
     transition: Array
     noise: Array
-
-    def covariance(self, before: Array) -> Array:
-        """The covariance (S, S) after the prediction, from that before."""
-        return np.asarray(gaussian_kernels.predicted(before, self.transition, self.noise))
 
 
 class _Record(NamedTuple):
@@ -203,20 +197,8 @@ class Ekf(Filter):
     def _smoothed(self, here: _State, step: _Step, after: _State) -> _State:
         """The state ``here`` given what came later: ``step`` led from it to where ``after`` is the smoothed state."""
         after = after.first(len(here.covariance))
-        change = np.concatenate((se2_kernels.twist_to(step.pose, after.pose), after.rest - here.rest))
-        try:
-            found = gaussian_kernels.smoothed(here.covariance, step.transition, step.noise, change, after.covariance)
-        except np.linalg.LinAlgError:
-            found = None
-        if found is not None and _is_sound(found[1]):
-            return here.plus(*found)
-        # a sum that is as positive as its parts, whatever the gain
-        transition = np.eye(len(change))
-        transition[:3] = step.transition
-        gain = positive.solve(positive.nearest(step.covariance(here.covariance)), transition @ here.covariance).T
-        left, later = np.eye(len(change)) - gain @ transition, after.covariance.copy()
-        later[:3, :3] += step.noise
-        return here.plus(gain @ change, positive.nearest(left @ here.covariance @ left.T + gain @ later @ gain.T))
+        change = np.concatenate((se2.twist_to(step.pose, after.pose), after.rest - here.rest))
+        return here.plus(*positive.smoothed(here.covariance, step.transition, step.noise, change, after.covariance))
 
     def _start(self, prior: PosePrior) -> _State:
         sigmas = np.concatenate([constants.sigmas for _, constants in self._blocks])
@@ -296,9 +278,3 @@ class Ekf(Filter):
     def _standstill(self) -> _Step:
         """The step to a second measurement of the same time."""
         return _Step(self._state.pose, np.eye(3, len(self._state.covariance)), np.zeros((3, 3)))
-
-
-def _is_sound(covariance: Array) -> bool:
-    """Whether rounding left a covariance symmetric and positive."""
-    # LAPACK's own, as this is asked at each step
-    return not gaussian_kernels.is_skew(covariance, SKEW) and bool(dpotrf(covariance, lower=1)[1] == 0)

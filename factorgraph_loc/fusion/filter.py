@@ -20,7 +20,7 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.motion import Motion
-from factors import se2, se2_kernels
+from factors import se2
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
@@ -228,7 +228,7 @@ def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: A
 
 def world_estimate(t: float, pose: Array, covariance: Array, status: Status = "localized") -> PoseEstimate:
     """An estimate from the covariance (S, S) of an error state that begins with the pose's body-frame perturbation."""
-    return PoseEstimate(t, pose, se2_kernels.body_to_world(pose, covariance), status)
+    return PoseEstimate(t, pose, se2.body_to_world_one(pose, covariance), status)
 
 
 def twin(rng: np.random.Generator) -> np.random.Generator:

@@ -47,7 +47,7 @@ from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import Binding, Link, NewVariable, Observation, bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
-from factors import positive, se2, se2_kernels
+from factors import positive, se2
 from factors.motion import Increment
 from factors.se2 import Array
 
@@ -234,7 +234,7 @@ class ParticleFilter(Filter):
         _, pose, _, _, spread = self._motion.predicted(
             cloud.odometry, self._t, cloud.moments[0], covariance, mean[part], POSE + part.start
         )
-        return pose, se2_kernels.body_to_world(pose, spread)
+        return pose, se2.body_to_world_one(pose, spread)
 
     def _moved(self, cloud: Cloud, increment: Increment, noise: Array | None = None) -> tuple[Array, Array]:
         """Poses (N, 3) after the increment, each under its own constants, and with body-frame ``noise`` (N, 3), if any.
@@ -251,7 +251,7 @@ class ParticleFilter(Filter):
             delta, by_constants[:, part] = self._motion.changed(increment, mean)
             changed = (values - mean) @ by_constants[:, part].T
             noise = changed if noise is None else noise + changed
-        poses = se2.compose(cloud.poses, delta) if noise is None else se2_kernels.all_moved(cloud.poses, delta, noise)
+        poses = se2.compose(cloud.poses, delta) if noise is None else se2.all_moved(cloud.poses, delta, noise)
         return poses, np.concatenate((se2.adjoint(se2.inverse(delta)), by_constants), axis=1)
 
     def _see(self, m: Measurement) -> None:

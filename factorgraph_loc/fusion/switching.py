@@ -165,6 +165,6 @@ def _smoothed(record: _PoseBelief, step: Increment, after: tuple[Array, Array]) 
     error = se2.log(se2.between(se2.compose(record.pose, step.delta), after[0]))
     if positive.squared(error, predicted + after[1]) > JUMPED:
         return record.pose, record.covariance
-    gain = positive.solve(predicted, se2.adjoint(se2.inverse(step.delta)) @ record.covariance).T
-    covariance = record.covariance + gain @ (after[1] - predicted) @ gain.T
-    return se2.compose(record.pose, se2.exp(gain @ error)), (covariance + covariance.T) / 2.0
+    moved = se2.adjoint(se2.inverse(step.delta))
+    change, covariance = positive.smoothed(record.covariance, moved, step.covariance, error, after[1])
+    return se2.compose(record.pose, se2.exp(change)), covariance

@@ -20,12 +20,12 @@ from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.registry import functions
-from factors import se2_kernels
+from factors import se2
 from factors.graph import Factor
-from factors.marginal import Marginalized
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
-from factors.update import CONVERGED, Correction, SightingFactor, update_state
+from factors.sighting import Marginalized, SightingFactor
+from factors.update import CONVERGED, Correction, update_state
 
 Blocks = Mapping[str, Array]  # values of blocks by name, or their covariances
 Columns = Mapping[str, slice]  # columns of blocks in an error state
@@ -323,7 +323,7 @@ WORK = 20  # for a residual: its robust loss takes as long as so many tags
 
 @dataclass(frozen=True)
 class ResidualObservation:
-    """An observation made of residual factors (:class:`~factors.update.SightingFactor`) of one sensor.
+    """An observation made of residual factors (:class:`~factors.sighting.SightingFactor`) of one sensor.
 
     Its log-likelihood is evaluated pose by pose; sensors that need speed with particles override it.
     """
@@ -364,7 +364,7 @@ class ResidualObservation:
         size = max((3, *(columns[name].stop for name in self.blocks)))
 
         def linearize(delta: Array) -> tuple[Array, Array]:
-            at = se2_kernels.moved(pose, delta)
+            at = se2.moved(pose, delta)
             parts = []
             for term, factor in zip(self.terms, self.factors, strict=True):
                 moved = [values[name] + delta[columns[name]] for name in term.blocks]

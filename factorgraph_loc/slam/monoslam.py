@@ -113,7 +113,7 @@ class Monoslam(Filter):
         self._check = TurnCheck(turns, self._motion, self.diagnostics, NOTHING)
         self._mounting = np.zeros((6, 6)) if camera is None else of_mounting(camera)
         self._step: Step | None = None
-        self._predicted, self._anew = np.empty((0, 0)), False
+        self._anew = False
         # without a map the start is unobservable: its uncertainty is kept out of the state, where it would shrink as the
         # linearization point moves (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010)
         self._origin: Origin | None = None
@@ -185,7 +185,6 @@ class Monoslam(Filter):
         step = measured(robot, planar(delta, increment.covariance, by_constants), dt)
         self._step = on_the_floor(step, dt, s.height_sigma, *self._state.sway(s.tilt_sigma))
         self._state = self._state.moved(self._step)
-        self._predicted = self._kept(self._state)
 
     def _uses(self, m: Measurement) -> bool:
         return m.modality in self.modalities
@@ -306,13 +305,7 @@ class Monoslam(Filter):
 
     def _record(self) -> UpdateRecord:
         s = self._state
-        step, predicted = self._step or standstill(s.robot), self._predicted
-        if self._step is None:  # a second measurement at the same time
-            predicted = self._records[-1].covariance if self._records else self._kept(s)
-            step = standstill(self._records[-1].robot if self._records else s.robot)
+        # without a step, it is a second measurement at the same time
+        step = self._step or standstill(self._records[-1].robot if self._records else s.robot)
         self._step, anew, self._anew = None, self._anew, False
-        return UpdateRecord(self._t, step, predicted, s.robot, s.constants, self._kept(s), anew)
-
-    def _kept(self, s: SlamState) -> Array:
-        """The covariance (12 + P, 12 + P) of a state without its points."""
-        return s.covariance[: s.base, : s.base].copy()
+        return UpdateRecord(self._t, step, s.robot, s.constants, s.covariance[: s.base, : s.base].copy(), anew)

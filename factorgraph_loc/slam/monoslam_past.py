@@ -15,13 +15,12 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class UpdateRecord:
-    """``step``: from the previous record; ``predicted``, ``covariance`` (12 + P, 12 + P): before and after the update, of ``robot``
-    and ``constants`` (P,). ``anew``: the pose was found by relocalization, independent of the past.
+    """``step``: from the previous record; ``covariance`` (12 + P, 12 + P): of ``robot`` and ``constants`` (P,) after the update.
+    ``anew``: the pose was found by relocalization, independent of the past.
     """
 
     t: float
     step: Step
-    predicted: Array
     robot: RobotState
     constants: Array
     covariance: Array
@@ -38,19 +37,16 @@ def smoothed(records: Sequence[UpdateRecord]) -> list[UpdateRecord]:
 
 def _smoothed(here: UpdateRecord, after: UpdateRecord, later: UpdateRecord) -> UpdateRecord:
     """The record ``here`` given ``later``, which is the smoothed ``after``."""
-    total = len(here.covariance)
-    known = after.step.transition.shape[1]
-    transition = np.eye(total)
-    transition[:ROBOT, :known] = after.step.transition
+    total, known = len(here.covariance), after.step.transition.shape[1]
+    transition = np.zeros((POSE, total))
+    transition[:, :known] = after.step.transition[:POSE]
     kept = np.r_[0:POSE, ROBOT:total]
     block = np.ix_(kept, kept)
-    own, predicted = here.covariance[block], after.predicted[block]
-    gain = positive.solve(predicted, transition[block] @ own).T
     error = np.concatenate((later.robot.minus(after.step.robot), later.constants - here.constants))
-    change = np.zeros(total)
-    change[kept] = gain @ error[kept]
-    own = own + gain @ (later.covariance[block] - predicted) @ gain.T
-    covariance = here.covariance.copy()
-    covariance[block] = 0.5 * (own + own.T)
+    motion = transition[:, kept], after.step.noise[:POSE, :POSE]
+    change, covariance = np.zeros(total), here.covariance.copy()
+    change[kept], covariance[block] = positive.smoothed(
+        here.covariance[block], *motion, error[kept], later.covariance[block]
+    )
     robot, constants = here.robot.plus(change[:ROBOT]), here.constants + change[ROBOT:]
     return replace(here, robot=robot, constants=constants, covariance=covariance, anew=False)

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from factors import positive, small_kernels
+from factors import gaussian, positive
 from factors.camera import kernels as reprojection_kernels
 from factors.camera import model as reprojection
 from factors.camera.kernels import Lens
@@ -142,10 +142,10 @@ def _joint(
             for m in range(6):
                 information[j, m] += xu * jacobian[i, 0, m] + xv * jacobian[i, 1, m]
     # by the matrix inversion lemma, in a form that allows a singular covariance
-    both = small_kernels.product(information, covariance)
+    both = gaussian.product(information, covariance)
     for j in range(6):
         both[j, j] += 1.0
-    drawn = small_kernels.product(covariance, small_kernels.solved(both, pull)[0])
+    drawn = gaussian.product(covariance, gaussian.solved(both, pull)[0])
     for j in range(6):
         total -= pull[j, 0] * drawn[j, 0]
     return total

@@ -6,14 +6,12 @@ Modern Synthesis", 2000).
 
 import numpy as np
 
-from factors.camera.kernels import Lens
-from factors.camera.point_kernels import POINT, WIDTH, see
+from factors.camera.kernels import POINT, WIDTH, Lens, see
 from factors.compiled import compiled
+from factors.gaussian import inverse, product, put, solved
 from factors.odometry.kernels import linearize as between
 from factors.robust import huber_loss
-from factors.se2 import Array, Integers
-from factors.se2_kernels import moved
-from factors.small_kernels import inverse, product, put, solved
+from factors.se2 import Array, Integers, moved
 
 GAIN, DAMPING = 1e-6, 1e-4  # relative decrease of the cost below which it has converged, and what damps the first step
 

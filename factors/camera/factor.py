@@ -10,22 +10,20 @@ import numpy as np
 
 from factors import se2
 from factors.camera import update_kernels as pixel_kernels
+from factors.camera.kernels import CONSTANTS, POINT, TILT, WIDTH
 from factors.camera.model import (
     PARAMETERS,
     TIME_OFFSET,
     CameraModel,
-    by_tilt,
     lens_of,
-    linearize,
     recalibrated,
 )
-from factors.displaced import carried, common_error, delayed, displaced
 from factors.robust import huber_loss, huber_weight
-from factors.se2 import Array
-from factors.se2_kernels import moved
+from factors.se2 import Array, moved
+from factors.sighting import delayed
 from factors.update import CONVERGED, Correction, update_state
 
-TILT = 2  # roll and pitch, which all points of an image have in common
+TILTS = 2  # roll and pitch, which all points of an image have in common
 NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
 
 
@@ -106,32 +104,22 @@ class ReprojectionFactor:
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, 2), predicted minus measured, of a robot that does not tilt, and its Jacobian (K, 2, d) by each
         value and by the tilt, without robust weights."""
-        if self.of_pose_alone:
-            residual, jacobian = pixel_kernels.whitened(self.packed(), np.ascontiguousarray(values[0], dtype=float))
-            return residual, [jacobian[..., :3], jacobian[..., 3:]]
         moved_by, displacements = np.array(self.moved_by, dtype=np.int64), values[1 + bool(self.estimated) :]
         moves = None if not self.moved_by else np.array((*displacements, np.zeros(3)))[moved_by]
         here = self.fixed(values[1 : 1 + bool(self.estimated)], moves)
-        offset = here.offset
-        at = values[0] if offset is None else se2.compose(values[0], offset)
-        pixels, by_pose, by_point, by_parameters = linearize(here.model, at, here.points)
-        scale = 1.0 / self.model.sigma
-        error, by_pose, by_point = scale * (pixels - self.pixels), scale * by_pose, scale * by_point
-        by_parameters = scale * by_parameters
-        blocks, tilts = [by_pose], by_tilt(here.model, by_parameters)
+        pose, width = np.ascontiguousarray(values[0], dtype=float), POINT if self.of_pose_alone else WIDTH
+        residual, jacobian = pixel_kernels.whitened(here.packed(), pose, width)
+        blocks = [jacobian[..., :TILT]]
         if self.estimated:
+            by_parameters = jacobian[..., CONSTANTS:]
             by_parameters[..., 3:6] = by_parameters[..., 3:6] @ _turns(self.estimated, values[1])
             if self.twist is not None:
-                by_parameters[..., TIME_OFFSET] = by_pose @ self.twist
+                twist = self.twist if here.offset is None else se2.adjoint(here.offset) @ self.twist
+                by_parameters[..., TIME_OFFSET] = blocks[0] @ twist
             blocks.append(by_parameters[..., list(self.estimated)])
+        by_point = jacobian[..., POINT:CONSTANTS]
         blocks += [np.where((moved_by == i)[:, None, None], by_point, 0.0) for i in range(len(displacements))]
-        spread = None
-        if self.point_covariances is not None:
-            spread = carried(by_point, self.point_covariances)
-        if self.offset_covariance is not None:
-            common = common_error(by_pose, self.offset_covariance)
-            spread = common if spread is None else spread + common
-        return displaced(error, [*blocks, tilts], offset, spread)
+        return residual, [*blocks, jacobian[..., TILT:POINT]]
 
     def fixed(self, parameters: Sequence[Array], displacement: Array | None) -> ReprojectionFactor:
         """The factor on the pose only, at given constants (one array (P,), or none) and a ``displacement`` (K, 3) of the points."""
@@ -182,7 +170,7 @@ def image_update(
             jacobian[..., :3] = jacobian[..., :3] @ se2.right_jacobian(delta[:3])
         return residual + blocks[-1] @ delta[size:], jacobian
 
-    found = update_state(linearize, covariance, factor.weight, iterations, factor.dof(), converged, TILT)
+    found = update_state(linearize, covariance, factor.weight, iterations, factor.dof(), converged, TILTS)
     if not values:
         return found
     reset = np.eye(size)

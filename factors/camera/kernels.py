@@ -1,16 +1,19 @@
-"""Compiled kernels of :mod:`factors.camera.model`."""
+"""Compiled kernels of :mod:`factors.camera.model` and :mod:`factors.camera.point`."""
 
 import math
 
 import numpy as np
 
 from factors.compiled import compiled
-from factors.robust import huber_loss
+from factors.robust import huber_loss, huber_weight
 from factors.se2 import Array
 
 NEAREST = 0.05  # m in front of the camera
 MOST_STEPS, ENOUGH = 50, 1e-14  # of Newton's method: maximum steps, and norm of the residual at convergence
 BLOCK = 256  # poses whose likelihoods are computed together, so that their data fit into the cache
+BEHIND = 100.0  # residual of a point behind the camera, in standard deviations
+# columns of a Jacobian: by the pose, by roll and pitch, by the point, and by all parameters of the camera
+TILT, POINT, CONSTANTS, WIDTH = 3, 5, 8, 16
 
 # fx, fy, cx, cy, k1, k2, p1, p2, and the reciprocal of the x^2 + y^2 up to which the distortion polynomial is used
 Lens = tuple[float, ...]
@@ -142,35 +145,121 @@ def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array)
 
 
 @compiled(error_model="numpy")
-def linearize(
-    k: Lens, position: Array, rotation: Array, pose: Array, points: Array
-) -> tuple[Array, Array, Array, Array]:
-    """See :func:`factors.camera.model.linearize`."""
-    n, place = len(points), mounting(position, rotation)
-    pixels, by_pose, by_point = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty((n, 2, 3))
-    by_parameters = np.zeros((n, 2, 8))
+def project_planar(
+    camera: tuple[Lens, Array, Array], pose: Array, tilt: Array, turn: Array, point: Array, jacobian: Array
+) -> tuple[float, float, float]:
+    """Pixel and depth of a ``point`` (3,) from a robot at ``pose`` (3,) with a ``tilt`` (2,), the rotation ``turn`` (3, 3); the
+    ``jacobian`` (2, WIDTH) in place."""
+    k, position, rotation = camera
     c, s = math.cos(pose[2]), math.sin(pose[2])
+    dx, dy, z = point[0] - pose[0], point[1] - pose[1], point[2]
+    x, y = c * dx + s * dy, c * dy - s * dx
+    # in the robot's frame, and from the camera along the robot's axes
+    bx = turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z
+    by = turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z
+    bz = turn[0, 2] * x + turn[1, 2] * y + turn[2, 2] * z
+    ax, ay, az = bx - position[0], by - position[1], bz - position[2]
+    depth = rotation[0, 2] * ax + rotation[1, 2] * ay + rotation[2, 2] * az
+    u, v, by_u, by_v = pixel(
+        k,
+        rotation[0, 0] * ax + rotation[1, 0] * ay + rotation[2, 0] * az,
+        rotation[0, 1] * ax + rotation[1, 1] * ay + rotation[2, 1] * az,
+        depth,
+    )
+    for r in range(2):
+        d = by_u if r == 0 else by_v
+        g0 = rotation[0, 0] * d[0] + rotation[0, 1] * d[1] + rotation[0, 2] * d[2]
+        g1 = rotation[1, 0] * d[0] + rotation[1, 1] * d[1] + rotation[1, 2] * d[2]
+        g2 = rotation[2, 0] * d[0] + rotation[2, 1] * d[1] + rotation[2, 2] * d[2]
+        e0 = turn[0, 0] * g0 + turn[0, 1] * g1 + turn[0, 2] * g2
+        e1 = turn[1, 0] * g0 + turn[1, 1] * g1 + turn[1, 2] * g2
+        e2 = turn[2, 0] * g0 + turn[2, 1] * g1 + turn[2, 2] * g2
+        jacobian[r, 0], jacobian[r, 1], jacobian[r, 2] = -e0, -e1, e0 * y - e1 * x
+        # a change of the tilt turns the robot about other axes than its own by half of the tilt
+        about = 0.5 * (g0 * by - g1 * bx)
+        jacobian[r, TILT] = g1 * bz - g2 * by + about * tilt[1]
+        jacobian[r, TILT + 1] = g2 * bx - g0 * bz - about * tilt[0]
+        jacobian[r, POINT], jacobian[r, POINT + 1], jacobian[r, POINT + 2] = c * e0 - s * e1, s * e0 + c * e1, e2
+        jacobian[r, CONSTANTS], jacobian[r, CONSTANTS + 1], jacobian[r, CONSTANTS + 2] = -g0, -g1, -g2
+        jacobian[r, CONSTANTS + 3] = g1 * az - g2 * ay
+        jacobian[r, CONSTANTS + 4] = g2 * ax - g0 * az
+        jacobian[r, CONSTANTS + 5] = g0 * ay - g1 * ax
+        jacobian[r, CONSTANTS + 6] = u - k[2] if r == 0 else v - k[3]  # a longer focal length
+        jacobian[r, CONSTANTS + 7] = 0.0
+    return u, v, depth
+
+
+@compiled(error_model="numpy")
+def linearize(camera: tuple[Lens, Array, Array], pose: Array, points: Array) -> tuple[Array, Array]:
+    """Pixels (K, 2) of ``points`` (K, 3) and their Jacobian (K, 2, WIDTH), for a robot that does not tilt."""
+    pixels, jacobian = np.empty((len(points), 2)), np.empty((len(points), 2, WIDTH))
+    level, upright = np.zeros(2), np.eye(3)
+    for i in range(len(points)):
+        pixels[i, 0], pixels[i, 1], _ = project_planar(camera, pose, level, upright, points[i], jacobian[i])
+    return pixels, jacobian
+
+
+@compiled(error_model="numpy")
+def turned(roll: float, pitch: float) -> Array:
+    """The rotation (3, 3) of a robot with this tilt."""
+    angle = math.sqrt(roll * roll + pitch * pitch)
+    a, b = (math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)) if angle > 1e-6 else (1.0, 0.5)
+    turn = np.empty((3, 3))
+    turn[0, 0], turn[1, 1], turn[2, 2] = 1.0 - b * pitch * pitch, 1.0 - b * roll * roll, 1.0 - b * angle * angle
+    turn[0, 1] = turn[1, 0] = b * roll * pitch
+    turn[0, 2], turn[2, 0], turn[1, 2], turn[2, 1] = a * pitch, -a * pitch, -a * roll, a * roll
+    return turn
+
+
+@compiled(error_model="numpy")
+def seen(
+    k: Lens,
+    position: Array,
+    rotation: Array,
+    poses: Array,
+    tilts: Array,
+    points: Array,
+    measured: Array,
+    sigma: float,
+    robust: float,
+) -> tuple[Array, Array, Array]:
+    """Of N points (N, 3), each seen from a pose (N, 3) by a robot with a tilt (N, 2): whitened, robustly weighted residuals (N, 2),
+    their Jacobian (N, 2, WIDTH), and the squared residuals (N,) without weight.
+
+    ``measured`` (N, 2): pixels. ``sigma``: standard deviation of each of their coordinates.
+    """
+    n = len(measured)
+    residual, jacobian, squared = np.empty((n, 2)), np.empty((n, 2, WIDTH)), np.zeros(n)
     for i in range(n):
-        (ax, ay, az), (lx, ly, lz) = in_camera(
-            place, c, s, points[i, 0] - pose[0], points[i, 1] - pose[1], points[i, 2]
-        )
-        rx, ry = ax + position[0], ay + position[1]  # from the robot
-        u, v, by_u, by_v = pixel(k, lx, ly, lz)
-        pixels[i, 0], pixels[i, 1] = u, v
-        for r in range(2):
-            d = by_u if r == 0 else by_v
-            b0 = d[0] * rotation[0, 0] + d[1] * rotation[0, 1] + d[2] * rotation[0, 2]
-            b1 = d[0] * rotation[1, 0] + d[1] * rotation[1, 1] + d[2] * rotation[1, 2]
-            b2 = d[0] * rotation[2, 0] + d[1] * rotation[2, 1] + d[2] * rotation[2, 2]
-            by_pose[i, r, 0], by_pose[i, r, 1], by_pose[i, r, 2] = -b0, -b1, b0 * ry - b1 * rx
-            by_point[i, r, 0], by_point[i, r, 1], by_point[i, r, 2] = c * b0 - s * b1, s * b0 + c * b1, b2
-            by_parameters[i, r, 0], by_parameters[i, r, 1], by_parameters[i, r, 2] = -b0, -b1, -b2
-            by_parameters[i, r, 3] = b1 * az - b2 * ay
-            by_parameters[i, r, 4] = b2 * ax - b0 * az
-            by_parameters[i, r, 5] = b0 * ay - b1 * ax
-        by_parameters[i, 0, 6] = u - k[2]
-        by_parameters[i, 1, 6] = v - k[3]
-    return pixels, by_pose, by_point, by_parameters
+        at = poses[i], tilts[i], points[i], measured[i]
+        squared[i] = see((k, position, rotation), at, sigma, robust, residual[i], jacobian[i])
+    return residual, jacobian, squared
+
+
+@compiled(error_model="numpy")
+def see(
+    camera: tuple[Lens, Array, Array],
+    at: tuple[Array, Array, Array, Array],
+    sigma: float,
+    robust: float,
+    residual: Array,
+    jacobian: Array,
+) -> float:
+    """One of :func:`seen`: the squared residual; ``residual`` and ``jacobian`` in place. ``at``: pose, tilt, point and pixel."""
+    pose, tilt, point, measured = at
+    u, v, depth = project_planar(camera, pose, tilt, turned(tilt[0], tilt[1]), point, jacobian)
+    residual[0], residual[1] = (u - measured[0]) / sigma, (v - measured[1]) / sigma
+    squared: float = residual[0] * residual[0] + residual[1] * residual[1]
+    scale = math.sqrt(huber_weight(squared, robust)) / sigma
+    if depth < NEAREST:
+        squared, scale = 2.0 * BEHIND * BEHIND, 0.0
+        residual[0] = residual[1] = BEHIND
+    weight = math.sqrt(huber_weight(squared, robust))
+    for r in range(2):
+        residual[r] *= weight
+        for j in range(WIDTH):
+            jacobian[r, j] *= scale
+    return squared
 
 
 @compiled(error_model="numpy")

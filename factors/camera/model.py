@@ -20,7 +20,7 @@ import numpy as np
 
 from factors import positive, se2
 from factors.camera import kernels as reprojection_kernels
-from factors.camera.kernels import Lens
+from factors.camera.kernels import CONSTANTS, POINT, TILT, Lens
 from factors.se2 import Array
 
 # the constants of a camera that can be estimated: position [m] and small rotations [rad] about the robot's axes, logarithm of the
@@ -183,10 +183,9 @@ def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Ar
     """Pixels (K, 2) of ``points`` (K, 3) from the planar ``pose`` (3,), and their Jacobians: by the pose's body-frame perturbation
     (K, 2, 3), by the points (K, 2, 3), and by corrections of :data:`PARAMETERS` (K, 2, 8); that by the time offset is zero, as it
     needs the robot's velocity."""
-    found: tuple[Array, Array, Array, Array] = reprojection_kernels.linearize(
-        lens_of(model), model.position, model.rotation, pose, np.ascontiguousarray(points, dtype=float)
-    )
-    return found
+    camera = lens_of(model), model.position, model.rotation
+    pixels, jacobian = reprojection_kernels.linearize(camera, pose, np.ascontiguousarray(points, dtype=float))
+    return pixels, jacobian[..., :TILT], jacobian[..., POINT:CONSTANTS], jacobian[..., CONSTANTS:]
 
 
 def by_tilt(model: CameraModel, by_parameters: Array) -> Array:

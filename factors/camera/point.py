@@ -10,10 +10,9 @@ import gtsam
 import numpy as np
 
 from factors import se2
-from factors.camera import point_kernels as kernels
-from factors.camera.kernels import Lens
+from factors.camera import kernels
+from factors.camera.kernels import BEHIND, CONSTANTS, POINT, TILT, Lens
 from factors.camera.model import PARAMETERS, TIME_OFFSET, CameraModel, lens_of, recalibrated
-from factors.camera.point_kernels import BEHIND, CONSTANTS, POINT, TILT
 from factors.robust import huber_loss
 from factors.se2 import Array
 

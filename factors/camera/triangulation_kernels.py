@@ -6,8 +6,8 @@ import numpy as np
 
 from factors.camera.kernels import Lens, pixel
 from factors.compiled import compiled
+from factors.gaussian import inverse, product, product_by_transpose, solved
 from factors.se2 import Array
-from factors.small_kernels import inverse, product, product_by_transpose, solved
 
 MIN_PARALLAX = 0.03  # rad, between the outermost rays
 NEAREST = 0.3  # m of depth

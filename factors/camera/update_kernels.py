@@ -5,15 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factors.camera.kernels import Lens, in_camera, mounting, pixel
+from factors.camera.kernels import POINT, TILT, WIDTH, Lens, project_planar
 from factors.compiled import compiled
-from factors.gaussian_kernels import corrected
+from factors.gaussian import corrected, inverse, put
 from factors.robust import huber_weight
-from factors.se2 import Array
-from factors.small_kernels import inverse, put
+from factors.se2 import Array, between_one, compose_one
 
 Row = tuple[float, float, float]
-WIDTH = 5  # of a Jacobian by a pose, and by roll and pitch of the robot in standard deviations
 REWEIGHTED, STILL = 50, 1e-5  # most rounds to find a tilt, and standard deviations that the last may change it
 
 
@@ -39,12 +37,58 @@ class Seen(NamedTuple):
 
 
 @compiled(error_model="numpy")
-def whitened(seen: Seen, pose: Array) -> tuple[Array, Array]:
-    """See :meth:`~factors.camera.factor.ReprojectionFactor.whitened`: residual (K, 2), and its Jacobian (K, 2, 5) by pose and
-    tilt."""
-    residual, jacobian = np.empty((len(seen.points), 2)), np.empty((len(seen.points), 2, WIDTH))
-    _whiten(seen, pose[0], pose[1], pose[2], residual, jacobian)
+def whitened(seen: Seen, pose: Array, width: int = POINT) -> tuple[Array, Array]:
+    """See :meth:`~factors.camera.factor.ReprojectionFactor.whitened`: residual (K, 2), and the first ``width`` columns of its
+    Jacobian (K, 2, WIDTH) by the pose (3), by the tilt (2) in standard deviations, by the point (3) and by the camera's constants
+    (8), without a time offset."""
+    count, row = len(seen.points), np.empty((2, WIDTH))
+    residual, jacobian = np.empty((count, 2)), np.empty((count, 2, width))
+    camera, scale = (seen.lens, seen.position, seen.rotation), 1.0 / seen.sigma
+    at, level, upright = compose_one(pose, seen.offset), np.zeros(2), np.eye(3)
+    # of the variable's pose, seen from the pose of the image
+    back = between_one(seen.offset, np.zeros(3))
+    co, so = math.cos(seen.offset[2]), math.sin(seen.offset[2])
+    exact, common = len(seen.point_covariances) == 0, np.trace(seen.offset_covariance) > 0.0
+    for k in range(count):
+        u, v, _ = project_planar(camera, at, level, upright, seen.points[k], row)
+        eu, ev = scale * (u - seen.pixels[k, 0]), scale * (v - seen.pixels[k, 1])
+        for r in range(2):
+            for j in range(WIDTH):
+                row[r, j] *= seen.tilt * scale if TILT <= j < POINT else scale
+        if common or not exact:
+            uu, uv, vv = 1.0, 0.0, 1.0
+            if not exact:
+                uu, uv, vv = _widened(seen.point_covariances[k], row, POINT, 1.0, uu, uv, vv)
+            if common:  # this error is common to all points, so it must not average out
+                uu, uv, vv = _widened(seen.offset_covariance, row, 0, float(count), uu, uv, vv)
+            # by the inverse of the lower root (a, 0; b, d)
+            a = math.sqrt(uu)
+            b = uv / a
+            d = math.sqrt(vv - b * b)
+            eu = eu / a
+            ev = (ev - b * eu) / d
+            for j in range(WIDTH):
+                row[0, j] /= a
+                row[1, j] = (row[1, j] - b * row[0, j]) / d
+        residual[k, 0], residual[k, 1] = eu, ev
+        for r in range(2):
+            gx, gy = row[r, 0], row[r, 1]
+            row[r, 0], row[r, 1] = co * gx - so * gy, so * gx + co * gy
+            row[r, 2] += gx * back[1] - gy * back[0]
+            for j in range(width):
+                jacobian[k, r, j] = row[r, j]
     return residual, jacobian
+
+
+@compiled(inline="always")
+def _widened(
+    covariance: Array, row: Array, first: int, count: float, uu: float, uv: float, vv: float
+) -> tuple[float, float, float]:
+    """The covariance (uu, uv, vv) of a pixel, plus ``count`` times that of three variables, whose columns begin at ``first``."""
+    p = row[0, first], row[0, first + 1], row[0, first + 2]
+    q = row[1, first], row[1, first + 1], row[1, first + 2]
+    uu, uv = uu + count * _product(covariance, p, p), uv + count * _product(covariance, p, q)
+    return uu, uv, vv + count * _product(covariance, q, q)
 
 
 @compiled(error_model="numpy")
@@ -123,10 +167,10 @@ def leaning(seen: Seen, pose: Array, covariance: Array) -> tuple[Array, Array]:
     """Roll and pitch (2,) [rad] of a robot at a ``pose`` (3,) with this ``covariance`` (3, 3), as least squares find them in an
     image, and their covariance (2, 2)."""
     residual, jacobian = whitened(seen, pose)
-    prior = np.eye(WIDTH)
+    prior = np.eye(POINT)
     put(inverse(covariance), prior)
-    known = np.arange(WIDTH), np.ones(len(residual)), np.zeros(WIDTH)
-    _, delta, after, _ = corrected(prior, residual, jacobian, *known)
+    known = np.arange(POINT), np.ones(len(residual)), np.zeros(POINT)
+    delta, after, _ = corrected(prior, residual, jacobian, *known)
     return seen.tilt * delta[3:], seen.tilt**2 * after[3:, 3:]
 
 
@@ -136,7 +180,7 @@ def placed(position: Array, rotation: Array, tilt: float, pose: Array, covarianc
     (3,), and the covariance (6, 6) of its perturbation in its own frame, rotation first, from ``covariance`` (3, 3) of the pose
     and the standard deviation ``tilt`` [rad] of roll and pitch."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    where, turned, lift, carried = np.empty(3), np.empty((3, 3)), np.zeros((6, WIDTH)), np.empty((6, 6))
+    where, turned, lift, carried = np.empty(3), np.empty((3, 3)), np.zeros((6, POINT)), np.empty((6, 6))
     x, y, z = position[0], position[1], position[2]
     where[0], where[1], where[2] = pose[0] + c * x - s * y, pose[1] + s * x + c * y, z
     for i in range(3):
@@ -173,76 +217,3 @@ def _product(matrix: Array, p: Row, q: Row) -> float:
     y = matrix[1, 0] * q[0] + matrix[1, 1] * q[1] + matrix[1, 2] * q[2]
     z = matrix[2, 0] * q[0] + matrix[2, 1] * q[1] + matrix[2, 2] * q[2]
     return float(p[0] * x + p[1] * y + p[2] * z)
-
-
-@compiled(error_model="numpy")
-def _whiten(seen: Seen, x: float, y: float, heading: float, residual: Array, jacobian: Array) -> None:
-    """Whitened residuals (K, 2), predicted minus measured, and their Jacobians (K, 2, 5) by the pose (x, y, heading) and the tilt,
-    about the robot's axes on the floor, in place."""
-    place, scale, n = mounting(seen.position, seen.rotation), 1.0 / seen.sigma, len(seen.points)
-    c, s = math.cos(heading), math.sin(heading)
-    dx, dy, turned = seen.offset[0], seen.offset[1], seen.offset[2]
-    x, y = x + c * dx - s * dy, y + s * dx + c * dy
-    c, s = math.cos(heading + turned), math.sin(heading + turned)
-    # of the variable's pose, seen from the pose of the image
-    co, so = math.cos(turned), math.sin(turned)
-    back_x, back_y = -co * dx - so * dy, so * dx - co * dy
-    exact = len(seen.point_covariances) == 0
-    common = np.trace(seen.offset_covariance) > 0.0
-    for k in range(n):
-        away, local = in_camera(place, c, s, seen.points[k, 0] - x, seen.points[k, 1] - y, seen.points[k, 2])
-        rx, ry = away[0] + seen.position[0], away[1] + seen.position[1]  # from the robot
-        u, v, by_u, by_v = pixel(seen.lens, local[0], local[1], local[2])
-        p, q = _along(seen.rotation, by_u, scale), _along(seen.rotation, by_v, scale)
-        by_p, by_q = (-p[0], -p[1], p[0] * ry - p[1] * rx), (-q[0], -q[1], q[0] * ry - q[1] * rx)
-        rz = seen.tilt * seen.points[k, 2]
-        tx, ty = seen.tilt * rx, seen.tilt * ry
-        tilt_p = p[1] * rz - p[2] * ty, p[2] * tx - p[0] * rz
-        tilt_q = q[1] * rz - q[2] * ty, q[2] * tx - q[0] * rz
-        eu, ev = scale * (u - seen.pixels[k, 0]), scale * (v - seen.pixels[k, 1])
-        if common or not exact:
-            uu, uv, vv = 1.0, 0.0, 1.0
-            if not exact:
-                of = seen.point_covariances[k]
-                in_u, in_v = (
-                    (c * p[0] - s * p[1], s * p[0] + c * p[1], p[2]),
-                    (
-                        c * q[0] - s * q[1],
-                        s * q[0] + c * q[1],
-                        q[2],
-                    ),
-                )
-                uu, uv, vv = uu + _product(of, in_u, in_u), uv + _product(of, in_v, in_u), vv + _product(of, in_v, in_v)
-            if common:
-                # this error is common to all points, so it must not average out
-                of = seen.offset_covariance
-                uu += n * _product(of, by_p, by_p)
-                uv += n * _product(of, by_q, by_p)
-                vv += n * _product(of, by_q, by_q)
-            # by the inverse of the lower root (a, 0; b, d)
-            a = math.sqrt(uu)
-            b = uv / a
-            d = math.sqrt(vv - b * b)
-            eu = eu / a
-            ev = (ev - b * eu) / d
-            by_p = (by_p[0] / a, by_p[1] / a, by_p[2] / a)
-            by_q = ((by_q[0] - b * by_p[0]) / d, (by_q[1] - b * by_p[1]) / d, (by_q[2] - b * by_p[2]) / d)
-            tilt_p = tilt_p[0] / a, tilt_p[1] / a
-            tilt_q = (tilt_q[0] - b * tilt_p[0]) / d, (tilt_q[1] - b * tilt_p[1]) / d
-        residual[k, 0], residual[k, 1] = eu, ev
-        for r in range(2):
-            g, t = (by_p, tilt_p) if r == 0 else (by_q, tilt_q)
-            jacobian[k, r, 3], jacobian[k, r, 4] = t
-            jacobian[k, r, 0], jacobian[k, r, 1] = co * g[0] - so * g[1], so * g[0] + co * g[1]
-            jacobian[k, r, 2] = g[0] * back_y - g[1] * back_x + g[2]
-
-
-@compiled(inline="always")
-def _along(rotation: Array, by_local: Row, scale: float) -> Row:
-    """Gradient of a pixel coordinate by a point in the robot's axes."""
-    a, b, c = scale * by_local[0], scale * by_local[1], scale * by_local[2]
-    return (
-        a * rotation[0, 0] + b * rotation[0, 1] + c * rotation[0, 2],
-        a * rotation[1, 0] + b * rotation[1, 1] + c * rotation[1, 2],
-        a * rotation[2, 0] + b * rotation[2, 1] + c * rotation[2, 2],
-    )

@@ -1,3 +1,3 @@
 """Ranges and bearings of landmarks: model and factor."""
 
-__all__ = ["factor", "model", "update_kernels"]
+__all__ = ["factor", "kernels", "model"]

@@ -9,22 +9,24 @@ from functools import lru_cache
 import numpy as np
 
 from factors import se2
-from factors.displaced import carried, common_error, delayed, displaced
-from factors.landmarks import kernels, update_kernels
+from factors.landmarks import kernels
 from factors.landmarks.model import (
+    CONSTANTS,
     EXACT,
     PARAMETERS,
+    POINT,
     TIME_OFFSET,
+    WIDTH,
     BearingRangeModel,
     located,
     log_likelihood,
     packed,
     recalibrated,
-    whitened_all,
     widened,
 )
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array, Integers
+from factors.sighting import delayed
 from factors.update import CONVERGED, GATE, Correction
 
 NOTHING = np.zeros(0)  # values of constants, where none are estimated
@@ -61,7 +63,7 @@ class BearingRangeFactor:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
         if not self.free:
             held = values[1] if self.estimated else NOTHING
-            found = update_kernels.weighted(packed(self.model), self.look, values[0], held, self.places)
+            found = kernels.weighted(packed(self.model), self.look, values[0], held, self.places)
             residual, by_pose, by_sensor = found
             return residual, [by_pose, by_sensor] if self.estimated else [by_pose]
         error, blocks = self.whitened(values)
@@ -78,25 +80,11 @@ class BearingRangeFactor:
         """Looks of this kind as one: see :class:`~factors.graph.Stackable`."""
         return BearingRangeStack(factors, numbers, column)
 
-    def _compiled(self, values: Sequence[Array]) -> tuple[Array, Array, Array]:
-        """Whitened residual (K, 2) of a factor without a free landmark, and its Jacobians by the pose (K, 2, 3) and by
-        :data:`PARAMETERS` (K, 2, 6)."""
-        changes, count = np.zeros(len(PARAMETERS)), len(self.points)
-        if self.estimated:
-            changes[list(self.estimated)] = values[1]
-        found = np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros((count, 2, len(PARAMETERS)))
-        kernels.linearize(packed(self.model), values[0], changes, self.look, *found)
-        return found
-
     def count_beyond(self, limit: float, pose: Array, covariance: Array) -> int:
         """How many of the landmarks of a factor on the pose only have a normalised innovation squared above ``limit`` at the
         predicted ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
         spread = np.ascontiguousarray(covariance)
         return int(kernels.beyond(packed(self.model), pose, self.look, spread, limit))
-
-    def _of_values(self, error: Array, by_pose: Array, by_sensor: Array) -> list[Array]:
-        """The residual, and the Jacobians by the values of the factor."""
-        return [error, by_pose, by_sensor[..., list(self.estimated)]] if self.estimated else [error, by_pose]
 
     @property
     def look(self) -> kernels.Look:
@@ -106,7 +94,7 @@ class BearingRangeFactor:
             *(self.points, self.ranges, self.bearings),
             *(offset is not None, _NOWHERE if offset is None else offset),
             *(spread is not None, _EXACTLY if spread is None else spread),
-            float(len(self.points) if self.in_look is None else self.in_look),
+            float(len(self.ranges) if self.in_look is None else self.in_look),
             *(twist is not None, _NOWHERE if twist is None else twist),
             EXACT if spreads is None else np.ascontiguousarray(spreads),
         )
@@ -137,27 +125,19 @@ class BearingRangeFactor:
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
-        if not self.free:
-            error, *blocks = self._of_values(*self._compiled(values))
-            return error, blocks
-        here = self.fixed(values[1 : 1 + bool(self.estimated)], values[-1])
-        offset = here.offset
-        at = values[0] if offset is None else se2.compose(values[0], offset)
-        arguments = (here.model, at, here.points, self.ranges, self.bearings)
-        error, by_pose, by_point, by_sensor = whitened_all(*arguments)
-        blocks = [by_pose]
+        look, changes, count = self.look, np.zeros(len(PARAMETERS)), len(self.ranges)
         if self.estimated:
-            if self.twist is not None:
-                by_sensor[..., TIME_OFFSET] = by_pose @ self.twist
-            blocks.append(by_sensor[..., list(self.estimated)])
-        blocks.append(by_point)
-        spread = None
-        if self.point_covariances is not None:
-            spread = carried(by_point, self.point_covariances)
-        if self.offset_covariance is not None:
-            common = common_error(by_pose, self.offset_covariance, self.in_look)
-            spread = common if spread is None else spread + common
-        return displaced(error, blocks, offset, spread)
+            changes[list(self.estimated)] = values[1]
+        if self.free:
+            look = (np.reshape(values[-1], (1, 2)), *look[1:])
+        error, jacobian = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
+        kernels.linearize(packed(self.model), values[0], changes, look, error, jacobian)
+        blocks = [jacobian[..., :POINT]]
+        if self.estimated:
+            blocks.append(jacobian[..., CONSTANTS:][..., list(self.estimated)])
+        if self.free:
+            blocks.append(jacobian[..., POINT:CONSTANTS])
+        return error, blocks
 
     def fixed(self, parameters: Sequence[Array], point: Array | None) -> BearingRangeFactor:
         """The factor on the pose only, at given constants (one array (P,), or none) and position (2,) of a free landmark."""
@@ -187,7 +167,7 @@ class BearingRangeFactor:
         point = se2.transform_from(at, located(here.model, self.ranges, self.bearings))[0]
         _, blocks = replace(self, free=True).whitened([*values, point])
         # the whitened residual stays zero: by_value dv + by_point dp = noise
-        to_point = _inverse(blocks[-1][0])
+        to_point = _raised_inverse(blocks[-1][0])
         return point, [-to_point @ block[0] for block in blocks[:-1]], to_point @ to_point.T
 
 
@@ -206,8 +186,10 @@ def landmark_update(
         return None
     before = np.ascontiguousarray(covariance)  # for each other order in memory it would be compiled anew
     known = packed(factor.model), factor.look, pose, before, constants, factor.places, first
-    there, delta, after, residual, nis, dof = update_kernels.updated(*known, iterations, converged, GATE)
-    return Correction(delta, after, residual, nis, dof) if there else None
+    try:
+        return Correction(*kernels.updated(*known, iterations, converged, GATE))
+    except np.linalg.LinAlgError:
+        return None
 
 
 class BearingRangeStack:
@@ -242,21 +224,22 @@ class BearingRangeStack:
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
         """Fill ``residual`` (2 K,) and ``jacobian`` (2 K, 6 + P), see :mod:`factors.chain`, weighted."""
-        error, by_pose, by_sensor = self._whitened(poses, parameters)
-        kernels.weigh(error, by_pose, by_sensor, self._robust)
-        residual[:], jacobian[:, :3] = error.ravel(), by_pose.reshape(-1, 3)
+        error, by_all = self._whitened(poses, parameters)
+        kernels.weigh(error, by_all, self._robust)
+        by_all = by_all.reshape(len(residual), WIDTH)
+        residual[:], jacobian[:, :3] = error.ravel(), by_all[:, :POINT]
         end = self._column + len(self._estimated)
-        jacobian[:, 6 + self._column : 6 + end] = by_sensor.reshape(len(residual), -1)[:, self._estimated]
+        jacobian[:, 6 + self._column : 6 + end] = by_all[:, CONSTANTS:][:, self._estimated]
 
     def cost(self, poses: Array, parameters: Array) -> float:
         """The robust loss of all."""
-        error, _, _ = self._whitened(poses, parameters)
+        error, _ = self._whitened(poses, parameters)
         return float(np.sum(geman_mcclure_loss(np.einsum("ki,ki->k", error, error), self._robust)))
 
-    def _whitened(self, poses: Array, parameters: Array) -> tuple[Array, Array, Array]:
+    def _whitened(self, poses: Array, parameters: Array) -> tuple[Array, Array]:
         changes, count = np.zeros(len(PARAMETERS)), self.rows // 2
         changes[self._estimated] = parameters[self._column : self._column + len(self._estimated)]
-        found = np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros((count, 2, len(PARAMETERS)))
+        found = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
         looks = self._flags, self._offsets, self._covariances, self._counts, self._twists, self._spreads
         kernels.linearize_all(self._model, poses, self._pose_of, changes, self._ends, self._seen, *looks, *found)
         return found
@@ -267,7 +250,7 @@ def _places(estimated: tuple[int, ...]) -> Integers:
     return np.array(estimated, dtype=np.int64)
 
 
-def _inverse(by_point: Array) -> Array:
+def _raised_inverse(by_point: Array) -> Array:
     """The inverse of a whitened Jacobian (2, 2) by a landmark; singular values below the minimum are raised, as for a landmark at
     the sensor."""
     rows, values, columns = np.linalg.svd(by_point)

@@ -1,14 +1,29 @@
-"""The compiled linearisation of looks at landmarks: graphs ask for it at every update, and for all looks of a run at its end."""
+"""Compiled linearisation of looks at landmarks, for graphs, and the Kalman update by them: that of
+:func:`factors.update.update_state`, by information. A filter makes a dozen small matrices of each look, for which NumPy is slow.
+"""
 
 import math
 
 import numpy as np
 
 from factors.compiled import compiled
-from factors.landmarks.model import BEARING_SIGMA, DEPTH, RANGE_SIGMA, RELATIVE, TIME_OFFSET, TURN, whitened_into
+from factors.gaussian import cholesky, corrected, invert_covariance, normalised
+from factors.landmarks.model import (
+    BEARING_SIGMA,
+    CONSTANTS,
+    DEPTH,
+    PARAMETERS,
+    POINT,
+    RANGE_SIGMA,
+    RELATIVE,
+    ROBUST,
+    TIME_OFFSET,
+    TURN,
+    WIDTH,
+    whitened_into,
+)
 from factors.robust import geman_mcclure_weight
-from factors.se2 import Array, Integers
-from factors.se2_kernels import exp, wrapped
+from factors.se2 import Array, Integers, compose_scalars, exp_scalars, moved
 
 # points (K, 2), ranges (K,), bearings (K,); of the motion since the pose, each with whether there is one: the offset (3,), its
 # covariance (3, 3) with the number of landmarks that have it in common, the velocity (3,); and spreads of the points (K, 2, 2), or
@@ -17,24 +32,18 @@ Look = tuple[Array, Array, Array, bool, Array, bool, Array, float, bool, Array, 
 
 
 @compiled
-def linearize(
-    model: Array, pose: Array, changes: Array, look: Look, error: Array, by_pose: Array, by_sensor: Array
-) -> None:
+def linearize(model: Array, pose: Array, changes: Array, look: Look, error: Array, jacobian: Array) -> None:
     """What :meth:`factors.landmarks.factor.BearingRangeFactor.whitened` returns of one look, with ``changes`` (6,) of the
-    constants: whitened ``error`` (K, 2), ``by_pose`` (K, 2, 3), ``by_sensor`` (K, 2, 6), which hold zeros. ``model``: of
+    constants: the whitened ``error`` (K, 2) and its ``jacobian`` (K, 2, WIDTH), which hold zeros. ``model``: of
     :func:`~factors.landmarks.model.packed`."""
     points, ranges, bearings, displaced, offset, widened, covariance, count, moves, twist, spreads = look
     x, y, turned = offset[0], offset[1], offset[2]
     if moves and changes[TIME_OFFSET] != 0.0:
         later = changes[TIME_OFFSET]
-        a, b, turn = exp(twist[0] * later, twist[1] * later, twist[2] * later)
-        c, s = math.cos(turned), math.sin(turned)
-        x, y, turned, displaced = x + c * a - s * b, y + s * a + c * b, wrapped(turned + turn), True
-    at = pose
-    if displaced:
-        c, s = math.cos(pose[2]), math.sin(pose[2])
-        at = np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrapped(pose[2] + turned)))
-    by_point = np.zeros((len(points), 2, 2))
+        a, b, turn = exp_scalars(twist[0] * later, twist[1] * later, twist[2] * later)
+        x, y, turned = compose_scalars(x, y, turned, a, b, turn)
+        displaced = True
+    at = np.array(compose_scalars(pose[0], pose[1], pose[2], x, y, turned)) if displaced else pose
     mounted = model[0] + changes[0], model[1] + changes[1], model[TURN]
     noise = model[RANGE_SIGMA], model[RELATIVE], model[2] + changes[2], model[BEARING_SIGMA]
     whitened_into(
@@ -47,34 +56,34 @@ def linearize(
         ranges,
         bearings,
         error,
-        by_pose,
-        by_point,
-        by_sensor,
+        jacobian,
     )
     c, s = math.cos(turned), math.sin(turned)
     lever_x, lever_y = s * x - c * y, c * x + s * y
     for k in range(len(points)):
         if moves:
             for i in range(2):
-                by_sensor[k, i, TIME_OFFSET] = (
-                    by_pose[k, i, 0] * twist[0] + by_pose[k, i, 1] * twist[1] + by_pose[k, i, 2] * twist[2]
-                )
+                row = jacobian[k, i]
+                row[CONSTANTS + TIME_OFFSET] = row[0] * twist[0] + row[1] * twist[1] + row[2] * twist[2]
         if widened or len(spreads):
             uu, uv, vv = 1.0, 0.0, 1.0
             if len(spreads):
-                a, b, d = _carried(by_point[k], spreads[k])
+                a, b, d = _carried(jacobian[k, :, POINT:CONSTANTS], spreads[k])
                 uu, uv, vv = uu + a, uv + b, vv + d
             if widened:
-                a, b, d = _carried(by_pose[k], covariance)
+                a, b, d = _carried(jacobian[k], covariance)
                 uu, uv, vv = uu + count * a, uv + count * b, vv + count * d
-            _widen(error[k], by_pose[k], by_sensor[k], uu, uv, vv)
+            _widen(error[k], jacobian[k], uu, uv, vv)
         if displaced:
-            _displace(by_pose[k], c, s, lever_x, lever_y)
+            for i in range(2):  # by the pose before the motion
+                u, v = jacobian[k, i, 0], jacobian[k, i, 1]
+                jacobian[k, i, 0], jacobian[k, i, 1] = u * c - v * s, u * s + v * c
+                jacobian[k, i, 2] += u * lever_x + v * lever_y
 
 
 @compiled
-def _widen(error: Array, by_pose: Array, by_sensor: Array, uu: float, uv: float, vv: float) -> None:
-    """Whiten the ``error`` (2,) of a landmark and its Jacobians (2, 3) and (2, 6) by a covariance [[uu, uv], [uv, vv]]."""
+def _widen(error: Array, jacobian: Array, uu: float, uv: float, vv: float) -> None:
+    """Whiten the ``error`` (2,) of a landmark and its ``jacobian`` (2, WIDTH) by a covariance [[uu, uv], [uv, vv]]."""
     # the inverse of its lower root [[p, 0], [r, q]]
     p = 1.0 / math.sqrt(uu)
     low = uv * p
@@ -82,26 +91,14 @@ def _widen(error: Array, by_pose: Array, by_sensor: Array, uu: float, uv: float,
     r = -low * p * q
     error[1] = r * error[0] + q * error[1]
     error[0] *= p
-    for j in range(3):
-        by_pose[1, j] = r * by_pose[0, j] + q * by_pose[1, j]
-        by_pose[0, j] *= p
-    for j in range(TIME_OFFSET + 1):
-        by_sensor[1, j] = r * by_sensor[0, j] + q * by_sensor[1, j]
-        by_sensor[0, j] *= p
-
-
-@compiled
-def _displace(by_pose: Array, c: float, s: float, lever_x: float, lever_y: float) -> None:
-    """Turn a Jacobian (2, 3) by a pose into that by the pose before a motion: see :func:`~factors.displaced.displaced`."""
-    for i in range(2):
-        u, v, w = by_pose[i, 0], by_pose[i, 1], by_pose[i, 2]
-        by_pose[i, 0], by_pose[i, 1] = u * c - v * s, u * s + v * c
-        by_pose[i, 2] = u * lever_x + v * lever_y + w
+    for j in range(WIDTH):
+        jacobian[1, j] = r * jacobian[0, j] + q * jacobian[1, j]
+        jacobian[0, j] *= p
 
 
 @compiled
 def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
-    """The elements (0, 0), (1, 0) and (1, 1) of what a Jacobian (2, D) makes of a covariance (D, D)."""
+    """The elements (0, 0), (1, 0) and (1, 1) of what the first columns of a Jacobian make of a covariance (D, D)."""
     a = b = d = 0.0
     for i in range(len(covariance)):
         for j in range(len(covariance)):
@@ -112,16 +109,14 @@ def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
 
 
 @compiled
-def weigh(error: Array, by_pose: Array, by_sensor: Array, robust: float) -> None:
+def weigh(error: Array, jacobian: Array, robust: float) -> None:
     """Multiply what :func:`linearize` found by the roots of the robust weights."""
     for k in range(len(error)):
         root = math.sqrt(geman_mcclure_weight(error[k, 0] ** 2 + error[k, 1] ** 2, robust))
         for i in range(2):
             error[k, i] *= root
-            for j in range(3):
-                by_pose[k, i, j] *= root
-            for j in range(TIME_OFFSET + 1):
-                by_sensor[k, i, j] *= root
+            for j in range(WIDTH):
+                jacobian[k, i, j] *= root
 
 
 @compiled(error_model="numpy")
@@ -129,9 +124,8 @@ def beyond(model: Array, pose: Array, look: Look, covariance: Array, limit: floa
     """How many landmarks have a normalised innovation squared above ``limit``, seen from a pose with body-frame ``covariance``
     (3, 3)."""
     count = len(look[0])
-    error, by_pose, by_sensor = np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros((count, 2, TIME_OFFSET + 1))
-    linearize(model, pose, np.zeros(TIME_OFFSET + 1), look, error, by_pose, by_sensor)
-    found = 0
+    error, by_pose, found = np.zeros((count, 2)), np.zeros((count, 2, WIDTH)), 0
+    linearize(model, pose, np.zeros(TIME_OFFSET + 1), look, error, by_pose)
     for k in range(count):
         a, b, c = 1.0, 0.0, 1.0
         for i in range(3):
@@ -161,8 +155,7 @@ def linearize_all(
     twists: Array,
     spreads: Array,
     error: Array,
-    by_pose: Array,
-    by_sensor: Array,
+    jacobian: Array,
 ) -> None:
     """:func:`linearize` of L looks: that with the number l, at the pose ``pose_of`` (L,), is of the rows up to ``ends`` (L,).
 
@@ -176,4 +169,115 @@ def linearize_all(
         spread = spreads[rows] if flags[i, 3] else spreads[:0]
         carried = flags[i, 0], offsets[i], flags[i, 1], covariances[i], counts[i], flags[i, 2], twists[i], spread
         look = (points[rows], ranges[rows], bearings[rows], *carried)
-        linearize(model, poses[pose_of[i]], changes, look, error[rows], by_pose[rows], by_sensor[rows])
+        linearize(model, poses[pose_of[i]], changes, look, error[rows], jacobian[rows])
+
+
+@compiled(error_model="numpy")
+def updated(
+    model: Array,
+    look: Look,
+    pose: Array,
+    covariance: Array,
+    values: Array,
+    indices: Integers,
+    first: int,
+    iterations: int,
+    converged: float,
+    gate: float,
+) -> tuple[Array, Array, Array, float, int]:
+    """The correction (S,) and the covariance (S, S) after it; the whitened residuals (K, 2) before it, their normalised square, and
+    how many numbers were measured. LinAlgError if rounding makes a covariance singular.
+
+    ``model``: of :func:`~factors.landmarks.model.packed`. ``values`` (P,): of the sensor's constants that are estimated;
+    ``indices`` (P,): their places in :data:`~factors.landmarks.model.PARAMETERS`; ``first``: of their columns in the error state.
+    ``gate``: beyond which a landmark's noise is widened.
+    """
+    count, size = len(look[0]), len(covariance)
+    columns = np.empty(3 + len(values), np.int64)
+    for j in range(len(columns)):
+        columns[j] = j if j < 3 else first + j - 3
+    residual, jacobian = np.empty((count, 2)), np.empty((count, 2, len(columns)))
+    _linearized(model, look, pose, values, indices, residual, jacobian)
+    measured = 0
+    for k in range(count):
+        measured += (not math.isnan(look[1][k])) + (not math.isnan(look[2][k]))
+    before, weights = np.zeros(size), np.ones(count)
+    prior = invert_covariance(covariance)
+    delta, after, pull = corrected(prior, residual, jacobian, columns, weights, before)
+    nis, widest, squared = 0.0, 1.0, normalised(residual, jacobian, columns, covariance)
+    for k in range(count):
+        nis += residual[k, 0] ** 2 + residual[k, 1] ** 2
+        widening = max(1.0, squared[k] / gate)
+        widest = max(widest, widening)
+        weights[k] = 1.0 / (widening * widening)
+    for i in range(len(columns)):
+        for j in range(len(columns)):
+            nis -= pull[i] * after[columns[i], columns[j]] * pull[j]
+    if widest > 1.0:
+        delta, after, _ = corrected(prior, residual, jacobian, columns, weights, before)
+    now = residual.copy()
+    for _ in range(iterations - 1):
+        if np.abs(delta - before).max() < converged:
+            break
+        before = delta
+        _linearized(model, look, moved(pose, delta), values + delta[columns[3:]], indices, now, jacobian)
+        for k in range(count):
+            weights[k] = geman_mcclure_weight(now[k, 0] ** 2 + now[k, 1] ** 2, model[ROBUST])
+        delta, after, _ = corrected(prior, now, jacobian, columns, weights, before)
+    if not (np.all(np.isfinite(delta)) and cholesky(after)[1]):
+        raise np.linalg.LinAlgError("an update is not finite, or not positive definite")
+    return delta, after, residual, max(0.0, nis), measured
+
+
+@compiled(error_model="numpy")
+def weighted(model: Array, look: Look, pose: Array, values: Array, indices: Integers) -> tuple[Array, Array, Array]:
+    """Whitened, robustly weighted residual (2K,) and its Jacobians by the pose (2K, 3) and by the constants (2K, P); arguments as
+    of :func:`updated`."""
+    count, wide = len(look[0]), len(indices)
+    residual, jacobian = np.empty((count, 2)), np.empty((count, 2, 3 + wide))
+    _linearized(model, look, pose, values, indices, residual, jacobian)
+    out, by_pose, by_values = np.empty(2 * count), np.empty((2 * count, 3)), np.empty((2 * count, wide))
+    for k in range(count):
+        root = math.sqrt(geman_mcclure_weight(residual[k, 0] ** 2 + residual[k, 1] ** 2, model[ROBUST]))
+        for i in range(2):
+            row = 2 * k + i
+            out[row] = root * residual[k, i]
+            for j in range(3):
+                by_pose[row, j] = root * jacobian[k, i, j]
+            for j in range(wide):
+                by_values[row, j] = root * jacobian[k, i, 3 + j]
+    return out, by_pose, by_values
+
+
+@compiled(error_model="numpy")
+def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
+    """Measured less predicted ranges [m] and bearings [rad], of those that were measured, from whitened ``residual`` (K, 2)."""
+    by_range, by_bearing = np.empty(len(ranges)), np.empty(len(ranges))
+    r = b = 0
+    for k in range(len(ranges)):
+        if not math.isnan(ranges[k]):
+            by_range[r] = -residual[k, 0] * math.hypot(model[RANGE_SIGMA], model[RELATIVE] * ranges[k])
+            r += 1
+        if not math.isnan(bearings[k]):
+            by_bearing[b] = -residual[k, 1] * model[BEARING_SIGMA]
+            b += 1
+    return by_range[:r], by_bearing[:b]
+
+
+@compiled(error_model="numpy")
+def _linearized(
+    model: Array, look: Look, pose: Array, values: Array, indices: Integers, residual: Array, jacobian: Array
+) -> None:
+    """Whitened residuals (K, 2) at constants that differ by ``values``, and their Jacobian (K, 2, 3+P)."""
+    count = len(residual)
+    changes = np.zeros(len(PARAMETERS))
+    for j in range(len(values)):
+        changes[indices[j]] = values[j]
+    by_all = np.zeros((count, 2, WIDTH))
+    linearize(model, pose, changes, look, residual, by_all)
+    for k in range(count):
+        for i in range(2):
+            for j in range(3):
+                jacobian[k, i, j] = by_all[k, i, j]
+            for j in range(len(values)):
+                jacobian[k, i, 3 + j] = by_all[k, i, CONSTANTS + indices[j]]

@@ -21,6 +21,8 @@ from factors.se2 import Array
 # the constants of a sensor that can be estimated: those of its model, and the time offset [s] of its timestamps
 PARAMETERS = ("x", "y", "bearing_bias", "range_scale", "depth_axis", "time_offset")
 TIME_OFFSET = PARAMETERS.index("time_offset")
+# columns of a Jacobian by the pose, by a point and by all PARAMETERS: where the point begins, and those, and their number
+POINT, CONSTANTS, WIDTH = 3, 5, 11
 EXACT = np.empty((0, 2, 2))  # covariances of exactly known points
 # indices in the result of packed(), after the constants that PARAMETERS change
 TURN, RANGE_SIGMA, RELATIVE, BEARING_SIGMA, DEPTH, ROBUST = range(TIME_OFFSET, TIME_OFFSET + 6)
@@ -166,34 +168,6 @@ def _constants(model: BearingRangeModel, parameters: Array) -> Array:
     return out
 
 
-def whitened_all(
-    model: BearingRangeModel, pose: Array, points: Array, ranges: Array, bearings: Array
-) -> tuple[Array, Array, Array, Array]:
-    """:func:`residuals` (K, 2) at one pose (3,), and their Jacobians by its body-frame perturbation (K, 2, 3), by the points
-    (K, 2, 2) and by :data:`PARAMETERS` (K, 2, 6), that by the time offset zero.
-
-    Compiled; equal to :func:`residuals` and :func:`jacobians`.
-    """
-    count = len(points)
-    error, by_pose = np.zeros((count, 2)), np.zeros((count, 2, 3))
-    by_point, by_sensor = np.zeros((count, 2, 2)), np.zeros((count, 2, len(PARAMETERS)))
-    whitened_into(
-        pose,
-        model.mounting,
-        (model.range_scale, model.range_sigma, model.range_sigma_relative, model.bearing_bias, model.bearing_sigma),
-        model.depth,
-        model.depth_axis,
-        points,
-        ranges,
-        bearings,
-        error,
-        by_pose,
-        by_point,
-        by_sensor,
-    )
-    return error, by_pose, by_point, by_sensor
-
-
 @compiled
 def whitened_into(
     pose: Array,
@@ -205,11 +179,10 @@ def whitened_into(
     ranges: Array,
     bearings: Array,
     error: Array,
-    by_pose: Array,
-    by_point: Array,
-    by_sensor: Array,
+    jacobian: Array,
 ) -> None:
-    """:func:`whitened_all` into arrays that hold zeros."""
+    """:func:`residuals` (K, 2) at one pose (3,), and their Jacobian (K, 2, WIDTH) by its body-frame perturbation, by the points and
+    by :data:`PARAMETERS`, that by the time offset zero. Written into arrays that hold zeros; equal to :func:`jacobians`."""
     range_scale, _, _, _, bearing_sigma = model
     c, s = math.cos(pose[2]), math.sin(pose[2])
     ahead_x, ahead_y = math.cos(mounting[2] + depth_axis), math.sin(mounting[2] + depth_axis)
@@ -223,20 +196,20 @@ def whitened_into(
         ux, uy = sx / distance, sy / distance
         if not math.isnan(ranges[k]):
             weight *= range_scale
-            by_pose[k, 0, 0], by_pose[k, 0, 1] = -vx * weight, -vy * weight
-            by_pose[k, 0, 2] = (vx * py - vy * px) * weight
-            by_sensor[k, 0, 3] = (vx * sx + vy * sy) * weight
-            by_sensor[k, 0, 4] = (ahead_x * sy - ahead_y * sx) * weight if depth else 0.0
+            jacobian[k, 0, 0], jacobian[k, 0, 1] = -vx * weight, -vy * weight
+            jacobian[k, 0, 2] = (vx * py - vy * px) * weight
+            jacobian[k, 0, CONSTANTS + 3] = (vx * sx + vy * sy) * weight
+            jacobian[k, 0, CONSTANTS + 4] = (ahead_x * sy - ahead_y * sx) * weight if depth else 0.0
         if not math.isnan(bearings[k]):
             weight = 1.0 / (distance * bearing_sigma)
-            by_pose[k, 1, 0], by_pose[k, 1, 1] = uy * weight, -ux * weight
-            by_pose[k, 1, 2] = (-uy * py - ux * px) * weight
-            by_sensor[k, 1, 2] = 1.0 / bearing_sigma
+            jacobian[k, 1, 0], jacobian[k, 1, 1] = uy * weight, -ux * weight
+            jacobian[k, 1, 2] = (-uy * py - ux * px) * weight
+            jacobian[k, 1, CONSTANTS + 2] = 1.0 / bearing_sigma
         for i in range(2):
             # moving the sensor is moving the robot; moving the point is the opposite, in the world frame
-            by_sensor[k, i, 0], by_sensor[k, i, 1] = by_pose[k, i, 0], by_pose[k, i, 1]
-            by_point[k, i, 0] = -c * by_pose[k, i, 0] + s * by_pose[k, i, 1]
-            by_point[k, i, 1] = -s * by_pose[k, i, 0] - c * by_pose[k, i, 1]
+            a, b = jacobian[k, i, 0], jacobian[k, i, 1]
+            jacobian[k, i, CONSTANTS], jacobian[k, i, CONSTANTS + 1] = a, b
+            jacobian[k, i, POINT], jacobian[k, i, POINT + 1] = s * b - c * a, -s * a - c * b
 
 
 @compiled(error_model="numpy")

@@ -15,11 +15,10 @@ import numpy as np
 
 from factors import positive, se2
 from factors.compiled import compiled
+from factors.gaussian import product
 from factors.motion import Increment
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
-from factors.se2 import Array
-from factors.se2_kernels import adjoint, between, compose, inverse_right_jacobian, twist_to
-from factors.small_kernels import product
+from factors.se2 import Array, adjoint_one, between_one, compose_one, inverse_right_jacobian, twist_to
 
 _NOWHERE = np.zeros(3)
 
@@ -104,8 +103,8 @@ def _linearize(
     by_later: Array,
     by_earlier: Array,
 ) -> None:
-    x = compose(later, offset)
-    rel = between(compose(earlier, earlier_offset), x)
+    x = compose_one(later, offset)
+    rel = between_one(compose_one(earlier, earlier_offset), x)
     derivative = np.zeros((len(error), 3))
     if len(error) == 2:
         residual = np.array((rel[0], rel[1]))
@@ -115,8 +114,8 @@ def _linearize(
         residual = twist_to(measured, rel)
         derivative = inverse_right_jacobian(residual)
     whitened = product(whitener, derivative)
-    to_later = product(whitened, adjoint(between(offset, np.zeros(3))))
-    to_earlier = product(whitened, adjoint(between(compose(earlier_offset, rel), np.zeros(3))))
+    to_later = product(whitened, adjoint_one(between_one(offset, np.zeros(3))))
+    to_earlier = product(whitened, adjoint_one(between_one(compose_one(earlier_offset, rel), np.zeros(3))))
     for i in range(len(error)):
         error[i] = 0.0
         for j in range(len(error)):

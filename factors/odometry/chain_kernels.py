@@ -4,12 +4,9 @@ import math
 
 import numpy as np
 
-from factors import se2
 from factors.compiled import compiled
 from factors.odometry.kernels import State, carried, predicted, recalibrated, relative
-from factors.se2 import Array, Integers
-from factors.se2_kernels import body_to_world
-from factors.se2_kernels import composed as one_composed
+from factors.se2 import Array, Integers, arc_coefficients, body_to_world_one, compose_scalars
 
 # columns of a row: time of its effect, its kind, and its values
 ROW = 5
@@ -24,8 +21,6 @@ _REST, _GYRO_REST = 1e-3, 0.02
 
 # indices in the array of the model's constants: an array, because a tuple is slower to pass to compiled code
 _COS, _SIN, _LAG, _HOLD, _GYRO_BIAS, _USES_GYRO = range(6, 12)  # behind scales and biases
-
-_arc_coefficients = compiled(se2.arc_coefficients)
 
 
 @compiled
@@ -205,7 +200,7 @@ def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> 
     if duration > hold:
         out[_VX] = out[_VY] = out[_W] = 0.0
     out[_UX], out[_UY], out[_UW], out[_STANDS], out[_GYRO_T] = ux, uy, uw, knot[_STANDS], knot[_GYRO_T]
-    a, b = _arc_coefficients(dtheta)
+    a, b = arc_coefficients(dtheta)
     c, s = math.cos(knot[_HEADING]), math.sin(knot[_HEADING])
     chord_x, chord_y = a * dx - b * dy, b * dx + a * dy
     out[T] = knot[T] + duration
@@ -283,9 +278,9 @@ def moved_to(
     delta, spread, duration, still = relative(noise, start, state_at(knots, count, t, chain))
     if len(indices):
         delta = recalibrated(delta, duration - still, constants, indices)
-    at = np.array(one_composed(pose[0], pose[1], pose[2], delta[0], delta[1], delta[2]))
+    at = np.array(compose_scalars(pose[0], pose[1], pose[2], delta[0], delta[1], delta[2]))
     body = carried(covariance, delta, spread)
-    return at, body, body_to_world(at, body)
+    return at, body, body_to_world_one(at, body)
 
 
 @compiled

@@ -3,11 +3,24 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.se2 import Array, Integers
-from factors.se2_kernels import arc, between, exp, inverse_right_jacobian, log, right_jacobian, twist_to, wrapped
-from factors.small_kernels import product
+from factors.gaussian import product, put
+from factors.se2 import (
+    Array,
+    Integers,
+    arc_coefficients,
+    between_one,
+    between_scalars,
+    compose_scalars,
+    exp_scalars,
+    inverse_right_jacobian,
+    log_scalars,
+    right_jacobian_one,
+    twist_to,
+    wrap_scalar,
+)
 
 # Minimum variance of positions relative to the largest one. A pose known only to a hundred metres is not known better than to a
 # tenth of a millimetre in any direction; otherwise its covariance would be numerically singular.
@@ -24,7 +37,7 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
     """See :func:`factors.odometry.model.relative_motion`: pose (3,), covariance (3, 3), duration and time at rest, for two states
     of a chain (t, x, y, heading, path, turn, unknown, still)."""
     c, s, dx, dy = math.cos(start[3]), math.sin(start[3]), end[1] - start[1], end[2] - start[2]
-    x, y, turned = c * dx + s * dy, c * dy - s * dx, wrapped(end[3] - start[3])
+    x, y, turned = c * dx + s * dy, c * dy - s * dx, wrap_scalar(end[3] - start[3])
     distance, rotation, duration = abs(end[4] - start[4]), abs(end[5] - start[5]), abs(end[0] - start[0])
     unknown, still = max(0.0, end[6] - start[6]), min(duration, abs(end[7] - start[7]))
     # time-dependent noise grows in motion only; the total is at least the minimum noise
@@ -109,7 +122,7 @@ def predicted(
         transition[j // size, j % size] = 0.0
     x, y, turned = delta[0], delta[1], delta[2]
     if count:
-        changed_delta, by_changes = recalibrate(np.array(log(x, y, turned)), moving, _full(constants, indices))
+        changed_delta, by_changes = recalibrate(np.array(log_scalars(x, y, turned)), moving, _full(constants, indices))
         x, y, turned = changed_delta[0], changed_delta[1], changed_delta[2]
         for i in range(3):
             for j in range(count):
@@ -133,7 +146,7 @@ def predicted(
             for k in columns:
                 after[i, j] += moved[i, k] * transition[j, k]
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    at[0], at[1], at[2] = pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrapped(pose[2] + turned)
+    at[0], at[1], at[2] = pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrap_scalar(pose[2] + turned)
 
 
 @compiled(inline="always")
@@ -150,9 +163,9 @@ def recalibrated(delta: Array, moving: float, constants: Array, indices: Integer
     """``delta`` (3,) of :func:`factors.odometry.model.recalibrated`, for corrections ``constants`` (P,) with ``indices`` (P,) among
     all constants."""
     changes = _full(constants, indices)
-    x, y, phi = log(delta[0], delta[1], delta[2])
+    x, y, phi = log_scalars(delta[0], delta[1], delta[2])
     turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * math.hypot(x, y)
-    return np.array(exp(x + changes[0] * x, y + changes[0] * y, turn))
+    return np.array(exp_scalars(x + changes[0] * x, y + changes[0] * y, turn))
 
 
 @compiled
@@ -179,14 +192,14 @@ def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Arr
     way = math.hypot(x, y)
     cx, cy = x + changes[0] * x, y + changes[0] * y
     turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * way
-    p, q = arc(turn)
-    jacobian = right_jacobian(np.array((cx, cy, turn)))
+    p, q = arc_coefficients(turn)
+    jacobian = right_jacobian_one(np.array((cx, cy, turn)))
     by_changes = np.zeros((3, 4))
     for i in range(3):
         by_changes[i, 0] = jacobian[i, 0] * x + jacobian[i, 1] * y
         by_changes[i, 1], by_changes[i, 2] = jacobian[i, 2] * phi, -jacobian[i, 2] * moving
         by_changes[i, 3] = jacobian[i, 2] * way
-    return np.array((p * cx - q * cy, q * cx + p * cy, wrapped(turn))), by_changes
+    return np.array((p * cx - q * cy, q * cx + p * cy, wrap_scalar(turn))), by_changes
 
 
 @compiled
@@ -214,7 +227,7 @@ def linearize(
 ) -> tuple[Array, Array, Array, Array]:
     """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobians by both poses (3, 3) and, through ``by_changes``
     (3, P) of ``delta``, by the constants (3, P)."""
-    relative = between(start, end)
+    relative = between_one(start, end)
     rx, ry, turned = relative[0], relative[1], relative[2]
     error = twist_to(delta, relative)
     by_end = product(whitener, inverse_right_jacobian(error))
@@ -252,7 +265,7 @@ def linearize_as_reported(
         as_reported[i, 1] /= unit
     delta, by_changes = changed(twist, moving, constants, indices)
     residual, by_start, by_end, by_constants = linearize(start, end, delta, by_changes, as_reported)
-    error = twist_to(delta, between(start, end))
+    error = twist_to(delta, between_one(start, end))
     for j in range(len(indices)):
         if indices[j] == 0:
             for i in range(3):
@@ -308,7 +321,50 @@ def cost_of_all(
         delta = deltas[k]
         if len(indices):
             delta, _ = recalibrate(twists[k], moving[k], _full(constants, indices))
-        error, w = twist_to(delta, between(poses[first[k]], poses[first[k] + 1])), whiteners[k]
+        error, w = twist_to(delta, between_one(poses[first[k]], poses[first[k] + 1])), whiteners[k]
         total += (w[0, 0] * error[0]) ** 2 + (w[1, 0] * error[0] + w[1, 1] * error[1]) ** 2
         total += (w[2, 0] * error[0] + w[2, 1] * error[1] + w[2, 2] * error[2]) ** 2
     return 0.5 * total
+
+
+@compiled
+def poses_between(
+    before: Integers,
+    deltas: Array,
+    noises: Array,
+    durations: Array,
+    steps: Array,
+    step_noises: Array,
+    step_durations: Array,
+    elsewhere: NDArray[np.bool_],
+    poses: Array,
+    covariances: Array,
+) -> tuple[Array, Array]:
+    """T poses (T, 3) and body-frame covariances (T, 3, 3), each after the one with the number ``before`` (T,) of M ``poses`` (M, 3)
+    with ``covariances`` (M, 3, 3).
+
+    ``deltas`` (T, 3), ``noises`` (T, 3, 3) and ``durations`` (T,) [s]: of the motion from there; ``steps`` (M-1, 3) and so on: of
+    that from each pose to the next. What the odometry then misses the next pose by is spread in proportion to time. The covariance
+    goes linearly from one to the other, plus that of a bridge pinned at both ends. ``elsewhere`` (M-1,): whether the robot was
+    carried to the next pose, which tells nothing of those before.
+    """
+    count = len(before)
+    at, spreads = np.empty((count, 3)), np.empty((count, 3, 3))
+    for i in range(count):
+        k = before[i]
+        x, y, heading = compose_scalars(poses[k, 0], poses[k, 1], poses[k, 2], deltas[i, 0], deltas[i, 1], deltas[i, 2])
+        if k < len(steps) and not elsewhere[k]:
+            share = durations[i] / step_durations[k]
+            a, b, c = compose_scalars(poses[k, 0], poses[k, 1], poses[k, 2], steps[k, 0], steps[k, 1], steps[k, 2])
+            a, b, c = between_scalars(a, b, c, poses[k + 1, 0], poses[k + 1, 1], poses[k + 1, 2])
+            a, b, c = log_scalars(a, b, c)
+            a, b, c = exp_scalars(share * a, share * b, share * c)
+            x, y, heading = compose_scalars(x, y, heading, a, b, c)
+            for m in range(3):
+                for n in range(3):
+                    ends = (1.0 - share) * covariances[k, m, n] + share * covariances[k + 1, m, n]
+                    spreads[i, m, n] = ends + share * (1.0 - share) * step_noises[k, m, n]
+        else:
+            put(carried(covariances[k], deltas[i], noises[i]), spreads[i])
+        at[i, 0], at[i, 1], at[i, 2] = x, y, heading
+    return at, spreads

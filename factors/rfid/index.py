@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.se2 import Array, Integers
-from factors.se2_kernels import wrapped
+from factors.se2 import Array, Integers, wrap_scalar
 
 CELL = 2.0  # m
 SPARE = 0.5  # m: tags are found in a box on a grid of this size, which neighbouring poses share
@@ -134,7 +133,7 @@ def moved(offset: Array, offsets: Array) -> Array:
     for k in range(len(offsets)):
         out[k, 0] = offset[0] + c * offsets[k, 0] - s * offsets[k, 1]
         out[k, 1] = offset[1] + s * offsets[k, 0] + c * offsets[k, 1]
-        out[k, 2] = wrapped(offset[2] + offsets[k, 2])
+        out[k, 2] = wrap_scalar(offset[2] + offsets[k, 2])
     return out
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import se2_kernels
+from factors import se2
 from factors.compiled import compiled
 from factors.rfid import knots
 from factors.rfid.kernels import MOST_CERTAIN, placed, seen
@@ -208,7 +208,7 @@ def relevant(
     low_x, high_x, low_y, high_y = poses[:, 0].min(), poses[:, 0].max(), poses[:, 1].min(), poses[:, 1].max()
     middle, turned = np.array((0.5 * (low_x + high_x), 0.5 * (low_y + high_y), poses[0, 2])), 0.0
     for n in range(len(poses)):
-        turned = max(turned, abs(se2_kernels.wrapped(poses[n, 2] - middle[2])))
+        turned = max(turned, abs(se2.wrap_scalar(poses[n, 2] - middle[2])))
     apart = 0.5 * math.hypot(high_x - low_x, high_y - low_y)
     for k in range(len(antennas)):
         m, antenna = packed.which[antennas[k]], packed.antennas[antennas[k]]

@@ -23,7 +23,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import se2_kernels
+from factors import se2
 from factors.compiled import compiled
 from factors.se2 import Array, Integers
 
@@ -140,9 +140,9 @@ def sigma_poses(pose: Array, root: Array) -> Array:
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(6):
         sign = 1.0 if i < 3 else -1.0
-        x, y, turned = se2_kernels.exp(sign * root[0, i % 3], sign * root[1, i % 3], sign * root[2, i % 3])
+        x, y, turned = se2.exp_scalars(sign * root[0, i % 3], sign * root[1, i % 3], sign * root[2, i % 3])
         out[i, 0], out[i, 1] = pose[0] + c * x - s * y, pose[1] + s * x + c * y
-        out[i, 2] = se2_kernels.wrapped(pose[2] + turned)
+        out[i, 2] = se2.wrap_scalar(pose[2] + turned)
     return out
 
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factors import positive, se2, se2_kernels
+from factors import positive, se2
 from factors.compiled import compiled
+from factors.gaussian import inverse, product, solved
 from factors.odometry.kernels import FAR, ROUNDING
 from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts
 from factors.rfid.factor import RfidFactor
@@ -16,7 +17,6 @@ from factors.rfid.index import MapTags, Seen
 from factors.rfid.kernels import score
 from factors.rfid.model import Packed
 from factors.se2 import Array, Integers
-from factors.small_kernels import inverse, product, solved
 
 CONVERGED = 0.1  # of a standard deviation: a step of an update that is not worth another
 NOTHING = np.zeros(0)
@@ -138,14 +138,14 @@ def _updated(
         for i in range(size):
             small = small and abs(step[i]) < CONVERGED * math.sqrt(covariance[i, i])
         if small:
-            best, changed = se2_kernels.moved(best, step), _added(changed, step)
+            best, changed = se2.moved(best, step), _added(changed, step)
             break
         lower = False
         for _ in range(4):
-            tried, tried_values, error = se2_kernels.moved(best, step), _added(changed, step), np.empty(size)
+            tried, tried_values, error = se2.moved(best, step), _added(changed, step), np.empty(size)
             _set(parameters, estimated, tried_values)
             nll, there, curve, _, _ = score(packed, of_map, seen, tempering, tried, parameters, estimated)
-            error[0], error[1], error[2] = se2_kernels.twist_to(pose, tried)
+            error[0], error[1], error[2] = se2.twist_to(pose, tried)
             for i in range(3, size):
                 error[i] = tried_values[i - 3] - values[i - 3]
             tried_cost = nll

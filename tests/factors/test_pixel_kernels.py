@@ -51,16 +51,25 @@ def seen(rng, *, inexact=False, offset=None, noise=None):
 @pytest.mark.parametrize("noise", [None, NOISE])
 @pytest.mark.parametrize("offset", [None, OFFSET])
 @pytest.mark.parametrize("inexact", [False, True])
-def test_a_factor_is_that_of_a_camera_whose_constants_stay(rng, inexact, offset, noise):
+def test_whitened_residuals_are_those_of_the_model_with_its_noise(rng, inexact, offset, noise):
     factor, pose = seen(rng, inexact=inexact, offset=offset, noise=noise)
-    twin = replace(factor, estimated=(2,))  # is not compiled
-    for compiled, plain in (
-        (factor.whitened([pose]), twin.whitened([pose, np.zeros(1)])),
-        (factor.linearize([pose]), twin.linearize([pose, np.zeros(1)])),
-    ):
-        np.testing.assert_allclose(compiled[0], plain[0], rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(compiled[1][0], plain[1][0], rtol=1e-9, atol=1e-7)
-    np.testing.assert_allclose(factor.whitened([pose])[1][1], twin.whitened([pose, np.zeros(1)])[1][2], atol=1e-9)
+    at = pose if offset is None else se2.compose(pose, offset)
+    pixels, by_pose, by_point, by_constants = reprojection.linearize(MODEL, at, factor.points)
+    spread = MODEL.sigma**2 * np.eye(2)
+    if inexact:
+        spread = spread + by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
+    if noise is not None:  # the error of all points
+        spread = spread + len(pixels) * by_pose @ noise @ by_pose.transpose(0, 2, 1)
+    whitener = np.linalg.inv(np.linalg.cholesky(np.broadcast_to(spread, (len(pixels), 2, 2))))
+    back = np.eye(3) if offset is None else se2.adjoint(se2.inverse(offset))
+    error, blocks = replace(factor, estimated=(2,)).whitened([pose, np.zeros(1)])
+    np.testing.assert_allclose(error, np.einsum("kij,kj->ki", whitener, pixels - factor.pixels), rtol=1e-9, atol=1e-9)
+    expected = by_pose @ back, by_constants[..., 2:3], reprojection.by_tilt(MODEL, by_constants)
+    for block, plain in zip(blocks, expected, strict=True):
+        np.testing.assert_allclose(block, whitener @ plain, rtol=1e-9, atol=1e-7)
+    alone, (of_pose, of_tilt) = factor.whitened([pose])
+    np.testing.assert_array_equal(alone, error)
+    np.testing.assert_array_equal(np.concatenate((of_pose, of_tilt), axis=2), np.concatenate(blocks[::2], axis=2))
 
 
 def test_the_camera_of_a_robot_moves_as_the_robot_does(rng):

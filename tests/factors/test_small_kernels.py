@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factors import small_kernels
+from factors import gaussian
 from factors.rfid import update
 
 
@@ -14,18 +14,18 @@ def test_products_and_solutions(size, width):
     matrix, right = rng.normal(size=(size, size)), rng.normal(size=(size, width))
     if size > 1:
         matrix[0, 0] = 0.0  # no pivot
-    solution, log_determinant = small_kernels.solved(matrix, right)
+    solution, log_determinant = gaussian.solved(matrix, right)
     np.testing.assert_allclose(solution, np.linalg.solve(matrix, right), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(log_determinant, np.linalg.slogdet(matrix)[1], rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(small_kernels.inverse(matrix), np.linalg.inv(matrix), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(small_kernels.product(matrix, right), matrix @ right, atol=1e-12)
-    np.testing.assert_allclose(small_kernels.product_by_transpose(right, right), right @ right.T, atol=1e-12)
+    np.testing.assert_allclose(gaussian.inverse(matrix), np.linalg.inv(matrix), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(gaussian.product(matrix, right), matrix @ right, atol=1e-12)
+    np.testing.assert_allclose(gaussian.product_by_transpose(right, right), right @ right.T, atol=1e-12)
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
 def test_what_has_no_inverse_is_an_error(value):
     with pytest.raises(np.linalg.LinAlgError):
-        small_kernels.inverse(np.array(((1.0, 2.0), (value, value))))
+        gaussian.inverse(np.array(((1.0, 2.0), (value, value))))
 
 
 def test_telling_directions_are_counted_as_by_eigenvalues():

@@ -33,10 +33,10 @@ from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import NewVariable, Sensor, Term
 from factorgraph_loc.sensors.motion import Motion
-from factors import se2, se2_kernels
-from factors.between import between
+from factors import se2
 from factors.graph import Factor
 from factors.motion import ChainState, Increment
+from factors.odometry.kernels import poses_between
 from factors.se2 import Array
 
 STATE = len(ChainState._fields)
@@ -137,7 +137,7 @@ class Graph:
         and in the world frame."""
         newest = self.newest
         if t <= newest.t:
-            return self.pose, self.covariance, se2_kernels.body_to_world(self.pose, self.covariance)
+            return self.pose, self.covariance, se2.body_to_world_one(self.pose, self.covariance)
         start = newest.odometry if self.is_anchored else self.motion.state(newest.t)
         return self.motion.moved(start, t, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
 
@@ -289,5 +289,5 @@ class Graph:
             np.array([step.duration for step in steps]),
             np.array([k.is_elsewhere for k in keyframes[1:]], dtype=np.bool_),
         )
-        at, spread = between(before, deltas, noises, np.abs(ends[:, 0] - starts[:, 0]), *later, poses, covariances)
+        at, spread = poses_between(before, deltas, noises, np.abs(ends[:, 0] - starts[:, 0]), *later, poses, covariances)
         return Trajectory(np.array([tick.t for tick in ticks]), at, se2.body_to_world(at, spread))

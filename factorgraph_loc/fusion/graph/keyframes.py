@@ -29,7 +29,7 @@ from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.fusion.search import Search, laplace_evidence
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation, Sensor
-from factors import se2_kernels
+from factors import se2
 from factors.graph import VectorPriorFactor
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
@@ -202,7 +202,7 @@ class Builder:
                 self._search.expect(sensor, here, odometry, view)
                 evidence = partial(laplace_evidence, here, view.pose, view.covariance, correction)
                 self._search.keep(sensor, here, odometry, evidence)
-                view.pose = se2_kernels.moved(view.pose, correction.delta)
+                view.pose = se2.moved(view.pose, correction.delta)
                 view.covariance = correction.covariance[:3, :3]
         return applied
 

@@ -38,7 +38,7 @@ from factorgraph_loc.fusion.graph.variables import (
     retract,
     to_gtsam,
 )
-from factors.gaussian_kernels import inverse
+from factors.gaussian import invert_covariance
 from factors.graph import gaussian_factor, jacobian_factors
 from factors.se2 import Array
 
@@ -191,13 +191,13 @@ class Window(FullHistory):
             order.push_back(key)
         found, end = {}, 0
         try:
-            joint, there = inverse(self.linear()[0].marginal(keys).hessian(order)[0])
+            joint = invert_covariance(self.linear()[0].marginal(keys).hessian(order)[0])
             for key in keys:
                 start, end = end, end + len(self._ours.at[key])
                 found[key] = joint[start:end, start:end].copy()
-        except (*GTSAM_ERRORS, LookupError):
+        except (*GTSAM_ERRORS, LookupError, np.linalg.LinAlgError):
             return {}
-        return found if there else {}
+        return found
 
     @property
     def oldest(self) -> int:

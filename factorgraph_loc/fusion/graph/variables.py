@@ -14,7 +14,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from factors import positive, se2, se2_kernels
+from factors import positive, se2
 from factors.graph import Factor, pose_array
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
@@ -167,7 +167,7 @@ def jumps(guess: Guess, pose: Array) -> bool:
 
 def retract(key: int, value: Array, step: Array) -> Array:
     """A variable moved by a step of its tangent space."""
-    return se2_kernels.moved(value, step) if is_pose(key) else value + step
+    return se2.moved(value, step) if is_pose(key) else value + step
 
 
 def frame_motions(values: Values) -> tuple[Array, list[int]]:

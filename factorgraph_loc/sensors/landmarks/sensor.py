@@ -21,7 +21,7 @@ from factors import positive
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor, landmark_update
 from factors.landmarks.model import PARAMETERS, TIME_OFFSET, packed
-from factors.landmarks.update_kernels import innovations
+from factors.landmarks.kernels import innovations
 from factors.motion import Increment
 from factors.se2 import Array
 from factors.update import GATE, Correction

@@ -24,7 +24,7 @@ from factorgraph_loc.sensors.rfid.monitor import (
     SilenceMonitor,
 )
 from factorgraph_loc.sensors.rfid.stream import RfidScan
-from factors import positive, se2_kernels
+from factors import positive, se2
 from factors.graph import Factor
 from factors.rfid import update as rfid_update
 from factors.rfid.detection import RfidLikelihood, TagReadCounts, together
@@ -94,7 +94,7 @@ class TagObservation:
             at, before = [*at, *range(columns[name].start, columns[name].stop)], np.array(values[name])
         own = np.ascontiguousarray(covariance[np.ix_(at, at)])
         found = rfid_update.updated(self.factor, pose, before, own, iterations)
-        delta = np.concatenate((se2_kernels.twist_to(pose, found.pose), found.values - before))
+        delta = np.concatenate((se2.twist_to(pose, found.pose), found.values - before))
         after = found.covariance
         if len(covariance) > len(at):
             gain = positive.solve(own, covariance[at]).T

@@ -1,16 +1,36 @@
-"""A sighting factor with some of its values marginalized: their uncertainty is added to its noise."""
+"""Common parts of sighting factors: a pose variable at a known motion before the sighting, and marginalization."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from factors import positive
-from factors.displaced import common_error
+from factors import positive, se2
 from factors.se2 import Array
-from factors.update import SightingFactor
+
+
+class SightingFactor(Protocol):
+    """A factor of K sightings with g coordinates each, such as :class:`~factors.landmarks.factor.BearingRangeFactor`."""
+
+    def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (K, g) and its Jacobian (K, g, d) by each value."""
+
+    def weight(self, squared: Array) -> Array:
+        """The robust weight of squared whitened residuals."""
+
+    def dof(self) -> int:
+        """Number of measured coordinates."""
+
+
+def delayed(offset: Array | None, twist: Array | None, seconds: float) -> Array | None:
+    """The ``offset`` (3,) of a sighting that is ``seconds`` later, for a robot with velocity ``twist`` (3,)."""
+    if twist is None or seconds == 0.0:
+        return offset
+    later = se2.exp(twist * seconds)
+    return later if offset is None else se2.compose(offset, later)
 
 
 @dataclass(frozen=True)
@@ -18,7 +38,7 @@ class Marginalized:
     """A sighting factor on the pose only: its other values are fixed at ``values``, with covariances ``spreads``, None for exact
     ones.
 
-    An error of a value is common to all K sightings: see :func:`~factors.displaced.common_error`.
+    An error of a value is common to all K sightings: its covariance is multiplied by K, so that it does not average out.
     """
 
     factor: SightingFactor
@@ -31,7 +51,7 @@ class Marginalized:
         noise = np.eye(residual.shape[1])
         for block, spread in zip(others, self.spreads, strict=True):
             if spread is not None:
-                noise = noise + common_error(block, spread)
+                noise = noise + len(block) * block @ spread @ block.transpose(0, 2, 1)
         if noise.ndim == 2:
             return residual, [by_pose]
         whitener = positive.whitener(noise)

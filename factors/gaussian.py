@@ -1,0 +1,250 @@
+"""Small matrices and Gaussians in compiled code: products, solutions, roots and inverses; prediction, correction by residuals, and
+smoothing.
+
+Plain loops: calls of LAPACK take longer than the arithmetic of small matrices, and what NumPy does with slices and matrices is
+compiled anew into each function that uses it, which takes a second or more.
+"""
+
+import math
+
+import numpy as np
+
+from factors.compiled import compiled
+from factors.se2 import Array, Integers
+
+SKEW = 1e-7  # of two standard deviations: more asymmetry is not one of a few roundings
+
+
+@compiled(error_model="numpy")
+def product(left: Array, right: Array) -> Array:
+    """The matrix product (M, N) of ``left`` (M, K) and ``right`` (K, N)."""
+    out = np.zeros((left.shape[0], right.shape[1]))
+    for i in range(left.shape[0]):
+        for k in range(left.shape[1]):
+            for j in range(right.shape[1]):
+                out[i, j] += left[i, k] * right[k, j]
+    return out
+
+
+@compiled(error_model="numpy")
+def product_by_transpose(left: Array, right: Array) -> Array:
+    """The matrix product (M, N) of ``left`` (M, K) and the transpose of ``right`` (N, K)."""
+    out = np.zeros((left.shape[0], right.shape[0]))
+    for i in range(left.shape[0]):
+        for j in range(right.shape[0]):
+            for k in range(left.shape[1]):
+                out[i, j] += left[i, k] * right[j, k]
+    return out
+
+
+@compiled(error_model="numpy")
+def solved(matrix: Array, right: Array) -> tuple[Array, float]:
+    """The solution (D, N) of ``matrix`` (D, D) times x = ``right`` (D, N), by elimination with pivots, and the logarithm of the
+    absolute determinant. LinAlgError if the matrix is singular or not finite."""
+    size, width = matrix.shape[0], right.shape[1]
+    left, out, log_determinant = matrix.copy(), right.copy(), 0.0
+    for k in range(size):
+        pivot = k
+        for i in range(k + 1, size):
+            if abs(left[i, k]) > abs(left[pivot, k]):
+                pivot = i
+        if not 0.0 < abs(left[pivot, k]) < np.inf:
+            raise np.linalg.LinAlgError("a matrix is singular, or not finite")
+        log_determinant += math.log(abs(left[pivot, k]))
+        for j in range(size):
+            left[k, j], left[pivot, j] = left[pivot, j], left[k, j]
+        for j in range(width):
+            out[k, j], out[pivot, j] = out[pivot, j], out[k, j]
+        for i in range(k + 1, size):
+            share = left[i, k] / left[k, k]
+            for j in range(k, size):
+                left[i, j] -= share * left[k, j]
+            for j in range(width):
+                out[i, j] -= share * out[k, j]
+    _substitute(left, out)
+    return out, log_determinant
+
+
+@compiled(error_model="numpy")
+def _substitute(upper: Array, out: Array) -> None:
+    """Solve ``upper`` (D, D), of which the upper half is read, times x = ``out`` (D, N), in place."""
+    size, width = out.shape
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            for j in range(width):
+                out[i, j] -= upper[i, k] * out[k, j]
+        for j in range(width):
+            out[i, j] /= upper[i, i]
+
+
+@compiled
+def put(matrix: Array, out: Array) -> None:
+    """Copy a matrix (M, N) into the first rows and columns of ``out``."""
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            out[i, j] = matrix[i, j]
+
+
+@compiled
+def inverse(matrix: Array) -> Array:
+    """The inverse of a matrix (D, D). LinAlgError if it is singular."""
+    return solved(matrix, np.eye(len(matrix)))[0]
+
+
+@compiled(error_model="numpy")
+def cholesky(covariance: Array) -> tuple[Array, bool]:
+    """The lower Cholesky root of a covariance (D, D), whose lower half is read, and whether it exists."""
+    size = len(covariance)
+    out = np.zeros((size, size))
+    for i in range(size):
+        for j in range(i + 1):
+            left = covariance[i, j]
+            for k in range(j):
+                left -= out[i, k] * out[j, k]
+            if i > j:
+                out[i, j] = left / out[j, j]
+            elif 0.0 < left < np.inf:
+                out[i, i] = math.sqrt(left)
+            else:
+                return out, False
+    return out, True
+
+
+@compiled(error_model="numpy")
+def invert_covariance(covariance: Array) -> Array:
+    """The inverse of a covariance (D, D), whose lower half is read. LinAlgError if it is not positive definite."""
+    size = len(covariance)
+    lower, exists = cholesky(covariance)
+    if not exists:
+        raise np.linalg.LinAlgError("a covariance is not positive definite")
+    out, back = np.empty((size, size)), np.zeros((size, size))  # ``back``: the inverse of the root
+    for j in range(size):
+        back[j, j] = 1.0 / lower[j, j]
+        for i in range(j + 1, size):
+            left = 0.0
+            for k in range(j, i):
+                left -= lower[i, k] * back[k, j]
+            back[i, j] = left / lower[i, i]
+    for i in range(size):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, size):
+                total += back[k, i] * back[k, j]
+            out[i, j] = out[j, i] = total
+    return out
+
+
+@compiled(error_model="numpy")
+def inform(residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array, total: Array) -> Array:
+    """Add the information of K residuals to ``total`` (S, S), and return the vector (D,) that the correction solves for.
+
+    ``residual`` (K, g) and ``jacobian`` (K, g, D): linearised at the correction ``at`` (S,); ``columns`` (D,): those of the
+    Jacobian in the error state; ``weights`` (K,). The correction is the inverse of the information times this vector.
+    """
+    wide = len(columns)
+    pull = np.zeros(wide)
+    for k in range(len(residual)):
+        for i in range(residual.shape[1]):
+            row = jacobian[k, i]
+            wanted = -residual[k, i]
+            for a in range(wide):
+                wanted += row[a] * at[columns[a]]
+            for a in range(wide):
+                weighted = weights[k] * row[a]
+                if weighted != 0.0:
+                    pull[a] += weighted * wanted
+                    for b in range(wide):
+                        total[columns[a], columns[b]] += weighted * row[b]
+    return pull
+
+
+@compiled(error_model="numpy")
+def corrected(
+    prior: Array, residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array
+) -> tuple[Array, Array, Array]:
+    """The correction (S,), the covariance (S, S) after it, and the vector (D,) of :func:`inform`.
+
+    ``prior`` (S, S): the information of the prediction; the other arguments are those of :func:`inform`. LinAlgError if there is no
+    solution.
+    """
+    total = prior.copy()
+    pull = inform(residual, jacobian, columns, weights, at, total)
+    after, delta = invert_covariance(total), np.zeros(len(prior))
+    for i in range(len(prior)):
+        for a in range(len(columns)):
+            delta[i] += after[i, columns[a]] * pull[a]
+    return delta, after, pull
+
+
+@compiled(error_model="numpy")
+def normalised(residual: Array, jacobian: Array, columns: Integers, covariance: Array) -> Array:
+    """Normalised innovation squared (K,) of K whitened residuals (K, g), each by itself, with Jacobians (K, g, D) by the
+    ``columns`` (D,) of a state with this ``covariance`` (S, S)."""
+    size, wide = residual.shape[1], len(columns)
+    out, left, whitened = np.zeros(len(residual)), np.empty((size, size)), np.empty(size)
+    for k in range(len(residual)):
+        for i in range(size):
+            whitened[i] = residual[k, i]
+            for j in range(i + 1):
+                spread = 1.0 if i == j else 0.0
+                for a in range(wide):
+                    if jacobian[k, i, a] != 0.0:
+                        carried = 0.0
+                        for b in range(wide):
+                            carried += covariance[columns[a], columns[b]] * jacobian[k, j, b]
+                        spread += jacobian[k, i, a] * carried
+                for m in range(j):
+                    spread -= left[i, m] * left[j, m]
+                # with unit noise a pivot is at least 1, whatever rounding leaves of it
+                left[i, j] = math.sqrt(max(spread, 0.5)) if i == j else spread / left[j, j]
+            for m in range(i):
+                whitened[i] -= left[i, m] * whitened[m]
+            whitened[i] /= left[i, i]
+            out[k] += whitened[i] * whitened[i]
+    return out
+
+
+@compiled
+def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
+    """The predicted covariance (S, S). ``transition`` (R, S): its first rows, the others are those of the identity; ``noise`` (R,
+    R): added to the first components."""
+    rows, moved, after = len(transition), product(transition, covariance), covariance.copy()
+    own = product_by_transpose(moved, transition)
+    for i in range(rows):
+        for j in range(rows, len(after)):
+            after[i, j] = after[j, i] = moved[i, j]
+        for j in range(rows):
+            after[i, j] = own[i, j] + noise[i, j]
+    return after
+
+
+@compiled
+def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, later: Array) -> tuple[Array, Array]:
+    """One backward step of the smoother of Rauch, Tung and Striebel (1965): the correction (S,) of a state, and its smoothed
+    covariance (S, S). :func:`factors.positive.smoothed` also serves where rounding makes this fail.
+
+    ``covariance`` (S, S): of the filtered state; ``transition`` and ``noise``: of the following step, as in :func:`predicted`. The
+    smoothed state after that step differs by ``change`` (S,) from the predicted one, and has the covariance ``later`` (S, S).
+    LinAlgError if the predicted covariance is singular, or if rounding leaves no positive definite one.
+    """
+    size, after, moved = len(covariance), predicted(covariance, transition, noise), product(transition, covariance)
+    carried = covariance.copy()  # transition times covariance
+    put(moved, carried)
+    gain, _ = solved(after, carried)  # its transpose
+    for i in range(size):
+        for j in range(size):
+            after[i, j] = later[i, j] - after[i, j]
+    correction, half, out = np.zeros(size), product(after, gain), covariance.copy()
+    for k in range(size):
+        for i in range(size):
+            correction[i] += gain[k, i] * change[k]
+            for j in range(size):
+                out[i, j] += gain[k, i] * half[k, j]
+    for i in range(size):
+        for j in range(i):
+            skew = out[i, j] - out[j, i]
+            if skew * skew > SKEW * SKEW * out[i, i] * out[j, j]:
+                raise np.linalg.LinAlgError("a smoothed covariance is not symmetric")
+    if not cholesky(out)[1]:
+        raise np.linalg.LinAlgError("a smoothed covariance is not positive definite")
+    return correction, out
