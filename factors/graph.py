@@ -135,7 +135,7 @@ class PriorFactor:
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (3,) ``log(mean^-1 * pose)`` and its Jacobian."""
         error = se2.log(se2.between(self._mean, values[0]))
-        return self._whitener @ error, [self._whitener @ np.linalg.inv(se2.right_jacobian(error))]
+        return self._whitener @ error, [self._whitener @ se2.inverse_right_jacobian(error)]
 
     def cost(self, values: Sequence[Array]) -> float:
         """Half the squared whitened residual."""

@@ -1,11 +1,12 @@
 """The minima of costs in a few variables, by the damped steps of Levenberg (1944) and Marquardt (1963).
 
 The damping is a share of the diagonal of the curvature, because metres, radians and scales differ. Many problems of one shape are
-solved together. A whole graph is solved elsewhere (:mod:`factorgraph_loc.fusion.graph.least_squares`), without dense matrices.
+solved together. :func:`descended` is for a problem that solves for its own steps, such as a whole graph, without dense matrices.
 """
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from factors.se2 import Array, Integers
 
 DAMPING, MAX_DAMPING = 1e-3, 1e8
 LEAST = 1e-9  # curvature of a direction that its problem does not determine
+MAX_ITERATIONS, CONVERGED_GAIN, INITIAL_DAMPING = 100, 1e-6, 1e-4  # of `descended`; gain relative to the cost
+State = TypeVar("State")
 
 
 class Minima(NamedTuple):
@@ -81,3 +84,27 @@ def minimum(
 
     found = minima(only, start[None], iterations, converged, moved=moved, largest=largest)
     return found.states[0], float(found.costs[0]), found.curvatures[0]
+
+
+def descended(
+    cost_of: Callable[[State], float],
+    moved: Callable[[State, float], State | None],
+    state: State,
+    max_iterations: int = MAX_ITERATIONS,
+    converged: float = CONVERGED_GAIN,
+) -> tuple[State, float, int]:
+    """The local minimum of a cost, the cost there, and the number of steps. ``moved``: the state after a step with some damping;
+    None where that is not determined. Solved when a step lowers the cost by less than the share ``converged``."""
+    damping, cost, iteration = INITIAL_DAMPING, cost_of(state), 0
+    while iteration < max_iterations and damping < MAX_DAMPING:
+        iteration += 1
+        new = moved(state, damping)
+        new_cost = math.inf if new is None else cost_of(new)
+        if new is None or not (math.isfinite(new_cost) and new_cost <= cost):
+            damping *= 10.0
+            continue
+        gained = cost - new_cost
+        state, cost, damping = new, new_cost, damping / 10.0
+        if gained <= converged * cost:
+            break
+    return state, cost, iteration

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import se2
 from factors.camera.model import CameraModel, linearize_in_space, rays
 from factors.compiled import compiled
+from factors.odometry.kernels import NO_CONSTANTS, linearize
 from factors.se2 import Array
 
 SHARED = 0.5  # share of the information that is used, because consecutive motions share an image
@@ -127,15 +127,13 @@ class VisualOdometryFactor:
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (3,) ``log(delta^-1 * first^-1 * second)`` and its Jacobians."""
-        relative = se2.between(values[0], values[1])
-        error = se2.log(se2.between(self._delta, relative))
-        by_second = self._whitener @ np.linalg.inv(se2.right_jacobian(error))
-        return self._whitener @ error, [-by_second @ se2.adjoint(se2.inverse(relative)), by_second]
+        residual, *blocks = linearize(values[0], values[1], self._delta, NO_CONSTANTS, self._whitener)
+        return residual, blocks[:2]
 
     def cost(self, values: Sequence[Array]) -> float:
         """Half the squared whitened residual."""
-        error = self._whitener @ se2.log(se2.between(self._delta, se2.between(values[0], values[1])))
-        return 0.5 * float(error @ error)
+        residual, _ = self.linearize(values)
+        return 0.5 * float(residual @ residual)
 
 
 def _rays(model: CameraModel, pixels: Array) -> tuple[Array, Array]:

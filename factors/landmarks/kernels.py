@@ -82,6 +82,19 @@ def linearize(model: Array, pose: Array, changes: Array, look: Look, error: Arra
 
 
 @compiled
+def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
+    """Whitened residuals (N, 2) of N sightings, each from a pose (N, 3), and their Jacobian (N, 2, WIDTH)."""
+    error, jacobian = np.zeros((len(poses), 2)), np.zeros((len(poses), 2, WIDTH))
+    mounted, depth = (model[0], model[1], model[TURN]), model[DEPTH] > 0.0
+    noise = model[3], model[RANGE_SIGMA], model[RELATIVE], model[2], model[BEARING_SIGMA]
+    for n in range(len(poses)):
+        row = slice(n, n + 1)
+        seen = points[row], ranges[row], bearings[row]
+        whitened_into(poses[n], mounted, noise, depth, model[4], *seen, error[row], jacobian[row])
+    return error, jacobian
+
+
+@compiled
 def _widen(error: Array, jacobian: Array, uu: float, uv: float, vv: float) -> None:
     """Whiten the ``error`` (2,) of a landmark and its ``jacobian`` (2, WIDTH) by a covariance [[uu, uv], [uv, vv]]."""
     # the inverse of its lower root [[p, 0], [r, q]]

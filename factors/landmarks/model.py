@@ -79,41 +79,6 @@ def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
     return se2.transform_from(np.array(model.mounting), local)
 
 
-def jacobians(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Derivatives of (range, bearing) at ``poses`` (..., 3) and ``points`` (..., 2).
-
-    Returns those by the pose's body-frame perturbation (..., 2, 3), by the point (..., 2, 2), and by :data:`PARAMETERS` (..., 2,
-    6): that by the range scale is relative, and that by the time offset is zero, as it needs the robot's velocity.
-    """
-    poses = np.asarray(poses, dtype=float)
-    mx, my, turn = model.mounting
-    axis = turn + model.depth_axis
-    robot = se2.transform_to(poses, points)  # the point in the robot frame
-    dx, dy = robot[..., 0] - mx, robot[..., 1] - my
-    distance = np.maximum(np.hypot(dx, dy), 1e-6)
-    ux, uy = dx / distance, dy / distance
-    ahead_x, ahead_y = math.cos(axis), math.sin(axis)
-    # by the point in the robot frame
-    local = np.empty((*np.shape(distance), 2, 2))
-    local[..., 0, 0] = model.range_scale * (ahead_x if model.depth else ux)
-    local[..., 0, 1] = model.range_scale * (ahead_y if model.depth else uy)
-    local[..., 1, 0], local[..., 1, 1] = -uy / distance, ux / distance
-    by_pose = np.zeros((*local.shape[:-1], 3))
-    by_pose[..., :2] = -local
-    by_pose[..., 2] = local[..., 0] * robot[..., 1, None] - local[..., 1] * robot[..., 0, None]
-    c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
-    to_robot = np.empty((*np.shape(c), 2, 2))
-    to_robot[..., 0, 0], to_robot[..., 0, 1], to_robot[..., 1, 0], to_robot[..., 1, 1] = c, s, -s, c
-    by_point = local @ to_robot
-    by_sensor = np.zeros((*local.shape[:-1], len(PARAMETERS)))
-    by_sensor[..., :2] = -local
-    by_sensor[..., 1, 2] = 1.0
-    by_sensor[..., 0, 3] = model.range_scale * (ahead_x * dx + ahead_y * dy if model.depth else distance)
-    if model.depth:
-        by_sensor[..., 0, 4] = model.range_scale * (ahead_x * dy - ahead_y * dx)
-    return by_pose, by_point, by_sensor
-
-
 def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
     """Standard deviations (K, 2) of range and bearing at measured ``ranges`` (K,); a missing range is replaced by 0."""
     ranges = np.where(np.isnan(ranges), 0.0, ranges)
@@ -182,7 +147,8 @@ def whitened_into(
     jacobian: Array,
 ) -> None:
     """:func:`residuals` (K, 2) at one pose (3,), and their Jacobian (K, 2, WIDTH) by its body-frame perturbation, by the points and
-    by :data:`PARAMETERS`, that by the time offset zero. Written into arrays that hold zeros; equal to :func:`jacobians`."""
+    by :data:`PARAMETERS`: that by the range scale is relative, and that by the time offset zero, as it needs the robot's velocity.
+    Written into arrays that hold zeros."""
     range_scale, _, _, _, bearing_sigma = model
     c, s = math.cos(pose[2]), math.sin(pose[2])
     ahead_x, ahead_y = math.cos(mounting[2] + depth_axis), math.sin(mounting[2] + depth_axis)

@@ -14,13 +14,10 @@ from functools import cached_property
 import numpy as np
 
 from factors import positive, se2
-from factors.compiled import compiled
-from factors.gaussian import product
 from factors.motion import Increment
+from factors.odometry.kernels import NO_CONSTANTS, linearize
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
-from factors.se2 import Array, adjoint_one, between_one, compose_one, inverse_right_jacobian, twist_to
-
-_NOWHERE = np.zeros(3)
+from factors.se2 import Array
 
 
 @dataclass(frozen=True)
@@ -54,12 +51,21 @@ class LoopFactor:
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, Array, Array]:
         """Whitened residual, and its Jacobian by each pose, without robust weights."""
-        n = self.rows
-        found = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))
-        measured = _NOWHERE if self.measured is None else self.measured
-        moved = [_NOWHERE if o is None else o.delta for o in (self.offset, self.earlier_offset)]
-        _linearize(values[0], values[1], moved[0], moved[1], measured, self._whitener, *found)
-        return found
+        moved = [None if o is None else o.delta for o in (self.offset, self.earlier_offset)]
+        later, earlier = (v if o is None else se2.compose(v, o) for v, o in zip(values, moved, strict=True))
+        if self.measured is not None:
+            error, by_earlier, by_later, _ = linearize(earlier, later, self.measured, NO_CONSTANTS, self._whitener)
+        else:
+            x, y, turned = se2.between(earlier, later).tolist()
+            c, s = math.cos(turned), math.sin(turned)
+            error = self._whitener @ (x, y)
+            by_later = self._whitener @ ((c, -s, 0.0), (s, c, 0.0))
+            by_earlier = self._whitener @ ((-1.0, 0.0, y), (0.0, -1.0, -x))
+        by_later, by_earlier = (
+            block if offset is None else block @ se2.adjoint(se2.inverse(offset))
+            for block, offset in zip((by_later, by_earlier), moved, strict=True)
+        )
+        return error, by_later, by_earlier
 
     def cost(self, values: Sequence[Array]) -> float:
         """The robust loss."""
@@ -89,36 +95,3 @@ class LoopFactor:
             back = se2.adjoint(se2.inverse(self.measured))
             noise = noise + back @ self.earlier_offset.covariance @ back.T
         return positive.whitener(noise)
-
-
-@compiled
-def _linearize(
-    later: Array,
-    earlier: Array,
-    offset: Array,
-    earlier_offset: Array,
-    measured: Array,
-    whitener: Array,
-    error: Array,
-    by_later: Array,
-    by_earlier: Array,
-) -> None:
-    x = compose_one(later, offset)
-    rel = between_one(compose_one(earlier, earlier_offset), x)
-    derivative = np.zeros((len(error), 3))
-    if len(error) == 2:
-        residual = np.array((rel[0], rel[1]))
-        c, s = math.cos(rel[2]), math.sin(rel[2])
-        derivative[0, 0], derivative[0, 1], derivative[1, 0], derivative[1, 1] = c, -s, s, c
-    else:
-        residual = twist_to(measured, rel)
-        derivative = inverse_right_jacobian(residual)
-    whitened = product(whitener, derivative)
-    to_later = product(whitened, adjoint_one(between_one(offset, np.zeros(3))))
-    to_earlier = product(whitened, adjoint_one(between_one(compose_one(earlier_offset, rel), np.zeros(3))))
-    for i in range(len(error)):
-        error[i] = 0.0
-        for j in range(len(error)):
-            error[i] += whitener[i, j] * residual[j]
-        for j in range(3):
-            by_later[i, j], by_earlier[i, j] = to_later[i, j], -to_earlier[i, j]

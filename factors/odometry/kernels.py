@@ -26,6 +26,8 @@ from factors.se2 import (
 # tenth of a millimetre in any direction; otherwise its covariance would be numerically singular.
 ROUNDING, FAR = 1e-12, 1e4  # m^2
 
+NO_CONSTANTS = np.zeros((3, 0))  # the derivative of an increment by no constants
+
 # direction of travel; variances per distance, rotation and time of longitudinal, lateral and heading error; variances per time
 # without odometry of position and heading; minimum variances, and minimum variances per time
 Noise = tuple[float, ...]

@@ -20,6 +20,7 @@ from factors import se2
 from factors.motion import ChainState, Increment
 from factors.odometry import kernels
 from factors.odometry.kernels import (
+    NO_CONSTANTS,
     Noise,
     linearize,
     linearize_as_reported,
@@ -225,7 +226,7 @@ class OdometryFactor:
             changed = self._arc, self._moving, constants[0], self._indices
             residual, *blocks = linearize_changed(start, end, *changed, self._whitener)
             return residual, blocks
-        residual, *blocks = linearize(start, end, self._increment.delta, np.zeros((3, 0)), self._whitener)
+        residual, *blocks = linearize(start, end, self._increment.delta, NO_CONSTANTS, self._whitener)
         return residual, blocks[:2]
 
     def cost(self, values: Sequence[Array]) -> float:

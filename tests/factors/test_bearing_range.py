@@ -9,14 +9,15 @@ from hypothesis import strategies as st
 from factors import positive, se2
 from factors.graph import jacobian_factors
 from factors.landmarks.factor import BearingRangeFactor
+from factors.landmarks.kernels import linearize_each
 from factors.landmarks.model import (
     CONSTANTS,
     POINT,
     WIDTH,
     BearingRangeModel,
-    jacobians,
     located,
     log_likelihood,
+    packed,
     predict,
     recalibrated,
     residuals,
@@ -68,7 +69,11 @@ def test_prediction_by_hand():
 @given(models, poses, points)
 def test_jacobians_are_the_numerical_ones(model, pose, point):
     assume(apart(model, pose, point))
-    by_pose, by_point, by_sensor = jacobians(model, pose, point)
+    seen = point[None], *(np.array([value]) for value in predict(model, pose, point))
+    error, jacobian = whitened(model, pose, *seen)
+    sigma = sigmas(model, seen[1])[0]
+    by_pose, by_point, by_sensor = np.split(sigma[:, None] * jacobian[0], (POINT, CONSTANTS), axis=1)
+    np.testing.assert_allclose(error, 0.0, atol=1e-8)
     step = 1e-6
 
     def derivative(function, size):
@@ -96,13 +101,12 @@ def test_the_compiled_function_gives_what_its_plain_twins_give(model, pose, seed
     ranges[1] = bearings[2] = np.nan
     assume(all(apart(model, pose, p) for p in seen))
     error, jacobian = whitened(model, pose, seen, ranges, bearings)
-    found = np.split(jacobian, (POINT, CONSTANTS), axis=2)
-    plain = [block / sigmas(model, ranges)[:, :, None] for block in jacobians(model, pose, seen)]
-    for block in plain:
-        block[1, 0] = block[2, 1] = 0.0
+    each = linearize_each(packed(model), np.tile(pose, (4, 1)), seen, ranges, bearings)
     np.testing.assert_allclose(error, residuals(model, pose, seen, ranges, bearings), atol=1e-8)
-    for compiled, block in zip(found, plain, strict=True):
-        np.testing.assert_allclose(compiled, block, rtol=1e-6, atol=1e-6)
+    assert not jacobian[1, 0].any()
+    assert not jacobian[2, 1].any()
+    for found, by_itself in zip((error, jacobian), each, strict=True):
+        np.testing.assert_array_equal(found, by_itself)
 
 
 def test_depth_is_the_distance_along_the_axis():
@@ -296,8 +300,7 @@ def test_the_likelihood_of_particles_knows_how_sure_the_map_is(model, seed):
     expected = []
     for particle in particles:
         error = residuals(model, particle, seen, ranges, bearings)
-        by_point = jacobians(model, particle, seen)[1] / sigmas(model, ranges)[..., None]
-        by_point[1, 0] = by_point[2, 1] = 0.0
+        by_point = whitened(model, particle, seen, ranges, bearings)[1][..., POINT:CONSTANTS]
         noise = np.eye(2) + by_point @ spreads @ by_point.transpose(0, 2, 1)
         squared = np.einsum("ki,kij,kj->k", error, np.linalg.inv(noise), error)
         expected.append(-np.sum(geman_mcclure_loss(squared, model.robust) + 0.5 * np.linalg.slogdet(noise)[1]))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factors import gaussian, positive
+from factors import positive
 
 SIGMAS = np.array((1e9, 1e9, 1e-3))
 
@@ -37,21 +37,6 @@ def test_other_covariances_are_taken_as_they_are():
 def test_what_is_no_covariance_is_refused(bad):
     with pytest.raises(np.linalg.LinAlgError):
         positive.nearest(np.diag((1.0, bad)))
-
-
-@pytest.mark.parametrize("size", [1, 3, 9])
-def test_compiled_roots_and_inverses_are_those_of_lapack(size):
-    parts = np.random.default_rng(size).standard_normal((size, size + 2))
-    covariance = parts @ parts.T
-    np.testing.assert_allclose(gaussian.cholesky(covariance)[0], np.linalg.cholesky(covariance), atol=1e-12)
-    np.testing.assert_allclose(gaussian.invert_covariance(covariance), np.linalg.inv(covariance), rtol=1e-9)
-
-
-@pytest.mark.parametrize("bad", [np.diag((1.0, -1.0)), np.ones((2, 2)), np.diag((1.0, np.nan)), np.diag((np.inf, 1.0))])
-def test_what_is_no_covariance_has_no_compiled_inverse(bad):
-    assert not gaussian.cholesky(bad)[1]
-    with pytest.raises(np.linalg.LinAlgError):
-        gaussian.invert_covariance(bad)
 
 
 def test_roots_and_solutions_are_those_of_the_nearest_one_too():

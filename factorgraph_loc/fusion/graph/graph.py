@@ -289,5 +289,7 @@ class Graph:
             np.array([step.duration for step in steps]),
             np.array([k.is_elsewhere for k in keyframes[1:]], dtype=np.bool_),
         )
-        at, spread = poses_between(before, deltas, noises, np.abs(ends[:, 0] - starts[:, 0]), *later, poses, covariances)
+        at, spread = poses_between(
+            before, deltas, noises, np.abs(ends[:, 0] - starts[:, 0]), *later, poses, covariances
+        )
         return Trajectory(np.array([tick.t for tick in ticks]), at, se2.body_to_world(at, spread))

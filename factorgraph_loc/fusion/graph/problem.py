@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
+import numpy as np
 
 from factorgraph_loc.fusion.graph.chained import Chained
-from factorgraph_loc.fusion.graph.least_squares import MAX_ITERATIONS, damped_step, optimum
 from factorgraph_loc.fusion.graph.marginals import Covariances, covariances
-from factorgraph_loc.fusion.graph.variables import Values, gather, retract
-from factors.graph import Factor, jacobian_factors
+from factorgraph_loc.fusion.graph.variables import GTSAM_ERRORS, Values, gather, retract
+from factors.graph import Factor, gaussian_factor, jacobian_factors
+from factors.least_squares import MAX_ITERATIONS, descended
 
 
 @dataclass(frozen=True)
@@ -44,14 +45,18 @@ class Problem:
         chain = self._chain
         begin = None if chain is None else chain.begin(values)
         if chain is not None and begin is not None:
-            state, cost, iterations = optimum(chain.cost, chain.moved, begin, max_iterations)
+            state, cost, iterations = descended(chain.cost, chain.moved, begin, max_iterations)
             return Solution(values | chain.values(state), cost, iterations)
-        return Solution(*optimum(self.cost, self._moved, values, max_iterations))
+        return Solution(*descended(self.cost, self._moved, values, max_iterations))
 
     def _moved(self, values: Values, damping: float) -> Values | None:
         """A step of Levenberg and Marquardt; None where the problem is nearly singular."""
-        step = damped_step(self.linearize(values), {key: len(value) for key, value in values.items()}, damping)
-        if step is None:
+        linear = self.linearize(values)
+        for key, value in values.items():
+            linear.add(gaussian_factor((key,), np.zeros(len(value)), (np.sqrt(damping) * np.eye(len(value)),)))
+        try:
+            step = linear.optimize()
+        except GTSAM_ERRORS:
             return None
         return {key: retract(key, value, step.at(key)) for key, value in values.items()}
 

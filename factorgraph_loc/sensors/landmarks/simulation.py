@@ -23,6 +23,7 @@ from factorgraph_loc.sensors.landmarks.measurement import (
 from factors import se2
 from factors.compiled import compiled
 from factors.landmarks import model as bearing_range
+from factors.landmarks.kernels import linearize_each
 from factors.landmarks.model import BearingRangeModel
 from factors.se2 import Array
 
@@ -123,9 +124,8 @@ class LandmarkForecast:
         """Information of the visible landmarks."""
         points = self.world.positions()
         n, k = in_sight(self.model, self.world, poses, self.settings)
-        by_pose, _, _ = bearing_range.jacobians(self.model, poses[n], points[k])
-        ranges, _ = bearing_range.predict(self.model, poses[n], points[k])
-        whitened = by_pose / bearing_range.sigmas(self.model, ranges)[:, :, None]
+        seen = poses[n], points[k], *bearing_range.predict(self.model, poses[n], points[k])
+        whitened = linearize_each(bearing_range.packed(self.model), *seen)[1][..., : bearing_range.POINT]
         out = np.zeros((len(poses), 3, 3))
         np.add.at(out, n, np.swapaxes(whitened, 1, 2) @ whitened)
         return np.asarray((self.looks_per_metre * ways)[:, None, None] * out)

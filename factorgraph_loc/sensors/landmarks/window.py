@@ -10,7 +10,8 @@ import numpy as np
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
-from factors.landmarks.model import BearingRangeModel, jacobians, located, residuals, sigmas
+from factors.landmarks.kernels import linearize_each
+from factors.landmarks.model import POINT, BearingRangeModel, located, packed, residuals, sigmas
 from factors.least_squares import minima
 from factors.motion import ChainState
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
@@ -113,10 +114,8 @@ class SightingWindow:
         error = self._drift
         if spread is not None:
             error = error + self._carried @ spread @ self._carried.transpose(0, 2, 1)
-        jacobian = (
-            jacobians(self._model, np.zeros((len(self.points), 3)), self._from_robot())[0] / self._sigmas[..., None]
-        )
-        jacobian[self._missing] = 0.0
+        seen = np.zeros((len(self.points), 3)), self._from_robot(), self._ranges, self._bearings
+        jacobian = linearize_each(packed(self._model), *seen)[1][..., :POINT]
         covariance = np.eye(2) + jacobian @ error @ jacobian.transpose(0, 2, 1)
         # without a bearing the direction of the range is unknown: use the worst case
         worst = np.linalg.eigvalsh(error[:, :2, :2])[:, -1] / self._sigmas[:, 0] ** 2
@@ -161,7 +160,7 @@ class SightingWindow:
         weight[first:] = geman_mcclure_weight(self.squared(pose[None], whitener)[0], self._model.robust)
         for _ in range(iterations):
             root = np.sqrt(np.maximum(weight, 1e-6))
-            jacobian, error = self._jacobians(pose[None])[0], self._residuals(pose[None])[0]
+            error, jacobian = (part[0] for part in self._linearized(pose[None]))
             if self._start is not None:
                 told, by_pose, _ = self._start.whitened(pose, self.now)
                 jacobian, error = np.concatenate((by_pose[None], jacobian)), np.concatenate((told[None], error))
@@ -196,17 +195,18 @@ class SightingWindow:
         at = se2.compose(poses[:, None], self._back)
         return residuals(self._model, at, self.points, self._ranges, self._bearings)
 
-    def _jacobians(self, poses: Array) -> Array:
-        """Jacobians (N, K, 2, 3) of the residuals by the perturbation of the present pose."""
-        at = se2.compose(poses[:, None], self._back)
-        jacobian = jacobians(self._model, at, self.points)[0] / self._sigmas[..., None]
-        jacobian[:, self._missing] = 0.0
-        return np.asarray(jacobian @ self._carried)
+    def _linearized(self, poses: Array) -> tuple[Array, Array]:
+        """Residuals (N, K, 2) at present poses (N, 3), and their Jacobians (N, K, 2, 3) by the perturbation of these."""
+        at, count = se2.compose(poses[:, None], self._back), len(poses)
+        seen = np.tile(self.points, (count, 1)), np.tile(self._ranges, count), np.tile(self._bearings, count)
+        error, jacobian = linearize_each(packed(self._model), at.reshape(-1, 3), *seen)
+        jacobian = jacobian[..., :POINT].reshape(*at.shape[:2], 2, 3) @ self._carried
+        return error.reshape(*at.shape[:2], 2), jacobian
 
     def _normal_equations(self, poses: Array, whitener: Array, spread: Array | None) -> tuple[Array, Array]:
         """Robustly weighted information (N, 3, 3), including that of a nearly flat prior or the start, and gradient (N, 3)."""
-        jacobian = whitener @ self._jacobians(poses)
-        error = (whitener @ self._residuals(poses)[..., None])[..., 0]
+        error, jacobian = self._linearized(poses)
+        error, jacobian = (whitener @ error[..., None])[..., 0], whitener @ jacobian
         weight = geman_mcclure_weight(np.sum(error**2, axis=-1), self._model.robust)
         weighted = np.swapaxes(weight[..., None, None] * jacobian, -1, -2)
         information, gradient = np.sum(weighted @ jacobian, axis=1) + FLAT, np.sum(weighted @ error[..., None], axis=1)

@@ -1,8 +1,7 @@
 """Fits of detection models to pairs of an antenna and a tag, and the selection of the one that predicts held-out data best.
 
 A parametric model whose logit is linear in its parameters is fitted by penalised maximum likelihood with Fisher scoring (McCullagh
-and Nelder, "Generalized Linear Models", 1989, section 2.5), using the derivatives of the likelihood with its floor; unsuccessful
-steps are halved.
+and Nelder, "Generalized Linear Models", 1989, section 2.5), using the derivatives of the likelihood with its floor.
 
 A grid of logits in an antenna's frame is fitted as a difference to a parametric field: smooth by a penalty on second differences
 (Eilers and Marx, "Flexible smoothing with B-splines and penalties", Statistical Science 11(2), 1996), and zero where there are no
@@ -19,6 +18,7 @@ from scipy.optimize import minimize
 from scipy.sparse.linalg import splu
 
 from factorgraph_loc.sensors.rfid.calibration.pairs import REACH, TagPairs, modelled, terms
+from factors.least_squares import descended
 from factors.rfid import knots
 from factors.rfid.model import FEATURES, NEAR, BeamModel, DetectionModel, GridModel, LogisticModel, bake, logits
 from factors.se2 import Array
@@ -55,32 +55,22 @@ def fit_linear(
     floor: Floor,
 ) -> Array:
     """Parameters (P,) of the logit ``offset + design @ p`` (M,) that maximise the likelihood minus ``p @ penalty @ p / 2``."""
-    values = np.zeros(design.shape[1])
 
-    def cost(p: Array) -> tuple[float, Array, Array]:
+    def cost(p: Array) -> float:
         found = terms(offset + design @ p, hits, count, floor.false_read, floor.miss)
-        return float(np.sum(found.nll) + 0.5 * p @ (penalty @ p)), found.gradient, found.information
+        return float(np.sum(found.nll) + 0.5 * p @ (penalty @ p))
 
-    here, slope, information = cost(values)
-    for _ in range(ITERATIONS):
-        gradient = design.T @ slope + penalty @ values
-        if sparse.issparse(design):
-            curvature = design.T @ sparse.diags_array(information) @ design + penalty
-            step = splu(
-                sparse.csc_matrix(curvature), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
-            ).solve(gradient)
-        else:
-            step = np.linalg.solve(design.T @ (information[:, None] * design) + penalty, gradient)
-        size = 1.0
-        while (tried := cost(values - size * step))[0] > here and size > 1e-3:
-            size *= 0.5
-        if tried[0] >= here:
-            break
-        values, gained = values - size * step, here - tried[0]
-        here, slope, information = tried
-        if gained < CONVERGED * here:
-            break
-    return values
+    def moved(p: Array, damping: float) -> Array:
+        found = terms(offset + design @ p, hits, count, floor.false_read, floor.miss)
+        gradient = design.T @ found.gradient + penalty @ p
+        if not sparse.issparse(design):
+            curvature = design.T @ (found.information[:, None] * design) + penalty
+            return p - np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
+        curvature = design.T @ sparse.diags_array(found.information) @ design + penalty
+        damped = sparse.csc_matrix(curvature + damping * sparse.diags_array(curvature.diagonal()))
+        return p - splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(gradient)
+
+    return descended(cost, moved, np.zeros(design.shape[1]), ITERATIONS, CONVERGED)[0]
 
 
 def fit_logistic(pairs: TagPairs, floor: Floor, *, with_facing: bool) -> LogisticModel:
