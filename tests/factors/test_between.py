@@ -3,8 +3,7 @@
 import numpy as np
 
 from factors import se2
-from factors.motion import Increment, propagate
-from factors.odometry.kernels import poses_between
+from factors.motion import Increment, poses_between, propagate
 
 
 def spread(rng):

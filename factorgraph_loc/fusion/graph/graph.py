@@ -35,8 +35,7 @@ from factorgraph_loc.sensors.base import NewVariable, Sensor, Term
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2
 from factors.graph import Factor
-from factors.motion import ChainState, Increment
-from factors.odometry.kernels import poses_between
+from factors.motion import ChainState, Increment, poses_between
 from factors.se2 import Array
 
 STATE = len(ChainState._fields)
