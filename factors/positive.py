@@ -17,6 +17,7 @@ from factors.se2 import Array
 
 LEAST = 1e-12  # minimum eigenvalue of an invertible correlation matrix
 CLEAR = 1e-9  # determinant of a clearly invertible correlation matrix
+SKEW = 1e-6  # of two standard deviations: most asymmetry of a covariance that rounding explains
 
 
 def nearest(covariances: Array) -> Array:
@@ -40,13 +41,16 @@ def sound(covariance: Array) -> Array:
 
 @compiled(error_model="numpy")
 def is_clear(covariance: Array) -> bool:
-    """Whether a covariance (D, D) is finite and far from singular, so that it is its own :func:`sound` covariance."""
+    """Whether a covariance (D, D) is finite, symmetric and far from singular, so that it is its own :func:`sound` covariance."""
     size, shares = len(covariance), np.empty(covariance.shape)
     for i in range(size):
         if not 0.0 < covariance[i, i] < np.inf:
             return False
         for j in range(i + 1):
             shares[i, j] = covariance[i, j] / math.sqrt(covariance[i, i]) / math.sqrt(covariance[j, j])
+            skew = shares[i, j] - covariance[j, i] / math.sqrt(covariance[i, i]) / math.sqrt(covariance[j, j])
+            if not abs(skew) <= SKEW:
+                return False
     lower, exists = gaussian.cholesky(shares)
     determinant = 1.0
     for i in range(size):

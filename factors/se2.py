@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from factors.compiled import compiled
 
-Array, Integers = NDArray[np.float64], NDArray[np.int64]
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 SMALL = 1e-4  # rad; smaller angles use series, against cancellation
 SHORT = 0.5  # rad; of many poses smaller angles use longer series, in less time
@@ -50,7 +51,8 @@ def inverse(a: Array) -> Array:
     """The pose ``a^-1``."""
     a = np.asarray(a, dtype=float)
     if a.ndim == 1:
-        return np.array(between_scalars(*a.tolist(), 0.0, 0.0, 0.0))
+        x, y, heading = a.tolist()
+        return np.array(between_scalars(x, y, heading, 0.0, 0.0, 0.0))
     out = np.empty_like(a)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     out[..., 0] = -c * a[..., 0] - s * a[..., 1]

@@ -21,15 +21,13 @@ from factorgraph_loc.model.belief import Belief, PoseEstimate
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.text import plain
-from factors.compiled import compiled
+from factors import positive
 from factors.se2 import Array
 
 # singular matrices, overflows, divisions by zero, values that no function takes; all that GTSAM throws
 FAILURES = (ArithmeticError, ValueError, RuntimeError, IndexError)
-SKEW = 1e-6  # of two standard deviations: how far rounding may take a covariance from symmetry
 ROUNDING = 1e-6  # of a correlation matrix: eigenvalues that are no lower are those of rounding
 LEAST = 1e-9  # what they are raised to
-CLEAR = 1e-4  # share of a variance that the others leave unexplained: nothing more has to be looked at
 
 
 class Guard:
@@ -107,10 +105,9 @@ def sound(estimate: PoseEstimate) -> PoseEstimate:
         return estimate
     if estimate.pose.shape != (3,) or estimate.covariance.shape != (3, 3):
         raise ValueError("the estimate is not a pose (3,) with a covariance (3, 3)")
-    is_finite, is_clear = _judged(estimate.pose, estimate.covariance)
-    if not is_finite:
+    if not all(map(math.isfinite, estimate.pose.tolist())):
         raise ValueError("the pose is not finite")
-    if is_clear:
+    if positive.is_clear(estimate.covariance):
         return estimate
     covariance = _positive(estimate.covariance)
     return estimate if covariance is estimate.covariance else replace(estimate, covariance=covariance)
@@ -134,7 +131,7 @@ def sound_trajectory(trajectory: Trajectory) -> Trajectory:
         raise ValueError(f"the pose at {trajectory.t[~finite][0]:.3f} s is not finite")
     if trajectory.covariances is None:
         return trajectory
-    doubtful = np.flatnonzero(~clearly_positive(trajectory.covariances)).tolist()
+    doubtful = [i for i, covariance in enumerate(trajectory.covariances) if not positive.is_clear(covariance)]
     if not doubtful:
         return trajectory
     covariances = trajectory.covariances.copy()
@@ -151,17 +148,6 @@ def _positive(covariance: Array, where: str = "") -> Array:
     return found
 
 
-def clearly_positive(covariances: Array) -> np.typing.NDArray[np.bool_]:
-    """Which of the covariances (N, D, D) are finite, symmetric and far from singular, whatever their units."""
-    with np.errstate(all="ignore"):
-        sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-        shares = covariances / sigmas[:, :, None] / sigmas[:, None, :]
-    finite = np.all(np.isfinite(shares), axis=(1, 2)) & np.all(np.isfinite(covariances), axis=(1, 2))
-    shares[~finite] = np.eye(shares.shape[1])
-    symmetric = np.all(np.abs(shares - shares.transpose(0, 2, 1)) <= SKEW, axis=(1, 2))
-    return np.asarray(finite & symmetric & (np.linalg.eigvalsh(shares)[:, 0] > CLEAR))
-
-
 def nearest_positive(covariance: Array) -> Array | None:
     """The covariance (D, D), or the nearest one that is symmetric and positive definite where it is not by rounding alone; None
     where it is no covariance."""
@@ -170,7 +156,7 @@ def nearest_positive(covariance: Array) -> Array | None:
         return None
     # by parts, as products of the largest and the smallest may be beyond numbers
     shares = covariance / sigmas[:, None] / sigmas
-    if not np.all(np.isfinite(shares)) or np.abs(shares - shares.T).max() > SKEW:
+    if not np.all(np.isfinite(shares)) or np.abs(shares - shares.T).max() > positive.SKEW:
         return None
     values, vectors = np.linalg.eigh((shares + shares.T) / 2.0)
     if values[0] < -ROUNDING:
@@ -180,21 +166,6 @@ def nearest_positive(covariance: Array) -> Array | None:
     raised = (vectors * np.maximum(values, LEAST)) @ vectors.T
     found = (raised + raised.T) / 2.0 * (sigmas[:, None] * sigmas)
     return found if np.all(np.isfinite(found)) else None
-
-
-@compiled(error_model="numpy")
-def _judged(pose: Array, covariance: Array) -> tuple[bool, bool]:
-    """Whether a pose (3,) is finite; and what :func:`clearly_positive` says of one covariance (3, 3), by what the rows before leave
-    unexplained of each variance. Compiled, as each estimate of a run is asked."""
-    finite = math.isfinite(pose[0]) and math.isfinite(pose[1]) and math.isfinite(pose[2])
-    c = covariance
-    x, y, z = math.sqrt(c[0, 0]), math.sqrt(c[1, 1]), math.sqrt(c[2, 2])
-    xy, xz, yz = c[0, 1] / x / y, c[0, 2] / x / z, c[1, 2] / y / z
-    second, across = 1.0 - xy * xy, yz - xy * xz
-    clear = 0.0 < c[0, 0] < math.inf and 0.0 < c[1, 1] < math.inf and 0.0 < c[2, 2] < math.inf
-    clear = clear and abs(xy - c[1, 0] / x / y) <= SKEW and abs(xz - c[2, 0] / x / z) <= SKEW
-    clear = clear and abs(yz - c[2, 1] / y / z) <= SKEW and second > CLEAR
-    return finite, clear and 1.0 - xz * xz - across * across / second > CLEAR
 
 
 def _named(measurement: Measurement) -> str:

@@ -98,7 +98,9 @@ class Associator:
         model = self._model if model is None else model
         if len(frame.pixels) == 0 or frame.feature != self.feature:
             return NONE
-        ahead = kernels.in_view(self._positions, position, rotation, NEAREST, FARTHEST, self._slopes)
+        x, y, depth = ((self._positions - position) @ rotation).T
+        inside = (depth >= NEAREST) & (depth <= FARTHEST) & (np.abs(x) <= self._slopes[0] * depth)
+        ahead = np.flatnonzero(inside & (np.abs(y) <= self._slopes[1] * depth))
         views, begins = kernels.agreeing_views(
             ahead, position, self._positions, self._starts, self._seen_from, math.cos(TURNED), ZOOMED
         )

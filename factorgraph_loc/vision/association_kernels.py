@@ -46,26 +46,6 @@ def agreeing_views(
 
 
 @compiled
-def in_view(
-    positions: Array, place: Array, rotation: Array, nearest: float, farthest: float, slopes: Array
-) -> Integers:
-    """Which points lie in front of the camera, between two depths and within the ``slopes`` (2,) of its field of view."""
-    out = np.empty(len(positions), np.int64)
-    n = 0
-    for i in range(len(positions)):
-        x, y, z = positions[i, 0] - place[0], positions[i, 1] - place[1], positions[i, 2] - place[2]
-        depth = rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z
-        if depth < nearest or depth > farthest:
-            continue
-        right = rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z
-        down = rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z
-        if abs(right) <= slopes[0] * depth and abs(down) <= slopes[1] * depth:
-            out[n] = i
-            n += 1
-    return out[:n]
-
-
-@compiled
 def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Array, cell: float) -> Integers:
     """Pairs (N, 2) of a point and a feature inside the gate of the point's prediction.
 

@@ -85,8 +85,8 @@ def on_floor(
     factor = ReprojectionFactor(model, points, pixels, point_covariances=spreads)
 
     def at(poses: Array, _: Integers) -> tuple[Array, Array, Array]:
-        residual, (jacobian,) = factor.linearize(poses)
-        return np.array([factor.cost(poses)]), (residual @ jacobian)[None], (jacobian.T @ jacobian)[None]
+        residual, (jacobian,) = factor.linearize([poses[0]])
+        return np.array([factor.cost([poses[0]])]), (residual @ jacobian)[None], (jacobian.T @ jacobian)[None]
 
     best = minima(at, pose[None], REFINEMENTS, CONVERGED, moved=lambda p, step: se2.compose(p, se2.exp(step)))
     pose, information = best.states[0], best.curvatures[0]

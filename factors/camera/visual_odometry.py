@@ -123,7 +123,7 @@ class VisualOdometryFactor:
     def __init__(self, delta: Array, information: Array) -> None:
         self._delta = delta
         values, vectors = np.linalg.eigh(information)
-        self._whitener = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+        self._whitener = np.ascontiguousarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (3,) ``log(delta^-1 * first^-1 * second)`` and its Jacobians."""

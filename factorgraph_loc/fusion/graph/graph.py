@@ -272,7 +272,7 @@ class Graph:
 
     def between(self, poses: Array, covariances: Array) -> Trajectory:
         """The trajectory from all keyframes, ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3), at the ticks, but for those
-        at which nobody knows where the robot was; see :func:`factors.between.between`."""
+        at which nobody knows where the robot was; see :func:`factors.motion.poses_between`."""
         newest = {tick.t: tick for tick in self.ticks}
         stamps = np.array(sorted(newest))
         ticks = [newest[t] for t in stamps[is_known(stamps, self.changes)].tolist()]

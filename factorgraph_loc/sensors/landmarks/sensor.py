@@ -20,8 +20,8 @@ from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingR
 from factors import positive
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor, landmark_update
-from factors.landmarks.model import PARAMETERS, TIME_OFFSET, packed
 from factors.landmarks.kernels import innovations
+from factors.landmarks.model import PARAMETERS, TIME_OFFSET, packed
 from factors.motion import Increment
 from factors.se2 import Array
 from factors.update import GATE, Correction

@@ -46,7 +46,7 @@ class SightingWindow:
         self._times = [r.odometry for r in rows]
         self.now = rows[-1].odometry
         self.points = np.array([r.point for r in rows])
-        self._ranges, self._bearings = np.array([(r.range, r.bearing) for r in rows]).T
+        self._ranges, self._bearings = np.array([r.range for r in rows]), np.array([r.bearing for r in rows])
         since = [motion.relative(r.odometry, self.now) for r in rows]
         self._forth = np.array([i.delta for i in since])
         self._back = se2.inverse(self._forth)  # pose at each sighting relative to the present one
