@@ -100,6 +100,8 @@ def log(pose: Array) -> Array:
 def adjoint(pose: Array) -> Array:
     """The adjoint matrix ``(..., 3, 3)``: ``pose * exp(xi) = exp(adjoint(pose) xi) * pose``."""
     pose = np.asarray(pose, dtype=float)
+    if pose.ndim == 1:
+        return adjoint_one(np.array(pose))
     out = _rotation3(pose[..., 2])
     out[..., 0, 2], out[..., 1, 2] = pose[..., 1], -pose[..., 0]
     return out
