@@ -1,7 +1,7 @@
 """Positions of tags to centimetres, from the phases of reads along known poses.
 
 The phases of one tag, antenna and channel within a window agree only at the tag's position, after the phase of the path is
-subtracted (:mod:`factors.rfid.phase`), as in a synthetic aperture (holography: Miesen, Kirsch, Vossiek, IEEE RFID 2011). Unknown
+subtracted (:mod:`factors.rfid.signals`), as in a synthetic aperture (holography: Miesen, Kirsch, Vossiek, IEEE RFID 2011). Unknown
 phase offsets and frequency hopping cancel within a window, so that only the poses of one window must be exact, relative to each
 other, to a fraction of the wavelength. The prior is the position that follows from reads and misses. The likelihood has side lobes:
 it is evaluated on a lattice first, then refined by Fisher scoring.
@@ -22,7 +22,7 @@ from factorgraph_loc.sensors.rfid.calibration.phase import phase_reads
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factors.least_squares import minimum
 from factors.rfid.detection import TagArray
-from factors.rfid.phase import PhaseLikelihood, PhaseModel, PhaseReads
+from factors.rfid.signals import PhaseLikelihood, PhaseModel, PhaseReads
 from factors.se2 import Array
 
 # Exponent of the likelihood. That of the rig, for localization, is smaller, as it also allows for errors of the surveyed tags.

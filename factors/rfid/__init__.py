@@ -12,8 +12,6 @@ __all__ = [
     "kernels",
     "knots",
     "model",
-    "phase",
-    "strength",
+    "signals",
     "tag_states",
-    "update",
 ]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from factors.rfid import kernels, weighing
 from factors.rfid.index import MapTags, Seen, moved, tag_index
 from factors.rfid.model import Packed, RfidModel
-from factors.rfid.places import Places, in_reach, is_wide, reach_of
+from factors.rfid.places import Places, RobotTables, antennas_of, in_reach, is_wide, reach_of, robot_tables
 from factors.rfid.tables import Tables, make_tables
 from factors.se2 import Array, Integers
 
@@ -139,6 +139,11 @@ class Score(NamedTuple):
     information: Array
     expected: Array
     variance: Array
+
+    @classmethod
+    def of_signals(cls, nll: Array, gradient: Array, information: Array) -> Score:
+        """The score of a likelihood whose expected value is not computed: every measurement counts as likely as expected."""
+        return cls(nll, gradient, information, nll, np.zeros(len(nll)))
 
 
 class ExpectedReads(NamedTuple):
@@ -265,9 +270,19 @@ class RfidLikelihood:
             if len(kept) >= KEPT:
                 del kept[next(k for k in kept if any(k))]
             packed = kernels.adjusted(self._unadjusted.packed, steps * rounded)
-            first = self._unadjusted
-            kept[key] = Places.of(self.model, packed, first._tables, first._map)
+            antennas = antennas_of(packed, self._unadjusted._tables)
+            kept[key] = Places.of(antennas, self._unadjusted._map, uses_facing=self.uses_facing)
         return kept[key]
+
+    @property
+    def uses_facing(self) -> bool:
+        """Whether the facing of tags matters."""
+        return any(self.model.models[a.model].uses_facing for a in self.model.antennas)
+
+    def robot_tables(self, finest: int, facings: int) -> RobotTables:
+        """Tables of the response by a tag's position in the robot frame (:func:`factors.rfid.places.robot_tables`)."""
+        antennas = antennas_of(self.packed, self._unadjusted._tables)
+        return robot_tables(antennas, self.tags.points[:, 2], finest, facings if self.uses_facing else 0)
 
     def by_tag(self, pose: Array, looks: TagReadCounts) -> tuple[Array, Array, Array]:
         """The contribution of each tag, all of the map being listed, at one pose (3,): tempered negative log-likelihood (T,),

@@ -1,10 +1,10 @@
-"""The likelihood of RFID reads for poses that may be anywhere in a large map, as those of a search.
+"""Tables of reads by the tag's position in the robot frame, and the likelihood of poses that may be anywhere in a large map.
 
-For each pose only the tags in its reach count, which a :class:`~factors.rfid.index.TagIndex` finds. Most of them were
-not read. The log-likelihood of a miss is a function of the tag's position in the robot frame, the same for all tags of
-one height. It is tabulated for all antennas together, as is what a read by each antenna adds, in the cells of
-:mod:`factors.rfid.tables`. Models are evaluated antenna by antenna if they use the facing of tags, if they have no
-tables of antennas (logistic ones), or if the tables of places would be too large.
+All antennas of a robot measure from one pose, so the response of all of them to a tag is a function of the tag's position in the
+robot frame, the same for all tags of one height. A search and planning both use these tables, planning with larger cells.
+For each pose only the tags in its reach count, which a :class:`~factors.rfid.index.TagIndex` finds. Most of them were not read, and
+the log-likelihood of a miss is tabulated for all antennas together. Models that use the facing of tags are evaluated antenna by
+antenna in a search: close to an antenna the facing changes within a cell.
 """
 
 from __future__ import annotations
@@ -19,34 +19,42 @@ from numpy.typing import NDArray
 from factors.compiled import compiled
 from factors.rfid.index import MapTags, Seen, TagIndex, cells
 from factors.rfid.kernels import FAST
-from factors.rfid.model import LOGISTIC, Packed, RfidModel
-from factors.rfid.tables import CELL, NO_MATTER, Array32, Tables, logs_of, row_of
-from factors.rfid.weighing import mixed
+from factors.rfid.model import Packed
+from factors.rfid.tables import CELL, LEVEL, NO_MATTER, Array32, Tables, logs_of, row_at
+from factors.rfid.weighing import LEAST, mixed
 from factors.se2 import Array, Integers
 
-MOST = 1 << 25  # numbers in the tables; more have none
+MOST = 1 << 24  # numbers in a table; cells are so large that there are no more
 WIDE = 2.0  # times the square that an antenna reaches: poses that touch more are evaluated one by one
 PLACED = 25  # work of a pose, besides that of its tags
-BY_ANTENNA = 7  # work of a tag for one antenna, where there are no tables of places
+BY_ANTENNA = 7  # work of a tag for one antenna, where there are no tables of the robot frame
 
 
-class PlaceTables(NamedTuple):
-    """Of H heights: ``gain`` (A, H, S, S), log q - log(1 - q) of each antenna for a tag at a position in the robot frame, and
-    ``missed`` (A, H, S, S), log(1 - q) above that out of reach; ``level`` (T,): height of each tag. Without tables these are
-    empty. ``none`` (A, 2): log q and log(1 - q) of each antenna out of reach."""
+class RobotTables(NamedTuple):
+    """The response of A antennas to a tag by its position in the robot frame: S x S cells of ``cell`` [m] in F layers, one for
+    each direction in which the tag faces and the last for an unknown or irrelevant one, for each of H heights.
+
+    ``gain`` (A, H, F, S, S): log q - log(1 - q); ``missed`` (A, H, F, S, S): log(1 - q) above that out of reach; ``level`` (T,):
+    height of each tag; ``none`` (A, 2): log q and log(1 - q) out of reach.
+    """
 
     gain: Array32
     missed: Array32
     level: Integers
     none: Array
+    cell: float
 
 
 class MissTable(NamedTuple):
-    """Log-likelihood of a tag that nobody reads, by its position in the robot frame: ``surveyed`` (H, S, S), above that out of
-    reach; ``folded`` (H, S, S): the same, tempered, of a tag that may be dead or moved; ``reach`` [m], beyond which it is 0."""
+    """Log-likelihood of a tag that nobody reads, by its position in the robot frame.
+
+    ``surveyed`` (H, S, S): of a tag as surveyed, above that out of reach; ``folded`` (H, S, S): the same, tempered, of a tag that
+    may be dead or moved; ``cell`` [m]; ``reach`` [m], beyond which it is 0.
+    """
 
     surveyed: Array32
     folded: Array32
+    cell: float
     reach: float
 
 
@@ -74,6 +82,11 @@ class Antennas(NamedTuple):
     reach: float
 
 
+def antennas_of(packed: Packed, tables: Tables) -> Antennas:
+    """An adjusted model with the ``tables`` of its antennas."""
+    return Antennas(packed, tables, logs_of(packed), reach_of(packed))
+
+
 def reach_of(packed: Packed) -> float:
     """How far [m] an antenna of an adjusted model reaches from the robot's middle."""
     levers = np.hypot(packed.antennas[:, 0], packed.antennas[:, 1])
@@ -94,13 +107,51 @@ def in_reach(points: Array, reach: float) -> float:
     return len(points) * min(1.0, math.pi * reach**2 / area)
 
 
+def robot_tables(antennas: Antennas, heights: Array, finest: int = 1, facings: int = 0) -> RobotTables:
+    """The tables of a model for tags at ``heights`` (T,) [m], which face in so many directions or in an irrelevant one.
+
+    Cells and heights are ``finest`` times as far apart as in the tables of the antennas, or farther if the table would be too
+    large.
+    """
+    scale, size, (packed, tables, logs, reach) = finest, MOST + 1, antennas
+    while size > MOST:
+        steps = np.rint(heights / (scale * LEVEL)).astype(np.int64)
+        _, first, level = np.unique(steps, return_index=True, return_inverse=True)
+        edge = math.ceil(reach / (scale * CELL))
+        shape = (len(packed.antennas), len(first), facings + 1, 2 * edge + 1, 2 * edge + 1)
+        size, cell, scale = math.prod(shape), scale * CELL, scale + 1
+    gain, missed = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+    q = np.clip(packed.false_read + packed.span * packed.rate[packed.which] * tables.sigmoids[0], LEAST, 1.0 - LEAST)
+    none = np.log(np.column_stack((q, 1.0 - q)))
+    _fill(packed, tables, logs, tables.level[:, first], heights[first], cell, none, gain, missed)
+    return RobotTables(gain, missed, level.reshape(-1).astype(np.int64), none, cell)
+
+
+def miss_table(tables: RobotTables, scan: Scan, tempering: float, reach: float) -> MissTable:
+    """The table of misses of the antennas and rounds of a scan."""
+    total: Array32 = np.zeros((tables.missed.shape[1], *tables.missed.shape[3:]), dtype=np.float32)
+    if not total.size:
+        return MissTable(total, total, tables.cell, reach)
+    for antenna, count in zip(scan.antennas.tolist(), scan.rounds.tolist(), strict=True):
+        total += np.float32(count) * tables.missed[antenna, :, 0]
+    own: Array32 = np.float32(tempering) * total
+    folded = own
+    if scan.others > -np.inf:
+        folded = (np.logaddexp(own, scan.others) - np.logaddexp(0.0, scan.others)).astype(np.float32)
+    relevant = np.argwhere((np.abs(own) > NO_MATTER).any(axis=0)) - total.shape[1] // 2
+    farthest = tables.cell * (float(np.max(np.hypot(*relevant.T), initial=0.0)) + 1.0)
+    return MissTable(total, folded, tables.cell, min(farthest, reach))
+
+
 @dataclass(frozen=True, eq=False)
 class Places:
-    """A map's tags by position, with the tables of a model. ``points`` (T, 3), ``normals`` (T, 2) and ``levels`` (A, T) are in the
-    order of the ``index``."""
+    """A map's tags by position, with the ``tables`` of a model, which are empty if it uses the facing of tags.
+
+    ``points`` (T, 3), ``normals`` (T, 2) and ``levels`` (A, T) are in the order of the ``index``.
+    """
 
     antennas: Antennas
-    tables: PlaceTables
+    tables: RobotTables
     index: TagIndex
     points: Array
     normals: Array
@@ -108,13 +159,14 @@ class Places:
     _last: dict[tuple[object, ...], MissTable] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, model: RfidModel, packed: Packed, tables: Tables, of_map: MapTags) -> Places:
-        """For the tags of a map, from the ``tables`` of the antennas. ``packed``: the adjusted model."""
+    def of(cls, antennas: Antennas, of_map: MapTags, *, uses_facing: bool) -> Places:
+        """For the tags of a map."""
         order = of_map.cells.order
-        of_tags = np.ascontiguousarray(of_map.points[order]), np.ascontiguousarray(of_map.normals[order])
-        antennas = Antennas(packed, tables, logs_of(packed), reach_of(packed))
-        made = place_tables(model, antennas, order)
-        return cls(antennas, made, of_map.cells, *of_tags, np.ascontiguousarray(tables.level[:, order]))
+        points, normals = np.ascontiguousarray(of_map.points[order]), np.ascontiguousarray(of_map.normals[order])
+        tables = robot_tables(antennas, points[: 0 if uses_facing else len(points), 2])
+        return cls(
+            antennas, tables, of_map.cells, points, normals, np.ascontiguousarray(antennas.tables.level[:, order])
+        )
 
     def work(self, seen: Seen) -> int:
         """How many tags count for one pose, on average; one that was read counts as four."""
@@ -129,8 +181,7 @@ class Places:
         scan = self._scan(seen)
         missed = float(scan.rounds @ self.tables.none[scan.antennas, 1])
         out = np.full(len(poses), tempering * len(self.points) * missed)
-        of_tags = self.points, self.normals, self.levels
-        table = self._missed(scan, tempering)
+        of_tags, table = (self.points, self.normals, self.levels), self._missed(scan, tempering)
         _log_likelihood(poses, self.index, *of_tags, self.antennas, self.tables, table, scan, tempering, out)
         return out
 
@@ -155,44 +206,6 @@ class Places:
         return Scan(antennas, rounds, np.ascontiguousarray(hits[:, rows]), *of_rows, others)
 
 
-def place_tables(model: RfidModel, antennas: Antennas, order: Integers) -> PlaceTables:
-    """The tables of places, from those of the antennas, for tags in this ``order``; empty where facings matter, for models that
-    have none, and where they would be too large."""
-    packed, tables, logs, reach = antennas
-    used = [packed.kinds[a.model] for a in model.antennas]
-    nothing, no_level = np.empty((0, 0, 0, 0), dtype=np.float32), np.empty(0, dtype=np.int64)
-    without = PlaceTables(nothing, nothing, no_level, logs[packed.which, 0].astype(float))
-    if not tables.level.size or LOGISTIC in used or tables.facings.max() > 1:
-        return without
-    columns, level = np.unique(tables.level.T, axis=0, return_inverse=True)
-    half = math.ceil(reach / CELL)
-    shape = (len(used), len(columns), 2 * half + 1, 2 * half + 1)
-    if math.prod(shape) > MOST:
-        return without
-    gain, missed = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-    q = packed.false_read + packed.span * tables.sigmoids[0]
-    none = np.tile(np.log(np.array((q, 1.0 - q))), (len(used), 1))
-    _fill(packed, tables, logs, columns, half, none, gain, missed)
-    return PlaceTables(gain, missed, level.reshape(-1).astype(np.int64)[order], none)
-
-
-def miss_table(tables: PlaceTables, scan: Scan, tempering: float, reach: float) -> MissTable:
-    """The table of misses of the antennas and rounds of a scan."""
-    total: Array32 = np.zeros(tables.missed.shape[1:], dtype=np.float32)
-    if not total.size:
-        return MissTable(total, total, reach)
-    for antenna, count in zip(scan.antennas.tolist(), scan.rounds.tolist(), strict=True):
-        total += np.float32(count) * tables.missed[antenna]
-    own: Array32 = np.float32(tempering) * total
-    folded = own
-    if scan.others > -np.inf:
-        folded = (np.logaddexp(own, scan.others) - np.logaddexp(0.0, scan.others)).astype(np.float32)
-    half = (total.shape[1] - 1) // 2
-    relevant = np.argwhere((np.abs(own) > NO_MATTER).any(axis=0)) - half
-    farthest = CELL * (float(np.max(np.hypot(*relevant.T), initial=0.0)) + 1.0)
-    return MissTable(total, folded, min(farthest, reach))
-
-
 @compiled(error_model="numpy", fastmath=FAST)
 def _log_likelihood(
     poses: Array,
@@ -201,7 +214,7 @@ def _log_likelihood(
     normals: Array,
     levels: Integers,
     model: Antennas,
-    tables: PlaceTables,
+    tables: RobotTables,
     missed: MissTable,
     scan: Scan,
     tempering: float,
@@ -211,17 +224,14 @@ def _log_likelihood(
 
     ``points`` (T, 3), ``normals`` (T, 2) and ``levels`` (A, T): of tags in the order of the index.
     """
-    far, tabled = _far(tables, scan, tempering), tables.gain.size > 0
-    rows, base = (len(index.start) - 1) // index.columns, far.sum()
-    reach2, missed2 = model.reach**2, missed.reach**2
-    at = np.empty((len(scan.antennas), 4))
+    far, tabled, reach = _far(tables, scan, tempering), tables.gain.size > 0, model.reach
+    rows, base, size = (len(index.start) - 1) // index.columns, far.sum(), missed.surveyed.shape[1]
+    reach2, missed2, middle, inverse = reach**2, missed.reach**2, size // 2 + 0.5, 1.0 / missed.cell
     for n in range(len(poses)):
         px, py, c, s = poses[n, 0], poses[n, 1], math.cos(poses[n, 2]), math.sin(poses[n, 2])
-        if not tabled:
-            _place(model.packed, scan.antennas, px, py, c, s, at)
         total = base
-        first_x, last_x = cells(index, px - model.reach, px + model.reach, 0, index.columns)
-        first_y, last_y = cells(index, py - model.reach, py + model.reach, 1, rows)
+        first_x, last_x = cells(index, px - reach, px + reach, 0, index.columns)
+        first_y, last_y = cells(index, py - reach, py + reach, 1, rows)
         for line in range(first_y, last_y + 1 if last_x >= first_x else first_y):
             begin, end = index.start[line * index.columns + first_x], index.start[line * index.columns + last_x + 1]
             for t in range(begin, end):
@@ -229,27 +239,51 @@ def _log_likelihood(
                 w = scan.number[t]
                 if ex * ex + ey * ey >= (missed2 if w < 0 else reach2):
                     continue
-                if tabled and w < 0:
-                    h, i, j = _cell(tables, missed, t, c * ex + s * ey, c * ey - s * ex)
-                    total += missed.folded[h, i, j]
-                elif tabled:
-                    h, i, j = _cell(tables, missed, t, c * ex + s * ey, c * ey - s * ex)
+                x, y = c * ex + s * ey, c * ey - s * ex
+                if tabled:
+                    h = tables.level[t]
+                    i = min(max(int(x * inverse + middle), 0), size - 1)
+                    j = min(max(int(y * inverse + middle), 0), size - 1)
+                    if w < 0:
+                        total += missed.folded[h, i, j]
+                        continue
                     own = float(missed.surveyed[h, i, j])
                     for k in range(len(scan.antennas)):
                         if scan.hits[k, w] > 0:
-                            own += scan.hits[k, w] * tables.gain[scan.antennas[k], h, i, j]
-                    total += mixed(tempering * own, scan.odds[w], scan.elsewhere[w]) - far[w]
+                            own += scan.hits[k, w] * tables.gain[scan.antennas[k], h, 0, i, j]
                 else:
-                    own = tempering * _of_tag(model, scan, at, points[t], normals[t], levels[:, t], w)
+                    nx, ny = c * normals[t, 0] + s * normals[t, 1], c * normals[t, 1] - s * normals[t, 0]
+                    own = _of_tag(model, scan, x, y, points[t, 2], nx, ny, levels[:, t], w)
                     if w < 0:
-                        total += mixed(own, scan.others, 0.0)
-                    else:
-                        total += mixed(own, scan.odds[w], scan.elsewhere[w]) - far[w]
+                        total += mixed(tempering * own, scan.others, 0.0)
+                        continue
+                total += mixed(tempering * own, scan.odds[w], scan.elsewhere[w]) - far[w]
         out[n] += total
 
 
+@compiled(inline="always")
+def _of_tag(
+    model: Antennas, scan: Scan, x: float, y: float, height: float, nx: float, ny: float, levels: Integers, w: int
+) -> float:
+    """The log-likelihood of one tag as surveyed at (x, y) in the robot frame, above that of misses out of reach, by antennas."""
+    packed, own = model.packed, 0.0
+    for k in range(len(scan.antennas)):
+        antenna = scan.antennas[k]
+        m, at = packed.which[antenna], packed.antennas[antenna]
+        unit = 1.0 / packed.scale[m]
+        ex, ey = unit * (x - at[0]), unit * (y - at[1])
+        row = row_at(packed, model.tables, antenna, levels[antenna], ex, ey, at[3], at[4], height, nx, ny)
+        if row == 0 and w < 0:
+            continue
+        log_p = np.float64(model.logs[m, row, 1])
+        own += scan.rounds[k] * (log_p - np.float64(model.logs[m, 0, 1]))
+        if w >= 0:
+            own += scan.hits[k, w] * (np.float64(model.logs[m, row, 0]) - log_p)
+    return own
+
+
 @compiled(error_model="numpy", fastmath=FAST)
-def _far(tables: PlaceTables, scan: Scan, tempering: float) -> Array:
+def _far(tables: RobotTables, scan: Scan, tempering: float) -> Array:
     """The tempered log-likelihood (W,) of each listed tag out of reach, above that of misses."""
     out = np.empty(len(scan.odds))
     for w in range(len(out)):
@@ -261,75 +295,33 @@ def _far(tables: PlaceTables, scan: Scan, tempering: float) -> Array:
     return out
 
 
-@compiled(inline="always")
-def _cell(tables: PlaceTables, missed: MissTable, t: int, along: float, across: float) -> tuple[int, int, int]:
-    """Height and cell in the tables of a tag at a position in the robot frame."""
-    size = missed.surveyed.shape[1]
-    middle, inverse = (size - 1) // 2 + 0.5, 1.0 / CELL
-    i = min(max(int(along * inverse + middle), 0), size - 1)
-    j = min(max(int(across * inverse + middle), 0), size - 1)
-    return tables.level[t], i, j
-
-
-@compiled(inline="always")
-def _place(packed: Packed, antennas: Integers, px: float, py: float, c: float, s: float, at: Array) -> None:
-    """Fill ``at`` (K, 4): position of each antenna, cosine and sine of its heading, for a robot at (px, py)."""
-    for k in range(len(antennas)):
-        a = packed.antennas[antennas[k]]
-        at[k, 0], at[k, 1] = px + c * a[0] - s * a[1], py + s * a[0] + c * a[1]
-        at[k, 2], at[k, 3] = c * a[3] - s * a[4], s * a[3] + c * a[4]
-
-
-@compiled(inline="always")
-def _of_tag(model: Antennas, scan: Scan, at: Array, point: Array, normal: Array, levels: Integers, w: int) -> float:
-    """The log-likelihood of one tag as surveyed, above that of misses out of reach, antenna by antenna."""
-    packed, own = model.packed, 0.0
-    for k in range(len(scan.antennas)):
-        antenna = scan.antennas[k]
-        m = packed.which[antenna]
-        x, y = point[0] - at[k, 0], point[1] - at[k, 1]
-        along, across = at[k, 2] * x + at[k, 3] * y, at[k, 2] * y - at[k, 3] * x
-        row = 0
-        if along * along + across * across < packed.reach[m] ** 2:
-            facing = -(normal[0] * x + normal[1] * y) / math.sqrt(x * x + y * y + 1e-9)
-            unit = 1.0 / packed.scale[m]
-            row = row_of(packed, model.tables, antenna, levels[antenna], unit * along, unit * across, point[2], facing)
-        if row == 0 and w < 0:
-            continue
-        log_p = np.float64(model.logs[m, row, 1])
-        own += scan.rounds[k] * (log_p - np.float64(model.logs[m, 0, 1]))
-        if w >= 0:
-            own += scan.hits[k, w] * (np.float64(model.logs[m, row, 0]) - log_p)
-    return own
-
-
-@compiled
+@compiled(error_model="numpy", fastmath=FAST)
 def _fill(
     packed: Packed,
     tables: Tables,
     logs: Array32,
-    columns: Integers,
-    half: int,
+    levels: Integers,
+    heights: Array,
+    cell: float,
     none: Array,
     gain: Array32,
     missed: Array32,
 ) -> None:
-    """Fill the tables of places from those of the antennas; ``columns`` (H, A): table of each height and antenna."""
+    """Fill ``gain`` and ``missed`` from the tables of the antennas; ``levels`` (A, H): table of each antenna and height."""
+    layers, half = gain.shape[2], gain.shape[3] // 2
     for a in range(len(gain)):
         at, m = packed.antennas[a], packed.which[a]
         unit = 1.0 / packed.scale[m]
-        for h in range(gain.shape[1]):
-            table = columns[h, a]
-            to_edge = tables.half[table]
-            size = 2 * to_edge + 1
-            for i in range(2 * half + 1):
-                for j in range(2 * half + 1):
-                    ex, ey = (i - half) * CELL - at[0], (j - half) * CELL - at[1]
-                    along = math.floor(unit * (at[3] * ex + at[4] * ey) / CELL + 0.5) + to_edge
-                    across = math.floor(unit * (at[3] * ey - at[4] * ex) / CELL + 0.5) + to_edge
-                    log_q, log_p = none[a]
-                    if 0 <= along < size and 0 <= across < size:
-                        row = tables.rows[tables.start[table] + along * size + across]
-                        log_q, log_p = logs[m, row, 0], logs[m, row, 1]
-                    gain[a, h, i, j] = log_q - log_p
-                    missed[a, h, i, j] = log_p - none[a, 1]
+        for h in range(len(heights)):
+            for f in range(layers):
+                angle = 2.0 * math.pi * f / max(layers - 1, 1)
+                nx, ny = (math.cos(angle), math.sin(angle)) if f < layers - 1 else (0.0, 0.0)
+                for i in range(2 * half + 1):
+                    for j in range(2 * half + 1):
+                        ex, ey = unit * ((i - half) * cell - at[0]), unit * ((j - half) * cell - at[1])
+                        row = row_at(packed, tables, a, levels[a, h], ex, ey, at[3], at[4], heights[h], nx, ny)
+                        log_q, log_p = none[a]
+                        if row > 0:
+                            log_q, log_p = logs[m, row, 0], logs[m, row, 1]
+                        gain[a, h, f, i, j] = log_q - log_p
+                        missed[a, h, f, i, j] = log_p - none[a, 1]

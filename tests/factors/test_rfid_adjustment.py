@@ -9,7 +9,6 @@ from factors import se2
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel, bake, probability
-from factors.rfid.update import updated
 
 POSE = np.array((0.3, -0.2, 0.5))
 MODELS = (
@@ -97,18 +96,18 @@ def test_a_factor_with_variables_has_the_likelihood_as_its_cost():
     assert residual.shape == (factor.rows,) == (6,)
     assert [j.shape for j in jacobians] == [(6, 3), (6, 2)]
     assert 0.5 * residual @ residual == pytest.approx(factor.cost(values))
-    score = factor.joint_score(values)
+    score = factor.score(values)
     np.testing.assert_allclose(np.hstack(jacobians).T @ residual, score.gradient[0], rtol=1e-6, atol=1e-6)
 
 
 def test_an_update_of_pose_and_parameters_is_that_of_the_pose_where_these_are_exact():
     likelihood, looks, _ = scene(4)
     covariance = np.diag((0.01, 0.02, 0.01))
-    alone = updated(RfidFactor(likelihood, looks), POSE, np.zeros(0), covariance)
+    alone = RfidFactor(likelihood, looks).correct(POSE, covariance)
     joint = np.diag((0.01, 0.02, 0.01, 1e-14))
-    found = updated(RfidFactor(likelihood, looks, (0,)), POSE, np.zeros(1), joint)
-    np.testing.assert_allclose(found.pose, alone.pose, atol=1e-6)
+    found = RfidFactor(likelihood, looks, (0,)).correct(POSE, joint, np.zeros(1))
+    np.testing.assert_allclose(found.delta[:3], alone.delta, atol=1e-6)
     np.testing.assert_allclose(found.covariance[:3, :3], alone.covariance, atol=1e-7)
-    wide = updated(RfidFactor(likelihood, looks, (0,)), POSE, np.zeros(1), np.diag((0.01, 0.02, 0.01, 0.04)))
+    wide = RfidFactor(likelihood, looks, (0,)).correct(POSE, np.diag((0.01, 0.02, 0.01, 0.04)), np.zeros(1))
     assert wide.covariance[3, 3] < 0.04
     assert np.linalg.slogdet(wide.covariance[:3, :3])[1] > np.linalg.slogdet(alone.covariance)[1] - 0.5

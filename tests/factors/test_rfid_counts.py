@@ -8,7 +8,6 @@ import pytest
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts, together
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, RfidModel
-from factors.rfid.update import updated
 
 ANTENNAS = tuple(Antenna(0.2, 0.1 * k, 1.2, 1.5 * k) for k in range(4))
 POSE = np.array((40.0, 20.0, 0.4))
@@ -73,8 +72,8 @@ def test_scores_do_not_depend_on_what_was_looked_at_before():
 def test_updates_are_the_same():
     likelihood, whole, some = scene()
     start, covariance = POSE + np.array((0.5, -0.4, 0.2)), np.diag((0.5, 0.5, 0.3)) ** 2
-    a, b = (updated(RfidFactor(likelihood, looks), start, np.zeros(0), covariance) for looks in (whole, some))
-    assert b.pose == pytest.approx(a.pose, abs=1e-9)
+    a, b = (RfidFactor(likelihood, looks).correct(start, covariance) for looks in (whole, some))
+    assert b.delta == pytest.approx(a.delta, abs=1e-9)
     for name in ("covariance", "nis", "excess_nll", "variance", "evidence"):
         assert getattr(b, name) == pytest.approx(getattr(a, name), rel=1e-9)
 

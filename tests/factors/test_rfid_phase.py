@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from factors import se2
 from factors.rfid.detection import TagArray
 from factors.rfid.model import Antenna
-from factors.rfid.phase import SPEED_OF_LIGHT, PhaseLikelihood, PhaseModel, PhaseReads
+from factors.rfid.signals import SPEED_OF_LIGHT, PhaseLikelihood, PhaseModel, PhaseReads
 from factors.se2 import Array
 
 ANTENNAS = (Antenna(-0.2, -0.3, 1.0), Antenna(-0.2, -0.3, 0.5))

@@ -9,7 +9,7 @@ from scipy import stats
 from factors import se2
 from factors.rfid.detection import TagArray
 from factors.rfid.model import Antenna
-from factors.rfid.strength import RssiLikelihood, RssiModel, RssiReads, features
+from factors.rfid.signals import RssiLikelihood, RssiModel, RssiReads, features
 from factors.se2 import Array
 
 ANTENNAS = (Antenna(-0.2, -0.3, 1.0, -1.5, 0.1), Antenna(0.1, 0.2, 0.5, 0.7))

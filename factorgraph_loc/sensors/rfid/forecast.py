@@ -20,28 +20,22 @@ from factorgraph_loc.sensors.interfaces import Array32, Places
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factors.compiled import compiled
-from factors.rfid import kernels
 from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.rfid.kernels import FAST
-from factors.rfid.model import RfidModel
 from factors.se2 import Array
 
-CELL = 0.15  # m, of the tables
+COARSE = 3  # cells and heights, in those of the tables of the antennas
 FACINGS = 24  # directions of tags
-LEVEL = 0.25  # m; tags within this height range share a table
-NOTHING = 1e-3  # a tag is out of range if no antenna exceeds the probability of a false read by this
+UNREAD = 1e-3  # a tag is out of range if no antenna exceeds the probability of a false read by this
 MOST_LOOKS = 1 << 16  # per path; a stride of random numbers, so that paths of all lengths share them
-ALMOST_NEVER = 1e-12  # minimum probability of a read
 
 
 class ScanTables(NamedTuple):
-    """The response of A antennas to a tag in a cell of the robot frame: layers F (facings of the tag, the last for an unknown or
-    irrelevant one) of N x N cells for each of L heights.
+    """:class:`~factors.rfid.places.RobotTables` with C = H F S S cells, for simulated scans.
 
-    ``read`` (L F N N, A): probability. ``gain`` (A, L F N N): its logit, and ``missed`` (L F N N): sum over antennas of log(1 - q),
-    both relative to the floor, and zero at the edge. ``silent`` (L F N N): the absolute sum, but zero at the edge. ``size``: N.
-    ``points`` (T, 2) [m], ``facing`` (T,) [rad], NaN if unknown, and ``first`` (T,): first cell of each tag's tables; ``layers``:
-    F.
+    ``read`` (C, A): probability; ``gain`` (A, C): its logit; ``missed`` (C,): sum over antennas of log(1 - q) above that out of
+    reach; ``silent`` (C,): the absolute sum, 0 out of range. ``size``: S; ``layers``: F. ``points`` (T, 2) [m], ``facing`` (T,)
+    [rad], NaN if unknown, and ``first`` (T,): first cell of each tag's height.
     """
 
     read: Array
@@ -50,6 +44,7 @@ class ScanTables(NamedTuple):
     silent: Array
     size: int
     layers: int
+    cell: float
     points: Array
     facing: Array
     first: Places
@@ -57,47 +52,14 @@ class ScanTables(NamedTuple):
 
 def make_tables(likelihood: RfidLikelihood) -> ScanTables:
     """The tables of a model with a map of tags."""
-    model, tags = likelihood.model, likelihood.tags
-    reach = max((model.models[a.model].reach + math.hypot(a.x, a.y) for a in model.antennas), default=0.0)
-    half = math.ceil(reach / CELL)
-    levels, level = np.unique(np.rint(tags.points[:, 2] / LEVEL).astype(np.int64), return_inverse=True)
-    layers = FACINGS + 1 if any(m.uses_facing for m in model.models) else 1
-    q = _probabilities(model, np.asarray(levels * LEVEL, dtype=float), layers, half)
-    floor = max(model.false_read, ALMOST_NEVER)
-    q = np.clip(q, floor, 1.0 - ALMOST_NEVER)
-    told = np.argwhere((q > floor + NOTHING).any(axis=(0, 1, 4)))
-    edge = 1 + (int(np.abs(told - half).max()) if len(told) else 0)
-    q = np.pad(q, ((0, 0), (0, 0), (1, 1), (1, 1), (0, 0)))
-    q = q[:, :, half + 1 - edge : half + 2 + edge, half + 1 - edge : half + 2 + edge]
-    inner = np.zeros((1, 1, *q.shape[2:4], 1), dtype=bool)
-    inner[:, :, 1:-1, 1:-1] = True
-    q = np.where(inner, q, floor)
-    log_missed = np.log1p(-q)
-    missed = log_missed - math.log1p(-floor)
-    size = q.shape[2]
-    return ScanTables(
-        read=q.reshape(-1, q.shape[-1]),
-        gain=np.ascontiguousarray((np.log(q) - math.log(floor) - missed).astype(np.float32).reshape(-1, q.shape[-1]).T),
-        missed=missed.sum(axis=-1).astype(np.float32).ravel(),
-        silent=np.where(inner, log_missed, 0.0).sum(axis=-1).ravel(),
-        size=size,
-        layers=layers,
-        points=np.ascontiguousarray(tags.points[:, :2]),
-        facing=tags.facing if layers > 1 else np.full(len(tags.facing), np.nan),
-        first=(level * layers * size * size).astype(np.int64),
-    )
-
-
-def _probabilities(model: RfidModel, heights: Array, layers: int, half: int) -> Array:
-    """Probability (L, F, N, N, A) that a round of each antenna reads a tag in a cell of the robot frame."""
-    angles = 2.0 * math.pi * np.arange(layers - 1) / max(layers - 1, 1)
-    normals = np.vstack((np.column_stack((np.cos(angles), np.sin(angles))), np.zeros(2)))
-    axis, antennas = (np.arange(2 * half + 1) - half) * CELL, np.arange(len(model.antennas))
-    h, f, x, y = np.meshgrid(heights, np.arange(layers), axis, axis, indexing="ij")
-    points = np.stack((x, y, h), axis=-1).reshape(-1, 3)
-    origin = np.zeros((len(antennas), 3))
-    found, _ = kernels.probabilities(model.packed(), antennas, origin, points, normals[f.ravel()])
-    return np.moveaxis(found.reshape(len(antennas), *h.shape), 0, -1)
+    tables, tags = likelihood.robot_tables(COARSE, FACINGS), likelihood.tags
+    antennas, _, layers, size, _ = tables.gain.shape
+    gain, missed = tables.gain.reshape(antennas, -1), tables.missed.sum(axis=0).ravel()
+    read = 1.0 / (1.0 + np.exp(-gain.T.astype(float)))
+    in_range = (read > np.exp(tables.none[:, 0]) + UNREAD).any(axis=1)
+    silent = np.where(in_range, missed + tables.none[:, 1].sum(), 0.0)
+    points, first = np.ascontiguousarray(tags.points[:, :2]), tables.level * layers * size * size
+    return ScanTables(read, gain, missed, silent, size, layers, tables.cell, points, tags.facing, first)
 
 
 @compiled
@@ -116,7 +78,7 @@ def _cells(tables: ScanTables, t: int, poses: Array, turns: Array32, out: NDArra
     size = np.int32(tables.size)
     ends, middle = np.int32(size - 1), np.float32(size // 2 + 0.5)
     first = np.int32(tables.first[t] + (tables.layers - 1) * size * size)
-    inverse = 1.0 / CELL
+    inverse = 1.0 / tables.cell
     tx, ty = tables.points[t]
     for i in range(len(poses)):
         ex, ey = np.float32((tx - poses[i, 0]) * inverse), np.float32((ty - poses[i, 1]) * inverse)
@@ -124,9 +86,9 @@ def _cells(tables: ScanTables, t: int, poses: Array, turns: Array32, out: NDArra
         b = np.int32(turns[0, i] * ey - turns[1, i] * ex + middle)
         a, b = min(max(a, np.int32(0)), ends), min(max(b, np.int32(0)), ends)
         out[i] = first + a * size + b
-    if math.isnan(tables.facing[t]):
-        return
     angles = tables.layers - 1
+    if angles == 0 or math.isnan(tables.facing[t]):
+        return
     for i in range(len(poses)):
         turn = (tables.facing[t] - poses[i, 2]) / (2.0 * math.pi)
         layer = int((turn - math.floor(turn)) * angles + 0.5) % angles

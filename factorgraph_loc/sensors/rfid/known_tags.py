@@ -20,8 +20,14 @@ from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factors import positive, se2
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
-from factors.rfid.phase import PhaseLikelihood, PhaseModel, PhaseReads
-from factors.rfid.strength import RssiLikelihood, RssiModel, RssiReads
+from factors.rfid.signals import (
+    PhaseLikelihood,
+    PhaseModel,
+    PhaseReads,
+    RssiLikelihood,
+    RssiModel,
+    RssiReads,
+)
 from factors.rfid.tag_states import FARTHEST, TagStates, sigma_poses
 from factors.se2 import Array, Integers
 
@@ -221,10 +227,6 @@ class KnownTags:
         tags = np.array([self.map.index.get(name, -1) for name in m.tags], dtype=np.int64)
         tags[(tags >= 0) & (self.states.odds[tags] > 0.0)] = -1
         return antennas[m.antenna], tags
-
-
-# The linear algebra of an update has three rows only, for which NumPy is ten times slower than compiled code. The update by
-# reads and misses, which is frequent, is compiled as a whole.
 
 
 M = TypeVar("M", RssiModel, PhaseModel)

@@ -24,17 +24,15 @@ from factorgraph_loc.sensors.rfid.monitor import (
     SilenceMonitor,
 )
 from factorgraph_loc.sensors.rfid.stream import RfidScan
-from factors import positive, se2
+from factors import positive
 from factors.graph import Factor
-from factors.rfid import update as rfid_update
 from factors.rfid.detection import RfidLikelihood, TagReadCounts, together
-from factors.rfid.factor import RfidFactor
+from factors.rfid.factor import ITERATIONS, NO_VALUES, RfidFactor
 from factors.se2 import Array
 from factors.update import Correction
 
 PLACED = 5.0  # m: standard deviation of the position, above which a scan tells nothing of single tags
 SCAN = 50  # work of a scan, besides that of the tags in reach
-NO_RESIDUAL = np.empty((0, 1))
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ class TagObservation:
     settled: RfidLikelihood | None = (
         None  # with the detection models for a search, where these are not as in the factor
     )
-    iterations: ClassVar[int] = rfid_update.ITERATIONS
+    iterations: ClassVar[int] = ITERATIONS
 
     @property
     def is_judged(self) -> bool:
@@ -89,19 +87,16 @@ class TagObservation:
         iterations: int = 1,
     ) -> Correction:
         """The most likely pose and parameters, by Fisher scoring; what else is in the state follows by correlation."""
-        at, before = [0, 1, 2], rfid_update.NOTHING
+        at, before = [0, 1, 2], NO_VALUES
         for name in self.blocks:  # at most one
             at, before = [*at, *range(columns[name].start, columns[name].stop)], np.array(values[name])
         own = np.ascontiguousarray(covariance[np.ix_(at, at)])
-        found = rfid_update.updated(self.factor, pose, before, own, iterations)
-        delta = np.concatenate((se2.twist_to(pose, found.pose), found.values - before))
-        after = found.covariance
-        if len(covariance) > len(at):
-            gain = positive.solve(own, covariance[at]).T
-            after = covariance - gain @ (own - found.covariance) @ gain.T
-            delta = gain @ delta
-        told = found.excess_nll, found.variance, found.evidence
-        return Correction(delta, after, NO_RESIDUAL, found.nis, found.dof, *told)
+        found = self.factor.correct(pose, own, before, iterations)
+        if len(covariance) == len(at):
+            return found
+        gain = positive.solve(own, covariance[at]).T
+        after = covariance - gain @ (own - found.covariance) @ gain.T
+        return replace(found, delta=gain @ found.delta, covariance=after)
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
         return self.factor.log_likelihood(poses, *(values[name] for name in self.blocks))
@@ -250,8 +245,12 @@ class TagSensor(Sensor):
         return min(scans, counts)
 
     @property
-    def unreliable(self) -> bool:
-        return self._silence.lasts or self._consistency.doubted
+    def silent(self) -> bool:
+        return self._silence.lasts
+
+    @property
+    def inconsistent(self) -> bool:
+        return self._consistency.doubted
 
     def accept(self) -> None:
         self._monitor.accept()

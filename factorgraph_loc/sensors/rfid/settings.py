@@ -19,8 +19,7 @@ from factorgraph_loc.text import listed, quoted
 from factors import se2
 from factors.rfid.kernels import PARAMETERS
 from factors.rfid.model import Antenna, BeamModel, DetectionModel, GridModel, LogisticModel, RfidModel
-from factors.rfid.phase import PhaseModel
-from factors.rfid.strength import RssiModel
+from factors.rfid.signals import PhaseModel, RssiModel
 from factors.se2 import Array
 
 Angle = Annotated[float, Field(ge=-math.pi, le=math.pi), InUnit("rad")]
@@ -116,7 +115,7 @@ class AntennaSettings(FileModel):
 
 
 class RssiSettings(FileModel):
-    """See :class:`factors.rfid.strength.RssiModel`; ``coefficients`` in the order of ``factors.rfid.strength.FEATURES``."""
+    """See :class:`factors.rfid.signals.RssiModel`; ``coefficients`` in the order of ``factors.rfid.signals.FEATURES``."""
 
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)]
     """of the RSSI [dBm]: by 1, -10 log10 of the distance, w, w^2, c and c^2, with w = 1 - cosine of the bearing and c the
@@ -134,7 +133,7 @@ class RssiSettings(FileModel):
 
 
 class PhaseSettings(FileModel):
-    """See :class:`factors.rfid.phase.PhaseModel`. Reads in overlapping windows are weighted by ``step`` / ``window``."""
+    """See :class:`factors.rfid.signals.PhaseModel`. Reads in overlapping windows are weighted by ``step`` / ``window``."""
 
     kappa: Annotated[float, Field(ge=1e-6, le=100.0)] = 1.0
     """concentration of the phases"""

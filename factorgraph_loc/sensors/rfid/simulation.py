@@ -20,10 +20,9 @@ from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings, 
 from factorgraph_loc.sensors.rfid.stream import RfidScan, RfidStream
 from factorgraph_loc.text import listed, quoted
 from factors import se2
-from factors.rfid import strength as rfid_rssi
 from factors.rfid.detection import RfidLikelihood, TagArray
-from factors.rfid.phase import SPEED_OF_LIGHT
-from factors.rfid.strength import RssiReads
+from factors.rfid.signals import SPEED_OF_LIGHT, RssiReads
+from factors.rfid.signals import features as strength_features
 from factors.se2 import Array
 
 
@@ -221,10 +220,10 @@ def strengths(
     settings: SimulatedRssiSettings,
     rng: np.random.Generator,
 ) -> Array:
-    """RSSI [dBm] (N, A, T) of the reads ``hits`` (N, A, T) at poses (N, 3), NaN elsewhere: :mod:`factors.rfid.strength`."""
+    """RSSI [dBm] (N, A, T) of the reads ``hits`` (N, A, T) at poses (N, 3), NaN elsewhere: :mod:`factors.rfid.signals`."""
     n, a, tag = np.nonzero(hits)
     reads = RssiReads(poses[n], a, tag, np.full(len(n), np.nan))
-    features = rfid_rssi.features(rfid.model().antennas, tags, np.zeros(3), reads)
+    features = strength_features(rfid.model().antennas, tags, np.zeros(3), reads)
     out = np.full(hits.shape, np.nan)
     out[hits] = features @ np.array(settings.coefficients) + settings.sigma * rng.standard_t(settings.dof, len(n))
     return out

@@ -26,8 +26,7 @@ from factorgraph_loc.sensors.rfid.settings import (
 )
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factors import se2
-from factors.rfid.phase import SPEED_OF_LIGHT
-from factors.rfid.strength import RssiReads, features
+from factors.rfid.signals import SPEED_OF_LIGHT, RssiReads, features
 from factors.se2 import Array
 
 SETTINGS = RfidSettings(

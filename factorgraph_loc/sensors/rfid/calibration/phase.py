@@ -1,7 +1,7 @@
 """Estimation of survey transform and antenna lever arm by focusing the phases of reads.
 
 Along a reference trajectory the phases of one tag's reads within a short window agree after subtracting the phase of the path
-(:mod:`factors.rfid.phase`), if the geometry is right. Their agreement over a log determines the survey's transform and the common
+(:mod:`factors.rfid.signals`), if the geometry is right. Their agreement over a log determines the survey's transform and the common
 lever arm of the antennas, as in synthetic aperture radar. The peak is wide enough for a coarse grid search, because errors common
 to a window defocus slowly.
 """
@@ -24,7 +24,7 @@ from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.text import listed
 from factors import se2
 from factors.rfid.detection import TagArray
-from factors.rfid.phase import PhaseLikelihood, PhaseModel, PhaseReads
+from factors.rfid.signals import PhaseLikelihood, PhaseModel, PhaseReads
 from factors.se2 import Array
 
 Rows = NDArray[np.int64]

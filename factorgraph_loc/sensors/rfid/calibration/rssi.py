@@ -1,4 +1,4 @@
-"""Fit of the signal strength model to logs with a reference: see :mod:`factors.rfid.strength`."""
+"""Fit of the signal strength model to logs with a reference: see :mod:`factors.rfid.signals`."""
 
 import math
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from factorgraph_loc.sensors.rfid.calibration.phase import along_reference
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, RssiSettings, SurveySettings
 from factorgraph_loc.text import listed
-from factors.rfid.strength import FEATURES, RssiReads, features
+from factors.rfid.signals import FEATURES, RssiReads, features
 from factors.se2 import Array
 
 ENOUGH_READS = 200
