@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from factors.rfid import kernels, weighing
 from factors.rfid.index import MapTags, Seen, moved, tag_index
 from factors.rfid.model import Packed, RfidModel
-from factors.rfid.places import Places, RobotTables, antennas_of, in_reach, is_wide, reach_of, robot_tables
+from factors.rfid.places import Places, RobotTables, antennas_of, in_reach, is_wide, robot_tables
 from factors.rfid.tables import Tables, make_tables
 from factors.se2 import Array, Integers
 
@@ -233,7 +233,7 @@ class RfidLikelihood:
         ``parameters`` (N, 2 M): of the detection models at each pose, by default its own.
         """
         poses = np.ascontiguousarray(poses, dtype=float)
-        if parameters is None and not looks.offsets.any() and is_wide(poses, reach_of(self.packed)):
+        if parameters is None and not looks.offsets.any() and is_wide(poses, self.reach):
             return self._places.log_likelihood(poses, looks.seen, self.model.tempering)
         parameters = self.parameters[None] if parameters is None else np.ascontiguousarray(parameters)
         return weighing.log_likelihood(*self._tabled, looks.seen, poses, float(self.model.tempering), parameters)
@@ -255,10 +255,15 @@ class RfidLikelihood:
         """How many tags are looked at, by all antennas, to tell the likelihood of one pose among poses that are far apart."""
         return self._unadjusted._places.work(looks.seen)
 
+    @property
+    def reach(self) -> float:
+        """How far [m] an antenna reaches from the robot's middle."""
+        return kernels.reach_of(self.packed, np.zeros((0, 3)))
+
     @cached_property
     def reached(self) -> float:
         """How many tags are in reach of a pose among them, on average."""
-        return in_reach(self.tags.points[:, :2], reach_of(self._unadjusted.packed))
+        return in_reach(self.tags.points[:, :2], self._unadjusted.reach)
 
     @property
     def _places(self) -> Places:

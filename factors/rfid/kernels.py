@@ -126,10 +126,10 @@ def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, floa
 
 
 @compiled
-def reach_of(packed: Packed, offsets: Array, antennas: Integers) -> float:
-    """How far [m] the antennas reach at most from the pose that measurements (K,) are relative to."""
+def reach_of(packed: Packed, offsets: Array) -> float:
+    """How far [m] the antennas reach at most from the pose that measurements at ``offsets`` (K, 3) are relative to."""
     way = farthest = 0.0
-    for k in range(len(antennas)):
+    for k in range(len(offsets)):
         way = max(way, math.hypot(offsets[k, 0], offsets[k, 1]))
     for a in range(len(packed.which)):
         lever = math.hypot(packed.antennas[a, 0], packed.antennas[a, 1])
@@ -264,7 +264,7 @@ def scores(
     count, looks, size = len(poses), len(antennas), 3
     for i in range(len(columns)):
         size += columns[i] >= 0
-    near = near_tags(of_map, seen, poses, reach_of(packed, offsets, antennas))
+    near = near_tags(of_map, seen, poses, reach_of(packed, offsets))
     hits, tags = near.hits, len(near.tags)
     heard = np.zeros(tags, np.int64)
     far, none, none_mean, none_variance = np.empty((looks, 3)), 0.0, 0.0, 0.0
@@ -386,6 +386,6 @@ def predicted(
     (C,), and for each measurement the hits, the probability of a read and the distance [m] from the antenna, (K, C)."""
     offsets, antennas = seen[:2]
     own = adjusted(packed, parameters)
-    near = near_tags(of_map, seen, pose.copy().reshape(1, 3), reach_of(own, offsets, antennas))
+    near = near_tags(of_map, seen, pose.copy().reshape(1, 3), reach_of(own, offsets))
     p, distance = probabilities(own, antennas, moved(pose, offsets), near.points, near.normals)
     return near.tags, near.hits, p, distance

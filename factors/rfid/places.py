@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from factors.compiled import compiled
 from factors.rfid.index import MapTags, Seen, TagIndex, cells
-from factors.rfid.kernels import FAST
+from factors.rfid.kernels import FAST, reach_of
 from factors.rfid.model import Packed
 from factors.rfid.tables import CELL, LEVEL, NO_MATTER, Array32, Tables, logs_of, row_at
 from factors.rfid.weighing import LEAST, mixed
@@ -84,13 +84,7 @@ class Antennas(NamedTuple):
 
 def antennas_of(packed: Packed, tables: Tables) -> Antennas:
     """An adjusted model with the ``tables`` of its antennas."""
-    return Antennas(packed, tables, logs_of(packed), reach_of(packed))
-
-
-def reach_of(packed: Packed) -> float:
-    """How far [m] an antenna of an adjusted model reaches from the robot's middle."""
-    levers = np.hypot(packed.antennas[:, 0], packed.antennas[:, 1])
-    return float(np.max(packed.reach[packed.which] + levers, initial=0.0))
+    return Antennas(packed, tables, logs_of(packed), reach_of(packed, np.zeros((0, 3))))
 
 
 def is_wide(poses: Array, reach: float) -> bool:

@@ -40,7 +40,11 @@ def log_likelihood(
     """The tempered log-likelihood (N,) of what was ``seen`` of a map's tags, for poses (N, 3) with ``parameters`` (N or 1, 2 M) of
     the detection models."""
     looks = seen[:3]
-    reach = _reach(packed, looks, parameters)
+    widest = parameters[0].copy()
+    for n in range(1, len(parameters)):
+        for i in range(len(widest)):
+            widest[i] = max(widest[i], parameters[n, i])
+    reach = reach_of(adjusted(packed, widest), looks[0])
     near = near_tags(of_map, seen, poses, reach)
     tags, odds, elsewhere = _tabled(tables, near), near.odds, near.elsewhere
     near_enough = np.empty(len(odds), np.bool_)
@@ -99,7 +103,7 @@ def displaced(
 ) -> tuple[Integers, Array, NDArray[np.bool_]]:
     """See :meth:`factors.rfid.detection.RfidLikelihood.displaced`."""
     looks = seen[:3]
-    reach = margin + reach_of(adjusted(packed, parameters), looks[0], looks[1])
+    reach = margin + reach_of(adjusted(packed, parameters), looks[0])
     near = near_tags(of_map, seen, poses, reach)
     tags, heard = _tabled(tables, near), np.zeros(len(near.tags), np.bool_)
     for u in range(len(heard)):
@@ -161,19 +165,6 @@ def _tabled(tables: Tables, near: NearTags) -> Tags:
         for u in range(len(near.tags)):
             levels[a, u] = tables.level[a, near.tags[u]]
     return near.points, near.normals, levels, near.hits
-
-
-@compiled
-def _reach(packed: Packed, looks: Measured, parameters: Array) -> float:
-    """How far [m] the antennas of ``looks`` reach at most, with any of the ``parameters`` (N or 1, 2 M), from the pose."""
-    offsets, antennas, _ = looks
-    reach = 0.0
-    for k in range(len(antennas)):
-        a, m = packed.antennas[antennas[k]], packed.which[antennas[k]]
-        way = math.sqrt(offsets[k, 0] ** 2 + offsets[k, 1] ** 2) + math.sqrt(a[0] ** 2 + a[1] ** 2)
-        for n in range(len(parameters)):
-            reach = max(reach, way + packed.reach[m] * math.exp(parameters[n, 2 * m]))
-    return reach
 
 
 @compiled
