@@ -149,10 +149,10 @@ class RfidFactor:
         pose, covariance = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
         problem = (*self._problems(), float(self.likelihood.model.tempering), pose, values)
         try:
-            delta, after, *rest = _corrected(*problem, covariance, iterations)
+            delta, after, nis, dof, *rest = _corrected(*problem, covariance, iterations)
         except np.linalg.LinAlgError:  # rounding made it singular
-            delta, after, *rest = _corrected(*problem, positive.nearest(covariance), iterations)
-        return Correction(delta, after, NO_RESIDUAL, *rest)
+            delta, after, nis, dof, *rest = _corrected(*problem, positive.nearest(covariance), iterations)
+        return Correction(delta, after, NO_RESIDUAL, nis, dof, *rest)
 
     def _problems(self) -> tuple[TagProblem | None, PhaseProblem | None, StrengthProblem | None]:
         """Likelihood and reads for compiled code: one of the three."""
