@@ -44,14 +44,8 @@ class Mapper:
     fewest: int = 0
     horizon: int = 0
     rejected: str = ""
-
-    @property
-    def estimates(self) -> bool:
-        return False
-
-    @property
-    def knows_scale(self) -> bool:
-        return True
+    estimates: bool = False
+    knows_scale: bool = True
 
     def is_due(self, m: Any) -> bool:
         """Whether a measurement needs a keyframe of its own."""

@@ -40,19 +40,12 @@ class PointMapper(Mapper):
         self._unknown: UnknownPoints | None = None
         if settings.landmarks != "known":
             self._unknown = UnknownPoints(model, diagnostics, camera.constants)
+        self.estimates = self._unknown is not None
+        self.knows_scale = self._unknown is None or len(camera.points.map) > 0
         self._things = MovingThings(model)
         self._pairs = FramePairs(model) if settings.visual_odometry else None
         self._taken = -math.inf
         self._tracks: set[Hashable] = set()  # of the last keyframe, without those on things that move
-
-    @property
-    def estimates(self) -> bool:
-        """Whether points become variables."""
-        return self._unknown is not None
-
-    @property
-    def knows_scale(self) -> bool:
-        return self._unknown is None or len(self._camera.points.map) > 0
 
     def is_due(self, m: Pixels) -> bool:
         # estimated points need keyframes of their own

@@ -24,7 +24,7 @@ from factors.rfid.tables import CELL, LEVEL, NO_MATTER, Array32, Tables, logs_of
 from factors.rfid.weighing import LEAST, mixed
 from factors.se2 import Array, Integers
 
-MOST = 1 << 24  # numbers in a table; cells are so large that there are no more
+MOST = 1 << 25  # numbers in a table; cells are so large that there are no more
 WIDE = 2.0  # times the square that an antenna reaches: poses that touch more are evaluated one by one
 PLACED = 25  # work of a pose, besides that of its tags
 BY_ANTENNA = 7  # work of a tag for one antenna, where there are no tables of the robot frame

@@ -177,9 +177,10 @@ def row_at(
     model's range, with its height and normal (nx, ny); 0 out of reach."""
     m, along, across, squared = packed.which[antenna], c * ex + s * ey, c * ey - s * ex, ex * ex + ey * ey
     facing = -(nx * ex + ny * ey) / math.sqrt(squared + 1e-9)
-    if packed.kinds[m] == LOGISTIC:
-        if squared >= (packed.reach[m] / packed.scale[m]) ** 2:
-            return 0
+    is_logistic = packed.kinds[m] == LOGISTIC
+    if (is_logistic or tables.facings[level] > 1) and squared >= (packed.reach[m] / packed.scale[m]) ** 2:
+        return 0
+    if is_logistic:
         above = height - packed.antennas[antenna, 2]
         cp, sp = packed.antennas[antenna, 5], packed.antennas[antenna, 6]
         u, z = cp * along + sp * above, cp * above - sp * along
