@@ -55,7 +55,7 @@ def make_tables(likelihood: RfidLikelihood) -> ScanTables:
     tables, tags = likelihood.robot_tables(COARSE, FACINGS), likelihood.tags
     antennas, _, layers, size, _ = tables.gain.shape
     gain, missed = tables.gain.reshape(antennas, -1), tables.missed.sum(axis=0).ravel()
-    read = np.ascontiguousarray((1.0 / (1.0 + np.exp(-gain))).T)
+    read = (1.0 / (1.0 + np.exp(-gain))).T.astype(np.float32, order="C")
     in_range = (read > np.exp(tables.none[:, 0]) + UNREAD).any(axis=1)
     silent = np.where(in_range, missed + tables.none[:, 1].sum(), 0.0)
     points, first = np.ascontiguousarray(tags.points[:, :2]), tables.level * layers * size * size
