@@ -133,7 +133,7 @@ def test_by_what_antennas_read_and_did_not_read(rng, iterations):
             return factor.cost([se2.compose(start, se2.exp(delta))]) + 0.5 * delta @ information @ delta
 
         best = optimize.minimize(cost, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-6})
-        if iterations > 1:
+        if iterations > 1 and scale < 0.1:
             assert np.abs((found.delta - best.x) / sigmas).max() < 0.2
         assert cost(found.delta) <= cost(np.zeros(3)) + 0.02
         there = factor.score([se2.compose(start, se2.exp(found.delta))]).information[0]
