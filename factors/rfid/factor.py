@@ -9,9 +9,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from factors import positive, se2_kernels
+from factors import positive, se2
 from factors.compiled import compiled
 from factors.compressed import compressed
+from factors.gaussian import inverse, product, solved
 from factors.odometry.kernels import FAR, ROUNDING
 from factors.rfid import kernels
 from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts
@@ -29,7 +30,6 @@ from factors.rfid.signals import (
     strength_scores,
 )
 from factors.se2 import Array, Integers
-from factors.small_kernels import inverse, product, solved
 from factors.update import Correction
 
 ROWS = 4  # of the residual
@@ -246,11 +246,11 @@ def _corrected(
         for i in range(size):
             small = small and abs(step[i]) < CONVERGED * math.sqrt(covariance[i, i])
         if small:
-            moved = _difference(pose, values, se2_kernels.moved(best, step), changed + step[3:])
+            moved = _difference(pose, values, se2.moved(best, step), changed + step[3:])
             break
         lower = False
         for _ in range(4):
-            tried, tried_values = se2_kernels.moved(best, step), changed + step[3:]
+            tried, tried_values = se2.moved(best, step), changed + step[3:]
             nll, there, curve, _, _ = _score(tags, phase, strength, tried, tried_values)
             error, tried_cost = _difference(pose, values, tried, tried_values), nll
             for i in range(size):
@@ -273,7 +273,7 @@ def _corrected(
 def _difference(pose: Array, values: Array, other: Array, other_values: Array) -> Array:
     """The step (3 + P,) from one pose and its values to another."""
     out = np.empty(3 + len(values))
-    out[0], out[1], out[2] = se2_kernels.twist_to(pose, other)
+    out[0], out[1], out[2] = se2.twist_to(pose, other)
     for i in range(len(values)):
         out[3 + i] = other_values[i] - values[i]
     return out

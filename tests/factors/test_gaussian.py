@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factors import gaussian, positive
-from factors.rfid import update
+from factors.rfid import factor
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7])
@@ -33,7 +33,7 @@ def test_telling_directions_are_counted_as_by_eigenvalues():
     for rank in (0, 1, 2, 3):
         for _ in range(20):
             rows = rng.normal(size=(rank, 3)) * 10.0 ** rng.uniform(-1.0, 3.0)
-            assert update._telling(rows.T @ rows) == rank
+            assert factor._rank(rows.T @ rows) == rank
 
 
 @pytest.mark.parametrize("size", [1, 3, 9])
