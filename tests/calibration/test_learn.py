@@ -80,9 +80,8 @@ def test_a_constant_that_the_robot_does_not_have_is_not_kept(simulate):
 
 def test_late_commands_have_a_delay(simulate):
     log = simulate(seconds=200.0, delay=0.2)
-    delay = next(c for c in learn([log], log.rig).constants if c.name == "delay")
-    lag = next(c for c in learn([log], log.rig).constants if c.name == "lag")
-    assert delay.value + lag.value == pytest.approx(0.2, abs=0.02)
+    constants = {c.name: c for c in learn([log], log.rig).constants}
+    assert constants["delay"].value + constants["lag"].value == pytest.approx(0.2, abs=0.02)
 
 
 def test_increments_have_neither_delay_nor_lag(simulate):

@@ -122,7 +122,7 @@ def scores_without() -> dict[str, object]:
     return fgloc.run(drifting_log(), "dead_reckoning", sensors=["odometry"]).scores
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "particle_filter", "smoother", "batch"])
+@pytest.mark.parametrize("estimator", ["ekf", "particle_filter", "smoother"])
 def test_estimators_use_it_and_learn_its_bias(estimator):
     log = drifting_log()
     without = scores_without()

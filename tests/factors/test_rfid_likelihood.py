@@ -230,9 +230,8 @@ def mixture(likelihood: RfidLikelihood, looks: TagReadCounts, pose: np.ndarray) 
 
 
 @pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("seed", range(2))
-def test_a_tag_that_may_not_be_as_surveyed_counts_as_a_mixture(name: str, seed: int) -> None:
-    likelihood, looks, mixed = doubtful(seed, name)
+def test_a_tag_that_may_not_be_as_surveyed_counts_as_a_mixture(name: str) -> None:
+    likelihood, looks, mixed = doubtful(0, name)
     found = likelihood.score(POSE, mixed)
     assert found.nll[0] == pytest.approx(mixture(likelihood, mixed, POSE), rel=1e-6)
     for k, step in enumerate(1e-5 * np.eye(3)):
@@ -240,7 +239,7 @@ def test_a_tag_that_may_not_be_as_surveyed_counts_as_a_mixture(name: str, seed: 
         assert found.gradient[0, k] == pytest.approx((high - low) / 2e-5, abs=1e-3, rel=1e-3)
     assert np.all(np.linalg.eigvalsh(found.information[0]) > -1e-9)
     assert np.trace(found.information[0]) < np.trace(likelihood.score(POSE, looks).information[0])
-    poses = POSE + np.random.default_rng(seed).normal(size=(300, 3)) * 0.5
+    poses = POSE + np.random.default_rng(0).normal(size=(300, 3)) * 0.5
     exact = -likelihood.score(poses, mixed).nll
     tabled = likelihood.log_likelihood(poses, mixed)
     assert np.median(np.abs(tabled - exact)) < 0.1 * np.std(exact)

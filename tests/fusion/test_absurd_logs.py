@@ -35,8 +35,15 @@ def test_a_log_with_a_fault_is_survived(fault, config):
     assert told == ("refused" if fault in BEYOND else "ok")
 
 
-@pytest.mark.parametrize("config", ["dead_reckoning", "ekf", "particle_filter"])
-@pytest.mark.parametrize("fault", ["glitch_within_bounds", "many_glitches", "coincident_landmarks", "tiny_sigmas"])
+@pytest.mark.parametrize(
+    ("fault", "config"),
+    [
+        ("glitch_within_bounds", "dead_reckoning"),
+        ("many_glitches", "particle_filter"),
+        ("coincident_landmarks", "ekf"),
+        ("tiny_sigmas", "ekf"),
+    ],
+)
 def test_a_robot_that_drives_survives_them_too(fault, config):
     log = FAULTS[fault](whole(), np.random.default_rng(5))
     name, settings = CONFIGS[config]

@@ -105,8 +105,6 @@ STANDS, CREEPS = (0.0, 0.0), (0.025, 0.02)
         ("particle_filter", CREEPS),
         ("smoother", CREEPS),
         ("smoother", STANDS),
-        ("smoother_lag", CREEPS),
-        ("batch", CREEPS),
     ],
 )
 def test_gap_in_all_sensors(name, motion):
@@ -126,12 +124,11 @@ def test_gap_in_all_sensors(name, motion):
     assert np.all(np.isfinite(result.final.covariances))
     final = errors(result.final, log.reference)
     assert final.position[final.t > 75.0].max() < 0.3
-    if name != "batch":
-        assert sigma(result, 10.0) < 0.1
-        assert sigma(result, 40.0) > 0.5
-        assert sigma(result, 69.9) > 1.2 * sigma(result, 40.0)
-        causal = errors(result.causal(), log.reference)
-        assert causal.position[causal.t > 75.0].max() < 0.3
+    assert sigma(result, 10.0) < 0.1
+    assert sigma(result, 40.0) > 0.5
+    assert sigma(result, 69.9) > 1.2 * sigma(result, 40.0)
+    causal = errors(result.causal(), log.reference)
+    assert causal.position[causal.t > 75.0].max() < 0.3
 
 
 @pytest.mark.parametrize("name", MAIN)
@@ -140,9 +137,8 @@ def test_gap_in_odometry_alone(name):
     log = silent(simulate(seconds=75.0), "odometry", 8.0, 68.0)
     result = run(log, CONFIGS[name])
     assert errors(result.final, log.reference).position.max() < 0.5
-    if name != "batch":
-        causal = errors(result.causal(), log.reference)
-        assert causal.position[causal.t > 73.0].max() < 0.3
+    causal = errors(result.causal(), log.reference)
+    assert causal.position[causal.t > 73.0].max() < 0.3
 
 
 @pytest.mark.parametrize("name", MAIN)
@@ -164,15 +160,6 @@ def test_unknown_landmarks_are_ignored(name, log, clean):
 
 
 @pytest.mark.parametrize("name", EXACT)
-def test_only_unknown_landmarks_is_dead_reckoning(name, log, clean):
-    stream = log.streams["bearing_range"]
-    result = run(with_sightings(log, landmark=["ghost"] * len(stream.t)), CONFIGS[name])
-    assert result.diagnostics.ignored == {"landmark not in the map": len(stream.t)}
-    # half a turn may be told with either sign
-    np.testing.assert_allclose(se2.between(clean("dead_reckoning").final.poses, result.final.poses), 0.0, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", EXACT)
 @pytest.mark.parametrize("how", ["not asked for", "no rows"])
 def test_no_landmarks_is_dead_reckoning(name, how, log, clean):
     if how == "no rows":
@@ -187,7 +174,7 @@ def test_no_landmarks_is_dead_reckoning(name, how, log, clean):
     np.testing.assert_allclose(se2.between(expected.final.poses[:n], result.final.poses), 0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize(("name", "pair"), [("smoother", "ae"), ("smoother", "bh"), ("batch", "cd")])
+@pytest.mark.parametrize(("name", "pair"), [("smoother", "ae"), ("batch", "cd")])
 def test_two_landmarks_swapped(name, pair, log, clean):
     landmarks = dict(log.world.landmarks)
     one, other = pair
@@ -198,7 +185,7 @@ def test_two_landmarks_swapped(name, pair, log, clean):
     assert rmse(result, log)[1] < 2.0 * rmse(clean(name), log)[1]
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", MAIN)
 def test_gross_outliers(name, log, clean):
     """A tenth of the rows says anything."""
     rng = np.random.default_rng(5)
@@ -210,8 +197,7 @@ def test_gross_outliers(name, log, clean):
         bearing=np.where(wrong, rng.uniform(-np.pi, np.pi, len(wrong)), stream.bearing),
     )
     for disturbed, normal in zip(rmse(run(worse, CONFIGS[name]), log), rmse(clean(name), log), strict=True):
-        if normal is not None:
-            assert disturbed < 2.5 * normal + 0.05
+        assert disturbed < 2.5 * normal + 0.05
 
 
 def delayed(stream, delay):
@@ -224,7 +210,7 @@ def frequent():
     return simulate(rate=8.0, seconds=15.0)
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", [*MAIN, "smoother_lag"])
 def test_late_rows(name, frequent):
     """Each row arrives up to 0.4 s late, also behind others of its stamp."""
     stream = frequent.streams["bearing_range"]
@@ -237,8 +223,7 @@ def test_late_rows(name, frequent):
         return
     # a window is seldom linearised anew, so that the order of its factors shows
     assert 0.0 < distance(result.final, expected.final) < (0.02 if name == "smoother_lag" else 0.01)
-    if name != "batch":
-        assert np.hypot(*(result.poses[-1] - expected.poses[-1])[:2]) < 0.01
+    assert np.hypot(*(result.poses[-1] - expected.poses[-1])[:2]) < 0.01
 
 
 @pytest.mark.parametrize("name", EXACT)
@@ -255,7 +240,7 @@ def test_too_late_rows_are_dropped(name, frequent):
     assert distance(result.final, expected.final) < 1e-9
 
 
-@pytest.mark.parametrize("name", MAIN)
+@pytest.mark.parametrize("name", ["ekf", "smoother"])
 def test_landmarks_before_the_first_odometry(name, log, clean):
     """With a known start they count; with the reference's they lie before it and are ignored."""
     first = 1.0
@@ -272,21 +257,17 @@ def test_landmarks_before_the_first_odometry(name, log, clean):
     assert rmse(result, log)[1] < 1.5 * rmse(clean(name), log)[1]
 
 
-@pytest.mark.parametrize("missing", ["range", "bearing", "either"])
 @pytest.mark.parametrize("name", MAIN)
-def test_range_or_bearing_missing(name, missing, log):
+def test_range_or_bearing_missing(name, log):
     stream = log.streams["bearing_range"]
     coin = np.random.default_rng(2).random(len(stream.t)) < 0.5
-    no_range = {"range": np.ones_like(coin), "bearing": np.zeros_like(coin), "either": coin}[missing]
-    no_bearing = {"range": np.zeros_like(coin), "bearing": np.ones_like(coin), "either": ~coin}[missing]
     partial = with_sightings(
-        log, range=np.where(no_range, np.nan, stream.range), bearing=np.where(no_bearing, np.nan, stream.bearing)
+        log, range=np.where(coin, np.nan, stream.range), bearing=np.where(coin, stream.bearing, np.nan)
     )
     result = run(partial, CONFIGS[name])
     assert result.diagnostics.ignored == {}
-    assert max(e for e in rmse(result, log) if e is not None) < 0.12
-    if name != "batch":
-        assert sum(dof for _, _, dof in result.diagnostics.nis["bearing_range"]) == len(stream.t)
+    assert max(rmse(result, log)) < 0.12
+    assert sum(dof for _, _, dof in result.diagnostics.nis["bearing_range"]) == len(stream.t)
 
 
 @pytest.mark.parametrize("name", ["ekf", "smoother"])

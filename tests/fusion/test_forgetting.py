@@ -27,7 +27,21 @@ def log():
     return simulate(named_settings("office", changes), 4)
 
 
-def driven(log, name, sensors, settings, forget):
+@pytest.fixture(scope="module")
+def driven(log):
+    """``driven(name, sensors, settings, forget)``: what :func:`drive` gives, computed once."""
+    known = {}
+
+    def of(name, sensors, settings, forget):
+        key = (name, sensors, tuple(settings.items()), forget)
+        if key not in known:
+            known[key] = drive(log, name, sensors, settings, forget)
+        return known[key]
+
+    return of
+
+
+def drive(log, name, sensors, settings, forget):
     """An estimator after a log with late measurements, which forgets what is older than ``forget`` seconds."""
     estimator = create(name, Setup(log.rig, log.world, sensors, np.random.default_rng(1)), settings_of(name, settings))
     prior, _ = resolve_prior(log, None)
@@ -49,9 +63,9 @@ def driven(log, name, sensors, settings, forget):
 
 
 @pytest.mark.parametrize(("name", "sensors", "settings"), CASES)
-def test_what_is_left_is_the_same(log, name, sensors, settings):
-    whole, estimates = driven(log, name, sensors, settings, None)
-    short, same = driven(log, name, sensors, settings, 0.0)
+def test_what_is_left_is_the_same(driven, name, sensors, settings):
+    whole, estimates = driven(name, sensors, settings, None)
+    short, same = driven(name, sensors, settings, 0.0)
     assert np.array_equal(same, estimates)
     expected, left = whole.trajectory(), short.trajectory()
     assert 0 < len(left) < len(expected)
@@ -60,19 +74,19 @@ def test_what_is_left_is_the_same(log, name, sensors, settings):
     assert left.covariances == pytest.approx(expected.covariances[-len(left) :], abs=1e-9)
 
 
-def test_clouds_are_kept_as_far_as_smoothing_needs_them(log):
+def test_clouds_are_kept_as_far_as_smoothing_needs_them(log, driven):
     settings = {"particles": 300, "smoothing_interval": 5.0}
-    estimator, _ = driven(log, "particle_filter", ("odometry", "bearing_range"), settings, 2.0)
+    estimator, _ = driven("particle_filter", ("odometry", "bearing_range"), settings, 2.0)
     left = estimator.trajectory()
     end = log.span()[1]
     assert end - 13.0 < left.t[0] < end - 2.0
     assert np.all(np.isfinite(left.poses))
 
 
-def test_nothing_is_kept_of_points_seen_before(log):
+def test_nothing_is_kept_of_points_seen_before(driven):
     settings = {"lag": 3.0, "landmarks": "unknown"}
-    whole, _ = driven(log, "smoother", ("odometry", "sightings"), settings, None)
-    short, _ = driven(log, "smoother", ("odometry", "sightings"), settings, 0.0)
+    whole, _ = driven("smoother", ("odometry", "sightings"), settings, None)
+    short, _ = driven("smoother", ("odometry", "sightings"), settings, 0.0)
     oldest, points = next(iter(short._graph.keyframes.values())), short._graph.mapper._unknown
     assert oldest.index > 0
     assert min(points._cameras.anchored) >= oldest.index
@@ -85,7 +99,7 @@ def test_nothing_is_kept_of_points_seen_before(log):
     assert left.positions == pytest.approx(expected.positions[rows], abs=1e-9)
 
 
-def test_a_full_history_forgets_nothing(log):
-    whole, _ = driven(log, "smoother", ("odometry", "bearing_range"), {}, None)
-    short, _ = driven(log, "smoother", ("odometry", "bearing_range"), {}, 1.0)
+def test_a_full_history_forgets_nothing(driven):
+    whole, _ = driven("smoother", ("odometry", "bearing_range"), {}, None)
+    short, _ = driven("smoother", ("odometry", "bearing_range"), {}, 1.0)
     assert len(short.trajectory()) == len(whole.trajectory())

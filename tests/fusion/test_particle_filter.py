@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import landmark_world
 import numpy as np
 import pytest
 from landmark_world import simulate, with_sightings
@@ -28,11 +27,6 @@ KNOWN = replace(UNKNOWN, prior=None)
 @pytest.fixture(scope="module")
 def log():
     return simulate(seconds=20.0)
-
-
-@pytest.fixture(scope="module")
-def kidnapped():
-    return landmark_world.kidnapped()
 
 
 def only(log, landmarks):
@@ -63,31 +57,6 @@ def test_late_sightings_of_an_unknown_start(log):
     result = run(replace(log, streams={**log.streams, "bearing_range": stream}), UNKNOWN)
     assert events(result) == ["localized"]
     assert score(result, log)["causal.position_max"] < 0.6
-
-
-def test_kidnapped(kidnapped):
-    result = run(kidnapped, KNOWN)
-    assert events(result) == ["lost", "recovered"]
-    lost, recovered = (t for t, _ in result.diagnostics.events)
-    assert 10.0 < lost <= recovered < 18.0
-    causal, final = (errors(found, kidnapped.reference) for found in (result.causal(), result.final))
-    assert np.nanmax(causal.position[causal.t > recovered + 1.0]) < 0.5
-    # the jump is known only after it, but spoils nothing before
-    assert np.nanmax(final.position[final.t < 9.0]) < 0.15
-    assert np.nanmax(final.position[final.t > recovered]) < 0.3
-
-
-def test_wrong_start(log):
-    result = run(log, replace(KNOWN, prior="4,4,2"))
-    assert events(result) == ["lost", "recovered"]
-    causal = errors(result.causal(), log.reference)
-    assert np.nanmax(causal.position[causal.t > 12.0]) < 0.5
-
-
-def test_a_known_start_never_seeks(log):
-    result = run(log, KNOWN)
-    assert result.diagnostics.events == []
-    assert set(result.status) == {"localized"}
 
 
 def test_one_landmark_is_ambiguous(log, tmp_path):

@@ -28,6 +28,12 @@ def office():
     return simulate_office(preset("office", changes), 3)
 
 
+@pytest.fixture(scope="module")
+def switched(office):
+    """The run that several tests look at."""
+    return run(office, RunConfig("switching", {"particles": 500}, sensors=BOTH))
+
+
 def position_rmse(log, t, poses):
     error = poses[:, :2] - log.reference.at(t)[:, :2]
     return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
@@ -54,10 +60,9 @@ def test_without_scans_it_is_the_ekf(office):
     np.testing.assert_allclose(switched.final.covariances, alone.final.covariances, rtol=0.05, atol=1e-6)
 
 
-def test_while_tags_are_read_it_is_the_particle_filter(office):
+def test_while_tags_are_read_it_is_the_particle_filter(office, switched):
     plain = {"self_calibration": False, "smooth": False, "particles": 500}
     alone = run(office, RunConfig("particle_filter", plain, sensors=TAGS))
-    switched = run(office, RunConfig("switching", {"particles": 500}, sensors=BOTH))
     scans = list(office.measurements(("rfid",)))
     silent = next(m.t for m in scans if not m.tags)
     until = switched.t < silent
@@ -83,9 +88,8 @@ def test_it_hands_over_mean_and_covariance(office):
     assert estimator.belief().particles is None
 
 
-def test_what_the_other_filter_would_take_is_counted(office):
-    result = run(office, RunConfig("switching", {"particles": 500}, sensors=BOTH))
-    ignored = result.diagnostics.ignored
+def test_what_the_other_filter_would_take_is_counted(office, switched):
+    ignored = switched.diagnostics.ignored
     assert ignored["landmarks while tags are read"] > 0
     assert ignored["rfid while no tag is read"] > 0
     sightings = sum(1 for _ in office.measurements(("bearing_range",)))
@@ -99,13 +103,12 @@ def test_rows_that_neither_filter_uses_are_counted_once(office):
     assert estimator.diagnostics.ignored == {"yaw rate": 1}
 
 
-def test_vision_and_smoothing_help(office):
-    switched = run(office, RunConfig("switching", {"particles": 1000}, sensors=BOTH))
+def test_vision_and_smoothing_help(office, switched):
     odometry = run(office, RunConfig("dead_reckoning"))
     causal, final = (position_rmse(office, x.t, x.poses) for x in (switched, switched.final))
     assert final < causal < position_rmse(office, odometry.t, odometry.poses)
     np.testing.assert_array_equal(switched.t, switched.final.t)
-    off = run(office, RunConfig("switching", {"particles": 1000, "smooth": False}, sensors=BOTH))
+    off = run(office, RunConfig("switching", {"particles": 500, "smooth": False}, sensors=BOTH))
     np.testing.assert_allclose(off.final.poses[:, :2], off.poses[:, :2], atol=1e-9)
     np.testing.assert_allclose(se2.wrap(off.final.poses[:, 2] - off.poses[:, 2]), 0.0, atol=1e-9)
 

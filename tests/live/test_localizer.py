@@ -62,8 +62,6 @@ def started(log, name="smoother", prior=None, **options):
         ("smoother", ("odometry", "rfid"), {}, "unknown"),
         ("ekf", ("odometry", "bearing_range"), {}, None),
         ("ekf", ("odometry", "bearing_range"), {}, "position"),
-        ("smoother", ("odometry", "rfid"), {}, "position"),
-        ("particle_filter", ("odometry", "bearing_range"), {"particles": 500}, "position"),
         ("particle_filter", ("odometry", "rfid"), {"particles": 500}, None),
         ("switching", SENSORS, {"particles": 500}, None),
         ("batch", ("odometry", "bearing_range"), {}, None),
@@ -92,6 +90,7 @@ def test_estimates_are_those_of_a_run(log, name, sensors, settings, prior):
     assert np.array_equal([e.covariance for e in found], expected.covariances, equal_nan=True)
     assert np.array_equal(localizer.trajectory().t, expected.final.t)
     assert np.array_equal(localizer.trajectory().poses, expected.final.poses)
+    assert localizer.diagnostics().doubted == expected.diagnostics.doubted
 
 
 def test_many_threads_push_while_others_pull(log):

@@ -147,9 +147,10 @@ def unchanged(log, case):
     check()
 
 
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_localizers_share_nothing(log, case):
+@pytest.mark.parametrize("name", ["ekf", "particle_filter", "smoother, window"])
+def test_localizers_share_nothing(log, name):
     """What one is given, and asked, changes nothing that another of the same settings tells."""
+    case = CASES[name]
     first, rows = started(log, case)
     second, _ = started(log, case)
     middle = len(rows) // 2

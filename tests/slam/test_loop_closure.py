@@ -106,7 +106,7 @@ def test_no_image_twice_a_second():
 
 def laps(points, seconds=66.0):
     """Two rounds in a room; no track lasts for more than ten seconds."""
-    return with_features(camera_world.simulate(3, seconds), 10.0, points=points)
+    return with_features(camera_world.simulate(3, seconds), 10.0, points=points, every=0.6)
 
 
 def both(log, monkeypatch):

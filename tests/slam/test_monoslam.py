@@ -33,7 +33,6 @@ EXACT_FLOOR = {"height_sigma": 1e-4, "tilt_sigma": 1e-4}  # which the simulated 
 TILT = CameraModel(1.0, 1.0, 0.0, 0.0, 1, 1).tilt
 ALIKE_FLOOR = {"height_sigma": 1e-4, "tilt_sigma": TILT}  # as the planar estimators take it to be
 SECONDS = 30.0
-WRONG = 0.4
 
 
 @pytest.fixture(scope="module")
@@ -56,14 +55,13 @@ def estimated(log, name="monoslam", **settings):
     return run(log, RunConfig(name, settings, SENSORS))
 
 
-@pytest.mark.parametrize("self_calibration", [False, True])
-def test_in_a_known_map_it_is_the_planar_filter(drive, self_calibration, monkeypatch):
+def test_in_a_known_map_it_is_the_planar_filter(drive, monkeypatch):
     monkeypatch.setattr(
         TiltScale, "learnt", lambda floor, *_: (floor, floor.sigma)
     )  # as monoslam's, which is a setting
     log = drive(1)
-    ours = estimated(log, **ALIKE_FLOOR, iterations=8, self_calibration=self_calibration)
-    planar = estimated(log, "ekf", self_calibration=self_calibration)
+    ours = estimated(log, **ALIKE_FLOOR, iterations=8)
+    planar = estimated(log, "ekf")
     sigmas = np.sqrt(planar.covariances[:, [0, 1, 2], [0, 1, 2]])
     seen = planar.t > 2.0  # until then the start is far off, and the two linearise differently
     assert np.quantile(np.abs(ours.poses - planar.poses)[seen] / sigmas[seen], 0.95) < 0.3
@@ -86,24 +84,10 @@ def test_its_covariance_is_that_of_its_errors(drive):
     assert low < sum(last) < high
 
 
-def test_wrong_names_do_little_harm(drive):
-    log = drive(2, wrong=WRONG)
-    figures = score(estimated(log), log)
-    assert figures["causal.position_p95"] < 0.15
-    assert figures["final.position_rmse"] < 0.03
-    assert figures["rejected.camera: does not agree with the others"] > 0.8 * WRONG * len(log.streams["sightings"].t)
-
-
 def elsewhere(log, sigma):
     """The log with a start that is wrong by metres and 2 rad."""
     pose = log.reference.poses[0] + np.array((1.5, -1.0, 2.0))
     return replace(log, start=replace(log.start, pose=pose, sigmas=np.full(3, sigma)))
-
-
-def test_a_wrong_start_does_not_lock_the_filter_out(drive):
-    log = drive(3, seconds=20.0)
-    result = estimated(elsewhere(log, 0.01))
-    assert errors(result.causal(), log.reference).position[-100:].max() < 0.1
 
 
 def test_a_vague_start_is_told_by_the_map(drive):
@@ -240,34 +224,6 @@ def features(log, rng, noise=0.05):
         frames.append(CameraFrame(m.t, "sift", m.pixels, np.full(len(rows), 8.0), seen, rows))
         stamps.append(m.t)
     return FeatureStream(np.array(stamps), frames)
-
-
-def with_views(log, stream):
-    """The map with a view of each point from wherever it was seen."""
-    camera = log.rig.camera.model()
-    poses = log.reference.at(stream.t)
-    centres = np.array([reprojection.camera_pose(camera, pose)[0] for pose in poses])
-    counts = [len(f.pixels) for f in stream.frame]
-    owners = np.concatenate([f.tracks for f in stream.frame])
-    looks = np.concatenate([f.descriptors for f in stream.frame])
-    return replace(
-        log.world.points,
-        feature="sift",
-        owners=owners,
-        descriptors=looks,
-        seen_from=np.repeat(centres, counts, axis=0),
-        sizes=np.full(len(owners), 8.0),
-    )
-
-
-def test_features_are_found_in_a_known_map(drive):
-    log = drive(7)
-    stream = features(log, np.random.default_rng(1))
-    world = log.world.model_copy(update={"points": with_views(log, stream)})
-    log = replace(log, world=world, streams={"odometry": log.streams["odometry"], "camera": stream})
-    figures = score(run(log, RunConfig("monoslam", {}, ("odometry", "camera"))), log)
-    assert figures["final.position_rmse"] < 0.03
-    assert figures["nis.camera.count"] > 0.9 * len(stream.t)
 
 
 def test_features_become_points_and_are_found_again(drive):

@@ -9,9 +9,8 @@ import pytest
 
 import factorgraph_loc as fgloc
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.model.log import Log, cut, join
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
@@ -21,7 +20,6 @@ from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import preset, simulate
 
 SENSORS = ("odometry", "rfid")
-ESTIMATORS = ["smoother", "batch", "particle_filter", "switching"]
 
 
 @cache
@@ -59,40 +57,6 @@ def test_hardly_worse_than_who_is_told(estimator: str) -> None:
     found, best = np.sqrt(np.mean(errors, axis=0))
     assert found < 1.15 * best
     assert any(f"{len(named)} of 40 tags of the map are believed dead" in w for w in result.warnings)
-
-
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_what_comes_later_changes_no_causal_estimate(estimator: str) -> None:
-    log, _ = office()
-    config = RunConfig(estimator, {"particles": 500} if estimator in ("particle_filter", "switching") else {})
-    whole, first = run(cut(log, 0.0, 16.0), config), run(cut(log, 0.0, 8.0), config)
-    count = len(first.t)
-    assert np.array_equal(whole.t[:count], first.t)
-    assert np.array_equal(whole.poses[:count], first.poses)
-    assert np.array_equal(whole.covariances[:count], first.covariances)
-    assert whole.status[:count] == first.status
-
-
-@pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
-def test_live_is_as_a_run(estimator: str) -> None:
-    log, _ = office()
-    log = cut(log, 0.0, 15.0)
-    settings = {"lag": None} if estimator == "smoother" else {}
-    result = run(log, RunConfig(estimator, settings, sensors=SENSORS))
-    localizer = fgloc.Localizer(log.rig, log.world, estimator, sensors=SENSORS, settings=settings)
-    prior, _ = resolve_prior(log, None)
-    assert prior is not None
-    localizer.initialize(prior.pose, prior.covariance, prior.t)
-    ticks, found = list(result.t), []
-    for m in log.measurements(SENSORS):
-        while ticks and ticks[0] < m.t:
-            found.append(localizer.estimate(float(ticks.pop(0))).pose)
-        localizer.push(m)
-        if not m.is_motion:
-            localizer.estimate()
-    found += [localizer.estimate(float(t)).pose for t in ticks]
-    assert np.array_equal(np.array(found), result.poses)
-    assert localizer.diagnostics().doubted["dead_tags"] == result.diagnostics.doubted["dead_tags"]
 
 
 def robot(estimator: str, **settings: float) -> fgloc.Localizer:
@@ -146,12 +110,3 @@ def test_a_late_scan_counts_once(estimator: str) -> None:
     expected = in_time.diagnostics().doubted["dead_tags"]["ahead"]
     assert late.diagnostics().doubted["dead_tags"]["ahead"] == pytest.approx(expected, abs=0.02)
     assert not late.diagnostics().late
-
-
-def test_what_a_lost_track_made_of_the_tags_is_taken_back() -> None:
-    """The robot is carried elsewhere: the tags that it then does not read, where it is thought to be, are not dead."""
-    log = simulate(preset("office", {"drive": {"duration": 80.0}}), 1)
-    carried = join(cut(log, 0.0, 30.0), cut(log, 50.0, 80.0))
-    result = run(carried, RunConfig("smoother"))
-    assert any(what.startswith("lost") for _, what in result.diagnostics.events)
-    assert len(result.diagnostics.doubted["dead_tags"]) <= 1

@@ -8,7 +8,7 @@ import pytest
 
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.model.log import Log, cut, join
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.simulation import preset, simulate
 
@@ -61,12 +61,3 @@ def test_an_error_of_the_pose_is_no_evidence_that_tags_have_moved() -> None:
     tags were believed moved at the end."""
     log = simulate(preset("office", {"drive": {"duration": 90.0}, "faults": {"dead": 0.3}}), 1)
     assert len(run(log, RunConfig("smoother")).diagnostics.doubted["moved_tags"]) <= 1
-
-
-def test_what_a_lost_track_made_of_the_tags_is_taken_back() -> None:
-    """The robot is carried elsewhere: the tags that it reads there, where it is not thought to be, have not moved."""
-    log = office(12, 0.0)
-    carried = join(cut(log, 0.0, 40.0), cut(log, 70.0, 110.0))
-    result = run(carried, RunConfig("smoother"))
-    assert any(what.startswith("lost") for _, what in result.diagnostics.events)
-    assert len(result.diagnostics.doubted["moved_tags"]) <= 1
