@@ -2,7 +2,6 @@
 
 import json
 import tomllib
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -63,18 +62,6 @@ def test_simulated_logs_are_those_of_the_same_seed(office, tmp_path):
     assert np.array_equal(read.streams["odometry"].dx, office.streams["odometry"].dx)
     with pytest.raises(fgloc.InputError, match="images need out"):
         fgloc.simulate("office", images=True)
-
-
-def test_calibrate_writes_a_rig(tmp_path):
-    changes = {"drive": {"duration": 45.0}, "world": {"tags": 0, "landmarks": 20}}
-    log = fgloc.simulate("office", 1, changes=changes)
-    streams = {name: log.streams[name] for name in ("odometry", "bearing_range")}
-    log = replace(log, streams=streams, rig=log.rig.model_copy(update={"sensors": tuple(streams)}))
-    made = fgloc.calibrate(log, tmp_path / "cart.rig.toml")
-    assert fgloc.read_rig(tmp_path / "cart.rig.toml").odometry == made.rig.odometry
-    assert (tmp_path / "cart.report.html").is_file()
-    with pytest.raises(fgloc.InputError, match="exists already"):
-        fgloc.calibrate(log, tmp_path / "cart.rig.toml")
 
 
 def test_an_experiment_gives_its_table(tmp_path):

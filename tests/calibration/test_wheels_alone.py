@@ -12,7 +12,12 @@ RADIUS, TRACK = 0.1, 0.5  # m, as the log was converted
 
 
 @pytest.fixture(scope="module")
-def calibrated(simulate, tmp_path_factory):
+def file(tmp_path_factory):
+    return tmp_path_factory.mktemp("wheels") / "cart.rig.toml"
+
+
+@pytest.fixture(scope="module")
+def calibrated(simulate, file):
     """What is learnt of two drives with wheels alone: 6 % larger than the rig says, 4 % further apart."""
     logs = []
     for seed in (1, 2):
@@ -21,7 +26,7 @@ def calibrated(simulate, tmp_path_factory):
         wheels = rig.odometry.model_copy(update={"wheels": DifferentialDrive(radius=RADIUS, track=TRACK)})
         odometry = {"odometry": log.streams["odometry"]}
         logs.append(replace(log, rig=rig.model_copy(update={"odometry": wheels}), streams=odometry))
-    return fgloc.calibrate(logs, tmp_path_factory.mktemp("wheels") / "cart.rig.toml")
+    return fgloc.calibrate(logs, file)
 
 
 def test_radius_and_track_are_found(calibrated):
@@ -32,6 +37,13 @@ def test_radius_and_track_are_found(calibrated):
     assert [row[0] for row in table[1]] == ["radius [m]", "track [m]"]
     assert calibrated.rig.odometry.wheels == DifferentialDrive(radius=RADIUS, track=TRACK)
     assert "radius [m]" in report.page(calibrated)
+
+
+def test_rig_and_report_are_written_once(calibrated, file):
+    assert fgloc.read_rig(file).odometry == calibrated.rig.odometry
+    assert file.with_name("cart.report.html").is_file()
+    with pytest.raises(fgloc.InputError, match="exists already"):
+        fgloc.calibrate([], file)
 
 
 def test_dead_reckoning_gains_by_it(calibrated):

@@ -76,15 +76,6 @@ def test_dead_tags_are_dropped_and_named(fgloc, on_disk, room, tmp_path):
     assert "--drop-dead edits the log's map and maps nothing" in refused.stderr
 
 
-def test_from_odometry_the_map_is_brought_onto_the_given_one(fgloc, on_disk, room, tmp_path):
-    result = fgloc("map", on_disk(), "--poses", "odometry", "-o", tmp_path / "a.world.toml", "--json")
-    assert result.exit_code == 0, result.output
-    content = json.loads(result.stdout)
-    assert content["frame"] == "that of the given map"
-    assert content["rms"] < 0.5
-    assert {entry["tag"] for entry in content["tags"]} == set(room.world.tags)
-
-
 def test_without_reference_and_map_the_frame_is_the_start(fgloc, on_disk, tmp_path):
     folder = on_disk(world=World(), reference=None)
     result = fgloc("map", folder, "--prior", "1,2,0.5", "--tag-height", "1.2", "-o", tmp_path / "a.world.toml")

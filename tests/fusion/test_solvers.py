@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.graph.solver import MARGIN, FullHistory, Window
+from factorgraph_loc.fusion.graph.solver import Window
 from factorgraph_loc.fusion.graph.summary import MarginalSummary
-from factorgraph_loc.fusion.graph.variables import Node, index_of, is_pose, landmark_key, pose_key, read, to_gtsam
+from factorgraph_loc.fusion.graph.variables import Node, is_pose, landmark_key, pose_key, to_gtsam
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factors import se2
 from factors.graph import pose_array
@@ -110,32 +110,6 @@ def test_covariances_of_poses_at_once_are_those_of_each(log):
     assert compared == [True, True, True]
 
 
-def test_what_is_solved_for_by_itself_is_the_estimate(log):
-    compared = []
-
-    def watch(_, estimator):
-        solver = estimator._backend._solver
-        compared.extend(np.allclose(solver.value(key), read(solver._isam, key), atol=1e-9) for key in solver._touched)
-
-    run(log, RunConfig("smoother", {"lag": "all"}, prior=START), watch=watch)
-    assert len(compared) > 100
-    assert all(compared)
-
-
-def test_poses_leave_a_window_several_at_a_time(log):
-    oldest = []
-
-    def watch(_, estimator):
-        graph, poses = estimator._graph, [k for k in estimator._backend._solver._ours.at if is_pose(k)]
-        assert graph.newest.t - graph.keyframes[index_of(min(poses))].t <= 6.0 + MARGIN + 0.5  # and two keyframes
-        oldest.append(index_of(min(poses)))
-
-    run(log, RunConfig("smoother", {"lag": 6.0}, prior=START), watch=watch)
-    left = np.diff(oldest)
-    assert oldest[-1] > 50
-    assert np.min(left[left > 0]) > 5
-
-
 def test_what_is_absent_is_marginalised_out_of_a_summary():
     graph, at = gtsam.NonlinearFactorGraph(), gtsam.Values()
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array((0.1, 0.1, 0.02)))
@@ -148,31 +122,6 @@ def test_what_is_absent_is_marginalised_out_of_a_summary():
     marginal = gtsam.Marginals(graph, at).marginalCovariance(pose_key(1))
     assert list(left.keys()) == [pose_key(1)]
     assert np.allclose(np.linalg.inv(left.linearize(at).information()), marginal, rtol=1e-6)
-
-
-@pytest.mark.parametrize("lag", [None, 8.0])
-@pytest.mark.parametrize("skip", [1, 10])
-def test_our_factors_are_linearised_where_isam2_linearises(skip, lag, log):
-    moved = set()
-
-    def watch(_, estimator):
-        solver = estimator._backend._solver
-        assert isinstance(solver, FullHistory if lag is None else Window)
-        isam = solver._isam if lag is None else solver._solver.getISAM2()
-        assert set(isam.getLinearizationPoint().keys()) == set(solver._ours.at)
-        factors = isam.getFactorsUnsafe()
-        for slot in solver._ours.slots:
-            assert isinstance(factors.at(slot), gtsam.LinearContainerFactor)
-        at = values_of(isam.getLinearizationPoint(), solver._ours.at)
-        for key, value in solver._ours.at.items():
-            assert np.allclose(at[key], value, atol=1e-12) or key in solver._ours._held
-            if not np.array_equal(value, first.setdefault(key, value)):
-                moved.add(key)
-
-    first = {}
-    settings = {"landmarks": "unknown", "relinearize_threshold": 0.02, "relinearize_skip": skip, "lag": lag}
-    run(log, RunConfig("smoother", settings, prior=START), watch=watch)
-    assert len(moved) > 5
 
 
 class _Seen:
