@@ -84,6 +84,7 @@ def check(log, result, *, within, off=0.4):
 @pytest.mark.parametrize(
     ("name", "missing"),
     [
+        ("ekf", None),
         ("smoother_lag", None),
         *((name, column) for name in MAIN for column in ("bearing", "range")),
     ],
