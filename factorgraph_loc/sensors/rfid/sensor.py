@@ -245,12 +245,8 @@ class TagSensor(Sensor):
         return min(scans, counts)
 
     @property
-    def silent(self) -> bool:
-        return self._silence.lasts
-
-    @property
-    def inconsistent(self) -> bool:
-        return self._consistency.doubted
+    def unreliable(self) -> bool:
+        return self._silence.lasts or self._consistency.doubted
 
     def accept(self) -> None:
         self._monitor.accept()
