@@ -118,7 +118,7 @@ def both(log, monkeypatch):
 
 
 def test_a_second_round_takes_the_drift_back(monkeypatch):
-    with_loops, without = both(laps(ROOM), monkeypatch)
+    with_loops, without = both(laps(looked(camera_world.room(200))), monkeypatch)
     assert with_loops < 0.7 * without
 
 
