@@ -17,9 +17,8 @@ from factors import positive, se2
 from factors.camera import model as reprojection
 from factors.camera.factor import ReprojectionFactor
 from factors.camera.model import CameraModel
-from factors.least_squares import minima
 from factors.robust import huber_weight
-from factors.se2 import Array, Integers
+from factors.se2 import Array
 
 REACH = 3.0  # standard deviations of a pixel for inliers
 CONFIDENCE, MOST_SAMPLES = 0.9999, 5000
@@ -83,15 +82,16 @@ def on_floor(
         return None
     pose = np.array((position[0], position[1], math.atan2(rotation[1, 0], rotation[0, 0])))
     factor = ReprojectionFactor(model, points, pixels, point_covariances=spreads)
-
-    def at(poses: Array, _: Integers) -> tuple[Array, Array, Array]:
-        residual, (jacobian,) = factor.linearize([poses[0]])
-        return np.array([factor.cost([poses[0]])]), (residual @ jacobian)[None], (jacobian.T @ jacobian)[None]
-
-    best = minima(at, pose[None], REFINEMENTS, CONVERGED, moved=lambda p, step: se2.compose(p, se2.exp(step)))
-    pose, information = best.states[0], best.curvatures[0]
-    if np.linalg.eigvalsh(information)[0] < DETERMINED**-2:
-        return None
+    information = np.zeros((3, 3))
+    for _ in range(REFINEMENTS):
+        residual, (jacobian,) = factor.linearize([pose])
+        information = jacobian.T @ jacobian
+        if np.linalg.eigvalsh(information)[0] < DETERMINED**-2:
+            return None
+        step: Array = -np.asarray(np.linalg.solve(information, jacobian.T @ residual), dtype=float)
+        pose = se2.compose(pose, se2.exp(step))
+        if np.abs(step).max() < CONVERGED:
+            break
     error, _ = factor.levelled([pose])
     inliers = np.sum(error**2, axis=1) < GATE
     if np.count_nonzero(inliers) < FEWEST:

@@ -68,7 +68,8 @@ def fit_linear(
             return p - np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
         curvature = design.T @ sparse.diags_array(found.information) @ design + penalty
         damped = sparse.csc_matrix(curvature + damping * sparse.diags_array(curvature.diagonal()))
-        return p - splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(gradient)
+        factor = splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        return np.asarray(p - factor.solve(gradient))
 
     return descended(cost, moved, np.zeros(design.shape[1]), ITERATIONS, CONVERGED)[0]
 
