@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from factors.compiled import compiled
 from factors.rfid.index import MapTags, Seen, TagIndex, cells
 from factors.rfid.kernels import FAST, reach_of
-from factors.rfid.model import Packed
-from factors.rfid.tables import CELL, LEVEL, NO_MATTER, Array32, Tables, logs_of, row_at
+from factors.rfid.model import LOGISTIC, Packed
+from factors.rfid.tables import CELL, LEVEL, NO_MATTER, Array32, Tables, logs_of, row_of
 from factors.rfid.weighing import LEAST, mixed
 from factors.se2 import Array, Integers
 
@@ -264,9 +264,11 @@ def _of_tag(
     for k in range(len(scan.antennas)):
         antenna = scan.antennas[k]
         m, at = packed.which[antenna], packed.antennas[antenna]
-        unit = 1.0 / packed.scale[m]
-        ex, ey = unit * (x - at[0]), unit * (y - at[1])
-        row = row_at(packed, model.tables, antenna, levels[antenna], ex, ey, at[3], at[4], height, nx, ny)
+        ex, ey, unit, row = x - at[0], y - at[1], 1.0 / packed.scale[m], 0
+        along, across, squared = at[3] * ex + at[4] * ey, at[3] * ey - at[4] * ex, ex * ex + ey * ey
+        if squared < packed.reach[m] ** 2:
+            facing = -(nx * ex + ny * ey) / math.sqrt(squared + 1e-9)
+            row = row_of(packed, model.tables, antenna, levels[antenna], unit * along, unit * across, height, facing)
         if row == 0 and w < 0:
             continue
         log_p = np.float64(model.logs[m, row, 1])
@@ -305,15 +307,24 @@ def _fill(
     layers, half = gain.shape[2], gain.shape[3] // 2
     for a in range(len(gain)):
         at, m = packed.antennas[a], packed.which[a]
-        unit = 1.0 / packed.scale[m]
+        unit, reach2, is_logistic = 1.0 / packed.scale[m], packed.reach[m] ** 2, packed.kinds[m] == LOGISTIC
+        by_reach = is_logistic or layers > 1  # else all of the square of a table counts
         for h in range(len(heights)):
+            level, edge = levels[a, h], 0.0
+            if not is_logistic:
+                edge = (tables.half[level] + 0.5) * CELL
             for f in range(layers):
                 angle = 2.0 * math.pi * f / max(layers - 1, 1)
                 nx, ny = (math.cos(angle), math.sin(angle)) if f < layers - 1 else (0.0, 0.0)
                 for i in range(2 * half + 1):
                     for j in range(2 * half + 1):
-                        ex, ey = unit * ((i - half) * cell - at[0]), unit * ((j - half) * cell - at[1])
-                        row = row_at(packed, tables, a, levels[a, h], ex, ey, at[3], at[4], heights[h], nx, ny)
+                        ex, ey = (i - half) * cell - at[0], (j - half) * cell - at[1]
+                        along, across = unit * (at[3] * ex + at[4] * ey), unit * (at[3] * ey - at[4] * ex)
+                        row, squared, facing = 0, ex * ex + ey * ey, 0.0
+                        if layers > 1:
+                            facing = -(nx * ex + ny * ey) / math.sqrt(squared + 1e-9)
+                        if squared < reach2 if by_reach else max(abs(along), abs(across)) < edge:
+                            row = row_of(packed, tables, a, level, along, across, heights[h], facing)
                         log_q, log_p = none[a]
                         if row > 0:
                             log_q, log_p = logs[m, row, 0], logs[m, row, 1]

@@ -160,27 +160,13 @@ def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray
 
 
 @compiled(inline="always")
-def row_at(
-    packed: Packed,
-    tables: Tables,
-    antenna: int,
-    level: int,
-    ex: float,
-    ey: float,
-    c: float,
-    s: float,
-    height: float,
-    nx: float,
-    ny: float,
+def row_of(
+    packed: Packed, tables: Tables, antenna: int, level: int, along: float, across: float, height: float, facing: float
 ) -> int:
-    """The place in the sigmoids of a tag that lies (ex, ey) from an antenna that looks along (c, s), in units of the scale of its
-    model's range, with its height and normal (nx, ny); 0 out of reach."""
-    m, along, across, squared = packed.which[antenna], c * ex + s * ey, c * ey - s * ex, ex * ex + ey * ey
-    facing = -(nx * ex + ny * ey) / math.sqrt(squared + 1e-9)
-    is_logistic = packed.kinds[m] == LOGISTIC
-    if (is_logistic or tables.facings[level] > 1) and squared >= (packed.reach[m] / packed.scale[m]) ** 2:
-        return 0
-    if is_logistic:
+    """The place in the sigmoids of a tag in reach, which lies along and across an antenna's heading, in units of the scale of its
+    model's range, with its height and facing."""
+    m = packed.which[antenna]
+    if packed.kinds[m] == LOGISTIC:
         above = height - packed.antennas[antenna, 2]
         cp, sp = packed.antennas[antenna, 5], packed.antennas[antenna, 6]
         u, z = cp * along + sp * above, cp * above - sp * along
@@ -188,9 +174,8 @@ def row_at(
         return logit_row(logistic_value(packed.parameters[m], r, 1.0 - u / r, z, facing))
     half, layers = tables.half[level], tables.facings[level]
     size = 2 * half + 1
-    i, j = math.floor(along / CELL + 0.5) + half, math.floor(across / CELL + 0.5) + half
-    if not (0 <= i < size and 0 <= j < size):
-        return 0
+    i = min(max(int(along / CELL + half + 0.5), 0), size - 1)
+    j = min(max(int(across / CELL + half + 0.5), 0), size - 1)
     place = tables.start[level] + i * size + j
     if layers == 1:
         return int(tables.rows[place])

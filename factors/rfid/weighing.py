@@ -14,7 +14,7 @@ from factors.compiled import compiled
 from factors.rfid.index import MapTags, NearTags, Seen, near_tags
 from factors.rfid.kernels import FAST, MOST_CERTAIN, adjusted, reach_of
 from factors.rfid.model import LOGISTIC, NEGLIGIBLE_LOGIT, Packed
-from factors.rfid.tables import CELL, NEGLIGIBLE, Measured, Tables, Tags, relevant, row_at
+from factors.rfid.tables import CELL, NEGLIGIBLE, Measured, Tables, Tags, relevant, row_of
 from factors.se2 import Array, Integers
 
 BLOCK = 512  # poses at a time, so that what is needed of them stays in the cache
@@ -274,10 +274,14 @@ def _chances(
     x, y, c, s = at[0], at[1], at[2], at[3]
     tx, ty, height, nx, ny = point[0], point[1], point[2], normal[0], normal[1]
     if packed.kinds[packed.which[antenna]] == LOGISTIC or tables.facings[level] > 1:
+        reach, sigmoids = packed.reach[packed.which[antenna]], tables.sigmoids
         for n in range(count):
             ex, ey = unit[n] * (tx - x[n]), unit[n] * (ty - y[n])
-            row = row_at(packed, tables, antenna, level, ex, ey, c[n], s[n], height, nx, ny)
-            chance[n] = tables.sigmoids[row]
+            along, across, squared, row = c[n] * ex + s[n] * ey, c[n] * ey - s[n] * ex, ex * ex + ey * ey, 0
+            if squared < reach * reach:
+                facing = -(nx * ex + ny * ey) / math.sqrt(squared + 1e-9)
+                row = row_of(packed, tables, antenna, level, along, across, height, facing)
+            chance[n] = sigmoids[row]
         return
     half = tables.half[level]
     width, ends, middle = np.int32(2 * half + 1), np.int32(2 * half), half + 0.5
