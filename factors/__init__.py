@@ -1,5 +1,5 @@
-"""Sensor models on plain arrays, and GTSAM factors made of them. All estimators use them; they do not depend on logs, rigs or
-files."""
+"""The numerical core on plain arrays: sensor models, factors, Gaussian corrections, least squares, planar poses. It does not depend
+on logs, rigs or files."""
 
 __all__ = [
     "camera",

@@ -98,9 +98,8 @@ def tables() -> Iterator[str]:
             if package:
                 yield f"| `{package}` | {_what(package)} | {_listed(_below(package))} |"
     yield from ("", "## What a package shows", "")
-    yield "Other packages import nothing but what a package lists as `__all__`, here: its public modules and names. The rest is"
-    yield "its inside, and may change without notice."
-    yield from ("", "| package | modules | of these private | public |", "|---|---|---|---|")
+    yield "The last column is `__all__`: the modules and names that other packages may import."
+    yield from ("", "| package | modules | private modules | public |", "|---|---|---|---|")
     for package, face in sorted(FACES.items()):
         inside = {m.rpartition(".")[2] for m in MODULES if m.rpartition(".")[0] == package}
         name = package.removeprefix("factorgraph_loc.")

@@ -1,3 +1,3 @@
-"""Robust fits of constants, used by the calibration of sensors."""
+"""Robust fits of constants, and intervals of shares."""
 
 __all__ = ["constants", "robust", "shares"]
