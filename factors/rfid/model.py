@@ -23,6 +23,10 @@ NEGLIGIBLE_LOGIT = -14.0  # out of range
 NEAR = 1e-2  # m; minimum distance with a defined direction
 PARAMETERS = 12  # maximum length of a parameter vector of a compiled model
 ALMOST_ONE = 1.0 - 1e-9
+FRONT, SIDE = (
+    0.25,
+    0.15,
+)  # cosines of the facing: where the reads of a beam fall off behind the tag, and over what width
 
 
 class DetectionModel(Protocol):
@@ -45,13 +49,19 @@ class DetectionModel(Protocol):
 
 @dataclass(frozen=True)
 class BeamModel:
-    """``p = p0 * sigmoid((r_max - r) / s_r) * exp(-(phi / sigma_phi)^2 / 2)``, with distance r [m] and bearing phi [rad] in the
-    plane of the boresight; the default of uncalibrated antennas."""
+    """``p = p0 * sigmoid((r_max - r) / s_r) * exp(-(phi / sigma_phi)^2 / 2) * front``, with distance r [m] and bearing phi [rad] in
+    the plane of the boresight; the default of uncalibrated antennas.
+
+    ``front = behind + (1 - behind) * sigmoid((c + 0.25) / 0.15)`` depends on the cosine c of the angle between the tag's facing
+    and the direction to the antenna, 0 if the facing is unknown. ``behind`` is the share of reads from behind a tag, 1 if tags
+    are read from all sides.
+    """
 
     p0: float = 0.9
     r_max: float = 4.5
     s_r: float = 0.3
     sigma_phi: float = 0.698
+    behind: float = 1.0
 
     @property
     def reach(self) -> float:
@@ -59,7 +69,7 @@ class BeamModel:
 
     @property
     def uses_facing(self) -> bool:
-        return False
+        return self.behind < 1.0
 
     @property
     def peak(self) -> float:
@@ -67,7 +77,8 @@ class BeamModel:
 
     def compiled(self) -> tuple[int, Sequence[float], Array]:
         # a probability of one has no logit
-        return BEAM, (math.log(min(self.p0, ALMOST_ONE)), self.r_max, self.s_r, self.sigma_phi), np.empty((0, 0, 0, 0))
+        values = math.log(min(self.p0, ALMOST_ONE)), self.r_max, self.s_r, self.sigma_phi, self.behind
+        return BEAM, values, np.empty((0, 0, 0, 0))
 
 
 @dataclass(frozen=True)
@@ -254,26 +265,31 @@ def logit(
 ) -> tuple[float, float, float, float, float]:
     """Logit at (x, y, z) in the antenna's frame with facing c, and its derivatives by them."""
     if kind == BEAM:
-        return _beam(parameters, x, y, z)
+        return _beam(parameters, x, y, z, c)
     if kind == LOGISTIC:
         return _logistic(parameters, x, y, z, c)
     return _grid(parameters, shape, knots, x, y, z, c)
 
 
 @compiled
-def _beam(parameters: Array, x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
+def _beam(parameters: Array, x: float, y: float, z: float, c: float) -> tuple[float, float, float, float, float]:
     log_p0, r_max, s_r, sigma_phi = parameters[0], parameters[1], parameters[2], parameters[3]
     r = math.sqrt(x * x + y * y + z * z + NEAR * NEAR)
     phi = math.atan2(y, x)
     excess = (r_max - r) / s_r
     # log of a sigmoid, without overflow
     log_range = -math.log1p(math.exp(-excess)) if excess > 0.0 else excess - math.log1p(math.exp(excess))
-    log_p = log_p0 + log_range - 0.5 * (phi / sigma_phi) ** 2
+    behind = parameters[4]
+    sigmoid = 1.0 / (1.0 + math.exp(-(c + FRONT) / SIDE))
+    front = behind + (1.0 - behind) * sigmoid
+    by_c = (1.0 - behind) * sigmoid * (1.0 - sigmoid) / SIDE / front
+    log_p = log_p0 + log_range - 0.5 * (phi / sigma_phi) ** 2 + math.log(front)
     by_log_p = 1.0 / -math.expm1(log_p)
     by_r = -(1.0 - math.exp(log_range)) / s_r / r
     by_phi = -phi / sigma_phi**2 / max(x * x + y * y, NEAR * NEAR)
     value = log_p - math.log(-math.expm1(log_p))
-    return value, by_log_p * (by_r * x - by_phi * y), by_log_p * (by_r * y + by_phi * x), by_log_p * by_r * z, 0.0
+    by_x, by_y = by_log_p * (by_r * x - by_phi * y), by_log_p * (by_r * y + by_phi * x)
+    return value, by_x, by_y, by_log_p * by_r * z, by_log_p * by_c
 
 
 @compiled(inline="always")

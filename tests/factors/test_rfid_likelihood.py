@@ -16,6 +16,7 @@ from factors.rfid.model import Antenna, BeamModel, DetectionModel, LogisticModel
 COEFFICIENTS = (3.0, -1.2, 0.02, -1.5, 0.2, -0.06, -0.6, 0.4, 0.9, 0.1, -0.16)
 MODELS: dict[str, DetectionModel] = {
     "beam": BeamModel(),
+    "beam, hardly from behind": BeamModel(behind=0.05),
     "logistic": LogisticModel(COEFFICIENTS),
     "grid": bake(LogisticModel(COEFFICIENTS), 6.0, 0.2, heights=(-0.4, 0.0, 0.4), facings=7),
 }

@@ -24,6 +24,10 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 Drive = Literal["differential", "omnidirectional", "none"]
 AROUND, HEIGHT = 0.25, 1.0  # m: distance of antennas from the robot's centre, height of antennas and camera
 FIELD_OF_VIEW = math.radians(60.0)
+# standard deviations of the constants of wheels that nobody has calibrated
+# reads of antennas that nobody has calibrated: five in a row count as one, and few are read from behind
+READS = {"tempering": 0.2, "models": {"default": {"kind": "beam", "behind": 0.05}}}
+UNCALIBRATED = {"scale_distance": 0.03, "scale_rotation": 0.05, "heading_drift": 0.03}
 
 
 def read_rig(path: str | Path) -> Rig:
@@ -92,9 +96,10 @@ def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
     remarks: list[str] = []
     if robot.odometry != "none":
         sensors.append("odometry")
-        remarks.append("odometry: the noise is that of unknown indoor wheels; `fgloc calibrate` learns it")
+        remarks.append("odometry: noise and uncertainty are those of unknown indoor wheels; `fgloc calibrate` learns them")
+        sections["odometry"] = {"uncertainty": UNCALIBRATED}
     if robot.odometry == "omnidirectional":
-        sections["odometry"] = {"noise": {"lateral": Rig().odometry.noise.along.model_dump()}}
+        sections["odometry"]["noise"] = {"lateral": Rig().odometry.noise.along.model_dump()}
     if robot.imu:
         sensors.append("imu")
         sections["imu"] = {}
@@ -104,7 +109,7 @@ def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
         remarks.append("bearing_range: the sensor is taken to be at the robot's centre, looking forward")
     if robot.antennas:
         sensors.append("rfid")
-        sections["rfid"] = {"antennas": _antennas(robot.antennas)}
+        sections["rfid"] = {"antennas": _antennas(robot.antennas), **READS}
         remarks.append(
             "rfid: names and places of the antennas are guesses: measure them; `fgloc calibrate` learns how they read"
         )

@@ -54,9 +54,11 @@ class BeamSettings(FileModel):
     """beam: width of that fall"""
     sigma_phi: Annotated[float, Field(ge=1e-3, le=10.0), InUnit("rad")] = 0.698
     """beam: width of the beam, as standard deviation of the bearing"""
+    behind: Annotated[float, Field(ge=1e-3, le=1.0)] = 1.0
+    """beam: share of reads from behind a tag whose facing is known"""
 
     def model(self) -> DetectionModel:
-        return BeamModel(self.p0, self.r_max, self.s_r, self.sigma_phi)
+        return BeamModel(self.p0, self.r_max, self.s_r, self.sigma_phi, self.behind)
 
 
 class LogisticSettings(FileModel):

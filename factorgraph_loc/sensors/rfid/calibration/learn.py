@@ -213,6 +213,7 @@ def written(model: DetectionModel, name: str, grids: Path) -> BeamSettings | Log
             r_max=round(model.r_max, 3),
             s_r=round(model.s_r, 3),
             sigma_phi=round(model.sigma_phi, 3),
+            behind=round(model.behind, 3),
             prior=CALIBRATED,
         )
     if isinstance(model, LogisticModel):

@@ -35,12 +35,17 @@ class Refit:
 
 
 def refit_beam(pairs: TagPairs, floor: Floor, start: BeamModel) -> Refit:
-    """Fit a beam, from ``start``."""
+    """Fit a beam, from ``start``; the share of reads from behind is that of ``start``."""
+
+    def build(p: Array) -> BeamModel:
+        r_max, s_r, sigma_phi = np.exp(p[1:]).tolist()
+        return BeamModel(float(1.0 / (1.0 + np.exp(-p[0]))), r_max, s_r, sigma_phi, start.behind)
+
     low, high = np.array(LOWEST), np.array(HIGHEST)
     p0 = min(max(start.p0, 1e-3), 1.0 - 1e-3)
     p = np.array((np.log(p0 / (1.0 - p0)), *np.log((start.r_max, start.s_r, start.sigma_phi))))
     p, _, _ = minimum(
-        lambda p: _fisher(_beam, p, pairs, floor),
+        lambda p: _fisher(build, p, pairs, floor),
         np.clip(p, low, high),
         ITERATIONS,
         CONVERGED,
@@ -48,7 +53,7 @@ def refit_beam(pairs: TagPairs, floor: Floor, start: BeamModel) -> Refit:
         low=low,
         high=high,
     )
-    model, errors = _beam(p), _errors(_beam, p, pairs, floor)
+    model, errors = build(p), _errors(build, p, pairs, floor)
     values = np.array((model.p0, model.r_max, model.s_r, model.sigma_phi))
     return Refit(
         model,
@@ -71,10 +76,6 @@ def refit_logistic(pairs: TagPairs, floor: Floor, *, with_facing: bool) -> Refit
 
     names = tuple(f"coefficient of {FEATURES[i]}" for i in used)
     return Refit(model, names, values[used], _errors(build, values[used], pairs, floor))
-
-
-def _beam(p: Array) -> BeamModel:
-    return BeamModel(float(1.0 / (1.0 + np.exp(-p[0]))), *np.exp(p[1:]).tolist())
 
 
 Build = Callable[[Array], DetectionModel]
