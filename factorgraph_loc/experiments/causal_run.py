@@ -39,6 +39,7 @@ class CausalEstimates:
     poses: list[Array] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
     status: list[Status] = field(default_factory=list)
+    doubts_model: list[bool] = field(default_factory=list)
 
     def add(self, t: float, e: PoseEstimate) -> None:
         """Take an estimate with the tick's time, as an unlocalized one has none; copied, as an estimator may reuse its arrays."""
@@ -46,6 +47,7 @@ class CausalEstimates:
         self.poses.append(np.array(e.pose, dtype=float))
         self.covariances.append(np.array(e.covariance, dtype=float))
         self.status.append(e.status)
+        self.doubts_model.append(e.doubts_model)
 
 
 @dataclass

@@ -47,7 +47,8 @@ def write_run(
     ``estimates.parquet`` has one row per tick and kind: ``kind`` (causal, final), ``t_ns`` (absolute), ``x``, ``y`` [m],
     ``heading`` [rad], covariances in the world frame; ``error_position`` [m], ``error_heading`` [rad, absolute] and ``nees`` at
     the stamp of the reference nearest to the tick (null if another tick is nearer); ``update_ms`` (causal: the slowest update
-    since the previous tick, null if there was none) and ``status`` (of the causal estimate). ``causal.tum`` contains the
+    since the previous tick, null if there was none), and of the causal estimate ``status`` and ``doubts_model`` (whether
+    measurements contradict the model of their sensor). ``causal.tum`` contains the
     estimates from the first localized one on. ``learnt.json``:
     ``constants`` by name with ``value`` and ``sigma``, ``landmarks`` by name with ``x``, ``y`` [m] and ``covariance`` (xx, xy,
     yy) [m^2] in the world frame. ``events.csv``: ``t_ns`` (absolute), ``t`` [s from the log's start] and the event.
@@ -158,13 +159,16 @@ def remove_run(out: Path) -> None:
 
 def estimates(result: RunResult, log: Log) -> pl.DataFrame:
     """The table of ``estimates.parquet``; see :func:`write_run`."""
-    status = np.array(result.status, dtype=object)
+    flags = pl.DataFrame(
+        {"status": list(result.status), "doubts_model": list(result.doubts_model) or [False] * len(result.status)},
+        {"status": pl.String, "doubts_model": pl.Boolean},
+    )
     causal = Trajectory(result.t, result.poses, result.covariances)
     at = np.searchsorted(result.t, result.final.t - 1e-9).clip(max=len(result.t) - 1)
     return pl.concat(
         [
-            _rows("causal", causal, result.max_gap, log, _slowest_update(result), status),
-            _rows("final", result.final, result.max_gap, log, np.full(len(result.final), np.nan), status[at]),
+            _rows("causal", causal, result.max_gap, log, _slowest_update(result), flags),
+            _rows("final", result.final, result.max_gap, log, np.full(len(result.final), np.nan), flags[at]),
         ]
     )
 
@@ -200,7 +204,7 @@ def _rows(
     max_gap: float,
     log: Log,
     update_ms: Array,
-    status: np.typing.NDArray[np.object_],
+    flags: pl.DataFrame,
 ) -> pl.DataFrame:
     n = len(trajectory)
     covariances = trajectory.covariances if trajectory.covariances is not None else np.full((n, 3, 3), np.nan)
@@ -221,10 +225,9 @@ def _rows(
         "error_heading": heading,
         "nees": nees,
         "update_ms": update_ms,
-        "status": status.tolist(),
     }
-    table = pl.DataFrame(columns, schema_overrides={"kind": pl.String, "t_ns": pl.Int64, "status": pl.String})
-    return table.with_columns(pl.col(pl.Float64).fill_nan(None))
+    table = pl.DataFrame(columns, schema_overrides={"kind": pl.String, "t_ns": pl.Int64})
+    return table.with_columns(pl.col(pl.Float64).fill_nan(None), *flags)
 
 
 def _slowest_update(result: RunResult) -> Array:

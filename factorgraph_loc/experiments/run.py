@@ -190,6 +190,7 @@ def _result(
         poses=np.array(causal.told.poses).reshape(-1, 3),
         covariances=np.array(causal.told.covariances).reshape(-1, 3, 3),
         status=tuple(causal.told.status),
+        doubts_model=tuple(causal.told.doubts_model),
         final=end.final,
         diagnostics=end.final_diagnostics,
         learnt=end.learnt,

@@ -9,6 +9,7 @@ the filter cannot lock itself out.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -16,10 +17,10 @@ from pydantic import Field
 
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
-from factorgraph_loc.fusion.search import Search, Tracked
+from factorgraph_loc.fusion.search import Search, Tracked, is_doubted, laplace_evidence
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import Binding, EarlierPose, Link, NewVariable, bound_sensors
@@ -138,10 +139,13 @@ class Ekf(Filter):
         self._sensors = bound_sensors(Binding(setup, self._motion, self.diagnostics, use=use, calibration=calibration))
         self._blocks = [(MOTION, self._motion.constants), *((n, s.constants) for n, s in self._sensors.items())]
         finders = {name: sensor for name, sensor in self._sensors.items() if sensor.finder is not None}
-        at_once = {name: sensor for name, sensor in finders.items() if sensor.finder and sensor.finder.at_once}
-        self._search = Search(at_once, self._motion, setup.rng)  # a Gaussian can be put where one measurement tells it
+        slow = {name for name, sensor in finders.items() if sensor.finder and not sensor.finder.at_once}
+        # a start is known from one measurement; a lost pose is searched by the same sensors, and by those that weigh poses
+        self._search = Search({n: s for n, s in self._sensors.items() if n not in slow}, self._motion, setup.rng)
+        if self._search.possible:
+            self._search.remember()
         self._headings = Search(finders, self._motion, setup.rng)
-        self.supports_unknown_start = self._search.possible
+        self.supports_unknown_start = len(slow) < len(finders)
         self.supports_unknown_heading = self._headings.possible
         self._step: _Step | None = None
 
@@ -228,17 +232,33 @@ class Ekf(Filter):
                     self._state = self._state.with_block(seen)
                 continue
             s = self._state
+            values = s.layout.values(s.rest)
             correction = seen.correct(
-                s.pose, s.covariance, s.layout.values(s.rest), s.layout.columns, seen.iterations or self._iterations
+                s.pose, s.covariance, values, s.layout.columns, seen.iterations or self._iterations
             )
-            if not seen.is_judged or sensor.judge(seen, correction, view):
-                self._state = s.plus(correction.delta, correction.covariance)
+            if seen.is_judged and not sensor.judge(seen, correction, view):
+                continue
+            if self._search.serves(sensor):
+                spreads = {name: view.spread(name) for name in seen.blocks}
+                here = seen.on_pose({name: values[name] for name in seen.blocks}, spreads)
+                self._search.expect(sensor, here, self._odometry, view)
+                evidence = partial(laplace_evidence, here, s.pose, s.covariance[:POSE, :POSE], correction)
+                self._search.keep(sensor, here, self._odometry, evidence)
+            self._state = s.plus(correction.delta, correction.covariance)
+        self._doubt(m)
+
+    def _pass(self, tick: Tick) -> None:
+        self._doubt(tick)
+
+    def _doubt(self, m: Measurement) -> None:
+        """Go on at another place where the search rejects the track."""
+        view = _View(self)
         refuted = self._search.refuted(m, lambda: Tracked(self._odometry, view.pose, view.covariance), self._pose_back)
         found = self._search.best if refuted is not None else None
         if refuted is not None and found is not None:
             what = f"lost: {refuted.why} since {refuted.since:.1f} s; goes on at another place"
             self.diagnostics.events.append((m.t, what))
-            self._jump(found)
+            self._jump(self._search.brought(found, self._odometry), refuted.since)
 
     def _pose_back(self, t: float, pose: Array) -> Array:
         """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""
@@ -256,18 +276,25 @@ class Ekf(Filter):
         self.diagnostics.events.append((m.t, "localized"))
         return self._start(found)
 
-    def _jump(self, found: PosePrior) -> None:
-        """Go on at another place: neither the pose nor what it has to do with the rest comes from the record before."""
+    def _jump(self, found: PosePrior, since: float) -> None:
+        """Go on at another place: neither the pose nor what it has to do with the rest comes from the record before.
+
+        Constants that were learnt after ``since``, on the wrong track, are as they were before.
+        """
         self._search.begin_track(found=True)
-        s, body = self._state, se2.world_to_body(found.pose, found.covariance)
+        for sensor in self._sensors.values():
+            sensor.restart(since)
+        right = next((r.updated for r in reversed(self._records) if r.t < since), self._state)
+        s = right if right.layout == self._state.layout else self._state
+        body = se2.world_to_body(found.pose, found.covariance)
         covariance = s.covariance.copy()
         covariance[:3], covariance[:, :3], covariance[:3, :3] = 0.0, 0.0, body
         self._state = s._replace(pose=np.array(found.pose), covariance=covariance)
         self._step = _Step(self._state.pose, np.zeros((3, len(covariance))), body)
 
     def _estimate(self) -> PoseEstimate:
-        doubted = any(s.unreliable for s in self._sensors.values())
-        doubted = doubted or self._search.is_unsure(self._state.covariance[:3, :3])
+        doubted = is_doubted(self._sensors.values())
+        doubted = doubted or self._search.is_unsure(self._t, self._state.covariance[:3, :3])
         status: Status = "ambiguous" if doubted else "localized"
         return world_estimate(self._t, self._state.pose, self._state.covariance, status)
 

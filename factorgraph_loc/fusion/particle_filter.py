@@ -350,7 +350,7 @@ class ParticleFilter(Filter):
     def _estimate(self) -> PoseEstimate:
         if self._state.localized:
             pose, covariance = self._moments()
-            doubted = self._search.doubts or self._search.is_unsure(covariance)
+            doubted = self._search.doubts or self._search.is_unsure(self._t, covariance)
             status: Status = "ambiguous" if doubted else "localized"
             return PoseEstimate(self._t, pose, covariance, status)
         mode = self._moved_on(twin(self._drawn_by)).modes()[0]

@@ -54,6 +54,7 @@ UNSURE = 5.0  # largest difference of a possible change's log-likelihood from th
 SLICE = 2_500_000  # work (:mod:`.population`) of one slice
 PAUSE = 0.05  # s between two slices, at least: a measurement and a tick often come at once
 NEAR, SURE = 0.5, 0.9  # m: a pose is known once it is so near with so much probability
+PROBATION = 5.0  # s after a track was rejected in which further measurements may contradict the next one
 APART = 16.0  # squared Mahalanobis distance from the track, beyond which a pose is another one
 
 
@@ -109,6 +110,7 @@ class Search:
         self._since = -math.inf
         self._advanced = -math.inf  # time of the last slice
         self._horizon = motion.horizon
+        self._rejected = -math.inf  # time of the last rejection of a track by particles
         self._unsure = False  # whether a track found by particles has not yet been known to half a metre
         self.newest: ChainState | None = None  # the odometry at the last informative measurement
         self.start: KnownPosition | None = None
@@ -117,6 +119,10 @@ class Search:
     def possible(self) -> bool:
         """Whether any measurement could give a pose."""
         return bool(self._finders) or self._weighs
+
+    def serves(self, sensor: Sensor) -> bool:
+        """Whether the search uses a sensor."""
+        return sensor.name in self._sensors
 
     def remember(self) -> None:
         """Keep the odometry for a search on the way."""
@@ -208,15 +214,17 @@ class Search:
         poses, reached = leading.sample(rng, count), leading.newest
         return poses, now if reached is None or reached.t >= now.t else reached
 
-    def is_unsure(self, covariance: Array) -> bool:
+    def is_unsure(self, t: float, covariance: Array) -> bool:
         """Whether a track that particles found has never been known to :data:`NEAR` with probability :data:`SURE`, nor is by its
-        ``covariance`` (3, 3) now."""
+        ``covariance`` (3, 3) at ``t``; or whether the last one was rejected less than :data:`PROBATION` ago."""
+        if self._rejected <= t < self._rejected + PROBATION:
+            return True
         return self._unsure and beyond(covariance, NEAR) > 1.0 - SURE
 
     @property
     def doubts(self) -> bool:
-        """Whether a track, or a sensor, is under suspicion."""
-        return any(s.suspicious_since is not None or s.unreliable for s in self._sensors.values())
+        """Whether a sensor doubts the track."""
+        return is_doubted(self._sensors.values())
 
     def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
         """Record an observation that is about to be applied to a track."""
@@ -247,7 +255,7 @@ class Search:
         if isinstance(m, Tick) and not self.waits:
             return None
         odometry, pose, covariance = track()
-        self._unsure = self.is_unsure(covariance)
+        self._unsure = self.is_unsure(odometry.t, covariance)
         finder = None if isinstance(m, Tick) else self._finders.get(m.source)
         if finder is not None:
             since = finder.refuted_since(m, odometry, pose, covariance)
@@ -271,7 +279,7 @@ class Search:
         best = self._population.best if self.advance(odometry.t) else None
         if best is None:
             return None
-        best = self._brought(best, odometry)
+        best = self.brought(best, odometry)
         if not _is_apart(best, pose, covariance):
             for sensor in doubting:
                 sensor.accept()
@@ -279,9 +287,10 @@ class Search:
             return None
         if self._population.log_evidence - self._population.rival_evidence <= REFUTING:
             return None
+        self._rejected = odometry.t
         return Refuted(next(iter(doubting)).lost, *self._change(best, pose_at))
 
-    def _brought(self, best: PosePrior, now: ChainState) -> PosePrior:
+    def brought(self, best: PosePrior, now: ChainState) -> PosePrior:
         """A pose moved to where the odometry is ``now``."""
         since = self._motion.relative(self._motion.state(best.t), now)
         pose = se2.compose(best.pose, since.delta)
@@ -336,6 +345,11 @@ class Search:
             return False
         self._last[sensor.name] = t
         return True
+
+
+def is_doubted(sensors: Iterable[Sensor]) -> bool:
+    """Whether one of the sensors doubts the track, or detects nothing where it should."""
+    return any(sensor.suspicious_since is not None or sensor.silent for sensor in sensors)
 
 
 def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:

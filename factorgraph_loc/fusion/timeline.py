@@ -11,6 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Container, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,15 +68,20 @@ class Timeline(ABC):
         """The pose at the time of the newest measurement or tick, or at ``t`` if that is later.
 
         Before the start: the most likely hypothesis of the search, ``ambiguous``, or NaN if there is none. Later it is
-        ``ambiguous`` while a search is going on, and while the measurements are not as expected.
+        ``ambiguous`` while a search is going on, and while the track does not explain the measurements.
         """
         if self._begun < math.inf:
-            return self._estimate_at(t)
+            found = self._estimate_at(t)
+            return replace(found, doubts_model=True) if self._doubts_model() else found
         at = self._t if t is None else max(t, self._t)
         modes = [] if self._seeking is None else self._seeking.modes(at)
         if not modes:
             return PoseEstimate(at, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
         return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
+
+    def _doubts_model(self) -> bool:
+        """Whether measurements contradict the model of their sensor."""
+        return any(sensor.doubts_model for sensor in self._sensors.values())
 
     def belief(self, t: float | None = None) -> Belief:
         """The belief behind :meth:`estimate`; before the start all hypotheses of the search, and its particles."""

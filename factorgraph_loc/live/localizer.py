@@ -268,7 +268,7 @@ class Localizer:
 
 def _copied(e: PoseEstimate, t: float) -> PoseEstimate:
     """The estimate with the time ``t``, and arrays of its own."""
-    return PoseEstimate(t, np.array(e.pose), np.array(e.covariance), e.status)
+    return replace(e, t=t, pose=np.array(e.pose), covariance=np.array(e.covariance))
 
 
 def _moved(m: Measurement, offset: float) -> Measurement:

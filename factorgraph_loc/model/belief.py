@@ -43,12 +43,17 @@ class PosePrior:
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """A causal estimate: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world frame."""
+    """A causal estimate: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world frame.
+
+    ``status`` is about the pose. ``doubts_model`` tells whether measurements contradict the model of their sensor: the covariance
+    may be too small then.
+    """
 
     t: float
     pose: Array
     covariance: Array
     status: Status
+    doubts_model: bool = False
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,8 @@ class RunResult:
     """The result of one estimator on one log.
 
     ``config``: the effective configuration, enough to repeat the run. ``t`` (N,), ``poses`` (N, 3), ``covariances`` (N, 3, 3) in
-    the world frame and ``status`` (N) are the causal estimates at the ticks; ``final`` is the estimate from the whole log.
+    the world frame and ``status`` (N) are the causal estimates at the ticks, ``doubts_model`` (N) tells
+    whether measurements contradicted the model of their sensor then; ``final`` is the estimate from the whole log.
     ``reliability``: of the sensors' models on this log, by sensor.
     """
 
@@ -74,6 +75,7 @@ class RunResult:
     versions: Mapping[str, str]
     warnings: tuple[str, ...] = ()
     reliability: Mapping[str, Reliability] = field(default_factory=dict)
+    doubts_model: tuple[bool, ...] = ()
 
     def __repr__(self) -> str:
         poses = f"{len(self.t)} causal and {len(self.final)} final poses"

@@ -291,9 +291,13 @@ class Sensor:
         return None
 
     @property
-    def unreliable(self) -> bool:
-        """Whether nothing is detected although something should be, or detections contradict the sensor's model, so that
-        covariances are too small."""
+    def silent(self) -> bool:
+        """Whether nothing is detected although something should be."""
+        return False
+
+    @property
+    def doubts_model(self) -> bool:
+        """Whether detections contradict the sensor's model, so that covariances are too small."""
         return False
 
     def accept(self) -> None:

@@ -297,7 +297,7 @@ class Monoslam(Filter):
     def _estimate(self) -> PoseEstimate:
         robot = self._state.robot
         pose, covariance = seen_from_above(robot, self._spread(robot, self._state.covariance))
-        return PoseEstimate(self._t, pose, covariance, "ambiguous" if self._check.told else "localized")
+        return PoseEstimate(self._t, pose, covariance, "localized", doubts_model=self._check.told)
 
     def _spread(self, robot: RobotState, covariance: Array) -> Array:
         """The covariance (6, 6) of a pose, including that of the start without a map, or of the camera's mounting in one."""

@@ -117,7 +117,7 @@ class Smoother(Timeline):
         """The newest keyframe, moved along the odometry since; with ``final_only`` a guess, ``unlocalized``."""
         at = self._t if t is None else max(t, self._t)
         pose, _, covariance = self._graph.moved(at)
-        doubted = self._behind or self._search.doubts or self._search.is_unsure(covariance)
+        doubted = self._behind or self._search.doubts or self._search.is_unsure(self._t, covariance)
         status: Status = "ambiguous" if doubted else "localized"
         if self._settings.final_only:
             status = "unlocalized"

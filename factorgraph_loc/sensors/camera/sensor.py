@@ -131,7 +131,7 @@ class CameraSensor(Sensor):
             self.solve_every = 0.0 if constants.names else SOLVE_EVERY
 
     @property
-    def unreliable(self) -> bool:
+    def doubts_model(self) -> bool:
         return self._check.told
 
     def observe(self, m: Pixels, view: View) -> Iterator[PixelObservation | NewVariable]:

@@ -15,6 +15,7 @@ from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags, TagEvidence, TagSignals, extent
 from factorgraph_loc.sensors.rfid.monitor import (
+    DURATION,
     KNOWN,
     POSSIBLE,
     BurstMonitor,
@@ -140,6 +141,7 @@ class TagSensor(Sensor):
         self._settled = SettledParameters()
         self._for_search = self.tags.likelihood
         self._heard = -math.inf  # last scan that was checked for silence
+        self._confirmed = -math.inf  # time [s] from which on a new track is believed, and models are learnt on it
 
     def observe(self, m: RfidScan, view: View) -> Iterator[TagObservation]:
         looks, likelihood = self.tags.looks(m), self.tags.likelihood
@@ -155,7 +157,8 @@ class TagSensor(Sensor):
                 told = self.tags.told(here, view.pose, view.covariance, estimated)
                 looks = self.tags.with_states(looks, told)
                 here = looks if view.offset is None else looks.moved(view.offset.delta)
-        yield replace(self._detection(m, here, looks), told=told, settled=self._for_search)
+        found = replace(self._detection(m, here, looks), told=told, settled=self._for_search)
+        yield found if not view.localized or self._learns(m.t) else found.on_pose(self._values(view), {})
         if self._silence.lasts and view.newest:
             return
         strengths = self._signals.strengths(m)
@@ -169,6 +172,10 @@ class TagSensor(Sensor):
                 window = self._signals.phases(view.poses_at(self._signals.times()), view.pose)
                 if window is not None:
                     yield TagObservation(m.t, window, 1)
+
+    def _learns(self, t: float) -> bool:
+        """Whether models and states of tags are learnt: not on a track that is suspicious, or that has just been found."""
+        return self.suspicious_since is None and t >= self._confirmed
 
     def _detection(self, m: RfidScan, moved: TagReadCounts, looks: TagReadCounts) -> TagObservation:
         assert self.tags.likelihood is not None
@@ -184,7 +191,7 @@ class TagSensor(Sensor):
             return False
         if view.newest:
             self._monitor.add(t, correction.excess_nll, correction.variance)
-        if observation.told is not None and self._monitor.suspicious_since is None:
+        if observation.told is not None and self._monitor.suspicious_since is None and t >= self._confirmed:
             self.tags.learn(t, observation.told)
             if view.newest:
                 self._count(observation, view)
@@ -209,15 +216,17 @@ class TagSensor(Sensor):
             if self._consistency.doubted and not doubted:
                 self._diagnostics.event(t, f"{ConsistencyMonitor.EVENT}: {self._consistency.shares}")
 
+    def _values(self, view: View) -> dict[str, Array]:
+        """The parameters (P,) of the detection models that are estimated, by block."""
+        found = {name: view.value(name) for name in self._blocks}
+        return {name: value for name, value in found.items() if value is not None}
+
     def _estimated(self, view: View) -> Array:
         """The parameters (2 M,) of the detection models as they are estimated to be."""
         assert self.tags.likelihood is not None
-        nominal = self.tags.likelihood.parameters
-        value = view.value(self.name) if self._blocks else None
-        if value is None:
-            return nominal
-        out = nominal.copy()
-        out[list(self.constants.indices)] = value
+        out = self.tags.likelihood.parameters.copy()
+        for value in self._values(view).values():
+            out[list(self.constants.indices)] = value
         return out
 
     def _is_evidence(self, observation: TagObservation, evidence: float) -> bool:
@@ -245,8 +254,12 @@ class TagSensor(Sensor):
         return min(scans, counts)
 
     @property
-    def unreliable(self) -> bool:
-        return self._silence.lasts or self._consistency.doubted
+    def silent(self) -> bool:
+        return self._silence.lasts
+
+    @property
+    def doubts_model(self) -> bool:
+        return self._consistency.doubted
 
     def accept(self) -> None:
         self._monitor.accept()
@@ -263,8 +276,11 @@ class TagSensor(Sensor):
             else:
                 terms.append(Term(factor, (), factor.rows))
         if counts and self.tags.likelihood is not None:
-            factor = RfidFactor(self.tags.likelihood, together(counts), self.constants.indices)
-            terms.append(Term(factor, self._blocks, factor.rows))
+            factor, blocks = RfidFactor(self.tags.likelihood, together(counts), self.constants.indices), self._blocks
+            fixed = next((o.factor for o in observations if o.is_judged and not o.blocks), None)
+            if blocks and fixed is not None:
+                factor, blocks = replace(fixed, seen=factor.seen), ()
+            terms.append(Term(factor, blocks, factor.rows))
         return terms
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
@@ -277,6 +293,7 @@ class TagSensor(Sensor):
         self._settled.forget(math.nextafter(t, math.inf))
 
     def restart(self, t: float) -> None:
+        self._confirmed = max(t, self._heard) + DURATION
         self._settled.forget(t)
         self._monitor.clear()
         self._bursts.clear()

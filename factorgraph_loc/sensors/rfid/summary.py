@@ -253,7 +253,8 @@ class _Looks:
 def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Trajectory) -> Reliability | None:
     """The reliability of the detection models with what was learnt of them; None without reads, antennas or covariances.
 
-    Tags that are believed dead or moved are left out, and times in which nothing was read.
+    Tags that are believed dead are left out, and times in which nothing was read. Tags that seem to have moved count, because many
+    seem to where the model is wrong.
     """
     log, settings = use.log, use.log.rig.find(RfidSettings)
     stream = log.streams.get("rfid")
@@ -261,8 +262,8 @@ def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Traje
         return None
     if not log.world.tags or len(final) < 2 or final.covariances is None or "rfid" not in use.modalities:
         return None
-    doubted = set[str]().union(*diagnostics.doubted.values())
-    kept = [name for name in log.world.tags if name not in doubted]
+    dead = diagnostics.doubted.get("dead_tags", {})
+    kept = [name for name in log.world.tags if name not in dead]
     looks = _looks(use, stream, settings, learnt, final, kept)
     if looks is None:
         return None

@@ -134,10 +134,11 @@ def test_an_offset_of_time_is_estimated_or_told(log):
         (event,) = [what for _, what in blind.diagnostics.events if "time_offset" in what]
         assert event.startswith("camera: images seem to be taken 0.1")
         assert "later" in event
-        assert blind.status[-1] != "localized"
+        assert blind.doubts_model[-1]
     right = run(log, CONFIGS["ekf"])
     assert not [what for _, what in right.diagnostics.events if "time_offset" in what]
-    assert right.status[-1] != "ambiguous"
+    assert right.status[-1] == "localized"
+    assert not right.doubts_model[-1]
 
 
 def test_a_wrong_focal_length_is_estimated_or_shows(log):

@@ -85,9 +85,9 @@ def test_where_the_robot_hardly_turns_nothing_is_told():
 
 
 @pytest.mark.parametrize(("estimator", "late"), [("smoother", 0.0), ("smoother", 0.1), ("monoslam", 0.1)])
-def test_a_run_without_a_map_does_not_claim_to_be_localized_with_a_wrong_clock(estimator, late):
+def test_a_run_without_a_map_doubts_the_model_with_a_wrong_clock(estimator, late):
     log = drive(1, seconds=20.0)
     stamped = with_sightings(log, t=log.streams["sightings"].t + late)
     result = run(stamped, RunConfig(estimator, {"landmarks": "unknown"}))
-    assert result.status[-1] == ("ambiguous" if late else "localized")
+    assert result.doubts_model[-1] == (late > 0.0)
     assert any("time_offset" in what for _, what in result.diagnostics.events) == (late > 0.0)
