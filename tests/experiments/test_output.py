@@ -34,6 +34,7 @@ COLUMNS = [
     "nees",
     "update_ms",
     "status",
+    "doubts_model",
 ]
 
 
@@ -57,7 +58,7 @@ def test_table_of_estimates(result, log, tmp_path):
     write_run(result, log, tmp_path / "out")
     table = pl.read_parquet(tmp_path / "out" / "estimates.parquet")
     assert table.columns == COLUMNS
-    types = {"kind": pl.String, "t_ns": pl.Int64, "status": pl.String}
+    types = {"kind": pl.String, "t_ns": pl.Int64, "status": pl.String, "doubts_model": pl.Boolean}
     assert dict(table.schema) == {name: types.get(name, pl.Float64) for name in COLUMNS}
     causal, final = (table.filter(pl.col("kind") == kind) for kind in ("causal", "final"))
     assert len(causal) == len(final) == 21

@@ -96,7 +96,9 @@ def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
     remarks: list[str] = []
     if robot.odometry != "none":
         sensors.append("odometry")
-        remarks.append("odometry: noise and uncertainty are those of unknown indoor wheels; `fgloc calibrate` learns them")
+        remarks.append(
+            "odometry: noise and uncertainty are those of unknown indoor wheels; `fgloc calibrate` learns them"
+        )
         sections["odometry"] = {"uncertainty": UNCALIBRATED}
     if robot.odometry == "omnidirectional":
         sections["odometry"]["noise"] = {"lateral": Rig().odometry.noise.along.model_dump()}

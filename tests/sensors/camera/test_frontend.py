@@ -268,7 +268,7 @@ def test_grey_and_16_bit_images(log, tmp_path):
 def test_the_version_is_of_all_code_that_features_come_from():
     """What the extractors import, directly or not, and what encodes them, must be in the hash that names them in the cache."""
     prefix = "factorgraph_loc.vision."
-    seen, open_ = set(), {"features", "found", "images"}
+    seen, open_ = set(), {"features", "feature_cache", "images"}
     while open_:
         name = open_.pop()
         seen.add(name)
