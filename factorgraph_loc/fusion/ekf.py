@@ -17,7 +17,7 @@ from pydantic import Field
 
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
-from factorgraph_loc.fusion.search import Search, Tracked, is_doubted, laplace_evidence
+from factorgraph_loc.fusion.search import Refuted, Search, Tracked, is_doubted, laplace_evidence
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -258,7 +258,7 @@ class Ekf(Filter):
         if refuted is not None and found is not None:
             what = f"lost: {refuted.why} since {refuted.since:.1f} s; goes on at another place"
             self.diagnostics.events.append((m.t, what))
-            self._jump(self._search.brought(found, self._odometry), refuted.since)
+            self._jump(self._search.brought(found, self._odometry), refuted)
 
     def _pose_back(self, t: float, pose: Array) -> Array:
         """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""
@@ -276,17 +276,17 @@ class Ekf(Filter):
         self.diagnostics.events.append((m.t, "localized"))
         return self._start(found)
 
-    def _jump(self, found: PosePrior, since: float) -> None:
+    def _jump(self, found: PosePrior, refuted: Refuted) -> None:
         """Go on at another place: neither the pose nor what it has to do with the rest comes from the record before.
 
-        Constants that were learnt after ``since``, on the wrong track, are as they were before.
+        Constants that were learnt on the wrong track are as they were before.
         """
         self._search.begin_track(found=True)
         for sensor in self._sensors.values():
-            sensor.restart(since)
-        right = next((r.updated for r in reversed(self._records) if r.t < since), self._state)
+            sensor.restart(refuted.since)
+        right = next((r.updated for r in reversed(self._records) if r.t < refuted.since), self._state)
         s = right if right.layout == self._state.layout else self._state
-        body = se2.world_to_body(found.pose, found.covariance)
+        body = se2.world_to_body(found.pose, found.covariance) + refuted.spread
         covariance = s.covariance.copy()
         covariance[:3], covariance[:, :3], covariance[:3, :3] = 0.0, 0.0, body
         self._state = s._replace(pose=np.array(found.pose), covariance=covariance)

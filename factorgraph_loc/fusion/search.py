@@ -55,6 +55,9 @@ SLICE = 2_500_000  # work (:mod:`.population`) of one slice
 PAUSE = 0.05  # s between two slices, at least: a measurement and a tick often come at once
 NEAR, SURE = 0.5, 0.9  # m: a pose is known once it is so near with so much probability
 PROBATION = 5.0  # s after a track was rejected in which further measurements may contradict the next one
+# m, m, rad: spread of a pose that the search found, as a prior of what follows. The same measurements enter a graph as factors. The
+# particles that found it were moved along an odometry that may have failed.
+FOUND = np.diag((1.0, 1.0, 0.5)) ** 2
 APART = 16.0  # squared Mahalanobis distance from the track, beyond which a pose is another one
 
 
@@ -75,11 +78,13 @@ class Tracked(NamedTuple):
 
 
 class Refuted(NamedTuple):
-    """Why a track is rejected, and since when it is wrong; ``change``: between which times the robot left it."""
+    """Why a track is rejected, and since when it is wrong; ``change``: between which times the robot left it; ``spread`` (3, 3): to
+    be added to the covariance of the new pose."""
 
     why: str
     since: float
     change: Change
+    spread: Array
 
 
 class Search:
@@ -261,7 +266,7 @@ class Search:
             since = finder.refuted_since(m, odometry, pose, covariance)
             if since is not None:
                 before = max((t for t in self._looked if t < since), default=-math.inf)
-                return Refuted(self._sensors[m.source].lost, since, (before, since))
+                return Refuted(self._sensors[m.source].lost, since, (before, since), np.zeros((3, 3)))
         return self._refuted_by_all(odometry, pose, covariance, pose_at)
 
     def _refuted_by_all(
@@ -288,7 +293,7 @@ class Search:
         if self._population.log_evidence - self._population.rival_evidence <= REFUTING:
             return None
         self._rejected = odometry.t
-        return Refuted(next(iter(doubting)).lost, *self._change(best, pose_at))
+        return Refuted(next(iter(doubting)).lost, *self._change(best, pose_at), FOUND)
 
     def brought(self, best: PosePrior, now: ChainState) -> PosePrior:
         """A pose moved to where the odometry is ``now``."""

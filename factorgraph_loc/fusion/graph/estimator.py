@@ -26,7 +26,7 @@ from factorgraph_loc.fusion.graph.keyframes import Backend, Builder
 from factorgraph_loc.fusion.graph.settings import BatchSettings, SmootherSettings
 from factorgraph_loc.fusion.graph.variables import Keyframe
 from factorgraph_loc.fusion.mapping import Mapper
-from factorgraph_loc.fusion.search import DURATION, Refuted, Search, Tracked
+from factorgraph_loc.fusion.search import DURATION, FOUND, Refuted, Search, Tracked
 from factorgraph_loc.fusion.timeline import Taken, Timeline
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -42,10 +42,6 @@ from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
 __all__ = ["Batch", "BatchSettings", "Smoother", "SmootherSettings"]
-
-# m, m, rad: of a place that the search told. What told it comes in as factors, so it is to count for next to nothing, but to keep
-# what the first scan alone tells from leading elsewhere.
-FOUND = np.diag((1.0, 1.0, 0.5)) ** 2
 
 
 REPLAYED, TICK = 300, 2  # work of which so much is done at once, and that of a tick; see `Sensor.work`
