@@ -269,17 +269,19 @@ class Ekf(Filter):
         return self._motion.poses_at(self._odometry, times, constants)
 
     def _seek(self, m: Measurement) -> _State | None:
-        found = self._search.best if self._search.look(m, self._odometry) else None
-        if found is None:
+        if not self.supports_unknown_start:
+            return None
+        pose = self._search.best if self._search.look(m, self._odometry) else None
+        if pose is None:
             return None
         self._search.begin_track(found=True)
         self.diagnostics.events.append((m.t, "localized"))
-        return self._start(found)
+        return self._start(self._search.brought(pose, self._odometry))
 
     def _jump(self, found: PosePrior, refuted: Refuted) -> None:
-        """Go on at another place: neither the pose nor what it has to do with the rest comes from the record before.
+        """Continue at another pose, which is not correlated with the rest of the state.
 
-        Constants that were learnt on the wrong track are as they were before.
+        Constants return to their estimates before the track was wrong.
         """
         self._search.begin_track(found=True)
         for sensor in self._sensors.values():

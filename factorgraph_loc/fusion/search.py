@@ -297,6 +297,8 @@ class Search:
 
     def brought(self, best: PosePrior, now: ChainState) -> PosePrior:
         """A pose moved to where the odometry is ``now``."""
+        if best.t >= now.t:
+            return best
         since = self._motion.relative(self._motion.state(best.t), now)
         pose = se2.compose(best.pose, since.delta)
         return PosePrior(now.t, pose, best.covariance + se2.body_to_world(pose, since.covariance))
