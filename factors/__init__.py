@@ -6,7 +6,6 @@ __all__ = [
     "chain",
     "chi_squared",
     "compiled",
-    "compressed",
     "gaussian",
     "graph",
     "landmarks",

@@ -1,5 +1,4 @@
-"""Small matrices and Gaussians in compiled code: products, solutions, roots and inverses; prediction, correction by residuals, and
-smoothing.
+"""Small matrices and Gaussians in compiled code: products, solutions, roots and inverses; prediction and smoothing.
 
 Plain loops: calls of LAPACK take longer than the arithmetic of small matrices, and what NumPy does with slices and matrices is
 compiled anew into each function that uses it, which takes a second or more.
@@ -10,7 +9,7 @@ import math
 import numpy as np
 
 from factors.compiled import compiled
-from factors.se2 import Array, Integers
+from factors.se2 import Array
 
 SKEW = 1e-7  # of two standard deviations: more asymmetry is not one of a few roundings
 
@@ -131,76 +130,6 @@ def invert_covariance(covariance: Array) -> Array:
             for k in range(i, size):
                 total += back[k, i] * back[k, j]
             out[i, j] = out[j, i] = total
-    return out
-
-
-@compiled(error_model="numpy")
-def inform(residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array, total: Array) -> Array:
-    """Add the information of K residuals to ``total`` (S, S), and return the vector (D,) that the correction solves for.
-
-    ``residual`` (K, g) and ``jacobian`` (K, g, D): linearised at the correction ``at`` (S,); ``columns`` (D,): those of the
-    Jacobian in the error state; ``weights`` (K,). The correction is the inverse of the information times this vector.
-    """
-    wide = len(columns)
-    pull = np.zeros(wide)
-    for k in range(len(residual)):
-        for i in range(residual.shape[1]):
-            row = jacobian[k, i]
-            wanted = -residual[k, i]
-            for a in range(wide):
-                wanted += row[a] * at[columns[a]]
-            for a in range(wide):
-                weighted = weights[k] * row[a]
-                if weighted != 0.0:
-                    pull[a] += weighted * wanted
-                    for b in range(wide):
-                        total[columns[a], columns[b]] += weighted * row[b]
-    return pull
-
-
-@compiled(error_model="numpy")
-def corrected(
-    prior: Array, residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array
-) -> tuple[Array, Array, Array]:
-    """The correction (S,), the covariance (S, S) after it, and the vector (D,) of :func:`inform`.
-
-    ``prior`` (S, S): the information of the prediction; the other arguments are those of :func:`inform`. LinAlgError if there is no
-    solution.
-    """
-    total = prior.copy()
-    pull = inform(residual, jacobian, columns, weights, at, total)
-    after, delta = invert_covariance(total), np.zeros(len(prior))
-    for i in range(len(prior)):
-        for a in range(len(columns)):
-            delta[i] += after[i, columns[a]] * pull[a]
-    return delta, after, pull
-
-
-@compiled(error_model="numpy")
-def normalised(residual: Array, jacobian: Array, columns: Integers, covariance: Array) -> Array:
-    """Normalised innovation squared (K,) of K whitened residuals (K, g), each by itself, with Jacobians (K, g, D) by the
-    ``columns`` (D,) of a state with this ``covariance`` (S, S)."""
-    size, wide = residual.shape[1], len(columns)
-    out, left, whitened = np.zeros(len(residual)), np.empty((size, size)), np.empty(size)
-    for k in range(len(residual)):
-        for i in range(size):
-            whitened[i] = residual[k, i]
-            for j in range(i + 1):
-                spread = 1.0 if i == j else 0.0
-                for a in range(wide):
-                    if jacobian[k, i, a] != 0.0:
-                        carried = 0.0
-                        for b in range(wide):
-                            carried += covariance[columns[a], columns[b]] * jacobian[k, j, b]
-                        spread += jacobian[k, i, a] * carried
-                for m in range(j):
-                    spread -= left[i, m] * left[j, m]
-                # with unit noise a pivot is at least 1, whatever rounding leaves of it
-                left[i, j] = math.sqrt(max(spread, 0.5)) if i == j else spread / left[j, j]
-            for m in range(i):
-                whitened[i] -= left[i, m] * whitened[m]
-            whitened[i] /= left[i, i]
-            out[k] += whitened[i] * whitened[i]
     return out
 
 

@@ -1,4 +1,7 @@
-"""Conversion of this package's factors to GTSAM's.
+"""Variables and factors as GTSAM gets them.
+
+A variable is a pose (3,), or a vector: roll and pitch (2,) of the robot at a pose, constants of a sensor that are estimated, or the
+position of a landmark (2,) or point (3,).
 
 A factor has ``linearize(values)``, whose values are arrays: poses (3,), vectors (P,). It returns the whitened, robustly weighted
 residual and one Jacobian per variable, by body-frame perturbation. GTSAM gets it as a linear factor: callbacks would copy all
@@ -16,9 +19,83 @@ import gtsam
 import numpy as np
 
 from factors import positive, se2
+from factors.compiled import compiled
+from factors.gaussian import cholesky
 from factors.se2 import Array, Integers
 
 MOST_TERMS = 3  # that a `gtsam.JacobianFactor` takes in Python; a conditional is one, and takes any number
+RELATIVE_RIDGE, RIDGE = 1e-9, 1e-10  # of the mean curvature of a cost, and of any: against division by zero
+LEAST = 1e-12  # a cost of zero has no gradient
+Values = dict[int, Array]
+GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)  # all that GTSAM raises
+
+_POSE, _TILT, _POINT, _LANDMARK = ord("x"), ord("t"), ord("p"), ord("l")
+_CHARACTER = 56  # bits of a key below its character
+
+
+def pose_key(index: int) -> int:
+    """The key of the pose of keyframe ``index``."""
+    return int(gtsam.symbol("x", index))
+
+
+def tilt_key(index: int) -> int:
+    """The key of the tilt of the robot at keyframe ``index``."""
+    return int(gtsam.symbol("t", index))
+
+
+def constants_key(index: int) -> int:
+    """The key of the constants of the sensor with number ``index``."""
+    return int(gtsam.symbol("c", index))
+
+
+def landmark_key(index: int) -> int:
+    """The key of the landmark that was met as number ``index``."""
+    return int(gtsam.symbol("l", index))
+
+
+def point_key(index: int) -> int:
+    """The key of the point in space that was taken in as number ``index``."""
+    return int(gtsam.symbol("p", index))
+
+
+def leaving_key(index: int) -> int:
+    """The key of a variable that only serves to leave a window, with number ``index``."""
+    return int(gtsam.symbol("q", index))
+
+
+def is_point(key: int) -> bool:
+    """Whether the variable is a point in space."""
+    return key >> _CHARACTER == _POINT
+
+
+def is_landmark(key: int) -> bool:
+    """Whether the variable is a landmark."""
+    return key >> _CHARACTER == _LANDMARK
+
+
+def is_pose(key: int) -> bool:
+    """Whether the variable is a pose."""
+    return key >> _CHARACTER == _POSE
+
+
+def is_place(key: int) -> bool:
+    """Whether the variable begins with x and y in the frame of the world."""
+    return key >> _CHARACTER in (_POSE, _POINT, _LANDMARK)
+
+
+def is_of_keyframe(key: int) -> bool:
+    """Whether the variable is a pose or a tilt, which a window loses with its keyframe."""
+    return key >> _CHARACTER in (_POSE, _TILT)
+
+
+def is_constant(key: int) -> bool:
+    """Whether the variable is always there: constants, or a landmark."""
+    return not is_of_keyframe(key) and not is_point(key)
+
+
+def index_of(key: int) -> int:
+    """The number of a pose, tilt, landmark or point."""
+    return key & ((1 << _CHARACTER) - 1)
 
 
 class Factor(Protocol):
@@ -185,3 +262,95 @@ def _checked(
 @lru_cache(maxsize=256)
 def _zeros(size: int) -> Array:
     return np.zeros(size)
+
+
+def retract(key: int, value: Array, step: Array) -> Array:
+    """A variable moved by a step of its tangent space."""
+    return se2.moved(value, step) if is_pose(key) else value + step
+
+
+def frame_motions(values: Values) -> tuple[Array, list[int]]:
+    """The steps (n, 3) of the tangent spaces of all variables, one below the other, by which they move with the frame of the world
+    in x, in y, and about its origin, and where that of each ends."""
+    parts = []
+    for key, value in values.items():
+        part = np.zeros((len(value), 3))
+        if is_place(key):
+            part[:2] = (1.0, 0.0, -value[1]), (0.0, 1.0, value[0])
+        if is_pose(key):
+            c, s = math.cos(value[2]), math.sin(value[2])
+            part[:2] = np.array(((c, s), (-s, c))) @ part[:2]
+            part[2, 2] = 1.0
+        parts.append(part)
+    return np.vstack(parts), np.cumsum([len(part) for part in parts]).tolist()
+
+
+def to_gtsam(values: Values) -> gtsam.Values:
+    """The same as GTSAM holds them."""
+    out = gtsam.Values()
+    for key, value in values.items():
+        out.insert(key, gtsam.Pose2(*value) if is_pose(key) else value)
+    return out
+
+
+def read(solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother, key: int) -> Array:
+    """The estimate of a variable."""
+    if is_pose(key):
+        return pose_array(solver.calculateEstimatePose2(key))
+    return np.asarray(solver.calculateEstimateVector(key), dtype=float)
+
+
+def gather(values: Values, keys: Sequence[int]) -> list[Array]:
+    """The values of several variables."""
+    return [values[key] for key in keys]
+
+
+@compiled(error_model="numpy")
+def _whitened(lower: Array, vector: Array, out: Array) -> float:
+    """Compute L^-1 v into ``out`` and return its squared norm."""
+    squared = 0.0
+    for i in range(len(vector)):
+        total = vector[i]
+        for k in range(i):
+            total -= lower[i, k] * out[k]
+        out[i] = total / lower[i, i]
+        squared += out[i] * out[i]
+    return squared
+
+
+@compiled(error_model="numpy")
+def _compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, Array]:
+    size, curvature, trace = len(gradient), information.copy(), 0.0
+    residual, jacobian = np.empty(size + 1), np.zeros((size + 1, size))
+    for i in range(size):
+        trace += curvature[i, i]
+    for i in range(size):
+        curvature[i, i] += RELATIVE_RIDGE * trace / size + RIDGE
+    lower, _ = cholesky(curvature)
+    squared, floor = _whitened(lower, gradient, residual), max(2.0 * nll, LEAST)
+    if squared > floor:
+        raised = 1.0 / floor - 1.0 / squared
+        for i in range(size):
+            for j in range(size):
+                curvature[i, j] += raised * gradient[i] * gradient[j]
+        lower, _ = cholesky(curvature)
+        squared = _whitened(lower, gradient, residual)
+    residual[size] = math.sqrt(max(2.0 * nll - squared, 0.0))
+    for i in range(size):
+        for j in range(i + 1):
+            jacobian[j, i] = lower[i, j]
+    return residual, jacobian
+
+
+def compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, Array]:
+    """Residual (d + 1,) and Jacobian (d + 1, d) of a cost ``nll`` >= 0 with ``gradient`` (d,) and symmetric positive semi-definite
+    ``information`` (d, d). All are finite for any rank of the information.
+
+    With the information H = L L^T the residual is ``[L^-1 g; sqrt(2 nll - g^T H^-1 g)]`` and its Jacobian ``[L^T; 0]``. Half its
+    square is nll exactly, its gradient is g and its curvature H, so a least-squares solver takes the scoring step and evaluates
+    the exact likelihood. The last row requires ``g^T H^-1 g <= 2 nll``: the minimum of the parabola must not be negative.
+    Otherwise the curvature is raised along g to ``H + t g g^T`` with ``t = 1 / (2 nll) - 1 / (g^T H^-1 g)``.
+    """
+    arrays = np.ascontiguousarray(gradient, dtype=float), np.ascontiguousarray(information, dtype=float)
+    residual, jacobian = _compressed(float(nll), *arrays)
+    return residual, jacobian

@@ -1,4 +1,4 @@
-"""The robust, iterated Kalman update in information form.
+"""The correction of a Gaussian by residuals: the robust, iterated Kalman update in information form.
 
 Robust, because an outlier must neither dominate nor be rejected by a wrong prediction. Landmarks of a map have a compiled version
 (:mod:`factors.landmarks.kernels`), because an EKF updates so often that calls of NumPy would take most of its time.
@@ -6,13 +6,16 @@ Robust, because an outlier must neither dominate nor be rejected by a wrong pred
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factors import gaussian, positive
-from factors.se2 import Array
+from factors import positive
+from factors.compiled import compiled
+from factors.gaussian import invert_covariance
+from factors.se2 import Array, Integers
 
 CONVERGED = 1e-6  # m and rad; convergence limit of an iterated update
 GATE = 9.21  # 99 % of chi-square with two degrees of freedom
@@ -92,7 +95,7 @@ def _iterated(
     zero = np.zeros(len(covariance))
     residual, blocks = map(np.ascontiguousarray, linearize(zero))  # compiled code is compiled anew for others
     size = blocks.shape[2]
-    squared = gaussian.normalised(residual, blocks, np.arange(size), np.ascontiguousarray(covariance))
+    squared = normalised(residual, blocks, np.arange(size), np.ascontiguousarray(covariance))
     widening = np.maximum(1.0, squared / GATES[blocks.shape[1]])
     delta, updated = first_solve(blocks, residual, np.ones(len(residual)), zero[:size])
     # by the matrix inversion lemma
@@ -117,7 +120,7 @@ def _informed(prior: Array) -> _Solver:
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         information = prior.copy()
-        pull = gaussian.inform(residual, blocks, np.arange(len(at)), weight, at, information)
+        pull = inform(residual, blocks, np.arange(len(at)), weight, at, information)
         updated = np.asarray(np.linalg.inv(information), dtype=float)
         return updated[:, : len(at)] @ pull, updated
 
@@ -145,3 +148,73 @@ def _require_sound(delta: Array, covariance: Array) -> None:
     np.linalg.cholesky(covariance)
     if not np.all(np.isfinite(delta)):
         raise np.linalg.LinAlgError("an update is not finite")
+
+
+@compiled(error_model="numpy")
+def inform(residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array, total: Array) -> Array:
+    """Add the information of K residuals to ``total`` (S, S), and return the vector (D,) that the correction solves for.
+
+    ``residual`` (K, g) and ``jacobian`` (K, g, D): linearised at the correction ``at`` (S,); ``columns`` (D,): those of the
+    Jacobian in the error state; ``weights`` (K,). The correction is the inverse of the information times this vector.
+    """
+    wide = len(columns)
+    pull = np.zeros(wide)
+    for k in range(len(residual)):
+        for i in range(residual.shape[1]):
+            row = jacobian[k, i]
+            wanted = -residual[k, i]
+            for a in range(wide):
+                wanted += row[a] * at[columns[a]]
+            for a in range(wide):
+                weighted = weights[k] * row[a]
+                if weighted != 0.0:
+                    pull[a] += weighted * wanted
+                    for b in range(wide):
+                        total[columns[a], columns[b]] += weighted * row[b]
+    return pull
+
+
+@compiled(error_model="numpy")
+def corrected(
+    prior: Array, residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array
+) -> tuple[Array, Array, Array]:
+    """The correction (S,), the covariance (S, S) after it, and the vector (D,) of :func:`inform`.
+
+    ``prior`` (S, S): the information of the prediction; the other arguments are those of :func:`inform`. LinAlgError if there is no
+    solution.
+    """
+    total = prior.copy()
+    pull = inform(residual, jacobian, columns, weights, at, total)
+    after, delta = invert_covariance(total), np.zeros(len(prior))
+    for i in range(len(prior)):
+        for a in range(len(columns)):
+            delta[i] += after[i, columns[a]] * pull[a]
+    return delta, after, pull
+
+
+@compiled(error_model="numpy")
+def normalised(residual: Array, jacobian: Array, columns: Integers, covariance: Array) -> Array:
+    """Normalised innovation squared (K,) of K whitened residuals (K, g), each by itself, with Jacobians (K, g, D) by the
+    ``columns`` (D,) of a state with this ``covariance`` (S, S)."""
+    size, wide = residual.shape[1], len(columns)
+    out, left, whitened = np.zeros(len(residual)), np.empty((size, size)), np.empty(size)
+    for k in range(len(residual)):
+        for i in range(size):
+            whitened[i] = residual[k, i]
+            for j in range(i + 1):
+                spread = 1.0 if i == j else 0.0
+                for a in range(wide):
+                    if jacobian[k, i, a] != 0.0:
+                        carried = 0.0
+                        for b in range(wide):
+                            carried += covariance[columns[a], columns[b]] * jacobian[k, j, b]
+                        spread += jacobian[k, i, a] * carried
+                for m in range(j):
+                    spread -= left[i, m] * left[j, m]
+                # with unit noise a pivot is at least 1, whatever rounding leaves of it
+                left[i, j] = math.sqrt(max(spread, 0.5)) if i == j else spread / left[j, j]
+            for m in range(i):
+                whitened[i] -= left[i, m] * whitened[m]
+            whitened[i] /= left[i, i]
+            out[k] += whitened[i] * whitened[i]
+    return out

@@ -8,7 +8,6 @@ __all__ = [
     "filter",
     "graph",
     "guarded",
-    "mapping",
     "particle_filter",
     "registry",
     "search",

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.fusion.graph.marginals import IndeterminateError
 from factorgraph_loc.fusion.graph.problem import Problem
-from factorgraph_loc.fusion.graph.variables import Values, constants_key, landmark_key, pose_key
 from factorgraph_loc.mapping.tag_looks import TagLooks
 from factorgraph_loc.mapping.tag_search import TagPosterior, of_tags, reach, search
 from factorgraph_loc.model.belief import LearntPoint, PosePrior
@@ -26,9 +25,10 @@ from factorgraph_loc.model.scoring import TICK_GAP
 from factorgraph_loc.sensors.motion import whole_motion
 from factorgraph_loc.sensors.registry import moving
 from factors import se2
-from factors.graph import Factor, PriorFactor, VectorPriorFactor
+from factors.graph import Factor, PriorFactor, Values, VectorPriorFactor, constants_key, landmark_key, pose_key
 from factors.motion import Increment
-from factors.odometry.model import PARAMETERS, OdometryFactor, recalibrated
+from factors.odometry.factor import OdometryFactor
+from factors.odometry.model import PARAMETERS, recalibrated
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor, RfidTagFactor
 from factors.se2 import Array

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.variables import Keyframe, Node
+from factorgraph_loc.fusion.graph.graph import Keyframe, Node
 from factorgraph_loc.vision.frame_motion import frame_motion
 from factors.camera.model import CameraModel
 from factors.camera.visual_odometry import SHARED, VisualOdometryFactor

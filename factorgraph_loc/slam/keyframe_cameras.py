@@ -12,13 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.variables import Guess, Keyframe, tilt_key
-from factorgraph_loc.fusion.mapping import GraphView
+from factorgraph_loc.fusion.graph.graph import GraphView, Guess, Keyframe
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.slam.local_bundle import bundled
 from factorgraph_loc.slam.new_points import KeyframeCamera, PointSighting
 from factors import se2
 from factors.camera.model import TIME_OFFSET, CameraModel
+from factors.graph import tilt_key
 from factors.se2 import Array
 
 ANCHORED, SLACK = 4, 2.0  # points of the graph that determine a keyframe to so many pixels

@@ -10,7 +10,7 @@ from collections.abc import Hashable, Mapping, Sequence
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.variables import Keyframe
+from factorgraph_loc.fusion.graph.graph import Keyframe
 from factorgraph_loc.slam.new_points import FEWEST, PointSighting
 from factorgraph_loc.vision.consensus import Truths
 from factors import positive, se2

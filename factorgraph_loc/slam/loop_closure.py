@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.variables import Guess, Keyframe
+from factorgraph_loc.fusion.graph.graph import Guess, Keyframe
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.sensors.camera.known_points import lifted
 from factorgraph_loc.vision.association import TURNED as VIEWED

@@ -62,8 +62,7 @@ from factorgraph_loc.slam.monoslam_state import (
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import FLOATS, TILTS
 from factors import se2
-from factors.camera.floor import TiltScale
-from factors.camera.model import carrier
+from factors.camera.model import TiltScale, carrier
 from factors.robust import huber_weight
 from factors.se2 import Array
 

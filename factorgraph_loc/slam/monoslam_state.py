@@ -30,8 +30,7 @@ from factorgraph_loc.slam.monoslam_motion import (
 )
 from factors import positive
 from factors.camera import inverse_depth
-from factors.camera.floor import TiltScale
-from factors.camera.model import CameraModel, linearize_in_space, mounted
+from factors.camera.model import CameraModel, TiltScale, linearize_in_space, mounted
 from factors.motion import ChainState
 from factors.se2 import Array, Integers
 from factors.update import GATE

@@ -13,8 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.variables import Keyframe
-from factorgraph_loc.fusion.mapping import GraphView
+from factorgraph_loc.fusion.graph.graph import GraphView, Keyframe
 from factorgraph_loc.sensors.camera.known_points import lifted
 from factorgraph_loc.vision.consensus import GATE, Truths
 from factors import positive

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.fusion.graph.variables import Guess
+from factorgraph_loc.fusion.graph.graph import Guess
 from factorgraph_loc.maps.common_error import carried
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.vision.consensus import CameraPose

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 
+from factorgraph_loc.fusion.graph.graph import Addition, GraphView, Guess, Keyframe, Mapper, Node
 from factorgraph_loc.fusion.graph.settings import GraphSettings
-from factorgraph_loc.fusion.graph.variables import Addition, Guess, Keyframe, Node, Values, gather
-from factorgraph_loc.fusion.mapping import GraphView, Mapper
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.base import Sensor
@@ -20,6 +19,7 @@ from factorgraph_loc.slam.new_points import FEWEST
 from factorgraph_loc.slam.unknown_points import UnknownPoints
 from factors.camera.model import CameraModel
 from factors.camera.point import PointFactor
+from factors.graph import Values, gather
 from factors.se2 import Array
 
 KEYFRAME_INTERVAL = 0.5  # s between images that become keyframes for points that are estimated

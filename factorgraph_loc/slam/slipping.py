@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.variables import Guess, Keyframe
+from factorgraph_loc.fusion.graph.graph import Guess, Keyframe
 from factorgraph_loc.sensors.camera.known_points import ITERATIONS, SETTLED, lifted
 from factorgraph_loc.vision.consensus import agreeing
 from factors import positive

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.graph.variables import Addition, Guess, Keyframe, Node, jumps, point_key, tilt_key
-from factorgraph_loc.fusion.mapping import GraphView
+from factorgraph_loc.fusion.graph.graph import Addition, GraphView, Guess, Keyframe, Node, jumps
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING, Estimated
@@ -33,11 +32,10 @@ from factors import positive, se2
 from factors.camera import model as reprojection
 from factors.camera import update_kernels as pixel_kernels
 from factors.camera.factor import ReprojectionFactor, image_update
-from factors.camera.floor import TiltScale
 from factors.camera.kernels import NEAREST
-from factors.camera.model import CameraModel, recalibrated
+from factors.camera.model import CameraModel, TiltScale, recalibrated
 from factors.camera.point import PointFactor, PointPrior
-from factors.graph import VectorPriorFactor
+from factors.graph import VectorPriorFactor, point_key, tilt_key
 from factors.se2 import Array
 
 PER_KEYFRAME, WAITING = 40, 160  # maximum number of estimated points per keyframe, and of points waiting

@@ -3,7 +3,6 @@
 __all__ = [
     "bundle_kernels",
     "factor",
-    "floor",
     "inverse_depth",
     "kernels",
     "model",

@@ -9,7 +9,7 @@ import numpy as np
 from factors.camera.kernels import POINT, WIDTH, Lens, see
 from factors.compiled import compiled
 from factors.gaussian import inverse, product, put, solved
-from factors.odometry.kernels import linearize as between
+from factors.odometry.factor import linearize as between
 from factors.robust import huber_loss
 from factors.se2 import Array, Integers, moved
 

@@ -7,9 +7,10 @@ import numpy as np
 
 from factors.camera.kernels import POINT, TILT, WIDTH, Lens, project_planar
 from factors.compiled import compiled
-from factors.gaussian import corrected, inverse, put
+from factors.gaussian import inverse, put
 from factors.robust import huber_weight
 from factors.se2 import Array, between_one, compose_one
+from factors.update import corrected
 
 Row = tuple[float, float, float]
 REWEIGHTED, STILL = 50, 1e-5  # most rounds to find a tilt, and standard deviations that the last may change it

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from factors.camera.model import CameraModel, linearize_in_space, rays
 from factors.compiled import compiled
-from factors.odometry.kernels import NO_CONSTANTS, linearize
+from factors.odometry.factor import linearize
+from factors.odometry.kernels import NO_CONSTANTS
 from factors.se2 import Array
 
 SHARED = 0.5  # share of the information that is used, because consecutive motions share an image

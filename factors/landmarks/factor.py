@@ -20,7 +20,6 @@ from factors.landmarks.model import (
     BearingRangeModel,
     located,
     log_likelihood,
-    packed,
     recalibrated,
     widened,
 )
@@ -63,7 +62,7 @@ class BearingRangeFactor:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
         if not self.free:
             held = values[1] if self.estimated else NOTHING
-            found = kernels.weighted(packed(self.model), self.look, values[0], held, self.places)
+            found = kernels.weighted(self.model.packed, self.look, values[0], held, self.places)
             residual, by_pose, by_sensor = found
             return residual, [by_pose, by_sensor] if self.estimated else [by_pose]
         error, blocks = self.whitened(values)
@@ -84,7 +83,7 @@ class BearingRangeFactor:
         """How many of the landmarks of a factor on the pose only have a normalised innovation squared above ``limit`` at the
         predicted ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
         spread = np.ascontiguousarray(covariance)
-        return int(kernels.beyond(packed(self.model), pose, self.look, spread, limit))
+        return int(kernels.beyond(self.model.packed, pose, self.look, spread, limit))
 
     @property
     def look(self) -> kernels.Look:
@@ -131,7 +130,7 @@ class BearingRangeFactor:
         if self.free:
             look = (np.reshape(values[-1], (1, 2)), *look[1:])
         error, jacobian = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
-        kernels.linearize(packed(self.model), values[0], changes, look, error, jacobian)
+        kernels.linearize(self.model.packed, values[0], changes, look, error, jacobian)
         blocks = [jacobian[..., :POINT]]
         if self.estimated:
             blocks.append(jacobian[..., CONSTANTS:][..., list(self.estimated)])
@@ -185,7 +184,7 @@ def landmark_update(
     if factor.free:
         return None
     before = np.ascontiguousarray(covariance)  # for each other order in memory it would be compiled anew
-    known = packed(factor.model), factor.look, pose, before, constants, factor.places, first
+    known = factor.model.packed, factor.look, pose, before, constants, factor.places, first
     try:
         return Correction(*kernels.updated(*known, iterations, converged, GATE))
     except np.linalg.LinAlgError:
@@ -198,7 +197,7 @@ class BearingRangeStack:
 
     def __init__(self, factors: Sequence[BearingRangeFactor], pose_of: Sequence[int], column: int) -> None:
         first = factors[0]
-        self._model, self._estimated, self._column = packed(first.model), list(first.estimated), column
+        self._model, self._estimated, self._column = first.model.packed, list(first.estimated), column
         self._robust = first.model.robust
         self._pose_of = np.array(pose_of, dtype=np.int64)
         sizes = np.array([len(f.points) for f in factors])

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from factors.compiled import compiled
-from factors.gaussian import cholesky, corrected, invert_covariance, normalised
+from factors.gaussian import cholesky, invert_covariance
 from factors.landmarks.model import (
     BEARING_SIGMA,
     CONSTANTS,
@@ -24,6 +24,7 @@ from factors.landmarks.model import (
 )
 from factors.robust import geman_mcclure_weight
 from factors.se2 import Array, Integers, compose_scalars, exp_scalars, moved
+from factors.update import corrected, normalised
 
 # points (K, 2), ranges (K,), bearings (K,); of the motion since the pose, each with whether there is one: the offset (3,), its
 # covariance (3, 3) with the number of landmarks that have it in common, the velocity (3,); and spreads of the points (K, 2, 2), or
@@ -34,8 +35,8 @@ Look = tuple[Array, Array, Array, bool, Array, bool, Array, float, bool, Array, 
 @compiled
 def linearize(model: Array, pose: Array, changes: Array, look: Look, error: Array, jacobian: Array) -> None:
     """What :meth:`factors.landmarks.factor.BearingRangeFactor.whitened` returns of one look, with ``changes`` (6,) of the
-    constants: the whitened ``error`` (K, 2) and its ``jacobian`` (K, 2, WIDTH), which hold zeros. ``model``: of
-    :func:`~factors.landmarks.model.packed`."""
+    constants: the whitened ``error`` (K, 2) and its ``jacobian`` (K, 2, WIDTH), which hold zeros. ``model``: ``packed`` of
+    a :class:`~factors.landmarks.model.BearingRangeModel`."""
     points, ranges, bearings, displaced, offset, widened, covariance, count, moves, twist, spreads = look
     x, y, turned = offset[0], offset[1], offset[2]
     if moves and changes[TIME_OFFSET] != 0.0:
@@ -201,9 +202,9 @@ def updated(
     """The correction (S,) and the covariance (S, S) after it; the whitened residuals (K, 2) before it, their normalised square, and
     how many numbers were measured. LinAlgError if rounding makes a covariance singular.
 
-    ``model``: of :func:`~factors.landmarks.model.packed`. ``values`` (P,): of the sensor's constants that are estimated;
-    ``indices`` (P,): their places in :data:`~factors.landmarks.model.PARAMETERS`; ``first``: of their columns in the error state.
-    ``gate``: beyond which a landmark's noise is widened.
+    ``model``: ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`. ``values`` (P,): of the sensor's constants that
+    are estimated; ``indices`` (P,): their places in :data:`~factors.landmarks.model.PARAMETERS`; ``first``: of their columns in
+    the error state. ``gate``: beyond which a landmark's noise is widened.
     """
     count, size = len(look[0]), len(covariance)
     columns = np.empty(3 + len(values), np.int64)

@@ -8,7 +8,7 @@ Gaussian with the robust loss of Geman and McClure, jointly for range and bearin
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -24,7 +24,7 @@ TIME_OFFSET = PARAMETERS.index("time_offset")
 # columns of a Jacobian by the pose, by a point and by all PARAMETERS: where the point begins, and those, and their number
 POINT, CONSTANTS, WIDTH = 3, 5, 11
 EXACT = np.empty((0, 2, 2))  # covariances of exactly known points
-# indices in the result of packed(), after the constants that PARAMETERS change
+# indices in ``packed``, after the constants that PARAMETERS change
 TURN, RANGE_SIGMA, RELATIVE, BEARING_SIGMA, DEPTH, ROBUST = range(TIME_OFFSET, TIME_OFFSET + 6)
 MINIMUM_COSINE = 0.1  # limit of the field of view of depth sensors
 
@@ -36,7 +36,7 @@ class BearingRangeModel:
     ``mounting``: (x, y, heading) of the sensor in the robot frame. ``range_scale``: reported divided by true. ``depth``: ranges are
     distances along one axis, at the angle ``depth_axis`` in the sensor frame. The standard deviation of a range r is
     ``hypot(range_sigma, range_sigma_relative * r)`` [m], that of a bearing ``bearing_sigma`` [rad]. ``robust``: scale of the
-    Geman-McClure loss in standard deviations.
+    Geman-McClure loss in standard deviations. ``packed``: the model as an array (11,) for compiled code.
     """
 
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -48,14 +48,13 @@ class BearingRangeModel:
     bearing_bias: float = 0.0
     bearing_sigma: float = 0.05
     robust: float = 4.0
+    packed: Array = field(init=False, repr=False, compare=False)
 
-
-def packed(model: BearingRangeModel) -> Array:
-    """A model as an array (11,) for compiled code."""
-    m = model
-    constants = (m.mounting[0], m.mounting[1], m.bearing_bias, m.range_scale, m.depth_axis)
-    noise = (m.range_sigma, m.range_sigma_relative, m.bearing_sigma)
-    return np.array((*constants, m.mounting[2], *noise, float(m.depth), m.robust))
+    def __post_init__(self) -> None:
+        constants = *self.mounting[:2], self.bearing_bias, self.range_scale, self.depth_axis
+        noise = self.range_sigma, self.range_sigma_relative, self.bearing_sigma
+        packed = np.array((*constants, self.mounting[2], *noise, float(self.depth), self.robust))
+        object.__setattr__(self, "packed", packed)
 
 
 def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Array, Array]:

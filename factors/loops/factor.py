@@ -15,7 +15,8 @@ import numpy as np
 
 from factors import positive, se2
 from factors.motion import Increment
-from factors.odometry.kernels import NO_CONSTANTS, linearize
+from factors.odometry.factor import linearize
+from factors.odometry.kernels import NO_CONSTANTS
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array
 

@@ -1,3 +1,3 @@
 """Increments of wheel odometry: model, integration, kernels."""
 
-__all__ = ["chain", "kernels", "model"]
+__all__ = ["chain", "factor", "kernels", "model"]

@@ -13,28 +13,36 @@ from collections.abc import Sequence
 import numpy as np
 
 from factors import se2
+from factors.compiled import compiled
 from factors.motion import ChainState, Increment
 from factors.odometry.chain_kernels import (
     GYRO,
+    HEADING,
+    HOLD,
     INCREMENT,
     KNOT,
+    LAG,
+    PATH,
     ROW,
     STATE,
+    STILL,
+    TURN,
+    UNKNOWN,
     VELOCITY,
     T,
+    X,
+    Y,
     append,
+    copy,
     insert,
     integrate,
-    moved_to,
-    predicted_at,
-    state_at,
-    states_at,
-    travelled,
+    move,
     without_old,
 )
-from factors.odometry.kernels import relative, relatives
-from factors.odometry.model import OdometryFactor, OdometryModel, ScaleFreeOdometryFactor, composed
-from factors.se2 import Array
+from factors.odometry.factor import OdometryFactor, ScaleFreeOdometryFactor
+from factors.odometry.kernels import State, carried, predicted, recalibrated, relative, relatives
+from factors.odometry.model import OdometryModel, composed
+from factors.se2 import Array, Integers, body_to_world_one, compose_scalars
 
 
 class OdometryChain:
@@ -223,3 +231,81 @@ class OdometryChain:
         self._count = count
         if forgets:
             self.begin = float(self._knots[0, T])
+
+
+@compiled
+def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
+    """t, x, y, heading, path, turn, unknown and still at ``t``, from the last knot before it."""
+    if count == 0:
+        return t, 0.0, 0.0, 0.0, 0.0, 0.0, t, 0.0
+    i = np.searchsorted(knots[:count, T], t, side="right") - 1
+    if i < 0:
+        k = knots[0]
+        return t, k[X], k[Y], k[HEADING], k[PATH], k[TURN], k[UNKNOWN] - (k[T] - t), k[STILL]
+    k = np.empty(KNOT)
+    move(knots[i], t - knots[i, T], constants[LAG], constants[HOLD], k)
+    return t, k[X], k[Y], k[HEADING], k[PATH], k[TURN], k[UNKNOWN], k[STILL]
+
+
+@compiled
+def travelled(
+    knots: Array, count: int, constants: Array, noise: Array, start: State, t: float
+) -> tuple[State, Array, Array, float, float]:
+    end = state_at(knots, count, t, constants)
+    delta, covariance, duration, still = relative(noise, start, end)
+    return end, delta, covariance, duration, still
+
+
+@compiled
+def predicted_at(
+    knots: Array,
+    count: int,
+    chain: Array,
+    noise: Array,
+    start: State,
+    t: float,
+    pose: Array,
+    covariance: Array,
+    constants: Array,
+    indices: Integers,
+    first: int,
+    at: Array,
+    transition: Array,
+    added: Array,
+    after: Array,
+) -> State:
+    end = state_at(knots, count, t, chain)
+    delta, spread, duration, still = relative(noise, start, end)
+    for i in range(3):
+        copy(spread[i], added[i])
+    predicted(delta, spread, duration - still, pose, covariance, constants, indices, first, at, transition, after)
+    return end
+
+
+@compiled
+def moved_to(
+    knots: Array,
+    count: int,
+    chain: Array,
+    noise: Array,
+    start: State,
+    t: float,
+    pose: Array,
+    covariance: Array,
+    constants: Array,
+    indices: Integers,
+) -> tuple[Array, Array, Array]:
+    delta, spread, duration, still = relative(noise, start, state_at(knots, count, t, chain))
+    if len(indices):
+        delta = recalibrated(delta, duration - still, constants, indices)
+    at = np.array(compose_scalars(pose[0], pose[1], pose[2], delta[0], delta[1], delta[2]))
+    body = carried(covariance, delta, spread)
+    return at, body, body_to_world_one(at, body)
+
+
+@compiled
+def states_at(knots: Array, count: int, times: Array, constants: Array, out: Array) -> None:
+    for j in range(len(times)):
+        s = state_at(knots, count, times[j], constants)
+        row = out[j]
+        row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7] = s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7]

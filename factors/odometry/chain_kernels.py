@@ -1,30 +1,29 @@
-"""Compiled integration of odometry: rows, the knots of a chain that they become, and states between knots."""
+"""Compiled integration of odometry: rows, and the knots of a chain that they become."""
 
 import math
 
 import numpy as np
 
 from factors.compiled import compiled
-from factors.odometry.kernels import State, carried, predicted, recalibrated, relative
-from factors.se2 import Array, Integers, arc_coefficients, body_to_world_one, compose_scalars
+from factors.se2 import Array, arc_coefficients
 
 # columns of a row: time of its effect, its kind, and its values
 ROW = 5
 VELOCITY, INCREMENT, GYRO = 0.0, 1.0, 2.0  # v, w, -; twist of the whole increment; w, -, -
 # columns of a knot: state at the time of a row, the velocity in the robot frame, the velocity that it converges to, whether the
 # wheels are at rest, and the time of the last row of a gyro
-T, _X, _Y, _HEADING, _PATH, _TURN, _UNKNOWN, _STILL, _VX, _VY, _W, _UX, _UY, _UW, _STANDS, _GYRO_T = range(16)
+T, X, Y, HEADING, PATH, TURN, UNKNOWN, STILL, _VX, _VY, _W, _UX, _UY, _UW, _STANDS, _GYRO_T = range(16)
 KNOT, STATE = 16, 8
 
 # m/s and rad/s, relative to the biases: wheels below are at rest; a gyro below agrees that the robot does not turn
 _REST, _GYRO_REST = 1e-3, 0.02
 
 # indices in the array of the model's constants: an array, because a tuple is slower to pass to compiled code
-_COS, _SIN, _LAG, _HOLD, _GYRO_BIAS, _USES_GYRO = range(6, 12)  # behind scales and biases
+_COS, _SIN, LAG, HOLD, _GYRO_BIAS, _USES_GYRO = range(6, 12)  # behind scales and biases
 
 
 @compiled
-def _copy(row: Array, to: Array) -> None:
+def copy(row: Array, to: Array) -> None:
     for j in range(len(row)):
         to[j] = row[j]
 
@@ -37,8 +36,8 @@ def without_old(rows: Array, knots: Array, count: int, horizon: float) -> int:
         return count
     keep = np.searchsorted(knots[:count, T], newest - horizon, side="right") - 1
     for i in range(count - keep):
-        _copy(rows[keep + i], rows[i])
-        _copy(knots[keep + i], knots[i])
+        copy(rows[keep + i], rows[i])
+        copy(knots[keep + i], knots[i])
     return int(count - keep)
 
 
@@ -84,7 +83,7 @@ def insert(
     if count and t < knots[count - 1, T]:
         i = int(np.searchsorted(knots[:count, T], t, side="right"))
         for k in range(count, i, -1):
-            _copy(rows[k - 1], rows[k])
+            copy(rows[k - 1], rows[k])
     rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4] = t, kind, a, b, c
     integrate(rows, knots, i, count + 1, constants)
     return without_old(rows, knots, count + 1, horizon) if i == count else count + 1
@@ -95,7 +94,7 @@ def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array)
     """Compute the knots of the rows from ``begin`` to ``end``, each from the knot before it."""
     scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
     heading_rate_bias, heading_drift, turn_slowdown = constants[3], constants[4], constants[5]
-    c, s, lag, hold = constants[_COS], constants[_SIN], constants[_LAG], constants[_HOLD]
+    c, s, lag, hold = constants[_COS], constants[_SIN], constants[LAG], constants[HOLD]
     gyro_bias, use_gyro = constants[_GYRO_BIAS], constants[_USES_GYRO] > 0.0
     for i in range(begin, end):
         t, kind, a, b, phi = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4]
@@ -118,11 +117,11 @@ def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array)
                 previous[_UY] = scale_distance * (s * forward + c * sideways)
                 speed = math.hypot(previous[_UX], previous[_UY])
                 previous[_UW] = scale_rotation * turn + heading_drift * speed
-            _move(previous, duration, 0.0, duration, knot)
-            knot[_UNKNOWN] += max(0.0, duration - hold)
+            move(previous, duration, 0.0, duration, knot)
+            knot[UNKNOWN] += max(0.0, duration - hold)
         else:
             previous = knots[i - 1]
-            _move(previous, t - previous[T], lag, hold, knot)
+            move(previous, t - previous[T], lag, hold, knot)
         if kind == VELOCITY:
             stands = abs(a - speed_bias) <= _REST and abs(b - heading_rate_bias) <= _REST
             knot[_STANDS] = stands
@@ -150,7 +149,7 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
     the increment and rotates by the gyro."""
     scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
     heading_rate_bias, heading_drift = constants[3], constants[4]
-    c, s, hold, gyro_bias = constants[_COS], constants[_SIN], constants[_HOLD], constants[_GYRO_BIAS]
+    c, s, hold, gyro_bias = constants[_COS], constants[_SIN], constants[HOLD], constants[_GYRO_BIAS]
     t, a, b, phi = rows[i, 0], rows[i, 2], rows[i, 3], rows[i, 4]
     first = i - 1
     while first >= 0 and rows[first, 1] != INCREMENT:
@@ -174,14 +173,14 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
             elif stands and abs(knot[_UW]) <= _GYRO_REST:
                 knot[_UW] = 0.0
         step = rows[k + 1, 0] - knot[T]
-        _move(knot, step, 0.0, step, following)
+        move(knot, step, 0.0, step, following)
         if rows[k + 1, 1] == GYRO:
             _take_gyro(following, rows[k + 1, 0], rows[k + 1, 2] - gyro_bias)
-    knots[i, _UNKNOWN] += max(0.0, duration - hold)
+    knots[i, UNKNOWN] += max(0.0, duration - hold)
 
 
 @compiled
-def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> None:
+def move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> None:
     """The knot after ``duration`` seconds: the motion continues for at most ``hold`` seconds, then it is unknown."""
     ux, uy, uw = knot[_UX], knot[_UY], knot[_UW]
     moving = min(duration, hold)
@@ -201,91 +200,13 @@ def _move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> 
         out[_VX] = out[_VY] = out[_W] = 0.0
     out[_UX], out[_UY], out[_UW], out[_STANDS], out[_GYRO_T] = ux, uy, uw, knot[_STANDS], knot[_GYRO_T]
     a, b = arc_coefficients(dtheta)
-    c, s = math.cos(knot[_HEADING]), math.sin(knot[_HEADING])
+    c, s = math.cos(knot[HEADING]), math.sin(knot[HEADING])
     chord_x, chord_y = a * dx - b * dy, b * dx + a * dy
     out[T] = knot[T] + duration
-    out[_X] = knot[_X] + c * chord_x - s * chord_y
-    out[_Y] = knot[_Y] + s * chord_x + c * chord_y
-    out[_HEADING] = knot[_HEADING] + dtheta
-    out[_PATH] = knot[_PATH] + math.hypot(dx, dy)
-    out[_TURN] = knot[_TURN] + abs(dtheta)
-    out[_UNKNOWN] = knot[_UNKNOWN] + duration - moving
-    out[_STILL] = knot[_STILL] + (moving if rests else 0.0)
-
-
-@compiled
-def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
-    """t, x, y, heading, path, turn, unknown and still at ``t``, from the last knot before it."""
-    if count == 0:
-        return t, 0.0, 0.0, 0.0, 0.0, 0.0, t, 0.0
-    i = np.searchsorted(knots[:count, T], t, side="right") - 1
-    if i < 0:
-        k = knots[0]
-        return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN] - (k[T] - t), k[_STILL]
-    k = np.empty(KNOT)
-    _move(knots[i], t - knots[i, T], constants[_LAG], constants[_HOLD], k)
-    return t, k[_X], k[_Y], k[_HEADING], k[_PATH], k[_TURN], k[_UNKNOWN], k[_STILL]
-
-
-@compiled
-def travelled(
-    knots: Array, count: int, constants: Array, noise: Array, start: State, t: float
-) -> tuple[State, Array, Array, float, float]:
-    end = state_at(knots, count, t, constants)
-    delta, covariance, duration, still = relative(noise, start, end)
-    return end, delta, covariance, duration, still
-
-
-@compiled
-def predicted_at(
-    knots: Array,
-    count: int,
-    chain: Array,
-    noise: Array,
-    start: State,
-    t: float,
-    pose: Array,
-    covariance: Array,
-    constants: Array,
-    indices: Integers,
-    first: int,
-    at: Array,
-    transition: Array,
-    added: Array,
-    after: Array,
-) -> State:
-    end = state_at(knots, count, t, chain)
-    delta, spread, duration, still = relative(noise, start, end)
-    for i in range(3):
-        _copy(spread[i], added[i])
-    predicted(delta, spread, duration - still, pose, covariance, constants, indices, first, at, transition, after)
-    return end
-
-
-@compiled
-def moved_to(
-    knots: Array,
-    count: int,
-    chain: Array,
-    noise: Array,
-    start: State,
-    t: float,
-    pose: Array,
-    covariance: Array,
-    constants: Array,
-    indices: Integers,
-) -> tuple[Array, Array, Array]:
-    delta, spread, duration, still = relative(noise, start, state_at(knots, count, t, chain))
-    if len(indices):
-        delta = recalibrated(delta, duration - still, constants, indices)
-    at = np.array(compose_scalars(pose[0], pose[1], pose[2], delta[0], delta[1], delta[2]))
-    body = carried(covariance, delta, spread)
-    return at, body, body_to_world_one(at, body)
-
-
-@compiled
-def states_at(knots: Array, count: int, times: Array, constants: Array, out: Array) -> None:
-    for j in range(len(times)):
-        s = state_at(knots, count, times[j], constants)
-        row = out[j]
-        row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7] = s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7]
+    out[X] = knot[X] + c * chord_x - s * chord_y
+    out[Y] = knot[Y] + s * chord_x + c * chord_y
+    out[HEADING] = knot[HEADING] + dtheta
+    out[PATH] = knot[PATH] + math.hypot(dx, dy)
+    out[TURN] = knot[TURN] + abs(dtheta)
+    out[UNKNOWN] = knot[UNKNOWN] + duration - moving
+    out[STILL] = knot[STILL] + (moving if rests else 0.0)

@@ -1,21 +1,17 @@
-"""Compiled kernels of the odometry: relative motion for each measurement, and linearisation for graphs."""
+"""Compiled kernels of the odometry: relative motion for each measurement, and its change with the constants."""
 
 import math
 
 import numpy as np
 
 from factors.compiled import compiled
-from factors.gaussian import product
 from factors.se2 import (
     Array,
     Integers,
     arc_coefficients,
-    between_one,
     exp_scalars,
-    inverse_right_jacobian,
     log_scalars,
     right_jacobian_one,
-    twist_to,
     wrap_scalar,
 )
 
@@ -121,7 +117,9 @@ def predicted(
         transition[j // size, j % size] = 0.0
     x, y, turned = delta[0], delta[1], delta[2]
     if count:
-        changed_delta, by_changes = recalibrate(np.array(log_scalars(x, y, turned)), moving, _full(constants, indices))
+        changed_delta, by_changes = recalibrate(
+            np.array(log_scalars(x, y, turned)), moving, all_changes(constants, indices)
+        )
         x, y, turned = changed_delta[0], changed_delta[1], changed_delta[2]
         for i in range(3):
             for j in range(count):
@@ -161,27 +159,10 @@ def _widen(covariance: Array) -> None:
 def recalibrated(delta: Array, moving: float, constants: Array, indices: Integers) -> Array:
     """``delta`` (3,) of :func:`factors.odometry.model.recalibrated`, for corrections ``constants`` (P,) with ``indices`` (P,) among
     all constants."""
-    changes = _full(constants, indices)
+    changes = all_changes(constants, indices)
     x, y, phi = log_scalars(delta[0], delta[1], delta[2])
     turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * math.hypot(x, y)
     return np.array(exp_scalars(x + changes[0] * x, y + changes[0] * y, turn))
-
-
-@compiled
-def whitener(covariance: Array) -> Array:
-    """The inverse of the lower root of a covariance (3, 3)."""
-    a = math.sqrt(covariance[0, 0])
-    b, c = covariance[1, 0] / a, covariance[2, 0] / a
-    d = math.sqrt(max(covariance[1, 1] - b * b, ROUNDING * covariance[1, 1]))
-    e = (covariance[2, 1] - b * c) / d
-    f = math.sqrt(max(covariance[2, 2] - c * c - e * e, ROUNDING * covariance[2, 2]))
-    return np.array(
-        (
-            (1.0 / a, 0.0, 0.0),
-            (-b / (a * d), 1.0 / d, 0.0),
-            ((b * e / d - c) / (a * f), -e / (d * f), 1.0 / f),
-        )
-    )
 
 
 @compiled
@@ -204,7 +185,7 @@ def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Arr
 @compiled
 def changed(twist: Array, moving: float, constants: Array, indices: Integers) -> tuple[Array, Array]:
     """:func:`recalibrate` for corrections ``constants`` (P,) with ``indices`` (P,) among all constants; the Jacobian is (3, P)."""
-    delta, by_changes = recalibrate(twist, moving, _full(constants, indices))
+    delta, by_changes = recalibrate(twist, moving, all_changes(constants, indices))
     out = np.empty((3, len(indices)))
     for i in range(3):
         for j in range(len(indices)):
@@ -213,114 +194,9 @@ def changed(twist: Array, moving: float, constants: Array, indices: Integers) ->
 
 
 @compiled
-def _full(constants: Array, indices: Integers) -> Array:
+def all_changes(constants: Array, indices: Integers) -> Array:
+    """The changes (4,) of all constants, of which those with ``indices`` (P,) change by ``constants`` (P,)."""
     changes = np.zeros(4)
     for i in range(len(indices)):
         changes[indices[i]] = constants[i]
     return changes
-
-
-@compiled
-def linearize(
-    start: Array, end: Array, delta: Array, by_changes: Array, whitener: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobians by both poses (3, 3) and, through ``by_changes``
-    (3, P) of ``delta``, by the constants (3, P)."""
-    relative = between_one(start, end)
-    rx, ry, turned = relative[0], relative[1], relative[2]
-    error = twist_to(delta, relative)
-    by_end = product(whitener, inverse_right_jacobian(error))
-    c, s = math.cos(turned), math.sin(turned)
-    # the adjoint of the inverse of the relative pose, negative
-    adjoint = np.array(((-c, -s, c * ry - s * rx), (s, -c, -c * rx - s * ry), (0.0, 0.0, -1.0)))
-    by_delta = product(whitener, inverse_right_jacobian(-error))
-    for i in range(3):
-        for j in range(3):
-            by_delta[i, j] = -by_delta[i, j]
-    residual = np.empty(3)
-    for i in range(3):
-        residual[i] = whitener[i, 0] * error[0] + whitener[i, 1] * error[1] + whitener[i, 2] * error[2]
-    return residual, product(by_end, adjoint), by_end, product(by_delta, by_changes)
-
-
-@compiled
-def linearize_changed(
-    start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
-) -> tuple[Array, Array, Array, Array]:
-    """:func:`linearize` of an increment whose logarithm is ``twist`` (3,), under changed ``constants``: see :func:`changed`."""
-    delta, by_changes = changed(twist, moving, constants, indices)
-    return linearize(start, end, delta, by_changes, whitener)
-
-
-@compiled
-def linearize_as_reported(
-    start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
-) -> tuple[Array, Array, Array, Array]:
-    """:func:`linearize_changed` with the translation of the residual, and its noise, in the unit that the wheels report."""
-    unit = 1.0 + _full(constants, indices)[0]
-    as_reported = whitener.copy()
-    for i in range(3):
-        as_reported[i, 0] /= unit
-        as_reported[i, 1] /= unit
-    delta, by_changes = changed(twist, moving, constants, indices)
-    residual, by_start, by_end, by_constants = linearize(start, end, delta, by_changes, as_reported)
-    error = twist_to(delta, between_one(start, end))
-    for j in range(len(indices)):
-        if indices[j] == 0:
-            for i in range(3):
-                by_constants[i, j] -= (as_reported[i, 0] * error[0] + as_reported[i, 1] * error[1]) / unit
-    return residual, by_start, by_end, by_constants
-
-
-@compiled
-def linearize_all(
-    poses: Array,
-    first: Integers,
-    deltas: Array,
-    twists: Array,
-    moving: Array,
-    constants: Array,
-    indices: Integers,
-    whiteners: Array,
-    jacobian: Array,
-    residual: Array,
-    column: int,
-) -> None:
-    """Residuals (3 K,) of K increments and their Jacobian (3 K, 6 + P), see :mod:`factors.chain`, between the poses ``first`` (K,)
-    and those that follow; ``column``: of the constants."""
-    for k in range(len(first)):
-        start, end, row = poses[first[k]], poses[first[k] + 1], 3 * k
-        if len(indices):
-            found = linearize_changed(start, end, twists[k], moving[k], constants, indices, whiteners[k])
-            for i in range(3):
-                for j in range(len(indices)):
-                    jacobian[row + i, column + j] = found[3][i, j]
-        else:
-            found = linearize(start, end, deltas[k], np.zeros((3, 0)), whiteners[k])
-        for i in range(3):
-            residual[row + i] = found[0][i]
-            for j in range(3):
-                jacobian[row + i, j], jacobian[row + i, 3 + j] = found[1][i, j], found[2][i, j]
-
-
-@compiled
-def cost_of_all(
-    poses: Array,
-    first: Integers,
-    deltas: Array,
-    twists: Array,
-    moving: Array,
-    constants: Array,
-    indices: Integers,
-    whiteners: Array,
-) -> float:
-    """Half the sum of the squared residuals of :func:`linearize_all`."""
-    total = 0.0
-    for k in range(len(first)):
-        delta = deltas[k]
-        if len(indices):
-            delta, _ = recalibrate(twists[k], moving[k], _full(constants, indices))
-        error, w = twist_to(delta, between_one(poses[first[k]], poses[first[k] + 1])), whiteners[k]
-        total += (w[0, 0] * error[0]) ** 2 + (w[1, 0] * error[0] + w[1, 1] * error[1]) ** 2
-        total += (w[2, 0] * error[0] + w[2, 1] * error[1] + w[2, 2] * error[2]) ** 2
-    return 0.5 * total

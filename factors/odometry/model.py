@@ -10,7 +10,6 @@ applies to all odometry, because an increment without noise would make a graph s
 """
 
 import math
-from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,18 +17,12 @@ from numpy.typing import NDArray
 
 from factors import se2
 from factors.motion import ChainState, Increment
-from factors.odometry import kernels
 from factors.odometry.kernels import (
-    NO_CONSTANTS,
     Noise,
-    linearize,
-    linearize_as_reported,
-    linearize_changed,
     recalibrate,
     relative,
-    whitener,
 )
-from factors.se2 import Array, Integers
+from factors.se2 import Array
 
 # minimum noise of an increment without duration, whose covariance must be invertible
 MINIMUM_POSITION_VARIANCE = 1e-8
@@ -157,98 +150,3 @@ def composed(t: Array | NDArray[np.int64], moves: Array) -> tuple[NDArray[np.int
         place = int(np.searchsorted(last, row))
         out[place] = se2.compose(out[place], moves[row])
     return last, out
-
-
-class OdometryStack:
-    """Increments ``factors``, each between the pose ``first`` (K,) by number and the next one. All have the same constants
-    estimated, which are the parameters from ``column`` on."""
-
-    def __init__(self, factors: Sequence["OdometryFactor"], first: Sequence[int], column: int) -> None:
-        self._first, self._column = np.array(first, dtype=np.int64), column
-        self._indices = np.array(factors[0].estimated, dtype=np.int64)
-        packed = [f.packed for f in factors]
-        self._deltas, self._twists = np.array([p[0] for p in packed]), np.array([p[1] for p in packed])
-        self._moving, self._whiteners = np.array([p[2] for p in packed]), np.array([p[3] for p in packed])
-        self.rows = 3 * len(packed)
-
-    @property
-    def first(self) -> Integers:
-        """The number of the first pose that each residual depends on."""
-        return np.repeat(self._first, 3)
-
-    def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Fill ``residual`` (3 K,) and ``jacobian`` (3 K, 6 + P), see :mod:`factors.chain`."""
-        given = self._deltas, self._twists, self._moving, self._constants(parameters), self._indices, self._whiteners
-        kernels.linearize_all(poses, self._first, *given, jacobian, residual, 6 + self._column)
-
-    def cost(self, poses: Array, parameters: Array) -> float:
-        """Half the sum of the squared residuals."""
-        given = self._deltas, self._twists, self._moving, self._constants(parameters), self._indices, self._whiteners
-        return float(kernels.cost_of_all(poses, self._first, *given))
-
-    def _constants(self, parameters: Array) -> Array:
-        return np.ascontiguousarray(parameters[self._column : self._column + len(self._indices)])
-
-
-class OdometryFactor:
-    """The increment between two poses, with odometry constants as a third variable.
-
-    ``estimated``: indices in :data:`PARAMETERS` of the P constants. The values of the factor are the two poses (3,), and the
-    constants (P,) unless P is zero.
-    """
-
-    def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
-        self._increment = increment
-        self._arc = se2.log(increment.delta)
-        self._moving = increment.duration - increment.still
-        self.estimated = tuple(estimated)
-        self._indices = np.array(estimated, dtype=np.int64)
-        self._whitener = whitener(increment.covariance)
-
-    @property
-    def packed(self) -> tuple[Array, Array, float, Array]:
-        """The increment (3,), its logarithm (3,), how long the robot moved, and what whitens it (3, 3)."""
-        return self._increment.delta, self._arc, self._moving, self._whitener
-
-    @property
-    def kind(self) -> Hashable:
-        """What increments have in common that are linearised together."""
-        return self.estimated
-
-    def stack(self, factors: Sequence["OdometryFactor"], numbers: Sequence[int], column: int) -> OdometryStack:
-        """Increments of this kind as one: see :class:`~factors.graph.Stackable`."""
-        return OdometryStack(factors, numbers, column)
-
-    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)`` and its Jacobians."""
-        start, end, *constants = values
-        if constants:
-            changed = self._arc, self._moving, constants[0], self._indices
-            residual, *blocks = linearize_changed(start, end, *changed, self._whitener)
-            return residual, blocks
-        residual, *blocks = linearize(start, end, self._increment.delta, NO_CONSTANTS, self._whitener)
-        return residual, blocks[:2]
-
-    def cost(self, values: Sequence[Array]) -> float:
-        """Half the squared whitened residual."""
-        residual, _ = self.linearize(values)
-        return 0.5 * float(residual @ residual)
-
-
-class ScaleFreeOdometryFactor(OdometryFactor):
-    """An increment where the wheels alone tell the scale of what is estimated; its residual is in the unit that they report.
-
-    A residual in metres becomes smaller as the world does, and nothing opposes that: the most probable world would be too small by
-    ``n s^2``, where ``n`` increments are estimated and ``s`` is the standard deviation of the scale.
-    """
-
-    kind = None  # not linearised together
-
-    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, its translation divided by the scale, and its Jacobians."""
-        start, end, *constants = values
-        if not constants:
-            return super().linearize(values)
-        changed = self._arc, self._moving, constants[0], self._indices
-        residual, *blocks = linearize_as_reported(start, end, *changed, self._whitener)
-        return residual, blocks

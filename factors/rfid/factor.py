@@ -11,8 +11,8 @@ import numpy as np
 
 from factors import positive, se2
 from factors.compiled import compiled
-from factors.compressed import compressed
 from factors.gaussian import inverse, product, solved
+from factors.graph import compressed
 from factors.odometry.kernels import FAR, ROUNDING
 from factors.rfid import kernels
 from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts

@@ -17,7 +17,6 @@ from factors.landmarks.model import (
     BearingRangeModel,
     located,
     log_likelihood,
-    packed,
     predict,
     recalibrated,
     residuals,
@@ -101,7 +100,7 @@ def test_the_compiled_function_gives_what_its_plain_twins_give(model, pose, seed
     ranges[1] = bearings[2] = np.nan
     assume(all(apart(model, pose, p) for p in seen))
     error, jacobian = whitened(model, pose, seen, ranges, bearings)
-    each = linearize_each(packed(model), np.tile(pose, (4, 1)), seen, ranges, bearings)
+    each = linearize_each(model.packed, np.tile(pose, (4, 1)), seen, ranges, bearings)
     np.testing.assert_allclose(error, residuals(model, pose, seen, ranges, bearings), atol=1e-8)
     assert not jacobian[1, 0].any()
     assert not jacobian[2, 1].any()

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factors.compressed import compressed
+from factors.graph import compressed
 from factors.se2 import Array
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factors.camera.floor import SCALES, TiltScale
+from factors.camera.model import SCALES, TiltScale
 
 GUESS = 0.005
 PRIOR = GUESS  # of the tilt in an image

@@ -12,15 +12,14 @@ from factors import se2
 from factors.graph import pose_array
 from factors.motion import Increment, propagate
 from factors.odometry.chain import OdometryChain
+from factors.odometry.factor import OdometryFactor, ScaleFreeOdometryFactor
 from factors.odometry.model import (
     LEAST_HEADING,
     LEAST_POSITION,
     MINIMUM_HEADING_VARIANCE,
     MINIMUM_POSITION_VARIANCE,
     Growth,
-    OdometryFactor,
     OdometryModel,
-    ScaleFreeOdometryFactor,
     recalibrated,
 )
 

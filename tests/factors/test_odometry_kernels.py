@@ -9,6 +9,7 @@ from factors import se2
 from factors.motion import ChainState, Increment
 from factors.odometry import kernels as odometry_kernels
 from factors.odometry.chain import OdometryChain
+from factors.odometry.factor import whitener
 from factors.odometry.model import (
     MINIMUM_HEADING_VARIANCE,
     MINIMUM_POSITION_VARIANCE,
@@ -97,9 +98,7 @@ def test_a_gaussian_is_predicted_by_its_jacobians(rng, places):
 
 def test_a_whitener_is_the_inverse_of_the_root(rng):
     spread = covariance(rng)
-    np.testing.assert_allclose(
-        odometry_kernels.whitener(spread), np.linalg.inv(np.linalg.cholesky(spread)), rtol=1e-6, atol=1e-9
-    )
+    np.testing.assert_allclose(whitener(spread), np.linalg.inv(np.linalg.cholesky(spread)), rtol=1e-6, atol=1e-9)
 
 
 def test_a_gaussian_in_one_call_is_predicted_along_the_motion():

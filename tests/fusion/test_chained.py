@@ -7,13 +7,12 @@ import pytest
 
 from factorgraph_loc.fusion.graph.chained import Chained
 from factorgraph_loc.fusion.graph.problem import Problem
-from factorgraph_loc.fusion.graph.variables import constants_key, landmark_key, pose_key
 from factors import se2
-from factors.graph import PriorFactor, VectorPriorFactor
+from factors.graph import PriorFactor, VectorPriorFactor, constants_key, landmark_key, pose_key
 from factors.landmarks.factor import BearingRangeFactor
 from factors.landmarks.model import PARAMETERS, BearingRangeModel
 from factors.motion import Increment
-from factors.odometry.model import OdometryFactor
+from factors.odometry.factor import OdometryFactor
 
 ODOMETRY, SENSOR = constants_key(0), constants_key(1)
 MODEL = BearingRangeModel(mounting=(0.1, -0.05, 0.2), range_scale=1.03, depth=True, bearing_bias=0.01, robust=3.0)

@@ -2,16 +2,8 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.fusion.graph.solver import unaware
-from factorgraph_loc.fusion.graph.variables import (
-    constants_key,
-    frame_motions,
-    is_place,
-    landmark_key,
-    point_key,
-    pose_key,
-    retract,
-)
 from factors import se2
+from factors.graph import constants_key, frame_motions, is_place, landmark_key, point_key, pose_key, retract
 
 VALUES = {
     pose_key(3): np.array((4.0, -2.0, 2.1)),

@@ -11,7 +11,7 @@ from factorgraph_loc.fusion.graph import isam
 from factorgraph_loc.fusion.graph.marginals import IndeterminateError, covariances
 from factorgraph_loc.fusion.graph.problem import Problem
 from factorgraph_loc.fusion.graph.solver import Window
-from factorgraph_loc.fusion.graph.variables import constants_key, pose_key
+from factors.graph import constants_key, pose_key
 
 STEP = np.array(((1.0, 0.0, 0.03), (0.0, 1.0, 0.3), (0.0, 0.0, 1.0)))
 WHITENER = np.diag((300.0, 3000.0, 200.0))

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.fusion.graph.graph import Node
 from factorgraph_loc.fusion.graph.solver import Window
 from factorgraph_loc.fusion.graph.summary import MarginalSummary
-from factorgraph_loc.fusion.graph.variables import Node, is_pose, landmark_key, pose_key, to_gtsam
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factors import se2
-from factors.graph import pose_array
+from factors.graph import is_pose, landmark_key, pose_array, pose_key, to_gtsam
 
 START = "0,0,0"  # its standard deviations are 0.05 m, 0.05 m, 0.05 rad
 SIGMA = 0.05

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.graph.variables import Keyframe
+from factorgraph_loc.fusion.graph.graph import Keyframe
 from factorgraph_loc.model.world import World
 from factorgraph_loc.slam.frame_pairs import FramePairs
 from factors import se2

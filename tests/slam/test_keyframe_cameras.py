@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from factorgraph_loc.fusion.graph.variables import Keyframe
+from factorgraph_loc.fusion.graph.graph import Keyframe
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.slam.keyframe_cameras import KeyframeCameras
 from factors import se2

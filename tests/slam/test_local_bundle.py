@@ -3,17 +3,17 @@
 import camera_world
 import numpy as np
 
+from factorgraph_loc.fusion.graph.graph import Keyframe
 from factorgraph_loc.fusion.graph.problem import Problem
-from factorgraph_loc.fusion.graph.variables import Keyframe, point_key, pose_key, tilt_key
 from factorgraph_loc.slam.local_bundle import bundled
 from factorgraph_loc.slam.new_points import sightings_of
 from factors import positive, se2
 from factors.camera import model as reprojection
 from factors.camera.bundle_kernels import adjusted
 from factors.camera.point import PointFactor
-from factors.graph import PriorFactor, VectorPriorFactor
+from factors.graph import PriorFactor, VectorPriorFactor, point_key, pose_key, tilt_key
 from factors.motion import ChainState, Increment
-from factors.odometry.model import OdometryFactor
+from factors.odometry.factor import OdometryFactor
 
 MODEL = camera_world.CAMERA.model()
 TURN = 0.015  # rad, that the odometry is off by from one keyframe to the next

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.graph.variables import Keyframe, point_key, pose_key
+from factorgraph_loc.fusion.graph.graph import Keyframe
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.slam import loop_closure
 from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints
 from factors import se2
+from factors.graph import point_key, pose_key
 from tests.slam.test_slam_points import rmse, with_features
 
 MODEL = camera_world.CAMERA.model()

@@ -25,8 +25,7 @@ from factorgraph_loc.slam.monoslam_sighting import FeatureMatcher
 from factorgraph_loc.slam.monoslam_state import Innovation
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera import model as reprojection
-from factors.camera.floor import TiltScale
-from factors.camera.model import CameraModel
+from factors.camera.model import CameraModel, TiltScale
 
 SENSORS = ("odometry", "sightings")
 EXACT_FLOOR = {"height_sigma": 1e-4, "tilt_sigma": 1e-4}  # which the simulated one is

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from factorgraph_loc.fusion.graph.variables import Keyframe
+from factorgraph_loc.fusion.graph.graph import Keyframe
 from factorgraph_loc.slam.moving_things import MovingThings
 from factors import se2
 from factors.camera.model import CameraModel, predict

@@ -11,7 +11,6 @@ import factorgraph_loc as fgloc
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.graph.solver import FullHistory
-from factorgraph_loc.fusion.graph.variables import pose_key
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
@@ -19,6 +18,7 @@ from factorgraph_loc.sensors.camera.measurement import FeatureStream, SightingSt
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
+from factors.graph import pose_key
 
 UNKNOWN = {"landmarks": "unknown"}
 CONFIGS = {

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.fusion.graph.variables import Keyframe
+from factorgraph_loc.fusion.graph.graph import Keyframe
 from factorgraph_loc.slam.slipping import moved_since, unless_slipped
 from factors import se2
 from factors.camera.model import CameraModel, predict

@@ -7,7 +7,7 @@ import pytest
 
 from factorgraph_loc.slam.monoslam_motion import ROBOT, UNEVEN, RobotState, exp, on_the_floor, standstill, tilt_of
 from factorgraph_loc.slam.monoslam_state import SlamState, with_floor
-from factors.camera.floor import TiltScale
+from factors.camera.model import TiltScale
 from factors.motion import ChainState
 
 RATE, TOLD = 0.2, 0.001  # s from image to image; rad, how well each tells the tilt

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from factorgraph_loc.fusion.graph.variables import Keyframe
+from factorgraph_loc.fusion.graph.graph import Keyframe
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.slam.unknown_points import UnknownPoints, _Point
 from factors import se2

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.graph import Graph
+from factorgraph_loc.fusion.graph.graph import Addition, Graph, Guess, Keyframe
 from factorgraph_loc.fusion.graph.marginals import IndeterminateError
 from factorgraph_loc.fusion.graph.problem import Problem, Solution
-from factorgraph_loc.fusion.graph.variables import Addition, Guess, Keyframe, Values, gather, is_of_keyframe, is_pose
 from factors import se2
-from factors.graph import Factor, PriorFactor, VectorPriorFactor
+from factors.graph import Factor, PriorFactor, Values, VectorPriorFactor, gather, is_of_keyframe, is_pose
 from factors.se2 import Array
 
 ITERATIONS_PER_WIDTH = 5

@@ -11,9 +11,8 @@ from typing import cast
 import numpy as np
 
 from factorgraph_loc.fusion.graph.marginals import Covariances
-from factorgraph_loc.fusion.graph.variables import Values, index_of, is_pose
 from factors import chain, se2
-from factors.graph import Factor, Stack, Stackable
+from factors.graph import Factor, Stack, Stackable, Values, index_of, is_pose
 from factors.se2 import Array
 
 MOST_PARAMETERS = 40  # all have to do with all: beyond this number GTSAM's elimination, which knows better, is faster

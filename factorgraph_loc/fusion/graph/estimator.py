@@ -14,21 +14,20 @@ until the graph has caught up it does not claim to be localized.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from factorgraph_loc.fusion.graph.batch import AtTheEnd
-from factorgraph_loc.fusion.graph.graph import Graph
+from factorgraph_loc.fusion.graph.graph import NOTHING_KNOWN, STATE, Graph, Keyframe, Mapper
 from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.graph.keyframes import Backend, Builder
 from factorgraph_loc.fusion.graph.settings import BatchSettings, SmootherSettings
-from factorgraph_loc.fusion.graph.variables import Keyframe
-from factorgraph_loc.fusion.mapping import Mapper
-from factorgraph_loc.fusion.search import DURATION, FOUND, Refuted, Search, Tracked
+from factorgraph_loc.fusion.layout import MOTION
+from factorgraph_loc.fusion.search import DURATION, FOUND, Refuted, Search, Tracked, is_known
 from factorgraph_loc.fusion.timeline import Taken, Timeline
-from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
+from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
@@ -38,7 +37,8 @@ from factorgraph_loc.sensors.base import Binding, bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2
-from factors.motion import ChainState, Increment
+from factors.graph import is_landmark
+from factors.motion import ChainState, Increment, poses_between
 from factors.se2 import Array
 
 __all__ = ["Batch", "BatchSettings", "Smoother", "SmootherSettings"]
@@ -122,16 +122,16 @@ class Smoother(Timeline):
     def learnt(self) -> Learnt:
         """The constants and landmarks that are estimated, as the final trajectory has them."""
         if self._graph.prior is None:
-            return self._graph.learnt()
+            return _learnt(self._graph)
         end = self._concluded()
-        return end.graph.learnt(end.poses, end.covariances)
+        return _learnt(end.graph, end.poses, end.covariances)
 
     def trajectory(self) -> Trajectory:
         """The best estimate of the whole past at the stamps of the ticks, from the start on; empty if there was none."""
         if self._graph.prior is None:
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
         end = self._concluded()
-        return end.graph.between(end.poses, end.covariances)
+        return _trajectory(end.graph, end.poses, end.covariances)
 
     def final_diagnostics(self) -> Diagnostics:
         """The diagnostics, and what the final trajectory adds to them."""
@@ -242,3 +242,44 @@ class Batch(Smoother):
     def __init__(self, setup: Setup, settings: BatchSettings) -> None:
         common = settings.model_dump(exclude={"widest_loss"})
         super().__init__(setup, SmootherSettings(**common, final_only=True), settings.widest_loss)
+
+
+def _learnt(graph: Graph, poses: Iterable[Array] = (), covariances: Iterable[Array] = ()) -> Learnt:
+    """The constants and landmarks that are estimated; points at final ``poses`` of all keyframes, with their body-frame
+    ``covariances``."""
+    values: dict[str, tuple[float, float]] = {}
+    blocks = [(name, graph.values[key], graph.spreads[key]) for name, key in graph.keys.items() if is_landmark(key)]
+    landmarks = learnt_landmarks(blocks)
+    for name, key in graph.keys.items():
+        if is_landmark(key):
+            continue
+        prefix = "" if name == MOTION else f"{name}."
+        sigmas = np.sqrt(np.diag(graph.spreads[key]))
+        for label, value, sigma in zip(graph.constants[name].names, graph.values[key], sigmas, strict=True):
+            values[prefix + label] = (float(value), float(sigma))
+    numbered = graph.keyframes.values()
+    at, spreads = ({k.key: v for k, v in zip(numbered, part)} for part in (poses, covariances))  # noqa: B905
+    points = graph.mapper.learnt(graph.departed[0] | graph.values | at, graph.departed[1] | graph.spreads | spreads)
+    return Learnt(values, landmarks, points)
+
+
+def _trajectory(graph: Graph, poses: Array, covariances: Array) -> Trajectory:
+    """The trajectory from all keyframes, ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3), at the ticks, but for those
+    at which nobody knows where the robot was; see :func:`factors.motion.poses_between`."""
+    newest = {tick.t: tick for tick in graph.ticks}
+    stamps = np.array(sorted(newest))
+    ticks = [newest[t] for t in stamps[is_known(stamps, graph.changes)].tolist()]
+    keyframes = list(graph.keyframes.values())
+    before = np.array([tick.keyframe - keyframes[0].index for tick in ticks], dtype=np.int64)
+    ends = np.array([tick.odometry for tick in ticks]).reshape(-1, STATE)
+    starts = np.array([k.odometry for k in keyframes]).reshape(-1, STATE)[before]
+    deltas, noises = graph.motion.relatives(starts, ends, graph.value(MOTION, NOTHING_KNOWN))
+    steps = [graph.recalibrated(k.from_previous) for k in keyframes[1:] if k.from_previous is not None]
+    later = (
+        np.array([step.delta for step in steps]).reshape(-1, 3),
+        np.array([step.covariance for step in steps]).reshape(-1, 3, 3),
+        np.array([step.duration for step in steps]),
+        np.array([k.is_elsewhere for k in keyframes[1:]], dtype=np.bool_),
+    )
+    at, spread = poses_between(before, deltas, noises, np.abs(ends[:, 0] - starts[:, 0]), *later, poses, covariances)
+    return Trajectory(np.array([tick.t for tick in ticks]), at, se2.body_to_world(at, spread))

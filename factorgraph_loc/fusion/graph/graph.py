@@ -1,20 +1,29 @@
-"""A graph as data: its keyframes and other variables, the factors on them, and the trajectory between."""
+"""A graph as data: its keyframes and other variables, the factors on them, and what maps points while it is solved."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
+import gtsam
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.fusion.graph.marginals import blamed, damped
-from factorgraph_loc.fusion.graph.variables import (
-    Keyframe,
-    Node,
-    TickAt,
+from factorgraph_loc.fusion.layout import MOTION
+from factorgraph_loc.fusion.search import Change
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.belief import PosePrior
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.settings import Estimated
+from factorgraph_loc.sensors.base import NewVariable, Sensor, Term
+from factorgraph_loc.sensors.motion import Motion
+from factors import positive, se2
+from factors.graph import (
+    Factor,
     Values,
     constants_key,
     index_of,
@@ -23,23 +32,158 @@ from factorgraph_loc.fusion.graph.variables import (
     is_point,
     is_pose,
     landmark_key,
+    pose_key,
 )
-from factorgraph_loc.fusion.layout import MOTION
-from factorgraph_loc.fusion.mapping import Mapper
-from factorgraph_loc.fusion.search import Change, is_known
-from factorgraph_loc.model.belief import Learnt, PosePrior, learnt_landmarks
-from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.settings import Estimated
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import NewVariable, Sensor, Term
-from factorgraph_loc.sensors.motion import Motion
-from factors import se2
-from factors.graph import Factor
-from factors.motion import ChainState, Increment, poses_between
+from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
 STATE = len(ChainState._fields)
 NOTHING_KNOWN = np.zeros(0)  # of constants, where none are estimated
+
+
+@dataclass(frozen=True)
+class Node:
+    """A factor of the graph on the variables ``keys``: one of ours with ``rows`` residuals, GTSAM's own (``native``),
+    or both, which are the same. ``sensor``: the name of the sensor that it comes from."""
+
+    keys: tuple[int, ...]
+    factor: Factor | None = None
+    rows: int = 0
+    native: gtsam.NonlinearFactor | None = None
+    sensor: str = ""
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether it is on a pose."""
+        return any(is_pose(key) for key in self.keys)
+
+
+Guess = tuple[Array, Array]  # a pose (3,) and its body-frame covariance (3, 3)
+
+
+@dataclass
+class Keyframe:
+    """A pose variable of the graph: its time, the odometry there, and the factors of what is seen from it.
+
+    ``from_previous``: the motion since the keyframe before, and ``factor``, the factor made of it. ``is_elsewhere``: whether the
+    robot was carried there from the keyframe before. ``causal``: the estimate while it was the newest one; ``final``: the estimate
+    with which it has left a window.
+    """
+
+    index: int
+    t: float
+    odometry: ChainState
+    from_previous: Increment | None
+    factor: Factor | None = None
+    is_elsewhere: bool = False
+    nodes: list[Node] = field(default_factory=list)
+    causal: Guess | None = None
+    final: Guess | None = None
+    key: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.key = pose_key(self.index)
+
+
+class TickAt(NamedTuple):
+    """A stamp at which the trajectory is wanted, the number of the keyframe before it, and the odometry there."""
+
+    t: float
+    keyframe: int
+    odometry: ChainState
+
+
+@dataclass
+class Addition:
+    """New factors of the graph, and new variables with their guesses."""
+
+    nodes: list[Node] = field(default_factory=list)
+    values: Values = field(default_factory=dict)
+
+    def hang(self, keyframe: Keyframe, *nodes: Node) -> None:
+        """Add factors, and keep them with a keyframe."""
+        keyframe.nodes += nodes
+        self.nodes += nodes
+
+
+# squared Mahalanobis distance of a pose from its guess; Gauss-Newton steps may diverge where points contain little information
+JUMPED = 50.0
+
+
+def jumps(guess: Guess, pose: Array) -> bool:
+    """Whether ``pose`` (3,) is where the robot, by the ``guess`` of it, cannot be."""
+    return not positive.squared(se2.log(se2.between(guess[0], pose)), guess[1]) < JUMPED
+
+
+@dataclass(frozen=True)
+class GraphView:
+    """What a mapper sees of its graph: the ``keyframes`` by number; estimates of all variables but poses, to which it adds
+    (``values``, ``spreads``); the ``current`` estimate of a variable by key; which keyframes are open; the motion ``between``
+    two of them; what wheels that ``slip`` do to an increment, and the robot's velocity (``twist``, (3,)) at a time, as the motion
+    tells them; keys of the sensor's constants (``shared``), and the values (P,) of these."""
+
+    keyframes: Mapping[int, Keyframe]
+    values: Values
+    spreads: Values
+    current: Callable[[int], Array]
+    is_open: Callable[[int], bool]
+    between: Callable[[Keyframe, Keyframe], Increment]
+    slip: Callable[[Increment], tuple[Array, float]]
+    twist: Callable[[float], Array]
+    shared: tuple[int, ...] = ()
+    constants: Array | None = None
+
+
+class Mapper:
+    """Makes variables of points that a sensor sees and no map has. This base class maps nothing.
+
+    ``sensor``: the name of the one whose measurements it takes, "" for none. ``fewest``: number of sightings that a point of the
+    graph needs.
+    ``horizon``: number of recent keyframes that it needs. ``rejected``: why sightings of something else are rejected.
+    ``estimates``: whether points become variables. ``knows_scale``: whether their scale comes from elsewhere than the motion.
+    """
+
+    sensor: str = ""
+    fewest: int = 0
+    horizon: int = 0
+    rejected: str = ""
+    estimates: bool = False
+    knows_scale: bool = True
+
+    def is_due(self, m: Any) -> bool:
+        """Whether a measurement needs a keyframe of its own."""
+        return False
+
+    def take(
+        self, m: Any, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition, *, is_new: bool
+    ) -> Guess:
+        """Add the information of a measurement from the newest keyframe to an ``addition``. Returns the corrected guess of its
+        pose. ``is_new``: whether the keyframe was made for it."""
+        return guess
+
+    def is_astray(self, node: Node, values: Values) -> bool:
+        """Whether a node is a sighting that cannot be of its point."""
+        return False
+
+    def point(self, node: Node) -> int | None:
+        """The key of the point that a node is a sighting of."""
+        return None
+
+    def leave(self, t: float) -> Sequence[int]:
+        """Keys of the points that were last seen before ``t``, which the graph has no more from now on."""
+        return ()
+
+    def keep_only(self, keys: set[int]) -> None:
+        """Give up all points but those with these ``keys``."""
+
+    def forget(self, first: Keyframe) -> Sequence[int]:
+        """Forget the keyframes before the ``first``, and the points that have left the graph and were not seen since.
+        Returns the keys of these points."""
+        return ()
+
+    def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
+        """All points that ever were in the graph. ``values`` and ``spreads``: of the points and of the poses of keyframes."""
+        return None
 
 
 class Graph:
@@ -53,9 +197,9 @@ class Graph:
 
     def __init__(self, motion: Motion, sensors: Mapping[str, Sensor], mapper: Mapper, diagnostics: Diagnostics) -> None:
         self.motion, self.sensors, self.mapper, self.diagnostics = motion, sensors, mapper, diagnostics
-        self._constants: dict[str, Estimated] = {MOTION: motion.constants}
-        self._constants |= {name: sensor.constants for name, sensor in sensors.items()}
-        self.keys = {n: constants_key(i) for i, (n, c) in enumerate(self._constants.items()) if c.names}
+        self.constants: dict[str, Estimated] = {MOTION: motion.constants}
+        self.constants |= {name: sensor.constants for name, sensor in sensors.items()}
+        self.keys = {n: constants_key(i) for i, (n, c) in enumerate(self.constants.items()) if c.names}
         self.values, self.spreads = self.constant_priors()
         self.departed: tuple[Values, Values] = {}, {}
         self.keyframes: dict[int, Keyframe] = {}  # consecutive numbers
@@ -153,7 +297,7 @@ class Graph:
 
     def constant_priors(self) -> tuple[Values, Values]:
         """Means and covariances of the sensors' constants before any measurement."""
-        held = [(self.keys[name], c) for name, c in self._constants.items() if c.names]
+        held = [(self.keys[name], c) for name, c in self.constants.items() if c.names]
         return {key: np.zeros(len(c.names)) for key, c in held}, {key: np.diag(c.sigmas**2) for key, c in held}
 
     def new_block(self, new: NewVariable, covariance: Array) -> int:
@@ -181,24 +325,6 @@ class Graph:
             else:
                 keyframe.factor = self.motion.factor(increment, scale_known=self.mapper.knows_scale)
         return keyframe.factor, keys
-
-    def learnt(self, poses: Iterable[Array] = (), covariances: Iterable[Array] = ()) -> Learnt:
-        """The constants and landmarks that are estimated; points at final ``poses`` of all keyframes, with their body-frame
-        ``covariances``."""
-        values: dict[str, tuple[float, float]] = {}
-        blocks = [(name, self.values[key], self.spreads[key]) for name, key in self.keys.items() if is_landmark(key)]
-        landmarks = learnt_landmarks(blocks)
-        for name, key in self.keys.items():
-            if is_landmark(key):
-                continue
-            prefix = "" if name == MOTION else f"{name}."
-            sigmas = np.sqrt(np.diag(self.spreads[key]))
-            for label, value, sigma in zip(self._constants[name].names, self.values[key], sigmas, strict=True):
-                values[prefix + label] = (float(value), float(sigma))
-        numbered = self.keyframes.values()
-        at, spreads = ({k.key: v for k, v in zip(numbered, part)} for part in (poses, covariances))  # noqa: B905
-        points = self.mapper.learnt(self.departed[0] | self.values | at, self.departed[1] | self.spreads | spreads)
-        return Learnt(values, landmarks, points)
 
     def drop_astray(self, keyframes: Collection[Keyframe], values: Values) -> bool:
         """Take sightings out of the graph that cannot be of their points, as these are estimated, and points of which too few are
@@ -269,26 +395,3 @@ class Graph:
             return f"point {index_of(key)}"
         name = {number: name for name, number in self.keys.items()}[key]
         return f"the landmark {name.partition('/')[2]}" if is_landmark(key) else f"the constants of the {name}"
-
-    def between(self, poses: Array, covariances: Array) -> Trajectory:
-        """The trajectory from all keyframes, ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3), at the ticks, but for those
-        at which nobody knows where the robot was; see :func:`factors.motion.poses_between`."""
-        newest = {tick.t: tick for tick in self.ticks}
-        stamps = np.array(sorted(newest))
-        ticks = [newest[t] for t in stamps[is_known(stamps, self.changes)].tolist()]
-        keyframes = list(self.keyframes.values())
-        before = np.array([tick.keyframe - keyframes[0].index for tick in ticks], dtype=np.int64)
-        ends = np.array([tick.odometry for tick in ticks]).reshape(-1, STATE)
-        starts = np.array([k.odometry for k in keyframes]).reshape(-1, STATE)[before]
-        deltas, noises = self.motion.relatives(starts, ends, self.value(MOTION, NOTHING_KNOWN))
-        steps = [self.recalibrated(k.from_previous) for k in keyframes[1:] if k.from_previous is not None]
-        later = (
-            np.array([step.delta for step in steps]).reshape(-1, 3),
-            np.array([step.covariance for step in steps]).reshape(-1, 3, 3),
-            np.array([step.duration for step in steps]),
-            np.array([k.is_elsewhere for k in keyframes[1:]], dtype=np.bool_),
-        )
-        at, spread = poses_between(
-            before, deltas, noises, np.abs(ends[:, 0] - starts[:, 0]), *later, poses, covariances
-        )
-        return Trajectory(np.array([tick.t for tick in ticks]), at, se2.body_to_world(at, spread))

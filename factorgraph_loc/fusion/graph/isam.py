@@ -13,27 +13,14 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.fusion.graph.batch import solve_whole, whole_problem
-from factorgraph_loc.fusion.graph.graph import Graph
+from factorgraph_loc.fusion.graph.graph import Addition, Graph, Guess, Keyframe, Node, jumps
 from factorgraph_loc.fusion.graph.marginals import IndeterminateError, covariances
 from factorgraph_loc.fusion.graph.settings import SmootherSettings
 from factorgraph_loc.fusion.graph.solver import MARGIN, WITH_POINTS, FullHistory, Window
 from factorgraph_loc.fusion.graph.summary import MarginalSummary, is_missing
-from factorgraph_loc.fusion.graph.variables import (
-    GTSAM_ERRORS,
-    Addition,
-    Guess,
-    Keyframe,
-    Node,
-    Values,
-    index_of,
-    is_constant,
-    is_landmark,
-    is_of_keyframe,
-    jumps,
-    tilt_key,
-)
 from factorgraph_loc.fusion.layout import MOTION
 from factors import positive, se2
+from factors.graph import GTSAM_ERRORS, Values, index_of, is_constant, is_landmark, is_of_keyframe, tilt_key
 from factors.se2 import Array
 
 ITERATIONS_AFTER_FAILURE = 10

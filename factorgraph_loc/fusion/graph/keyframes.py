@@ -20,12 +20,10 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.fusion.graph.batch import AtTheEnd
-from factorgraph_loc.fusion.graph.graph import Graph
+from factorgraph_loc.fusion.graph.graph import Addition, Graph, GraphView, Guess, Keyframe, Node, TickAt
 from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.graph.settings import GraphSettings
-from factorgraph_loc.fusion.graph.variables import Addition, Guess, Keyframe, Node, TickAt
 from factorgraph_loc.fusion.layout import MOTION
-from factorgraph_loc.fusion.mapping import GraphView
 from factorgraph_loc.fusion.search import Search, laplace_evidence
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation, Sensor

@@ -14,8 +14,7 @@ import numpy as np
 
 from factorgraph_loc.fusion.graph.chained import Chained
 from factorgraph_loc.fusion.graph.marginals import Covariances, covariances
-from factorgraph_loc.fusion.graph.variables import GTSAM_ERRORS, Values, gather, retract
-from factors.graph import Factor, gaussian_factor, jacobian_factors
+from factors.graph import GTSAM_ERRORS, Factor, Values, gather, gaussian_factor, jacobian_factors, retract
 from factors.least_squares import MAX_ITERATIONS, descended
 
 

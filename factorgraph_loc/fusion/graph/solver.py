@@ -23,23 +23,24 @@ from typing import Any, cast
 import gtsam
 import numpy as np
 
+from factorgraph_loc.fusion.graph.graph import Node
 from factorgraph_loc.fusion.graph.summary import MarginalSummary, oldest_pose
-from factorgraph_loc.fusion.graph.variables import (
+from factors.gaussian import invert_covariance
+from factors.graph import (
     GTSAM_ERRORS,
-    Node,
     Values,
     frame_motions,
+    gaussian_factor,
     is_constant,
     is_place,
     is_point,
     is_pose,
+    jacobian_factors,
     leaving_key,
     read,
     retract,
     to_gtsam,
 )
-from factors.gaussian import invert_covariance
-from factors.graph import gaussian_factor, jacobian_factors
 from factors.se2 import Array
 
 # s that a pose may stay longer in a window, so that several are read at a time; less with points, which make it large

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import gtsam
 
-from factorgraph_loc.fusion.graph.variables import Node, Values, index_of, is_of_keyframe, is_pose, to_gtsam
+from factorgraph_loc.fusion.graph.graph import Node
+from factors.graph import Values, index_of, is_of_keyframe, is_pose, to_gtsam
 
 KINDS = (gtsam.LinearContainerFactor, gtsam.PriorFactorPose2, gtsam.PriorFactorVector)
 

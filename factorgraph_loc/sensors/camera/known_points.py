@@ -26,8 +26,7 @@ from factors import se2
 from factors.camera import model as reprojection
 from factors.camera import update_kernels as pixel_kernels
 from factors.camera.factor import ReprojectionFactor
-from factors.camera.floor import TiltScale
-from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel
+from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel, TiltScale
 from factors.motion import Increment, propagate
 from factors.se2 import Array
 
@@ -225,7 +224,7 @@ class KnownPoints:
         if len(seen) == 0:
             return None
         pixels = np.asarray(m.pixels[seen.features], dtype=float)
-        chosen = spread_out(pixels, MOST)
+        chosen = spread_out(pixels, MOST) if len(pixels) > MOST else np.arange(len(pixels))
         points = seen.points[chosen]
         spreads = self.map.covariances[points] if self._map_matters else None
         return replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=spreads)

@@ -28,8 +28,7 @@ from factorgraph_loc.vision.relocalization import FoundOnFloor
 from factors import positive, se2
 from factors.camera import model as reprojection
 from factors.camera.factor import ReprojectionFactor, image_update
-from factors.camera.floor import TiltScale
-from factors.camera.model import TIME_OFFSET
+from factors.camera.model import TIME_OFFSET, TiltScale
 from factors.motion import ChainState, propagate
 from factors.se2 import Array
 from factors.update import Correction

@@ -21,7 +21,7 @@ from factors import positive
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor, landmark_update
 from factors.landmarks.kernels import innovations
-from factors.landmarks.model import PARAMETERS, TIME_OFFSET, packed
+from factors.landmarks.model import PARAMETERS, TIME_OFFSET
 from factors.motion import Increment
 from factors.se2 import Array
 from factors.update import GATE, Correction
@@ -333,7 +333,7 @@ class LandmarkSensor(Sensor):
     def judge(self, observation: LandmarkObservation, correction: Correction, view: View) -> bool:
         factor = observation.measured
         self._diagnostics.innovation(self.name, observation.t, correction.nis, correction.dof)
-        ranges, bearings = innovations(packed(factor.model), correction.residual, factor.ranges, factor.bearings)
+        ranges, bearings = innovations(factor.model.packed, correction.residual, factor.ranges, factor.bearings)
         self._diagnostics.add_residuals(f"{self.name}.range", ranges.tolist())
         self._diagnostics.add_residuals(f"{self.name}.bearing", bearings.tolist())
         return True

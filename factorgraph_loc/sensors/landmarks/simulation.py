@@ -125,7 +125,7 @@ class LandmarkForecast:
         points = self.world.positions()
         n, k = in_sight(self.model, self.world, poses, self.settings)
         seen = poses[n], points[k], *bearing_range.predict(self.model, poses[n], points[k])
-        whitened = linearize_each(bearing_range.packed(self.model), *seen)[1][..., : bearing_range.POINT]
+        whitened = linearize_each(self.model.packed, *seen)[1][..., : bearing_range.POINT]
         out = np.zeros((len(poses), 3, 3))
         np.add.at(out, n, np.swapaxes(whitened, 1, 2) @ whitened)
         return np.asarray((self.looks_per_metre * ways)[:, None, None] * out)

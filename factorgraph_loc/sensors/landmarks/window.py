@@ -11,7 +11,7 @@ from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
 from factors.landmarks.kernels import linearize_each
-from factors.landmarks.model import POINT, BearingRangeModel, located, packed, residuals, sigmas
+from factors.landmarks.model import POINT, BearingRangeModel, located, residuals, sigmas
 from factors.least_squares import minima
 from factors.motion import ChainState
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
@@ -115,7 +115,7 @@ class SightingWindow:
         if spread is not None:
             error = error + self._carried @ spread @ self._carried.transpose(0, 2, 1)
         seen = np.zeros((len(self.points), 3)), self._from_robot(), self._ranges, self._bearings
-        jacobian = linearize_each(packed(self._model), *seen)[1][..., :POINT]
+        jacobian = linearize_each(self._model.packed, *seen)[1][..., :POINT]
         covariance = np.eye(2) + jacobian @ error @ jacobian.transpose(0, 2, 1)
         # without a bearing the direction of the range is unknown: use the worst case
         worst = np.linalg.eigvalsh(error[:, :2, :2])[:, -1] / self._sigmas[:, 0] ** 2
@@ -199,7 +199,7 @@ class SightingWindow:
         """Residuals (N, K, 2) at present poses (N, 3), and their Jacobians (N, K, 2, 3) by the perturbation of these."""
         at, count = se2.compose(poses[:, None], self._back), len(poses)
         seen = np.tile(self.points, (count, 1)), np.tile(self._ranges, count), np.tile(self._bearings, count)
-        error, jacobian = linearize_each(packed(self._model), at.reshape(-1, 3), *seen)
+        error, jacobian = linearize_each(self._model.packed, at.reshape(-1, 3), *seen)
         jacobian = jacobian[..., :POINT].reshape(*at.shape[:2], 2, 3) @ self._carried
         return error.reshape(*at.shape[:2], 2), jacobian
 

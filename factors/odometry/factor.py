@@ -1,0 +1,231 @@
+"""Increments of odometry as factors of a graph, one by one and many at once."""
+
+import math
+from collections.abc import Hashable, Sequence
+
+import numpy as np
+
+from factors import se2
+from factors.compiled import compiled
+from factors.gaussian import product
+from factors.motion import Increment
+from factors.odometry.kernels import NO_CONSTANTS, ROUNDING, all_changes, changed, recalibrate
+from factors.se2 import Array, Integers, between_one, inverse_right_jacobian, twist_to
+
+
+class OdometryStack:
+    """Increments ``factors``, each between the pose ``first`` (K,) by number and the next one. All have the same constants
+    estimated, which are the parameters from ``column`` on."""
+
+    def __init__(self, factors: Sequence["OdometryFactor"], first: Sequence[int], column: int) -> None:
+        self._first, self._column = np.array(first, dtype=np.int64), column
+        self._indices = np.array(factors[0].estimated, dtype=np.int64)
+        packed = [f.packed for f in factors]
+        self._deltas, self._twists = np.array([p[0] for p in packed]), np.array([p[1] for p in packed])
+        self._moving, self._whiteners = np.array([p[2] for p in packed]), np.array([p[3] for p in packed])
+        self.rows = 3 * len(packed)
+
+    @property
+    def first(self) -> Integers:
+        """The number of the first pose that each residual depends on."""
+        return np.repeat(self._first, 3)
+
+    def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
+        """Fill ``residual`` (3 K,) and ``jacobian`` (3 K, 6 + P), see :mod:`factors.chain`."""
+        given = self._deltas, self._twists, self._moving, self._constants(parameters), self._indices, self._whiteners
+        linearize_all(poses, self._first, *given, jacobian, residual, 6 + self._column)
+
+    def cost(self, poses: Array, parameters: Array) -> float:
+        """Half the sum of the squared residuals."""
+        given = self._deltas, self._twists, self._moving, self._constants(parameters), self._indices, self._whiteners
+        return float(cost_of_all(poses, self._first, *given))
+
+    def _constants(self, parameters: Array) -> Array:
+        return np.ascontiguousarray(parameters[self._column : self._column + len(self._indices)])
+
+
+class OdometryFactor:
+    """The increment between two poses, with odometry constants as a third variable.
+
+    ``estimated``: indices in :data:`PARAMETERS` of the P constants. The values of the factor are the two poses (3,), and the
+    constants (P,) unless P is zero.
+    """
+
+    def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
+        self._increment = increment
+        self._arc = se2.log(increment.delta)
+        self._moving = increment.duration - increment.still
+        self.estimated = tuple(estimated)
+        self._indices = np.array(estimated, dtype=np.int64)
+        self._whitener = whitener(increment.covariance)
+
+    @property
+    def packed(self) -> tuple[Array, Array, float, Array]:
+        """The increment (3,), its logarithm (3,), how long the robot moved, and what whitens it (3, 3)."""
+        return self._increment.delta, self._arc, self._moving, self._whitener
+
+    @property
+    def kind(self) -> Hashable:
+        """What increments have in common that are linearised together."""
+        return self.estimated
+
+    def stack(self, factors: Sequence["OdometryFactor"], numbers: Sequence[int], column: int) -> OdometryStack:
+        """Increments of this kind as one: see :class:`~factors.graph.Stackable`."""
+        return OdometryStack(factors, numbers, column)
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)`` and its Jacobians."""
+        start, end, *constants = values
+        if constants:
+            changed = self._arc, self._moving, constants[0], self._indices
+            residual, *blocks = linearize_changed(start, end, *changed, self._whitener)
+            return residual, blocks
+        residual, *blocks = linearize(start, end, self._increment.delta, NO_CONSTANTS, self._whitener)
+        return residual, blocks[:2]
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """Half the squared whitened residual."""
+        residual, _ = self.linearize(values)
+        return 0.5 * float(residual @ residual)
+
+
+class ScaleFreeOdometryFactor(OdometryFactor):
+    """An increment where the wheels alone tell the scale of what is estimated; its residual is in the unit that they report.
+
+    A residual in metres becomes smaller as the world does, and nothing opposes that: the most probable world would be too small by
+    ``n s^2``, where ``n`` increments are estimated and ``s`` is the standard deviation of the scale.
+    """
+
+    kind = None  # not linearised together
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, its translation divided by the scale, and its Jacobians."""
+        start, end, *constants = values
+        if not constants:
+            return super().linearize(values)
+        changed = self._arc, self._moving, constants[0], self._indices
+        residual, *blocks = linearize_as_reported(start, end, *changed, self._whitener)
+        return residual, blocks
+
+
+@compiled
+def whitener(covariance: Array) -> Array:
+    """The inverse of the lower root of a covariance (3, 3)."""
+    a = math.sqrt(covariance[0, 0])
+    b, c = covariance[1, 0] / a, covariance[2, 0] / a
+    d = math.sqrt(max(covariance[1, 1] - b * b, ROUNDING * covariance[1, 1]))
+    e = (covariance[2, 1] - b * c) / d
+    f = math.sqrt(max(covariance[2, 2] - c * c - e * e, ROUNDING * covariance[2, 2]))
+    return np.array(
+        (
+            (1.0 / a, 0.0, 0.0),
+            (-b / (a * d), 1.0 / d, 0.0),
+            ((b * e / d - c) / (a * f), -e / (d * f), 1.0 / f),
+        )
+    )
+
+
+@compiled
+def linearize(
+    start: Array, end: Array, delta: Array, by_changes: Array, whitener: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobians by both poses (3, 3) and, through ``by_changes``
+    (3, P) of ``delta``, by the constants (3, P)."""
+    relative = between_one(start, end)
+    rx, ry, turned = relative[0], relative[1], relative[2]
+    error = twist_to(delta, relative)
+    by_end = product(whitener, inverse_right_jacobian(error))
+    c, s = math.cos(turned), math.sin(turned)
+    # the adjoint of the inverse of the relative pose, negative
+    adjoint = np.array(((-c, -s, c * ry - s * rx), (s, -c, -c * rx - s * ry), (0.0, 0.0, -1.0)))
+    by_delta = product(whitener, inverse_right_jacobian(-error))
+    for i in range(3):
+        for j in range(3):
+            by_delta[i, j] = -by_delta[i, j]
+    residual = np.empty(3)
+    for i in range(3):
+        residual[i] = whitener[i, 0] * error[0] + whitener[i, 1] * error[1] + whitener[i, 2] * error[2]
+    return residual, product(by_end, adjoint), by_end, product(by_delta, by_changes)
+
+
+@compiled
+def linearize_changed(
+    start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
+) -> tuple[Array, Array, Array, Array]:
+    """:func:`linearize` of an increment whose logarithm is ``twist`` (3,), under changed ``constants``: see :func:`changed`."""
+    delta, by_changes = changed(twist, moving, constants, indices)
+    return linearize(start, end, delta, by_changes, whitener)
+
+
+@compiled
+def linearize_as_reported(
+    start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
+) -> tuple[Array, Array, Array, Array]:
+    """:func:`linearize_changed` with the translation of the residual, and its noise, in the unit that the wheels report."""
+    unit = 1.0 + all_changes(constants, indices)[0]
+    as_reported = whitener.copy()
+    for i in range(3):
+        as_reported[i, 0] /= unit
+        as_reported[i, 1] /= unit
+    delta, by_changes = changed(twist, moving, constants, indices)
+    residual, by_start, by_end, by_constants = linearize(start, end, delta, by_changes, as_reported)
+    error = twist_to(delta, between_one(start, end))
+    for j in range(len(indices)):
+        if indices[j] == 0:
+            for i in range(3):
+                by_constants[i, j] -= (as_reported[i, 0] * error[0] + as_reported[i, 1] * error[1]) / unit
+    return residual, by_start, by_end, by_constants
+
+
+@compiled
+def linearize_all(
+    poses: Array,
+    first: Integers,
+    deltas: Array,
+    twists: Array,
+    moving: Array,
+    constants: Array,
+    indices: Integers,
+    whiteners: Array,
+    jacobian: Array,
+    residual: Array,
+    column: int,
+) -> None:
+    """Residuals (3 K,) of K increments and their Jacobian (3 K, 6 + P), see :mod:`factors.chain`, between the poses ``first`` (K,)
+    and those that follow; ``column``: of the constants."""
+    for k in range(len(first)):
+        start, end, row = poses[first[k]], poses[first[k] + 1], 3 * k
+        if len(indices):
+            found = linearize_changed(start, end, twists[k], moving[k], constants, indices, whiteners[k])
+            for i in range(3):
+                for j in range(len(indices)):
+                    jacobian[row + i, column + j] = found[3][i, j]
+        else:
+            found = linearize(start, end, deltas[k], np.zeros((3, 0)), whiteners[k])
+        for i in range(3):
+            residual[row + i] = found[0][i]
+            for j in range(3):
+                jacobian[row + i, j], jacobian[row + i, 3 + j] = found[1][i, j], found[2][i, j]
+
+
+@compiled
+def cost_of_all(
+    poses: Array,
+    first: Integers,
+    deltas: Array,
+    twists: Array,
+    moving: Array,
+    constants: Array,
+    indices: Integers,
+    whiteners: Array,
+) -> float:
+    """Half the sum of the squared residuals of :func:`linearize_all`."""
+    total = 0.0
+    for k in range(len(first)):
+        delta = deltas[k]
+        if len(indices):
+            delta, _ = recalibrate(twists[k], moving[k], all_changes(constants, indices))
+        error, w = twist_to(delta, between_one(poses[first[k]], poses[first[k] + 1])), whiteners[k]
+        total += (w[0, 0] * error[0]) ** 2 + (w[1, 0] * error[0] + w[1, 1] * error[1]) ** 2
+        total += (w[2, 0] * error[0] + w[2, 1] * error[1] + w[2, 2] * error[2]) ** 2
+    return 0.5 * total
