@@ -2,12 +2,6 @@
 this file, so that each name is listed once."""
 # ruff: noqa: I001 - of each module together
 
-from factorgraph_loc.api.experimenting import (
-    active as active,
-    experiment as experiment,
-    report as report,
-    status as status,
-)
 from factorgraph_loc.api.learning import build_map as build_map, calibrate as calibrate, features as features
 from factorgraph_loc.api.logs import (
     convert as convert,
@@ -26,13 +20,17 @@ from factorgraph_loc.api.lookups import (
     new_rig as new_rig,
 )
 from factorgraph_loc.api.results import export as export, score as score, view as view
-from factorgraph_loc.api.running import Run as Run, compare as compare, run as run
+from factorgraph_loc.api.running import Run as Run, run as run
 from factorgraph_loc.errors import (
     FglocError as FglocError,
     InputError as InputError,
     RunFailedError as RunFailedError,
 )
 from factorgraph_loc.evaluation.inference import contrast as contrast
+from factorgraph_loc.experiments.active import active as active
+from factorgraph_loc.experiments.compare import compare as compare
+from factorgraph_loc.experiments.experiment import experiment as experiment, status as status
+from factorgraph_loc.experiments.reporting import report as report
 from factorgraph_loc.experiments.result_table import load_results as load_results
 from factorgraph_loc.exports.trajectories import write_trajectory as write_trajectory
 from factorgraph_loc.io.native.native import write_native as write_native

@@ -5,4 +5,4 @@ They are available as ``factorgraph_loc.run`` and so on, each imported when it i
 :class:`~factorgraph_loc.errors.InputError`, and a run without a usable result :class:`~factorgraph_loc.errors.RunFailedError`.
 """
 
-__all__ = ["experimenting", "learning", "logs", "lookups", "results", "running"]
+__all__ = ["learning", "logs", "lookups", "results", "running"]

@@ -1,10 +1,9 @@
 """``fgloc calibrate``, ``map`` and ``features evaluate`` as functions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from factorgraph_loc.api.given import LogLike, Progress, RigLike, Settings, WorldLike, every
 from factorgraph_loc.api.running import run
 from factorgraph_loc.calibration import calibrate as calibration
 from factorgraph_loc.calibration import report as rig_report
@@ -15,7 +14,7 @@ from factorgraph_loc.experiments import maps, output
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.temporary import of_system, temporary_folder, writing
 from factorgraph_loc.io.native.rig_file import write_rig
-from factorgraph_loc.io.readers import read_log
+from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, load_all, read_log
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.plugins import FEATURES, MAP_ESTIMATORS
@@ -30,12 +29,12 @@ def calibrate(
     rig: RigLike | None = None,
     world: WorldLike | None = None,
     overwrite: bool = False,
-    progress: Progress | None = None,
+    progress: Callable[[float, float], None] | None = None,
 ) -> calibration.Calibration:
     """Calibrate a rig from logs, all with reference poses or all without. Writes ``out`` (``NAME.rig.toml``) and
     ``NAME.report.html`` next to it."""
     file, page = Path(out), report_beside(Path(out), overwrite=overwrite)
-    loaded = every(logs, rig, world)
+    loaded = load_all(logs, rig, world)
     # learnt grids are kept here until the rig is written, so that a failed calibration leaves nothing behind
     with temporary_folder(of_system("grids")) as folder:
         grids = folder / file.name.removesuffix(RIG)
@@ -57,13 +56,13 @@ def build_map(
     *,
     of: str | None = None,
     estimator: str = MAP_ESTIMATORS[0],
-    settings: Settings | None = None,
+    settings: Mapping[str, Any] | None = None,
     extend: bool = False,
     poses: str | None = None,
     tag_height: float | None = None,
     prior: str | None = None,
     drop_dead: bool = False,
-    points: Settings | None = None,
+    points: Mapping[str, Any] | None = None,
     rig: RigLike | None = None,
     world: WorldLike | None = None,
     overwrite: bool = False,
@@ -98,7 +97,7 @@ def features(
     features: Sequence[str] = FEATURES,
     count: int = 1000,
     overwrite: bool = False,
-    progress: Progress = lambda _done, _total: None,
+    progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> feature_scores.FeatureScores:
     """Evaluate point features on images of planar scenes: folders of sequences, or photographs, which are warped."""
     feature_scores.check_free(Path(out), overwrite=overwrite)

@@ -1,11 +1,10 @@
 """``fgloc datasets``, ``info``, ``convert``, ``manifest`` and ``simulate`` as functions."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from factorgraph_loc.api.given import LogLike, Progress, RigLike, Settings, WorldLike, every
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.inspect import Inspection, inspect
@@ -15,7 +14,7 @@ from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import temporary_folder, writing
 from factorgraph_loc.io.bags.manifest import BagManifest, manifest_of_bag
 from factorgraph_loc.io.native.native import require_new, write_native
-from factorgraph_loc.io.readers import Dataset, describe, read_log
+from factorgraph_loc.io.readers import Dataset, LogLike, RigLike, WorldLike, describe, load_all, read_log
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import RunConfig
 from factorgraph_loc.sensors.registry import moving
@@ -89,11 +88,11 @@ def simulate(
     what: str | Path | SimulationSettings = "office",
     seed: int = 0,
     *,
-    changes: Settings | None = None,
+    changes: Mapping[str, Any] | None = None,
     recorded: RecordedLooks | LogLike | Sequence[LogLike] | None = None,
     images: bool = False,
     out: str | Path | None = None,
-    progress: Progress = lambda _done, _total: None,
+    progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> Log:
     """Simulate a log with known ground truth. The same seed gives the same bytes.
 
@@ -107,7 +106,7 @@ def simulate(
     if images and out is None:
         raise InputError("images need out, a folder to write the log to")
     if recorded is not None and not isinstance(recorded, RecordedLooks):
-        recorded = recorded_looks(every(recorded))
+        recorded = recorded_looks(load_all(recorded))
     log = make_log(settings, seed, recorded)
     if out is None:
         return log
@@ -120,7 +119,9 @@ def simulate(
     return read_log(folder) if images else log
 
 
-def _write_with_images(log: Log, settings: SimulationSettings, seed: int, folder: Path, progress: Progress) -> None:
+def _write_with_images(
+    log: Log, settings: SimulationSettings, seed: int, folder: Path, progress: Callable[[float, float], None]
+) -> None:
     """Render the images into a temporary folder first, so that the log is written completely or not at all."""
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from factorgraph_loc.api.given import LogLike, RigLike, WorldLike
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.trajectories.page import check_free, write_score
 from factorgraph_loc.evaluation.trajectories.score import TrajectoryScore, score_paths
@@ -14,7 +13,7 @@ from factorgraph_loc.exports.ros import write_mcap
 from factorgraph_loc.exports.runs import StoredRun, find_runs, is_results, read_runs
 from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write_g2o, write_trajectory
 from factorgraph_loc.files.shipped import manifests
-from factorgraph_loc.io.readers import read_log
+from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, read_log
 from factorgraph_loc.io.trajectories import read_trajectory
 from factorgraph_loc.maps.points import write_ply
 from factorgraph_loc.model.log import Log

@@ -85,8 +85,7 @@ def run(
     json: Json = False,
 ) -> None:
     """Execute the runs of an experiment that have no result yet; can be interrupted and resumed at any time."""
-    from factorgraph_loc.api import experimenting
-    from factorgraph_loc.experiments.experiment import prepare
+    from factorgraph_loc.experiments.experiment import prepare, run_experiment
     from factorgraph_loc.experiments.plan import MOST_RUNS, TooManyRunsError
 
     try:
@@ -101,11 +100,11 @@ def run(
     try:
         show.first_use()
         with show.progress("runs", counted=True) as bar:
-            done = experimenting.execute(
+            done = run_experiment(
                 prepared,
                 jobs=jobs,
                 scheduler=scheduler,
-                retry_failed=retry_failed,
+                again=retry_failed,
                 progress=lambda done, total, failed: bar(done, total, f"{failed} failed" if failed else ""),
             )
     except KeyboardInterrupt as stop:
@@ -142,16 +141,17 @@ def status(
     json: Json = False,
 ) -> None:
     """Show how many runs of an experiment are done, failed, missing or damaged."""
-    from factorgraph_loc.api import experimenting
+    from factorgraph_loc.experiments.experiment import STATES
+    from factorgraph_loc.experiments.experiment import status as count_states
 
-    found = experimenting.status(file, **options.given(), verify=verify)
+    found = count_states(file, **options.given(), verify=verify)
     if json:
         show.document(vars(found) | {"folder": str(found.folder)})
         return
     by_label = {label: list(counts.values()) for label, counts in found.labels.items()}
     total = [sum(numbers) for numbers in zip(*by_label.values(), strict=True)]
     rows = [[label, *map(str, numbers)] for label, numbers in (*by_label.items(), ("(all)", total))]
-    show.table(["label", *experimenting.STATES], rows)
+    show.table(["label", *STATES], rows)
     _print_damaged(found.damaged, file)
     for one in found.failures:
         show.line(f"failed: {one['log']}, {one['label']}, seed {one['seed']}: {one['kind']}: {one['reason']}")
@@ -317,12 +317,12 @@ def active(
     json: Json = False,
 ) -> None:
     """Drive simulated robots from an unknown start until they are localized, and compare policies on the same seeds."""
-    from factorgraph_loc.api import experimenting
+    from factorgraph_loc.experiments.active import active as seek
     from factorgraph_loc.experiments.active_results import difference_cells, differences, summaries, summary_cells
 
     show.first_use()
     with show.progress("runs", counted=True) as report:
-        results = experimenting.active(
+        results = seek(
             world,
             out,
             **options.given(),

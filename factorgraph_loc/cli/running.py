@@ -116,9 +116,9 @@ def compare(
     json: Json = False,
 ) -> None:
     """Run several estimators on several logs; write a table and plots."""
-    from factorgraph_loc.api import running
     from factorgraph_loc.evaluation.tables import comparison_table, further_tables, unscored, verdict
     from factorgraph_loc.experiments.compare import check_free
+    from factorgraph_loc.experiments.compare import compare as compare_estimators
     from factorgraph_loc.fusion.registry import check_names
 
     names = parse_list(estimators)
@@ -129,7 +129,7 @@ def compare(
     loaded = source.load(logs)
     show.first_use()
     with show.progress("runs", counted=True) as report:
-        comparison = running.compare(
+        comparison = compare_estimators(
             loaded,
             names,
             out,

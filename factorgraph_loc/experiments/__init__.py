@@ -3,7 +3,6 @@
 __all__ = [
     "active",
     "active_results",
-    "cluster",
     "compare",
     "experiment",
     "experiment_file",

@@ -4,7 +4,7 @@ The runs are executed and stored like those of other experiments, so that an int
 """
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,12 +30,12 @@ from factorgraph_loc.experiments.experiment_file import ENDLESS, Limits
 from factorgraph_loc.experiments.keys import digest_of
 from factorgraph_loc.experiments.pool import Processes
 from factorgraph_loc.experiments.store import METRICS, Store
-from factorgraph_loc.files.models import file_name, nearest, write_bytes, write_toml
+from factorgraph_loc.files.models import file_name, nearest, parse_model, write_bytes, write_toml
 from factorgraph_loc.files.temporary import require_free, writing
 from factorgraph_loc.planning.closed_loop import ActiveRun, run_active
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.plugins import ACTIVE_ESTIMATORS, POLICIES
-from factorgraph_loc.simulation.settings import SimulationSettings
+from factorgraph_loc.simulation import SimulationSettings, named_settings
 from factorgraph_loc.text import quoted
 from factorgraph_loc.version import __version__
 
@@ -104,20 +104,23 @@ class ActiveResults:
     failures: list[str] = field(default_factory=list)
 
 
-def seek(
-    simulation: SimulationSettings,
-    policies: Sequence[str],
-    estimators: Sequence[str],
-    seeds: Sequence[int],
-    out: Path,
-    settings: ActiveSettings | None = None,
+def active(
+    world: str | Path | SimulationSettings,
+    out: str | Path,
     *,
+    policies: Sequence[str] = ("information",),
+    estimators: Sequence[str] = ("active_mcl",),
+    seeds: Iterable[int] = (0,),
+    changes: Mapping[str, Any] | None = None,
     jobs: int | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> ActiveResults:
-    """Run every policy with every estimator on every seed, in ``jobs`` parallel processes (None: one per core).
+    """Drive simulated robots from an unknown start until they are localized: every policy with every estimator on every seed, in
+    ``jobs`` parallel processes (None: one per core).
 
+    ``world``: a preset of :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings. ``changes``: nested tables of
+    settings of robot, policy or world, such as ``{"policy": {"horizon": 8}, "max_metres": 50}``.
     Written into ``out``: ``results.parquet`` and ``results.csv`` (a row per run), ``differences.csv`` (see
     :func:`~factorgraph_loc.experiments.active_results.differences`), ``table.md``, ``config.toml``, ``plots/comparison.png``
     and for each policy and estimator a plot of the run of the first seed. A failed run is a row with its reason; the others
@@ -126,9 +129,10 @@ def seek(
     Raises InputError, before anything runs, for an unknown or repeated policy or estimator, or an ``out`` that contains results
     without ``overwrite``; and if all runs are refused for their input.
     """
+    simulation, settings = _settings(world, changes or {})
+    seeds, out = list(seeds), Path(out)
     _check_names("policy", policies, tuple(POLICIES))
     _check_names("estimator", estimators, ACTIVE_ESTIMATORS)
-    settings = ActiveSettings() if settings is None else settings
     require_free(out, FILES, overwrite=overwrite, folders=(out / PLOTS,))
     with writing(out):
         (out / PLOTS).mkdir(parents=True, exist_ok=True)
@@ -154,6 +158,22 @@ def seek(
             name = file_name(f"{job.source}-{job.estimator}-{job.policy}-seed{job.seed}.png")
             write_bytes(out / PLOTS / name, Store(out).read(job.key, PICTURE))
     return results
+
+
+def _settings(
+    world: str | Path | SimulationSettings, changes: Mapping[str, Any]
+) -> tuple[SimulationSettings, ActiveSettings]:
+    """Split the changes into settings of the world and of the run; no key belongs to both."""
+    of_run, of_world = ActiveSettings.model_fields, SimulationSettings.model_fields
+    for key in changes:
+        if key not in of_run and key not in of_world:
+            raise InputError(f"unknown key {key}{nearest(key, [*of_run, *of_world])}")
+    changed = {key: value for key, value in changes.items() if key in of_world}
+    if isinstance(world, SimulationSettings) and changed:
+        raise InputError("changes of the world apply to a preset or a file, but settings are given")
+    simulation = world if isinstance(world, SimulationSettings) else named_settings(str(world), changed)
+    run = {key: value for key, value in changes.items() if key in of_run}
+    return simulation, parse_model(ActiveSettings, run, "the settings")
 
 
 def jobs_of(

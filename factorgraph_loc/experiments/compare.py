@@ -1,7 +1,7 @@
 """Comparison of several estimators on several logs: an experiment without a file, a table, differences, and plots."""
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -28,9 +28,11 @@ from factorgraph_loc.experiments.store import Store
 from factorgraph_loc.files.models import file_name, parse_model
 from factorgraph_loc.files.temporary import of_system, require_free, temporary_folder
 from factorgraph_loc.fusion import registry
+from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, load_all
 from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.text import plain
+from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
+from factorgraph_loc.text import listed, plain
 
 # without results.parquet, which an unfinished comparison has
 _WRITTEN = (*(name for name in TABLES if name != "results.parquet"), PAGE)
@@ -57,21 +59,33 @@ def told(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def compare(
-    logs: Sequence[Log],
-    estimators: Mapping[str, Mapping[str, Any]],
-    out: Path,
+    logs: LogLike | Sequence[LogLike],
+    estimators: Sequence[str],
+    out: str | Path,
     *,
+    settings: Mapping[str, Mapping[str, Any]] | None = None,
+    sensors: Sequence[str] | None = None,
+    prior: str | None = None,
+    seeds: Iterable[int] = (0,),
+    rig: RigLike | None = None,
+    world: WorldLike | None = None,
+    max_gap: float = MAX_GAP,
+    tick_gap: float = TICK_GAP,
+    align: Alignment = "none",
     rpe: bool = False,
+    final_only: bool = False,
     jobs: int | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
-    **keys: Any,
 ) -> Comparison:
-    """Run ``estimators``, with the settings of each, on every log, as an experiment in ``jobs`` processes (None: one per core).
+    """Run several estimators on several logs with each seed, as an experiment in ``jobs`` processes (None: one per core).
 
-    ``keys``: other keys of an experiment, see :class:`~factorgraph_loc.experiments.experiment_file.Experiment`. A run that
-    fails, or whose process dies, becomes a row with its reason; the others continue. Runs whose results are stored are not
-    repeated. Written into ``out``: ``results.parquet`` and ``results.csv`` (the rows), ``differences.csv`` (see
+    ``settings``: of each estimator. ``sensors``, ``prior``, ``max_gap``, ``tick_gap``, ``align``: see
+    :class:`~factorgraph_loc.experiments.experiment_file.Experiment`. ``final_only``: make no causal estimates, where an estimator
+    can do without. A run that fails, or whose process dies, becomes a row with its reason; the others continue. Runs whose
+    results are stored are not repeated.
+
+    Written into ``out``: ``results.parquet`` and ``results.csv`` (the rows), ``differences.csv`` (see
     :func:`~factorgraph_loc.evaluation.inference.differences`), ``table.md``, ``report.html`` (see
     :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png``, and the files of each run in the folder ``store``, by
     its key (see :class:`~factorgraph_loc.experiments.store.Store`). ``rpe``: also show relative errors, as further tables in
@@ -80,13 +94,45 @@ def compare(
     Raises InputError before anything runs: without logs or estimators, for two logs of one name, invalid settings or prior, a
     sensor that no log has, or an ``out`` that contains results without ``overwrite``.
     """
-    if not logs or not estimators:
-        raise InputError("there is nothing to compare, expected at least one log and one estimator")
+    out = Path(out)
     check_free(out, overwrite=overwrite)
-    prepared = _prepared(_experiment(logs, estimators, keys, rpe=rpe), logs, out)
+    named = _named(estimators, settings or {})
+    if final_only:
+        named = registry.for_final_only(named)
+    logs = load_all(logs, rig, world)
+    if not logs or not named:
+        raise InputError("there is nothing to compare, expected at least one log and one estimator")
+    keys: dict[str, Any] = {
+        "prior": prior,
+        "seeds": tuple(seeds),
+        "max_gap": max_gap,
+        "tick_gap": tick_gap,
+        "align": align,
+    }
+    keys["sensors"] = (None if sensors is None else tuple(sensors),)
+    prepared = _prepared(_experiment(logs, named, keys, rpe=rpe), logs, out)
     for name in _WRITTEN:
         (out / name).unlink(missing_ok=True)
     remove_plots(out / "plots")
+    _find_features(logs, prepared)
+    done = run_experiment(prepared, jobs=jobs, again=True, progress=lambda made, total, _: progress(made, total))
+    report_experiment(prepared)
+    for log in logs:
+        _plot(log, prepared, out / "plots")
+    rows = done.rows.to_dicts()
+    write_tables(done.rows, pl.DataFrame(differences(rows), schema=DIFFERENCES), _table(rows, rpe=rpe), out)
+    return Comparison(rows, done.failures, done.warnings)
+
+
+def _named(estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Mapping[str, Any]]:
+    """The settings of each estimator, by name; InputError for settings of another one."""
+    if others := [name for name in settings if name not in estimators]:
+        raise InputError(f"settings are given for {others[0]}, which is not run here; run: {listed(estimators)}")
+    return {name: settings.get(name, {}) for name in estimators}
+
+
+def _find_features(logs: Sequence[Log], prepared: Prepared) -> None:
+    """Find the features of all images first, so that the runs find them in the cache."""
     for log in logs:
         fill_cache(
             use_of(
@@ -95,13 +141,6 @@ def compare(
             for run in prepared.runs
             if run.log == log.name
         )
-    done = run_experiment(prepared, jobs=jobs, again=True, progress=lambda made, total, _: progress(made, total))
-    report_experiment(prepared)
-    for log in logs:
-        _plot(log, prepared, out / "plots")
-    rows = done.rows.to_dicts()
-    write_tables(done.rows, pl.DataFrame(differences(rows), schema=DIFFERENCES), _table(rows, rpe=rpe), out)
-    return Comparison(rows, done.failures, done.warnings)
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:

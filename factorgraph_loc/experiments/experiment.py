@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.warned import lines
+from factorgraph_loc.experiments.cluster import Cluster
 from factorgraph_loc.experiments.execute import Executor, execute
 from factorgraph_loc.experiments.experiment_file import Experiment, read_experiment
 from factorgraph_loc.experiments.plan import MOST_RUNS, PlannedRun, TooManyRunsError, plan
@@ -23,6 +24,7 @@ from factorgraph_loc.text import plain
 if TYPE_CHECKING:
     import polars as pl
 
+STATES = ("ok", "failed", "missing", "damaged")
 PACE = 20.0  # assumed ratio of log time to computing time, for an unknown estimator
 
 
@@ -69,6 +71,60 @@ class Done:
     warnings: list[str]
 
 
+@dataclass(frozen=True)
+class ExperimentStatus:
+    """``labels``: for each label of the plan how many runs are ok, failed, missing and damaged. ``failures``: a row for each
+    failed run, with its ``reason``; ``damaged``: names of runs whose stored results are."""
+
+    folder: Path
+    labels: Mapping[str, Mapping[str, int]]
+    failures: Sequence[Mapping[str, Any]]
+    damaged: Sequence[str]
+
+
+def experiment(
+    file: str | Path,
+    *,
+    changes: Mapping[str, Any] | None = None,
+    out: str | Path | None = None,
+    data_root: str | Path | None = None,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    retry_failed: bool = False,
+    verify: bool = False,
+    progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
+) -> Done:
+    """Execute those runs of an experiment file that have no stored result yet.
+
+    ``changes``, ``out``, ``data_root``, ``verify``: see :func:`prepare`; damaged runs are repeated. ``jobs``: number of processes,
+    by default one per core. ``scheduler``: address of a ``dask.distributed`` cluster to use instead. ``progress`` is called with
+    the numbers of finished, all and failed runs. A failed run is recorded as a row and in ``failures``; it raises nothing.
+    """
+    prepared = prepare(file, changes, out=out, data_root=data_root, verify=verify)
+    return run_experiment(prepared, jobs=jobs, scheduler=scheduler, again=retry_failed, progress=progress)
+
+
+def status(
+    file: str | Path,
+    *,
+    changes: Mapping[str, Any] | None = None,
+    out: str | Path | None = None,
+    data_root: str | Path | None = None,
+    verify: bool = False,
+) -> ExperimentStatus:
+    """How many runs of an experiment file are done, failed, missing or damaged. For the arguments see :func:`prepare`."""
+    planned = prepare(file, changes, out=out, data_root=data_root, verify=verify)
+    counts = {run.label: dict.fromkeys(STATES, 0) for run in planned.runs}
+    for run in planned.runs:
+        counts[run.label][planned.states[run.key]] += 1
+    failures = [
+        {"log": run.log, "label": run.label, "seed": run.seed, **dict(run.sweep), **planned.store.row(run.key)}
+        for run in planned.runs
+        if planned.states[run.key] == "failed"
+    ]
+    return ExperimentStatus(planned.folder, counts, failures, [run.shown for run in planned.damaged()])
+
+
 def prepare(
     file: str | Path,
     changes: Mapping[str, Any] | None = None,
@@ -104,24 +160,29 @@ def run_experiment(
     prepared: Prepared,
     *,
     jobs: int | None = None,
+    scheduler: str | None = None,
     again: bool = False,
-    executor: Executor | None = None,
     progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
 ) -> Done:
     """Make the runs that are not stored, with ``again`` also the failed ones, and write the table of all results.
 
-    ``jobs``: processes, by default one per core; ``executor``: computes the runs instead. ``progress`` is called
-    with the numbers of runs made, to be made, and failed. The table is written also after an error or interrupt. Raises StoreError
-    if the store cannot be written.
+    For ``jobs``, ``scheduler`` and ``progress`` see :func:`experiment`. The table is written also after an error or interrupt.
+    Raises StoreError if the store cannot be written.
     """
+    if scheduler is not None and jobs is not None:
+        raise InputError("--jobs applies to this machine, but --scheduler names a cluster: expected one of them")
     todo = prepared.todo(again=again)
     states = dict(prepared.states)
     waiting = {run.key for run in todo}
     failed = sum(states[run.key] == "failed" and run.key not in waiting for run in prepared.runs)
     made = 0
     progress(made, len(todo), failed)
-    if executor is None:
-        executor = Processes(max(1, min(jobs or os.cpu_count() or 1, len(todo))), prepared.experiment.limits)
+    limits = prepared.experiment.limits
+    executor: Executor
+    if scheduler is None:
+        executor = Processes(max(1, min(jobs or os.cpu_count() or 1, len(todo))), limits)
+    else:
+        executor = Cluster(scheduler, limits)
     try:
         for outcome in execute(todo, prepared.folder, executor, again=again) if todo else ():
             states[outcome.key] = outcome.status

@@ -1,14 +1,16 @@
 """The report of an experiment."""
 
 import json
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
-from factorgraph_loc.experiments.experiment import Prepared
+from factorgraph_loc.experiments.experiment import Prepared, prepare
 from factorgraph_loc.experiments.keys import code_version, library_versions
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.result_table import collect
@@ -24,6 +26,24 @@ class Report:
 
     page: Path
     damaged: list[str]
+
+
+def report(
+    file: str | Path,
+    *,
+    changes: Mapping[str, Any] | None = None,
+    out: str | Path | None = None,
+    data_root: str | Path | None = None,
+    page: str | Path | None = None,
+) -> Path:
+    """Write the results of an experiment as an HTML page, and return its path: ``page``, by default ``report.html`` in its
+    folder.
+
+    Damaged results are listed on the page and left out. For the other arguments see
+    :func:`~factorgraph_loc.experiments.experiment.prepare`.
+    """
+    prepared = prepare(file, changes, out=out, data_root=data_root)
+    return report_experiment(prepared, None if page is None else Path(page)).page
 
 
 def report_experiment(prepared: Prepared, out: Path | None = None) -> Report:

@@ -9,7 +9,7 @@ from computed_here import Here
 
 from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.experiments import active
-from factorgraph_loc.experiments.active import ROW, jobs_of, run_jobs, seek
+from factorgraph_loc.experiments.active import ROW, jobs_of, run_jobs
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
@@ -55,7 +55,9 @@ def calls(monkeypatch):
 def test_each_policy_runs_on_each_seed(calls, tmp_path):
     told = []
     report = lambda done, total: told.append((done, total))  # noqa: E731
-    results = seek(OFFICE, ("information", "random"), ("active_mcl",), range(7), tmp_path / "out", progress=report)
+    results = active.active(
+        OFFICE, tmp_path / "out", policies=("information", "random"), seeds=range(7), progress=report
+    )
     assert sorted(calls) == sorted((p, "active_mcl", s) for p in ("information", "random") for s in range(7))
     assert not results.failures
     assert told[0] == (0, 14)
@@ -75,7 +77,7 @@ def test_each_policy_runs_on_each_seed(calls, tmp_path):
 @pytest.mark.usefixtures("calls")
 def test_files_of_an_experiment(tmp_path):
     out = tmp_path / "out"
-    results = seek(OFFICE, ("information", "random"), ("active_mcl",), range(3), out)
+    results = active.active(OFFICE, out, policies=("information", "random"), seeds=range(3))
     assert sorted(
         str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and "store" not in path.parts
     ) == [
@@ -98,7 +100,7 @@ def test_files_of_an_experiment(tmp_path):
 
 @pytest.mark.usefixtures("calls")
 def test_a_run_that_fails_is_a_row(tmp_path):
-    results = seek(OFFICE, ("information",), ("active_mcl",), range(5, 10), tmp_path)
+    results = active.active(OFFICE, tmp_path, seeds=range(5, 10))
     assert [row["status"] for row in results.rows] == ["ok", "ok", "failed", "failed", "ok"]
     assert list(results.rows[2]) == list(ROW)
     assert results.rows[2]["metres"] is None
@@ -113,7 +115,7 @@ def test_a_run_that_fails_is_a_row(tmp_path):
 @pytest.mark.usefixtures("calls")
 def test_input_that_no_run_takes_is_an_error(tmp_path):
     with pytest.raises(InputError, match="inside a wall"):
-        seek(OFFICE, ("information",), ("active_mcl",), (0, 1), tmp_path, ActiveSettings(start=(0.0, 0.0, 0.0)))
+        active.active(OFFICE, tmp_path, seeds=(0, 1), changes={"start": (0.0, 0.0, 0.0)})
     assert not (tmp_path / "results.parquet").exists()
 
 
@@ -144,6 +146,6 @@ def test_what_was_interrupted_goes_on(calls, tmp_path):
 )
 def test_names_are_checked_before_anything_runs(calls, tmp_path, policies, estimators, message):
     with pytest.raises(InputError, match=message):
-        seek(OFFICE, policies, estimators, (0,), tmp_path / "out")
+        active.active(OFFICE, tmp_path / "out", policies=policies, estimators=estimators)
     assert not calls
     assert not (tmp_path / "out").exists()

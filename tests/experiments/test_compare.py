@@ -14,7 +14,7 @@ from factorgraph_loc.io.results import FILES
 @pytest.mark.usefixtures("runs_here", "blank_pictures")
 def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
     nowhere = replace(log, name="no/where", reference=None)
-    estimators = {"dead_reckoning": {}, "particle_filter": {}}
+    estimators = ["dead_reckoning", "particle_filter"]
     out = tmp_path / "out"
     done = []
     comparison = compare(
@@ -55,10 +55,10 @@ def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
     assert "has no reference to start from" in page
 
     with pytest.raises(InputError, match="holds results already"):
-        compare([log], {"dead_reckoning": {}}, out)
+        compare([log], ["dead_reckoning"], out)
     (out / "notes.txt").write_text("mine")
     (out / "plots/mine.png").write_text("mine")
-    compare([log], {"dead_reckoning": {}}, out, overwrite=True)
+    compare([log], ["dead_reckoning"], out, overwrite=True)
     assert len(pl.read_csv(out / "results.csv")) == 1
     assert pl.read_csv(out / "differences.csv").is_empty()
     assert [folder.estimator for folder in find_runs(out)] == ["dead_reckoning"]
@@ -69,13 +69,13 @@ def test_a_failing_run_is_reported_while_the_others_complete(log, tmp_path):
 
 def test_bad_input_is_found_before_anything_runs(log, tmp_path):
     for logs, estimators, others, message in (
-        ([], {"ekf": {}}, {}, "nothing to compare"),
-        ([log], {}, {}, "nothing to compare"),
-        ([log, log], {"ekf": {}}, {}, "two logs are called straight"),
-        ([log], {"dead_reckoning": {"max_dely": 0.1}}, {}, "did you mean max_delay"),
-        ([log], {"smother": {}}, {}, "did you mean smoother"),
-        ([log], {"ekf": {}}, {"prior": "1"}, "prior is '1'"),
-        ([log], {"ekf": {}}, {"sensors": ["odometri"]}, "did you mean odometry"),
+        ([], ["ekf"], {}, "nothing to compare"),
+        ([log], [], {}, "nothing to compare"),
+        ([log, log], ["ekf"], {}, "two logs are called straight"),
+        ([log], ["ekf"], {"settings": {"ekf": {"max_dely": 0.1}}}, "did you mean max_delay"),
+        ([log], ["smother"], {}, "did you mean smoother"),
+        ([log], ["ekf"], {"prior": "1"}, "prior is '1'"),
+        ([log], ["ekf"], {"sensors": ["odometri"]}, "did you mean odometry"),
     ):
         with pytest.raises(InputError, match=message):
             compare(logs, estimators, tmp_path / "out", **others)
@@ -85,7 +85,7 @@ def test_bad_input_is_found_before_anything_runs(log, tmp_path):
 @pytest.mark.usefixtures("runs_here", "blank_pictures")
 def test_a_comparison_that_was_interrupted_goes_on_where_it_was(log, tmp_path):
     out = tmp_path / "out"
-    estimators = {"dead_reckoning": {}, "ekf": {}}
+    estimators = ["dead_reckoning", "ekf"]
 
     def interrupt(done, _):
         if done == 1:
@@ -111,7 +111,7 @@ def test_a_log_that_differs_has_another_digest(log):
 
 @pytest.mark.usefixtures("runs_here", "blank_pictures")
 def test_no_terminal_obeys_the_tables_of_a_log_with_any_name(log, tmp_path):
-    compare([replace(log, name="a\x1b[31m\u202eb")], {"dead_reckoning": {}, "ekf": {}}, tmp_path / "out")
+    compare([replace(log, name="a\x1b[31m\u202eb")], ["dead_reckoning", "ekf"], tmp_path / "out")
     for name in ("table.md", "results.csv", "differences.csv"):
         text = (tmp_path / "out" / name).read_text()
         assert all(line.isprintable() for line in text.split("\n")), name

@@ -133,8 +133,8 @@ def test_a_log_that_vanishes_or_changes_mid_way_is_a_failure(planned, out, tmp_p
 
 
 @pytest.fixture
-def experiment(log, tmp_path, out):
-    """``experiment(text)``: an experiment prepared from its file, with the log of a nasty name."""
+def experiment(log, tmp_path, out, runs_here):  # noqa: ARG001
+    """``experiment(text)``: an experiment prepared from its file, with the log of a nasty name; its runs are made here."""
     write_native(dataclasses.replace(log, name=NASTY), tmp_path / "log")
 
     def make(text="estimators = ['fake', 'ekf']", folder=out, **options):
@@ -148,7 +148,7 @@ def experiment(log, tmp_path, out):
 def test_the_table_has_a_row_a_run_and_names_stay_what_they_are(experiment, out, tmp_path):
     told = []
     text = "estimators = ['ekf', {name = 'smoother', label = 'short'}]\nsensors = ['odometry']\n[sweep]\nshort.lag = [1, 2]"
-    done = run_experiment(experiment(text), executor=Here(), progress=lambda *numbers: told.append(numbers))
+    done = run_experiment(experiment(text), progress=lambda *numbers: told.append(numbers))
     rows = load_results(out)
     assert rows.equals(done.rows)
     assert rows["log"].to_list() == [NASTY] * 3
@@ -168,38 +168,39 @@ def test_failures_are_rows_and_are_tried_again_if_told(experiment, fake, monkeyp
 
     with monkeypatch.context() as patch:
         patch.setattr(fake, "process", fail)
-        done = run_experiment(experiment(), executor=Here())
+        done = run_experiment(experiment())
     assert done.rows["status"].to_list() == ["failed", "ok"]
     assert done.rows["reason"].to_list() == ["cannot go on", None]
     assert done.failures == [f"{NASTY}, fake, seed 0: cannot go on"]
     assert experiment().todo() == []
     (again,) = experiment().todo(again=True)
     assert again.label == "fake"
-    done = run_experiment(experiment(), again=True, executor=Here())
+    done = run_experiment(experiment(), again=True)
     assert done.rows["status"].to_list() == ["ok", "ok"]
 
 
 def test_a_damaged_result_is_found_and_done_again(experiment, out):
-    first = run_experiment(experiment(), executor=Here()).rows
+    first = run_experiment(experiment()).rows
     key = first["key"][1]
     (Store(out).path(key) / "estimates.parquet").write_bytes(b"")
     prepared = experiment()
     assert Counter(prepared.states.values()) == {"ok": 1, "damaged": 1}
     assert [one.key for one in prepared.todo()] == [key]
-    second = run_experiment(prepared, executor=Here()).rows
+    second = run_experiment(prepared).rows
     times = [name for name in first.columns if name.startswith("timing.")]
     assert second.drop(times).equals(first.drop(times))
 
 
-def test_the_table_is_written_when_an_experiment_is_stopped(experiment, out):
+def test_the_table_is_written_when_an_experiment_is_stopped(experiment, out, monkeypatch):
     class Stopped(Here):
         def submit(self, take, left):
             if left == 1:
                 raise KeyboardInterrupt
             super().submit(take, left)
 
+    monkeypatch.setattr("factorgraph_loc.experiments.experiment.Processes", Stopped)
     with pytest.raises(KeyboardInterrupt):
-        run_experiment(experiment(), executor=Stopped())
+        run_experiment(experiment())
     assert load_results(out)["label"].to_list() == ["fake"]
     assert [one.label for one in experiment().todo()] == ["ekf"]
 
@@ -208,9 +209,9 @@ def test_an_experiment_ends_with_one_line_when_the_disk_is_full_and_goes_on_when
     disk = small_disk(120)
     text = "estimators = ['particle_filter']\nseeds = '0:20'"
     with pytest.raises(StoreError, match="No space left on device"):
-        run_experiment(experiment(text, folder=disk), executor=Here())
+        run_experiment(experiment(text, folder=disk))
     counts = Counter(experiment(text, folder=disk, verify=True).states.values())
     assert 0 < counts["ok"] < 20
     assert set(counts) == {"ok", "missing"}
     subprocess.run(["mount", "-o", "remount,size=10M", disk], check=True)
-    assert len(run_experiment(experiment(text, folder=disk), executor=Here()).rows) == 20
+    assert len(run_experiment(experiment(text, folder=disk)).rows) == 20

@@ -121,6 +121,6 @@ def test_a_comparison_finds_features_once(seeing, sees, tmp_path, monkeypatch):
 
     monkeypatch.setattr(frontend, "_find", noted)
     monkeypatch.setattr(sees, "deterministic", False)
-    rows = compare([seeing], {"fake": {}}, tmp_path / "out", seeds=range(3)).rows
+    rows = compare([seeing], ["fake"], tmp_path / "out", seeds=range(3)).rows
     assert [row["timing.images"] for row in rows] == [8, 8, 8]
     assert sorted(found) == [f"{k}.png" for k in range(8)]

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import computed_here
 import pytest
-from computed_here import Here
 
-from factorgraph_loc.experiments.experiment import prepare, run_experiment
+from factorgraph_loc.experiments.experiment import experiment
 
 SCRIPT = """
 import sys
 sys.path.append(sys.argv[1])
 from computed_here import Here
-from factorgraph_loc.experiments.experiment import prepare, run_experiment
+from factorgraph_loc.experiments import experiment
+experiment.Processes = Here
 for out in sys.argv[3:]:
-    run_experiment(prepare(sys.argv[2], out=out), executor=Here())
+    experiment.experiment(sys.argv[2], out=out)
 """
 MANY = """
 name = "many"
@@ -55,9 +55,10 @@ def wait_for_results(out, count):
         time.sleep(0.01)
 
 
+@pytest.mark.usefixtures("runs_here")
 def test_two_processes_share_the_work_of_one_experiment_and_one_that_is_killed_loses_nothing(start, tmp_path):
     # what numba compiles in one go is rounded in another way than what it has kept, which the others use
-    run_experiment(prepare(tmp_path / "many.toml", out=tmp_path / "compiled"), executor=Here())
+    experiment(tmp_path / "many.toml", out=tmp_path / "compiled")
     killed, other = start("disturbed"), start("disturbed", "undisturbed")
     wait_for_results(tmp_path / "disturbed", 3)
     killed.kill()

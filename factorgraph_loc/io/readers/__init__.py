@@ -1,15 +1,19 @@
 """Readers of log formats, one module each, and ``load``, which selects the reader."""
 
-from factorgraph_loc.io.readers.load import load, read_log, reader
+from factorgraph_loc.io.readers.load import LogLike, RigLike, WorldLike, load, load_all, read_log, reader
 from factorgraph_loc.io.readers.manifests import Dataset, Manifest, describe, read_manifest, verify
 from factorgraph_loc.plugins import READERS
 
 __all__ = [
     "READERS",
     "Dataset",
+    "LogLike",
     "Manifest",
+    "RigLike",
+    "WorldLike",
     "describe",
     "load",
+    "load_all",
     "manifests",
     "mapped",
     "mrclam",

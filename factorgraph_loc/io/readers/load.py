@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,9 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import READERS
 from factorgraph_loc.text import listed, one_line, quoted
 
+LogLike = Log | str | Path
+RigLike = Rig | str | Path
+WorldLike = World | str | Path
 RUN_FILE = "run.toml"
 MOST = 1000  # maximum number of logs from lists of options
 TABLES = (".csv", *JSON_SUFFIXES)
@@ -62,13 +65,13 @@ class _Source:
 
 
 def load(
-    log: Log | str | Path,
+    log: LogLike,
     *,
     data_root: str | Path | None = None,
     reader: str | None = None,
     options: Mapping[str, Any] | None = None,
-    rig: Rig | str | Path | None = None,
-    world: World | str | Path | None = None,
+    rig: RigLike | None = None,
+    world: WorldLike | None = None,
 ) -> list[Log]:
     """The logs that ``log`` refers to.
 
@@ -108,14 +111,22 @@ def load(
     ]
 
 
+def load_all(
+    logs: LogLike | Sequence[LogLike], rig: RigLike | None = None, world: WorldLike | None = None
+) -> list[Log]:
+    """The logs that one or several values refer to, as in :func:`load`."""
+    several = [logs] if isinstance(logs, (Log, str, Path)) else logs
+    return [found for log in several for found in load(log, rig=rig, world=world)]
+
+
 def read_log(
-    log: Log | str | Path,
+    log: LogLike,
     *,
     data_root: str | Path | None = None,
     reader: str | None = None,
     options: Mapping[str, Any] | None = None,
-    rig: Rig | str | Path | None = None,
-    world: World | str | Path | None = None,
+    rig: RigLike | None = None,
+    world: WorldLike | None = None,
 ) -> Log:
     """The log that ``log`` refers to, as in :func:`load`; InputError if there are several."""
     logs = load(log, data_root=data_root, reader=reader, options=options, rig=rig, world=world)
