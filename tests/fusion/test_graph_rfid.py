@@ -19,7 +19,7 @@ from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, IncrementStream
-from factorgraph_loc.sensors.rfid.stream import RfidScan, RfidStream
+from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import preset, simulate
 from factors import se2
 
@@ -44,63 +44,10 @@ def errors(log: Log, result: RunResult) -> np.ndarray:
     return np.hypot(difference[:, 0], difference[:, 1])
 
 
-def test_smoother_is_near_and_knows_how_near() -> None:
-    """One run of 80 s has a dozen independent stretches: bounds at three times what many runs have on average."""
-    log, result = plain()
-    figures = score(result, log)
-    assert figures["causal.position_rmse"] < 0.2
-    assert figures["final.position_rmse"] < 0.12
-    assert figures["final.position_rmse"] < figures["causal.position_rmse"]
-    assert 0.5 < figures["causal.anees"] < 9.0
-    assert 0.5 < figures["final.anees"] < 9.0
-
-
 def test_final_is_the_optimum() -> None:
     log, result = plain()
     batch = run(log, RunConfig("batch"))
     assert np.hypot(*(batch.final.poses - result.final.poses)[:, :2].T).max() < 0.01
-
-
-def test_a_window_is_between_filter_and_optimum() -> None:
-    log, full = plain()
-    window = run(log, RunConfig("smoother", {"lag": 10.0}))
-    of_full, of_window = score(full, log), score(window, log)
-    assert of_window["causal.position_rmse"] < 1.1 * of_full["causal.position_rmse"] + 0.01
-    assert of_window["final.position_rmse"] < of_window["causal.position_rmse"]
-
-
-def test_scans_that_come_late_are_put_in_at_their_time() -> None:
-    """Each third scan arrives after the two that follow it: rows in another order, with the same stamps."""
-    log, in_time = plain()
-    stream = log.streams["rfid"]
-    assert isinstance(stream, RfidStream)
-    stamps = {t: i for i, t in enumerate(np.unique(stream.t))}
-    # scans are half a second apart: a delay of one of them is what is allowed by default
-    place = np.array([stamps[t] + (1.5 if stamps[t] % 3 == 0 else 0.0) for t in stream.t])
-    order = np.argsort(place, kind="stable")
-    columns = {
-        name: getattr(stream, name)[order] if isinstance(getattr(stream, name), np.ndarray) else None
-        for name in ("t", "round", "age", "rssi", "phase", "frequency")
-    }
-    late = replace(stream, antenna=[stream.antenna[i] for i in order], epc=[stream.epc[i] for i in order], **columns)
-    result = run(replace(log, streams={**log.streams, "rfid": late}), RunConfig("smoother"))
-    assert not result.diagnostics.late
-    assert np.hypot(*(result.final.poses - in_time.final.poses)[:, :2].T).max() < 0.03
-
-
-@pytest.mark.parametrize(
-    ("faults", "bound"),
-    [
-        ({"false_reads": 0.2}, 0.2),
-        ({"clock_jump": {"time": 25.0, "jump": -3.0}}, 2.0),
-    ],
-)
-def test_faults_degrade(faults: Mapping[str, Any], bound: float) -> None:
-    """Bounds at about twice what this log has; a clock that is 3 s late costs 3 s of the way for as long as it lasts."""
-    log = office(faults, drive={"duration": 40.0})
-    result = run(log, RunConfig("smoother"))
-    assert np.all(np.isfinite(result.poses))
-    assert score(result, log)["causal.position_rmse"] < bound
 
 
 def test_a_silence_of_all_tags_is_no_place() -> None:

@@ -7,17 +7,16 @@ import pytest
 from landmark_world import simulate, with_sightings
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.evaluation.metrics import errors, score
+from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.cloud import Cloud, largest_share, pose_moments, systematic
 from factorgraph_loc.fusion.particle_filter import ParticleFilter, ParticleFilterSettings
-from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream, BearingRangeUncertainty
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeUncertainty
 from factors import se2
 
 UNKNOWN = RunConfig("particle_filter", {"particles": 1000}, prior="unknown")
@@ -35,28 +34,6 @@ def only(log, landmarks):
 
 def events(result):
     return [what.partition(":")[0] for _, what in result.diagnostics.events]
-
-
-def test_unknown_start(log):
-    result = run(log, UNKNOWN)
-    scores = score(result, log)
-    assert result.status[0] == "unlocalized"
-    assert events(result) == ["localized"]
-    assert scores["time_to_localized"] < 5.0
-    assert scores["causal.position_max"] < 0.5
-    assert scores["final.position_rmse"] < 0.06
-    assert result.final.t[0] < 0.5
-    again = run(cut(log, 0.0, 5.0), UNKNOWN)
-    np.testing.assert_array_equal(result.poses[:40], again.poses[:40])
-
-
-def test_late_sightings_of_an_unknown_start(log):
-    s = log.streams["bearing_range"]
-    order = np.argsort(s.t + np.random.default_rng(3).uniform(0.0, 0.4, len(s.t)), kind="stable")
-    stream = BearingRangeStream(s.t[order], [s.landmark[i] for i in order], s.range[order], s.bearing[order])
-    result = run(replace(log, streams={**log.streams, "bearing_range": stream}), UNKNOWN)
-    assert events(result) == ["localized"]
-    assert score(result, log)["causal.position_max"] < 0.6
 
 
 def test_one_landmark_is_ambiguous(log, tmp_path):
@@ -157,14 +134,6 @@ def test_constants_of_the_sensor_travel_with_the_particles():
     assert right["causal.position_rmse"] < 0.5 * left["causal.position_rmse"]
     assert right["final.position_rmse"] < 0.06
     assert right["final.anees"] < 6.0
-
-
-def test_recorded_start_and_kidnapping(data_root):
-    (log,) = load("mrclam6-robot3", data_root=data_root)
-    carried = join(cut(log, 310.0, 330.0), cut(log, 105.0, 135.0))
-    result = run(carried, UNKNOWN)
-    assert events(result) == ["localized", "lost", "recovered"]
-    assert errors(result.causal(), carried.reference).position[-50:].max() < 0.5
 
 
 class Likely:

@@ -82,25 +82,6 @@ def test_posterior_of_one_tag(kld):
     np.testing.assert_allclose(np.diag(estimate.covariance), np.diag(expected), rtol=0.08)
 
 
-def test_known_start(log):
-    result = run(log, replace(KNOWN, settings={"particles": 1500}))
-    assert np.sqrt(np.mean(position_errors(result, log) ** 2)) < 0.2
-    final = np.linalg.norm(result.final.poses[:, :2] - log.reference.at(result.final.t)[:, :2], axis=1)
-    assert np.sqrt(np.mean(final**2)) < 0.12
-    assert events(result) == []
-    constants = {"scale_distance", "scale_rotation", "heading_drift", "rfid.range_scale", "rfid.read_rate"}
-    assert set(result.learnt.values) == constants
-    assert len(result.diagnostics.nis["rfid"]) > 50
-
-
-def test_start_three_metres_and_sixty_degrees_off(log):
-    wrong = log.start.pose + np.array((2.1, 2.1, np.radians(60.0)))
-    off = replace(log, start=replace(log.start, pose=wrong))
-    result = run(off, KNOWN)
-    assert position_errors(result, off)[result.t > 15.0].max() < 0.5
-    assert "ambiguous" in result.status
-
-
 def test_silence_of_a_minute_is_survived():
     log = office(0, 85.0, faults={"silence": {"time": 10.0, "duration": 60.0}})
     result = run(log, KNOWN)

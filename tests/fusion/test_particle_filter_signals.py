@@ -10,7 +10,6 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
@@ -85,27 +84,6 @@ def test_phases_leave_particles_enough():
     error[:, 2] = np.mod(error[:, 2] + np.pi, 2.0 * np.pi) - np.pi
     nees = np.einsum("ni,ni->n", error, np.linalg.solve(result.covariances, error[..., None])[..., 0])
     assert nees.mean() < 10.0
-
-
-def test_unknown_start():
-    log = cut(office(1), 0.0, 15.0)
-    result = run(log, config("rssi", "phase", prior="unknown"))
-    assert events(result) == ["localized"]
-    assert position_errors(result, log)[result.t > 6.0].max() < 0.5
-    assert rms(position_errors(result, log)[result.t > 10.0]) < 0.15
-
-
-def test_kidnapped():
-    log = office(1, 150.0)
-    carried = join(cut(log, 0.0, 15.0), cut(log, 130.0, 150.0))
-    result = run(carried, config("phase", settings={"particles": 800}))
-    assert events(result) == ["lost", "recovered"]
-    assert position_errors(result, carried)[result.t > 30.0].max() < 0.4
-    # of what lies between the two places nothing is told
-    assert np.nanmax(final_errors(result, carried)) < 0.6
-    assert 0.5 < np.diff(result.final.t).max() < 3.0
-    dated = float(result.diagnostics.events[0][1].split("since ")[1].removesuffix(" s"))
-    assert 14.0 < dated < 17.0
 
 
 def test_start_three_metres_and_sixty_degrees_off():

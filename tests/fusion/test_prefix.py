@@ -1,12 +1,10 @@
 """What an estimator says at a time is the same whether the log goes on or not: every estimator on every sensor."""
 
 from dataclasses import replace
-from functools import cache
 
 import cv2
 import numpy as np
 import pytest
-from recorded_logs import recorded_log
 from short_logs import frames, late, office, plaza, room, with_gyro
 
 from factorgraph_loc.errors import InputError
@@ -90,27 +88,6 @@ def test_causal_estimates_do_not_know_what_comes(name, kind):
     check(log, RunConfig(name, SETTINGS.get(name, {}), **more), (first + last) / 2.0)
 
 
-@cache
-def begun(recorded, data_root, seconds):
-    """The first seconds of a recorded log."""
-    log = recorded_log(recorded, data_root)
-    return prefix(log, log.span()[0] + seconds)
-
-
-@pytest.mark.parametrize(
-    ("recorded", "seconds", "names"),
-    [
-        ("mrclam6-robot1", 8.0, ESTIMATORS),
-        ("woods-r1", 8.0, ESTIMATORS),
-        ("rfid-aisle-run13", 4.0, ("ekf", "particle_filter", "smoother")),
-    ],
-)
-def test_nor_on_recorded_logs(recorded, seconds, names, data_root):
-    log = begun(recorded, data_root, seconds)
-    for name in names:
-        check(log, RunConfig(name, SETTINGS.get(name, {})), log.span()[0] + seconds / 2.0)
-
-
 @pytest.mark.parametrize(
     ("name", "kind", "settings"),
     [
@@ -151,16 +128,3 @@ def test_nor_do_features_that_are_found_in_images(name, tmp_path):
     log = replace(log, rig=rig, streams=streams, world=World(points=PointMap.of((), np.empty((0, 3)))))
     config = RunConfig(name, SETTINGS[name] | {"landmarks": "unknown"}, prior="0,0,0")
     check(log, config, 1.3)
-
-
-def test_a_look_ahead_would_be_seen():
-    """The test itself: a log whose first half depends on its second fails it."""
-    log = office()
-    short = prefix(log, 7.0)
-    config = RunConfig("ekf", SETTINGS["ekf"], ("odometry", "bearing_range"))
-    seen = set(short.streams["bearing_range"].landmark)
-    less = log.world.model_copy(
-        update={"landmarks": {n: m for n, m in log.world.landmarks.items() if n in sorted(seen)[1:]}}
-    )
-    whole, part = run(log, config), run(replace(short, world=less), config)
-    assert np.abs(part.poses - whole.poses[: len(part.t)]).max() > 1e-6

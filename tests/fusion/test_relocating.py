@@ -8,18 +8,14 @@ import pytest
 from landmark_world import dirty, simulate, swapped, with_sightings
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import cut, join
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 
 CONFIGS = {
     "smoother": RunConfig("smoother"),
     "smoother_lag": RunConfig("smoother", {"lag": 10.0}),
     "batch": RunConfig("batch"),
 }
-LOST = "lost: landmarks were not where they were expected since {:.1f} s; goes on at another place"
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +26,6 @@ def log():
 @pytest.fixture(scope="module")
 def kidnapped():
     return landmark_world.kidnapped()
-
-
-@pytest.fixture(scope="module")
-def recorded(data_root):
-    return cut(load("mrclam6-robot3", data_root=data_root)[0], 300.0, 340.0)
 
 
 def silent(log, start, end):
@@ -61,58 +52,6 @@ def distance(a, b):
     """Largest distance [m] between two trajectories at the stamps that both have."""
     _, i, k = np.intersect1d(a.t, b.t, return_indices=True)
     return np.hypot(*(a.poses[i] - b.poses[k])[:, :2].T).max()
-
-
-@pytest.mark.parametrize(("name", "how"), [("smoother", lambda log: log), ("batch", dirty)], ids=["clean", "batch"])
-def test_unknown_start(name, how, log):
-    log = how(log)
-    result = run(log, replace(CONFIGS[name], prior="unknown"))
-    ((t, event),) = result.diagnostics.events
-    assert event == "localized"
-    if name != "batch":  # which has no causal result
-        (before, _), (between, _), (after, since) = changes(result)
-        assert (before, between, after) == ("unlocalized", "ambiguous", "localized")
-        assert t <= since < min(t + 0.11, 5.0)
-        assert off(result.causal(), log)[0] < 0.3
-        assert off(result.causal(), log).max() < 0.3
-    # what told the place is taken in from its first sighting on
-    assert result.final.t[0] < 0.3
-    assert off(result.final, log).max() < 0.15
-    assert distance(result.final, run(log, CONFIGS[name]).final) < 0.1
-
-
-@pytest.mark.parametrize("name", ["smoother_lag", "batch"])
-def test_wrong_start(name, log):
-    result = run(log, replace(CONFIGS[name], prior="3,3,1.0"))
-    ((t, event),) = result.diagnostics.events
-    assert event == LOST.format(log.streams["bearing_range"].t[0])
-    assert t < 5.0
-    if name != "batch":
-        assert off(result.causal(), log)[result.t > t].max() < 0.3
-    assert off(result.final, log)[result.final.t > 0.2].max() < 0.15
-
-
-@pytest.mark.parametrize(("name", "prior"), [("smoother_lag", None), ("batch", None), ("smoother", "unknown")])
-def test_kidnapped(name, prior, kidnapped, log):
-    result = run(kidnapped, replace(CONFIGS[name], prior=prior))
-    events = [what for _, what in result.diagnostics.events]
-    assert events[:-1] == ([] if prior is None else ["localized"])
-    assert events[-1].startswith("lost: ")
-    t = result.diagnostics.events[-1][0]
-    # a suspicion needs 2 s of landmarks, of which most are where they should not be
-    assert 10.0 < t < 13.0
-    if name != "batch":
-        assert np.nanmax(off(result.causal(), kidnapped)[result.causal().t > t]) < 0.3
-    # the jump is known only after it, but spoils nothing before
-    final = off(result.final, kidnapped)
-    assert np.nanmax(final[result.final.t < 9.8]) < 0.15
-    assert np.nanmax(final[result.final.t > 10.5]) < 0.15
-    undisturbed = run(cut(log, 0.0, 10.0), replace(CONFIGS[name], prior=prior))
-    early = result.final.t < 9.0
-    assert np.hypot(*(result.final.poses[early] - undisturbed.final.poses[: early.sum()])[:, :2].T).max() < 0.05
-    # and no causal estimate is taken back
-    if name != "batch":
-        np.testing.assert_array_equal(result.poses[:90], undisturbed.poses[:90])
 
 
 def test_a_lost_track_is_ambiguous_until_its_place_is_found(log):
@@ -216,26 +155,3 @@ def test_nothing_tells_the_place(name, how, log):
 def test_landmarks_that_are_to_be_estimated_cannot_tell_the_place(log):
     with pytest.raises(InputError, match="cannot start from an unknown pose"):
         run(log, RunConfig("smoother", {"landmarks": "unknown"}, prior="unknown"))
-
-
-def test_late_sightings_of_an_unknown_start(log):
-    s = log.streams["bearing_range"]
-    order = np.argsort(s.t + np.random.default_rng(3).uniform(0.0, 0.4, len(s.t)), kind="stable")
-    stream = BearingRangeStream(s.t[order], [s.landmark[i] for i in order], s.range[order], s.bearing[order])
-    result = run(
-        replace(log, streams={**log.streams, "bearing_range": stream}),
-        replace(CONFIGS["smoother_lag"], prior="unknown"),
-    )
-    assert [what for _, what in result.diagnostics.events] == ["localized"]
-    assert off(result.causal(), log).max() < 0.3
-    assert off(result.final, log).max() < 0.15
-
-
-def test_recorded_start(recorded):
-    log = recorded
-    result = run(log, replace(CONFIGS["smoother"], prior="unknown"))
-    assert [what for _, what in result.diagnostics.events] == ["localized"]
-    found = errors(result.final, log.reference)
-    assert np.nanmax(found.position) < 0.5
-    assert np.nanmax(found.heading) < 0.3
-    assert off(result.causal(), log)[0] < 0.5

@@ -133,25 +133,6 @@ def test_one_landmark_is_enough_where_the_position_is_known(name, log):
     check(one, result, within=6.0)
 
 
-@cache
-def office():
-    return simulated(preset("office", {"drive": {"duration": 25.0}}), 1)
-
-
-@pytest.mark.parametrize("name", ["particle_filter", "smoother"])
-def test_tags_tell_the_heading(name):
-    log = office()
-    result = run(log, replace(CONFIGS[name], prior=position(log)))
-    check(log, result, within=15.0, off=0.6)
-
-
-@pytest.mark.parametrize("name", ["particle_filter", "smoother_lag"])
-def test_a_camera_tells_the_heading(name):
-    log = camera_world.simulate(seconds=5.0)
-    result = run(log, replace(CONFIGS[name], prior=position(log)))
-    check(log, result, within=0.5, off=0.1)
-
-
 def test_a_camera_that_sees_the_robot_elsewhere_is_not_believed():
     log = camera_world.simulate(seconds=3.0)
     x, y, _ = log.reference.poses[0]
@@ -178,14 +159,6 @@ def test_before_anything_is_seen_the_position_is_known_as_far_as_it_can_be(log):
             error[2] = se2.wrap_scalar(error[2])
             assert error @ np.linalg.solve(result.covariances[i], error) < UNLIKELY
         check(late, result, within=14.0)
-
-
-def test_the_past_alone_finds_it(log):
-    for name in ("ekf", "smoother", "particle_filter"):
-        config = replace(CONFIGS[name], prior=position(log))
-        whole, part = run(log, config), run(cut(log, 0.0, 8.0), config)
-        np.testing.assert_array_equal(whole.poses[:80], part.poses[:80])
-        assert whole.status[:80] == part.status[:80]
 
 
 def test_a_reference_without_headings_is_a_position(log):
