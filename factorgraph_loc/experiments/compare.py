@@ -91,14 +91,11 @@ def compare(
     its key (see :class:`~factorgraph_loc.experiments.store.Store`). ``rpe``: also show relative errors, as further tables in
     ``table.md`` and further scores in the report. ``progress`` is called with the number of runs done and of all.
 
-    Raises InputError before anything runs: without logs or estimators, for two logs of one name, invalid settings or prior, a
-    sensor that no log has, or an ``out`` that contains results without ``overwrite``.
+    Raises InputError, before anything runs, for invalid or missing input, and for results in ``out`` without ``overwrite``.
     """
     out = Path(out)
     check_free(out, overwrite=overwrite)
-    named = _named(estimators, settings or {})
-    if final_only:
-        named = registry.for_final_only(named)
+    named = _named(estimators, settings or {}, final_only=final_only)
     logs = load_all(logs, rig, world)
     if not logs or not named:
         raise InputError("there is nothing to compare, expected at least one log and one estimator")
@@ -124,11 +121,14 @@ def compare(
     return Comparison(rows, done.failures, done.warnings)
 
 
-def _named(estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Mapping[str, Any]]:
+def _named(
+    estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]], *, final_only: bool
+) -> Mapping[str, Mapping[str, Any]]:
     """The settings of each estimator, by name; InputError for settings of another one."""
     if others := [name for name in settings if name not in estimators]:
         raise InputError(f"settings are given for {others[0]}, which is not run here; run: {listed(estimators)}")
-    return {name: settings.get(name, {}) for name in estimators}
+    named = {name: settings.get(name, {}) for name in estimators}
+    return registry.for_final_only(named) if final_only else named
 
 
 def _find_features(logs: Sequence[Log], prepared: Prepared) -> None:
