@@ -89,7 +89,7 @@ def _subtract(left: Array, right: Array, out: Array) -> None:
 
 @compiled
 def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Array, Array]:
-    """Eliminate one pose after the other, with ``damping`` added to the diagonal.
+    """Eliminate one pose after the other, with the share ``damping`` of the diagonal added to it.
 
     Returns whether that is possible; the inverse block of each pose (N, 3, 3), and its products with the blocks by the next pose
     (N, 3, 3) and by the parameters and the gradient (N, 3, P + 1); and the remaining block of the parameters (P + 1, P + 1).
@@ -99,10 +99,10 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
     inverses, by_next, by_side = np.zeros_like(own), np.zeros_like(own), np.zeros_like(side)
     block, here, left = own[0].copy(), side[0].copy(), corner.copy()
     for i in range(shared):
-        left[i, i] += damping
+        left[i, i] *= 1.0 + damping
     for i in range(count):
         for a in range(POSE):
-            block[a, a] += damping
+            block[a, a] += damping * own[i, a, a]
         if not _inverted(block, inverses[i]):
             return False, inverses, by_next, by_side, left
         put(product(inverses[i], after[i]), by_next[i])
@@ -117,7 +117,7 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
 
 @compiled
 def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
-    """The Gauss-Newton step, with ``damping`` added to the diagonal: of the poses (N, 3) and of the parameters (P,).
+    """The step of the poses (N, 3) and of the parameters (P,), with the share ``damping`` of the diagonal added to that.
 
     The first value is False if the problem does not determine the poses. LinAlgError if it does not determine the parameters.
     """

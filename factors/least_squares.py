@@ -14,7 +14,8 @@ from factors.se2 import Array, Integers
 
 DAMPING, MAX_DAMPING = 1e-3, 1e8
 LEAST = 1e-9  # curvature of a direction that its problem does not determine
-MAX_ITERATIONS, CONVERGED_GAIN, INITIAL_DAMPING = 100, 1e-6, 1e-4  # of `descended`; gain relative to the cost
+# of `descended`: a gain relative to the cost, and a step in m, rad or the units of other variables
+MAX_ITERATIONS, CONVERGED_GAIN, CONVERGED_STEP, INITIAL_DAMPING = 100, 1e-6, 1e-6, 1e-8
 State = TypeVar("State")
 
 
@@ -88,23 +89,27 @@ def minimum(
 
 def descended(
     cost_of: Callable[[State], float],
-    moved: Callable[[State, float], State | None],
+    moved: Callable[[State, float], tuple[State, float] | None],
     state: State,
     max_iterations: int = MAX_ITERATIONS,
     converged: float = CONVERGED_GAIN,
 ) -> tuple[State, float, int]:
-    """The local minimum of a cost, the cost there, and the number of steps. ``moved``: the state after a step with some damping;
-    None where that is not determined. Solved when a step lowers the cost by less than the share ``converged``."""
+    """The local minimum of a cost, the cost there, and the number of steps.
+
+    ``moved``: the state after a step whose damping is a share of the curvature, and the largest component of the step; None where
+    the step is not determined. The problem is solved when a step is below :data:`CONVERGED_STEP`, or lowers the cost by less than
+    the share ``converged``.
+    """
     damping, cost, iteration = INITIAL_DAMPING, cost_of(state), 0
     while iteration < max_iterations and damping < MAX_DAMPING:
         iteration += 1
         new = moved(state, damping)
-        new_cost = math.inf if new is None else cost_of(new)
+        new_cost = math.inf if new is None else cost_of(new[0])
         if new is None or not (math.isfinite(new_cost) and new_cost <= cost):
             damping *= 10.0
             continue
         gained = cost - new_cost
-        state, cost, damping = new, new_cost, damping / 10.0
-        if gained <= converged * cost:
+        (state, step), cost, damping = new, new_cost, damping / 10.0
+        if step <= CONVERGED_STEP or gained <= converged * cost:
             break
     return state, cost, iteration

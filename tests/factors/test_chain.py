@@ -29,7 +29,8 @@ def test_a_step_is_that_of_dense_algebra(rows):
     whole = dense(poses, first, jacobian)
     for damping in (0.0, 0.3):
         found, steps, shared = chain.solved(chain.normal(poses, first, jacobian, residual), damping)
-        expected = -np.linalg.solve(whole.T @ whole + damping * np.eye(whole.shape[1]), whole.T @ residual)
+        curvature = whole.T @ whole
+        expected = -np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), whole.T @ residual)
         assert found
         np.testing.assert_allclose(np.concatenate((steps.ravel(), shared)), expected, rtol=1e-9, atol=1e-12)
 
@@ -52,4 +53,3 @@ def test_what_is_not_determined_is_said(rows):
     system = chain.normal(poses, first, jacobian, residual)
     assert not chain.solved(system, 0.0)[0]
     assert not chain.covariances(system)[0]
-    assert chain.solved(system, 1e-3)[0]

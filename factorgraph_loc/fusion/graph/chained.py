@@ -73,13 +73,17 @@ class Chained:
             begin += stack.rows
         return chain.normal(len(poses), self._first, jacobian, residual)
 
-    def moved(self, state: State, damping: float) -> State | None:
-        """A step of Levenberg and Marquardt; None where the problem is nearly singular."""
+    def moved(self, state: State, damping: float) -> tuple[State, float] | None:
+        """The state after a step of Levenberg and Marquardt, and the largest component of the step; None where the problem is
+        nearly singular."""
         try:
             found, poses, parameters = chain.solved(self.system(state), damping)
         except np.linalg.LinAlgError:
             return None
-        return (se2.compose(state[0], se2.exp(poses)), state[1] + parameters) if found else None
+        if not found:
+            return None
+        largest = max(np.abs(poses).max(initial=0.0), np.abs(parameters).max(initial=0.0))
+        return (se2.compose(state[0], se2.exp(poses)), state[1] + parameters), float(largest)
 
     def covariances(self, values: Values) -> Covariances | None:
         """Marginal covariances of all variables; None where they must be found with more digits."""

@@ -15,7 +15,7 @@ import numpy as np
 from factorgraph_loc.fusion.graph.chained import Chained
 from factorgraph_loc.fusion.graph.marginals import Covariances, covariances
 from factors.graph import GTSAM_ERRORS, Factor, Values, gather, gaussian_factor, jacobian_factors, retract
-from factors.least_squares import MAX_ITERATIONS, descended
+from factors.least_squares import LEAST, MAX_ITERATIONS, descended
 
 
 @dataclass(frozen=True)
@@ -48,16 +48,25 @@ class Problem:
             return Solution(values | chain.values(state), cost, iterations)
         return Solution(*descended(self.cost, self._moved, values, max_iterations))
 
-    def _moved(self, values: Values, damping: float) -> Values | None:
-        """A step of Levenberg and Marquardt; None where the problem is nearly singular."""
+    def _moved(self, values: Values, damping: float) -> tuple[Values, float] | None:
+        """The values after a step of Levenberg and Marquardt, and the largest component of the step; None where the problem is
+        nearly singular."""
         linear = self.linearize(values)
-        for key, value in values.items():
-            linear.add(gaussian_factor((key,), np.zeros(len(value)), (np.sqrt(damping) * np.eye(len(value)),)))
+        curvature = {key: np.full(len(value), LEAST) for key, value in values.items()}
+        for i in range(linear.size()):
+            factor = linear.at(i)
+            columns, end = np.square(factor.jacobian()[0]).sum(axis=0), 0
+            for key in factor.keys():  # noqa: SIM118
+                begin, end = end, end + len(curvature[key])
+                curvature[key] += columns[begin:end]
+        for key, diagonal in curvature.items():
+            linear.add(gaussian_factor((key,), np.zeros(len(diagonal)), (np.diag(np.sqrt(damping * diagonal)),)))
         try:
             step = linear.optimize()
         except GTSAM_ERRORS:
             return None
-        return {key: retract(key, value, step.at(key)) for key, value in values.items()}
+        largest = max((float(np.abs(step.at(key)).max()) for key in values), default=0.0)
+        return {key: retract(key, value, step.at(key)) for key, value in values.items()}, largest
 
     def cost(self, values: Values) -> float:
         """The robust cost, infinite where it is not a number."""

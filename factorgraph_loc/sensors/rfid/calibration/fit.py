@@ -60,16 +60,18 @@ def fit_linear(
         found = terms(offset + design @ p, hits, count, floor.false_read, floor.miss)
         return float(np.sum(found.nll) + 0.5 * p @ (penalty @ p))
 
-    def moved(p: Array, damping: float) -> Array:
+    def moved(p: Array, damping: float) -> tuple[Array, float]:
         found = terms(offset + design @ p, hits, count, floor.false_read, floor.miss)
         gradient = design.T @ found.gradient + penalty @ p
         if not sparse.issparse(design):
             curvature = design.T @ (found.information[:, None] * design) + penalty
-            return p - np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
+            step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
+            return p - step, float(np.abs(step).max())
         curvature = design.T @ sparse.diags_array(found.information) @ design + penalty
         damped = sparse.csc_matrix(curvature + damping * sparse.diags_array(curvature.diagonal()))
         factor = splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        return np.asarray(p - factor.solve(gradient))
+        step = np.asarray(factor.solve(gradient))
+        return p - step, float(np.abs(step).max())
 
     return descended(cost, moved, np.zeros(design.shape[1]), ITERATIONS, CONVERGED)[0]
 
