@@ -42,28 +42,3 @@ def test_a_robot_that_finds_nothing_gives_up(fgloc, tmp_path):
     assert not row["localized"]
     assert 2.0 < row["metres"] <= 3.3  # a step of its way more
     assert "never" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("ofice",), "did you mean office?"),
-        (("office", "--policy", "informations"), "did you mean information?"),
-        (("office", "--policy", ","), "no policy is given"),
-        (("office", "-e", "ekf"), "unknown estimator 'ekf'"),
-        (("office", "--seeds", "3:3"), "expected a number such as 3, or a range"),
-        (("office", "--set", "polcy.horizon=3"), "unknown key polcy: did you mean policy?"),
-        (("office", "--set", "policy.horizn=3"), "unknown key policy.horizn: did you mean horizon?"),
-        (("office", "--set", "policy.horizon=0"), "policy.horizon is 0"),
-        (("office", "--set", "world.tgas=3"), "unknown key world.tgas: did you mean tags?"),
-        (("office", "--max-metres", 0), "max_metres is 0"),
-        (("office", "--set", "start=[-5.0, 1.0, 0.0]"), "expected a place between the walls"),
-        (("missing.toml",), "missing.toml: cannot be read"),
-    ],
-)
-def test_what_is_wrong_is_told_in_one_line(fgloc, tmp_path, arguments, message):
-    done = fgloc("active", *arguments, "-o", tmp_path / "out")
-    assert done.exit_code == 2
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert not (tmp_path / "out" / "results.parquet").exists()

@@ -1,6 +1,5 @@
 """`fgloc compare`, from the arguments to the files."""
 
-import json
 import shutil
 
 import polars as pl
@@ -58,9 +57,3 @@ def test_compare_reports_a_failed_run_and_goes_on(fgloc, short_log, tmp_path):
     table = pl.read_csv(tmp_path / "out/results.csv")
     assert table["status"].to_list() == ["ok", "failed"]
     assert table["final.position_rmse"].null_count() == 1
-
-
-def test_compare_prints_json_alone(fgloc, short_log, tmp_path):
-    result = fgloc("compare", short_log, "-e", "ekf", "-o", tmp_path / "out", "--json")
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)

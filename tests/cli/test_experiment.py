@@ -78,29 +78,6 @@ def test_a_failure_is_named_and_the_exit_code_is_1(fgloc, file, tmp_path):
     assert rows["kind"].to_list() == ["error", "error"]
 
 
-@pytest.mark.parametrize(
-    ("args", "fragments"),
-    [
-        (["--set", "sedes=1"], ["sedes", "did you mean seeds?"]),
-        (["--set", "efk.max_delay=1"], ["efk", "did you mean ekf?"]),
-        (["--set", "ekf.max_dely=1"], ["max_dely", "did you mean max_delay?"]),
-        (["--set", "seeds"], ["--set", "KEY=VALUE"]),
-        (["--set", 'logs=["nowhere"]'], ["nowhere"]),
-        (["--set", 'estimators=["particle_filter"]', "--set", "seeds=0:10000"], ["10,000 runs", "--yes", "--dry-run"]),
-        (["--set", f"out={os.devnull}"], [os.devnull, "folder"]),
-        (["--set", "out=/proc/nowhere"], ["/proc/nowhere", "cannot be written"]),
-    ],
-)
-def test_what_is_wrong_is_refused_in_one_line(fgloc, file, args, fragments):
-    result = fgloc("experiment", "run", file, *args)
-    # where the words are right and the system refuses, it is not the input that is bad
-    assert result.exit_code == (1 if "cannot be written" in fragments else 2), result.output
-    assert result.stdout == ""
-    (line,) = result.stderr.splitlines()
-    for fragment in ("error: ", *fragments):
-        assert fragment in line
-
-
 def test_an_interrupt_ends_it_cleanly_and_it_goes_on(fgloc, file, tmp_path, processes):
     (tmp_path / "slow.toml").write_text(
         file.read_text().replace('"ekf"]', '{name = "particle_filter", settings = {particles = 200000}}]')

@@ -62,35 +62,3 @@ def test_results_are_written_and_named(fgloc, images, tmp_path):
     assert "spots, scale change" not in table  # by 1.24: below what is called one
     with Image.open(out / "figure3.png") as shown:
         assert shown.width == 1600
-
-
-def test_results_are_not_overwritten_unasked(fgloc, images, tmp_path):
-    out = tmp_path / "out"
-    command = ("features", "evaluate", images, "-o", out, "--features", "orb", "--count", 20)
-    assert fgloc(*command).exit_code == 0
-    result = fgloc(*command)
-    assert result.exit_code == 2
-    assert "holds results already (table.md); choose another folder, or --overwrite" in result.stderr
-    assert fgloc(*command, "--overwrite").exit_code == 0
-
-
-@pytest.mark.parametrize(
-    ("damage", "options", "message"),
-    [
-        (lambda f: (f / "spots" / "H1to2p").unlink(), (), "spots: has no homography H1to2p"),
-        (lambda f: (f / "spots" / "H1to2p").write_text("1 2 3 2 4 6 0 0 1"), (), "H1to2p: is singular"),
-        (lambda f: (f / "spots" / "img2.pgm").write_bytes(b"P5"), (), "img2.pgm: is not an image that can be decoded"),
-        (lambda f: [p.unlink() for p in (f / "spots").glob("img*")], (), "images: has no images"),
-        (None, ("--features", "surf"), "feature 'surf' is not known"),
-        (None, ("--features", ","), "--features is ',', expected names such as"),
-        (None, ("--count", "0"), "--count"),
-    ],
-)
-def test_bad_input_is_one_line(fgloc, images, tmp_path, damage, options, message):
-    if damage:
-        damage(images)
-    options = options if "--features" in options else ("--features", "orb", *options)
-    result = fgloc("features", "evaluate", images, "-o", tmp_path / "out", *options)
-    assert result.exit_code == 2
-    assert message in result.stderr
-    assert not (tmp_path / "out").exists()

@@ -7,7 +7,6 @@ import numpy as np
 from PIL import Image
 
 from factorgraph_loc.io.native.world_file import read_world
-from factorgraph_loc.model.rig import Rig
 
 WALL = 3.0  # m, where the picture hangs
 
@@ -30,25 +29,6 @@ def test_points_lie_on_the_wall(fgloc, gallery_on_disk, tmp_path):
     with Image.open(tmp_path / "hall.map.png") as picture:
         assert picture.width == 1600
     assert report["frame"] == "that of the reference"
-
-
-def test_bad_input(fgloc, gallery_on_disk, tmp_path, gallery):
-    out = tmp_path / "a.world.toml"
-
-    def refused(*args, **changes):
-        result = fgloc("map", gallery_on_disk(**changes), "-o", out, *args)
-        assert result.exit_code == 2
-        assert "Traceback" not in result.output
-        assert not out.exists()
-        return result.stderr
-
-    assert "expected landmarks, tags or points" in refused("--of", "lines")
-    assert "--poses is 'odometry', expected reference for points: fgloc run" in refused("--poses", "odometry")
-    assert "has no reference that says where its images were taken: fgloc run" in refused(reference=None)
-    assert "are for other maps" in refused("--of", "points", "--tag-height", "1.0")
-    blind = {name: s for name, s in gallery.streams.items() if name != "camera"}
-    assert "has no images" in refused("--of", "points", streams=blind)
-    assert "has no [camera]" in refused("--of", "points", rig=Rig(sensors=("odometry",)))
 
 
 def test_a_map_is_thinned_extended_and_exported(fgloc, gallery_on_disk, tmp_path):

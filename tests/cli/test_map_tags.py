@@ -84,22 +84,3 @@ def test_without_reference_and_map_the_frame_is_the_start(fgloc, on_disk, tmp_pa
     tags = read_world(tmp_path / "a.world.toml").tags
     assert tags
     assert {tag.z for tag in tags.values()} == {1.2}
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--of", "walls"], "--of is 'walls', expected landmarks, tags or points"),
-        (["--poses", "gps"], "--poses is 'gps', expected reference or odometry"),
-        (["--tag-height", "1200"], "--tag-height is 1200, expected metres"),
-        (["--of", "landmarks"], "has no sightings of landmarks"),
-        (["--of", "landmarks", "--poses", "reference"], "--poses and --tag-height are for maps of tags"),
-        (["--set", "batch.widest_loss=1"], "--estimator and --set are for maps of landmarks"),
-    ],
-)
-def test_bad_options_are_one_line(fgloc, on_disk, tmp_path, options, message):
-    result = fgloc("map", on_disk(), "-o", tmp_path / "a.world.toml", *options)
-    assert result.exit_code == 2
-    assert message in result.stderr
-    assert result.stderr.count("\n") == 1
-    assert not list(tmp_path.glob("a.*"))

@@ -60,13 +60,9 @@ def test_eight_antennas_stand_as_on_the_robot_of_the_paper(fgloc, tmp_path):
     ("options", "why"),
     [
         ((), "--out is missing, expected the file to write, such as robot.rig.toml"),
-        (("-o", "a.txt"), "--out is 'a.txt', expected the file to write"),
         (("--odometry", "tracks"), "--odometry is 'tracks', expected one of differential, omnidirectional, none"),
-        (("--antennas", "-1"), "--antennas is '-1', expected a whole number from 0 to 64"),
         (("--camera", "640"), "--camera is '640', expected a size such as 640x480, or none"),
         (("--camera", "8x480", "-o", "a.toml"), "the new rig: camera.width is 8: input should be greater"),
-        (("--landmarks", "near"), "--landmarks is 'near', expected the noise of a range in m, or none"),
-        (("--landmarks", "inf", "-o", "a.toml"), "the new rig: bearing_range.range_sigma is inf"),
         (("--odometry", "none", "-o", "a.toml"), "the new rig has no sensors, expected odometry"),
     ],
 )

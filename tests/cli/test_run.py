@@ -1,6 +1,5 @@
 """`fgloc run`, from the arguments to the files."""
 
-import json
 import tomllib
 from dataclasses import replace
 
@@ -40,14 +39,6 @@ def test_run_writes_its_files_and_says_where(fgloc, short_log, tmp_path):
     assert set(pl.read_parquet(out / "estimates.parquet")["kind"]) == {"causal", "final"}
 
 
-def test_run_prints_json_alone(fgloc, short_log, tmp_path):
-    result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out", "--json")
-    content = json.loads(result.stdout)
-    assert content["causal.position_rmse"] == pytest.approx(
-        json.loads((tmp_path / "out/metrics.json").read_text())["causal.position_rmse"]
-    )
-
-
 def test_run_takes_settings_sensors_and_a_start(fgloc, short_log, tmp_path):
     options = ["--set", "ekf.max_delay=0.25", "--sensors", "odometry", "--prior", "0,0,0.5"]
     result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out", *options)
@@ -55,18 +46,6 @@ def test_run_takes_settings_sensors_and_a_start(fgloc, short_log, tmp_path):
     config = tomllib.loads((tmp_path / "out/config.toml").read_text())
     assert config["settings"]["max_delay"] == 0.25
     assert config["sensors"] == ["odometry"]
-
-
-def test_run_refuses_to_overwrite_unless_told(fgloc, short_log, tmp_path):
-    first = fgloc("run", short_log, "-e", "dead_reckoning", "-o", tmp_path / "out")
-    again = fgloc("run", short_log, "-e", "dead_reckoning", "-o", tmp_path / "out")
-    (tmp_path / "out/plots/mine.png").write_text("mine")
-    (tmp_path / "out/plots/old-errors-ekf.png").write_text("of an earlier run")
-    told = fgloc("run", short_log, "-e", "dead_reckoning", "-o", tmp_path / "out", "--overwrite")
-    assert (first.exit_code, again.exit_code, told.exit_code) == (0, 2, 0)
-    assert "--overwrite" in again.stderr
-    assert (tmp_path / "out/plots/mine.png").is_file()
-    assert not (tmp_path / "out/plots/old-errors-ekf.png").exists()
 
 
 def test_run_says_how_consistent_it_was_and_what_it_learnt(fgloc, short_log, tmp_path, monkeypatch):

@@ -66,8 +66,3 @@ def test_a_run_against_its_log(fgloc, short_log, tmp_path):
     assert result["pairs"] == run["final.scored"]
     assert result["ape.position_rmse"] == pytest.approx(run["final.position_rmse"], rel=1e-6)
     assert result["rpe_per_m.position_rmse"] == pytest.approx(run["final.rpe_position_per_m"], rel=1e-6)
-
-
-def test_what_is_not_there(fgloc, pair):
-    assert_refused(fgloc("score", "nowhere.tum", pair[1]), "nowhere.tum: is neither a file, nor a folder")
-    assert_refused(fgloc("score", "nowhere.bag:/odom", pair[1]), "nowhere.bag: does not exist")

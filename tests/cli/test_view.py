@@ -37,16 +37,3 @@ def test_a_viewer_that_does_not_start(fgloc, short_log, monkeypatch):
     result = fgloc("view", short_log)
     assert result.exit_code == 2
     assert result.stderr == "error: the viewer did not start; --rrd FILE writes a file that `rerun FILE` opens\n"
-
-
-def test_what_is_not_clear_is_asked_for(fgloc, short_log, run_folder, tmp_path):
-    def error(*args):
-        result = fgloc("view", *args, "--rrd", tmp_path / "view.rrd")
-        assert result.exit_code == 2
-        assert result.stderr.count("\n") == 1
-        return result.stderr
-
-    assert "is of the log short, which `fgloc datasets` does not list" in error(run_folder)
-    assert "are 2 logs, expected one log and folders of its results" in error(short_log, "plaza1")
-    assert "holds runs of short, expected some of the log plaza2" in error("plaza2", run_folder)
-    assert "is neither a file, nor a folder, nor a known data set" in error("nothing")

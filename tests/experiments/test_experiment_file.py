@@ -1,7 +1,6 @@
 """What an experiment's file may say, and what is said of one that is wrong."""
 
 import re
-from datetime import date
 from pathlib import Path
 
 import pytest
@@ -53,37 +52,17 @@ def test_changes_reach_keys_estimators_and_simulated_logs(read):
     ("text", "fragments"),
     [
         ("sedes = 1", ["sedes", "did you mean seeds?"]),
-        ("estimators = [{nmae = 'ekf'}]", ["estimators", "nmae", "did you mean name?"]),
-        ("[limits]\nmemroy = 3", ["memroy", "did you mean memory?"]),
         ("[limits]\ntime = 0", ["limits.time", "0"]),
         ("[report]\nbaseline = 'efk'", ["efk", "did you mean ekf?"]),
         ("[sweep]\n'smother.lag' = [1]", ["smother.lag", "did you mean smoother?"]),
-        ("[sweep]\n'short.lag' = []", ["short.lag", "[]", "values"]),
         ("[sweep]\nmode = 'list'\n'short.lag' = [1]\n'ekf.max_delay' = [1, 2]", ["as many values"]),
-        ("[sweep]\nmode = 'gird'\n'short.lag' = [1]", ["mode", "gird"]),
         ("seeds = '5:2'", ["seeds", "5:2", "0:10"]),
-        ("prior = ''", ["prior"]),
-        ("sensors = []", ["sensors", "at least 1"]),
         ("estimators = ['ekf', 'ekf']", ["ekf", "label"]),
-        ("estimators = []", ["estimators"]),
         ("logs = [{simulate = 'office', rig = 'a.rig.toml'}]", ["rig", "simulate"]),
-        ("logs = [{log = 'plaza2', simulate = 'office'}]", ["either log or simulate"]),
         ("name = '../out'", ["name", "../out"]),
-        (f"name = '{'n' * 300}'", ["name", "200 characters"]),
-        (f"out = '{'o' * 300}'", ["out", "path"]),
-        ("logs = ['a\\u0000']".replace("'", '"'), ["logs.0.log", "path"]),
-        ("logs = 5", ["logs", "5"]),
-        ("estimators = [5]", ["estimators", "5"]),
         ("seeds = '0:1000000000'", ["seeds", "10,000 seeds"]),
-        ("seeds = [99999999999999999999]", ["seeds", "64 bits"]),
-        ("seeds = ['a', 'a', 'a']", ["seeds", "'a'"]),
-        ("seeds = 1979-05-27", ["seeds", "date"]),
         ("[sweep]\n'short.lag' = [nan]", ["short.lag", "nan"]),
-        ("[sweep]\n'short.lag' = [[1]]", ["short.lag", "[1]"]),
-        ("[sweep]\n'short.lag' = 5", ["short.lag", "5"]),
-        ("sweep = 5", ["sweep", "5"]),
         ("[sweep]\n" + "\n".join(f"short.x{i} = [1]" for i in range(60)), ["60 settings", "at most 50"]),
-        (f"estimators = {['ekf'] * 2000}", ["estimators", "1000"]),
     ],
 )
 def test_what_is_wrong_is_one_line_with_key_and_value(read, text, fragments):
@@ -91,25 +70,6 @@ def test_what_is_wrong_is_one_line_with_key_and_value(read, text, fragments):
     kept = "\n".join(line for line in GOOD.splitlines() if not line.startswith(f"{key} ="))
     with pytest.raises(InputError) as caught:
         read(f"{kept}\n{text}")
-    for fragment in ("a.toml", *fragments):
-        assert fragment in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("change", "fragments"),
-    [
-        (("estimators", 5), ["estimators", "5"]),
-        (("name.x", 5), ["name", "no key"]),
-        (("short.lag", date(1979, 5, 27)), ["lag", "date"]),
-        (("short.lag", Path("x")), ["lag", "Path"]),
-        (("short.lag", "\udc80"), ["lag", "UTF-8"]),
-        (("short." + "a." * 3000 + "b", 1), ["parts, expected at most 64"]),
-        (("seeds", "0:99999999999999999999"), ["seeds"]),
-    ],
-)
-def test_a_change_of_another_type_is_one_line(read, change, fragments):
-    with pytest.raises(InputError) as caught:
-        read(GOOD, change)
     for fragment in ("a.toml", *fragments):
         assert fragment in str(caught.value)
 

@@ -3,15 +3,9 @@
 import resource
 from contextlib import contextmanager
 
-import numpy as np
-import polars as pl
 import pytest
-from matplotlib.figure import Figure
 
 import factorgraph_loc as fgloc
-from factorgraph_loc.evaluation.figures import write_picture
-from factorgraph_loc.files.tables import write_parquet
-from factorgraph_loc.files.temporary import writing
 
 
 @contextmanager
@@ -47,22 +41,3 @@ def test_a_run_is_not_written(office, tmp_path, size):
         fgloc.run(office, "dead_reckoning", out=tmp_path / "run")
     assert str(caught.value) == f"{tmp_path / 'run'}: cannot be written: File too large"
     assert list(tmp_path.iterdir()) == []
-
-
-def test_tables_and_pictures_name_their_files(tmp_path):
-    figure = Figure()
-    figure.subplots().plot(np.arange(3))
-    table = pl.DataFrame({"x": np.random.default_rng(1).normal(size=1000)})
-    for name, write in (
-        ("a.parquet", lambda path: write_parquet(table, path)),
-        ("a.png", lambda path: write_picture(figure, path)),
-    ):
-        with full(1000), pytest.raises(OSError, match="File too large") as caught:
-            write(tmp_path / name)
-        assert caught.value.filename == str(tmp_path / name)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_error_without_a_reason_of_the_system_is_told():
-    with pytest.raises(fgloc.InputError, match=r"a.png: cannot be written: encoder error -2"), writing("a.png"):
-        raise OSError("encoder error -2")

@@ -123,15 +123,3 @@ def test_a_run_that_cannot_be_written_is_kept_elsewhere(result, log, tmp_path, m
     (folder,) = (tmp_path / "temporary").iterdir()
     assert str(caught.value).endswith(f" {folder}")
     assert {path.name for path in folder.iterdir()} == set(FILES)
-
-
-def test_a_run_that_can_be_written_nowhere_leaves_nothing(result, log, tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-
-    def fail(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("factorgraph_loc.experiments.output.write_toml", fail)
-    with pytest.raises(InputError, match=r"out: cannot be written: No space left on device$"):
-        save_run(result, log, tmp_path / "out")
-    assert list(tmp_path.iterdir()) == []

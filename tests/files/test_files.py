@@ -125,17 +125,10 @@ def test_toml_of_other_editors_is_read(tmp_path):
         (b"x = " + b"9" * 4000, "more than 64 bits"),
         (b"x = " + b"[" * 3000 + b"]" * 3000, "nested too deep"),
         (b"x = " + b"[" * 100 + b"]" * 100, "64 tables or lists deep"),
-        (b"x = " + b"{a=" * 3000 + b"1" + b"}" * 3000, "nested too deep"),
         (b"\n" + b"a." * 100_000 + b"a = 1", "a.toml:2: a key has more than 64 parts"),
-        (b'["a"' + b" . 'b'" * 100_000 + b"]", "a key has more than 64 parts"),
         (b"x = 1979-05-27", "x is a date"),
-        (b"x = [{y = [07:32:00]}]", "y is a date or time"),
-        (b"x = 1979-05-27T07:32:00Z", "x is a date"),
         (b"x = \xff", "is not text in UTF-8"),
         (b"x = 1\0", "is not TOML"),
-        ("x = 1".encode("utf-16"), "is not text in UTF-8"),
-        (b"x = 1\nx = 2", "is not TOML"),
-        (b"x = 1\n[x.y]", "is not TOML"),
     ],
 )
 def test_what_is_no_toml_of_ours_is_one_line(tmp_path, content, words):
@@ -167,13 +160,10 @@ def test_json_has_so_many_values_at_most(monkeypatch):
     [
         ("[" * 5000 + "]" * 5000, "nested too deep"),
         ("[" * 100 + "]" * 100, "64 tables or lists deep"),
-        ('{"a":' * 100 + "1" + "}" * 100, "64 tables or lists deep"),
         ("9" * 5000, "5000 digits"),
         ('{"a": NaN}', "NaN"),
-        ("-Infinity", "Infinity"),
         ('{"a": 1, "a": 2}', "'a' is duplicate"),
         ('{"a": 1', "is not JSON"),
-        ("", "is not JSON"),
         ("\ufeff1", "is not JSON"),
     ],
 )

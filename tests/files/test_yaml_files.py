@@ -36,16 +36,9 @@ def test_an_empty_file_has_no_keys(read):
     ("text", "said"),
     [
         ("a: 1\nb: [1, 2\nc: 3\n", "a.yaml:2: is not YAML that can be read: while parsing a flow sequence"),
-        ("a: 1\nb 2\nc: 3\n", "a.yaml:2: is not YAML that can be read: while scanning a simple key"),
         ("a: &x 1\nb: *x\n", "a.yaml:2: .*: [*]x is an alias, expected the value itself"),
-        ("a: &x {c: 1}\nb:\n  <<: *x\n", "a.yaml:3: .*: [*]x is an alias"),
         ("a: 1\nb: " + "[" * 1000 + "]" * 1000, "a.yaml: is not YAML that can be read: it is nested too deeply"),
-        ("a: 1\n---\nb: 2\n", "a.yaml:1: .*: expected a single document"),
         ("- 1\n- 2\n", "a.yaml:1: .*: expected key: value"),
-        ("a: 1\n? [b]\n: 2\n", "a.yaml:1: .*: while constructing a mapping, found unhashable key"),
-        ("a: 1\n\tb: 2\n", "a.yaml:2: is not YAML"),
-        ("a: \x07\n", "a.yaml: is not YAML"),
-        ("a: 2025-13-45\n", "a.yaml: is not YAML that can be read: month must be in 1..12"),
         ("a: !!python/object:os.system x\n", "a.yaml:1: .*: could not determine a constructor"),
     ],
 )

@@ -8,10 +8,8 @@ import pytest
 import factorgraph_loc as fgloc
 from factorgraph_loc import (
     BearingRange,
-    CameraFrame,
     IncrementOdometry,
     InputError,
-    PixelSightings,
     RfidRead,
     RfidScan,
     Tick,
@@ -35,36 +33,18 @@ def started(log, name="smoother", **options):
 ONE = np.ones(1)
 BAD = [
     (VelocityOdometry(1.0, math.nan, 0.0), r"VelocityOdometry at 1.000 s: v is nan, expected a finite number"),
-    (VelocityOdometry(math.nan, 0.0, 0.0), r"VelocityOdometry: t is nan, expected a finite number of seconds"),
-    (VelocityOdometry("1", 0.0, 0.0), r"VelocityOdometry: t is '1', expected a finite number of seconds"),
     (VelocityOdometry(1.0, "fast", 0.0), r"v is 'fast', expected numbers"),
-    (IncrementOdometry(1.0, 0.0, math.inf, 0.0), r"dy is inf, expected a finite number"),
     (
         BearingRange(1.0, ("a",), -ONE, ONE),
         r"range is -1.0, expected a finite number of m in 0.001 to 100000, or NaN where",
     ),
     (BearingRange(1.0, ("a", "b"), ONE, ONE), r"range has shape \(1,\), expected \(2,\)"),
     (BearingRange(1.0, "ab", ONE, ONE), r"landmarks is 'ab', expected names"),
-    (PixelSightings(1.0, ("a",), np.array(((math.nan, 1.0),))), r"pixels is nan, expected a finite number"),
     (
         RfidScan(1.0, ("a",), np.array([1]), ("e",), ONE, ONE, ONE, ONE),
         r"antenna is \[1\], expected indices of its 1 ant",
     ),
-    (
-        RfidScan(1.0, ("a",), np.array([0]), ("e",), -ONE, ONE, ONE, ONE),
-        r"age is -1.0, expected a finite number of seconds in 0 to 3600",
-    ),
-    (RfidScan(1.0, ("a",), ONE, ("e",), ONE, ONE, ONE, ONE), r"antenna is array\(\[1.\]\), expected 1 whole numbers"),
-    (
-        CameraFrame(1.0, "orb", np.zeros((2, 2)), ONE, np.zeros((2, 3)), np.arange(2)),
-        r"sizes has shape \(1,\), expected \(2,\)",
-    ),
-    (
-        CameraFrame(1.0, "orb", np.zeros((1, 2)), ONE, np.zeros((2, 3)), np.arange(1)),
-        r"descriptors has shape \(2, 3\)",
-    ),
     (Tick(1.0), r"^Tick is not a measurement, expected one of VelocityOdometry, "),
-    (None, r"^NoneType is not a measurement"),
 ]
 
 
@@ -100,14 +80,10 @@ def test_clocks_that_go_back_or_are_others_are_refused(log):
     ("given", "message"),
     [
         ({"pose": (1.0, 2.0)}, r"pose is \[1.0, 2.0\], expected finite x, y \[m\] and heading"),
-        ({"pose": (1.0, math.nan, 0.0)}, "expected finite x, y"),
-        ({"pose": "here"}, r"initialize\(\): pose is 'here', expected numbers"),
         (
             {"pose": (0, 0, 0), "covariance": np.diag((1.0, 0.0, 1.0))},
             r"expected \(3, 3\), symmetric and positive definite",
         ),
-        ({"pose": (0, 0, 0), "t": math.inf}, "t is inf, expected a finite number"),
-        ({"pose": (0, 0, math.nan), "covariance": np.eye(3)}, r"expected \(2, 2\), symmetric and positive definite"),
         ({}, "ekf cannot start from an unknown pose with this rig and map, expected a pose"),
     ],
 )

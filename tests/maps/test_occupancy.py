@@ -115,17 +115,12 @@ def test_a_world_names_its_occupancy_map(hall):
     ("old", "new", "fragments"),
     [
         ("resolution: 0.1", "", ("hall.yaml: resolution is missing",)),
-        ("resolution: 0.1", "resolution: -1", ("hall.yaml: resolution is -1",)),
         ("resolution", "resolutoin", ("unknown key resolutoin: did you mean resolution",)),
         ("0.0]", "", ("hall.yaml:3: is not YAML that can be read: while parsing a flow sequence",)),
-        ("negate: 0", "negate 0", ("hall.yaml:4: is not YAML that can be read", "could not find expected ':'")),
         ("free_thresh: 0.196", "free_thresh: 0.7", ("free_thresh is 0.7", "less than occupied_thresh")),
-        ("hall.pgm", "none.pgm", ("none.pgm: cannot be read",)),
         ("hall.pgm", "hall.yaml", ("hall.yaml: is not an image",)),
-        ("hall.pgm", "../hall.pgm", ("leaves its folder",)),
         ("negate: 0", "map_type: costmap", ("map_type is 'costmap': input should be 'occupancy'",)),
         ("negate: 0", "negate: 1\nmode: trinary", None),
-        ("negate: 0", "negate: true", None),
     ],
 )
 def test_a_wrong_map(hall, old, new, fragments):

@@ -11,7 +11,6 @@ import factorgraph_loc as fgloc
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.graph.solver import FullHistory
-from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.measurement import FeatureStream, SightingStream
@@ -85,16 +84,6 @@ def truth_of(points, log):
     return np.array([true.positions[true.index[name]] for name in points.names])
 
 
-def with_wrong(log, share, seed=0):
-    """A share of the pixels is anywhere in the image."""
-    rng = np.random.default_rng(seed)
-    s = log.streams["sightings"]
-    wrong = rng.random(len(s.t)) < share
-    u = np.where(wrong, rng.uniform(0.0, 640.0, len(s.t)), s.u)
-    v = np.where(wrong, rng.uniform(0.0, 480.0, len(s.t)), s.v)
-    return replace(log, streams={**log.streams, "sightings": replace(s, u=u, v=v)})
-
-
 @pytest.mark.parametrize("name", CONFIGS)
 def test_points_without_a_map_hold_the_robot(mapped, log, name):
     alone = run(log, RunConfig("dead_reckoning"))
@@ -121,17 +110,6 @@ def test_the_scale_is_that_of_the_odometry(mapped, log, name):
     assert spread / expected == pytest.approx(1.0, abs=0.08)
 
 
-def test_smoother_and_batch_agree(mapped):
-    smoother, batch = mapped("smoother"), mapped("batch")
-    apart = smoother.final.poses - batch.final.poses
-    apart[:, 2] = se2.wrap(apart[:, 2])
-    squared = [d @ np.linalg.solve(c, d) for d, c in zip(apart, batch.final.covariances, strict=True)]
-    # they differ in which sightings they took for wrong or came too late, not in what they make of them
-    assert np.mean(squared) < 0.3
-    variances = [np.diagonal(one.final.covariances, axis1=1, axis2=2) for one in (smoother, batch)]
-    np.testing.assert_allclose(variances[0][-1], variances[1][-1], rtol=0.3)
-
-
 def test_errors_are_as_large_as_the_covariances_say(mapped, logs):
     # the last pose of five runs; the mean leaves this band once in a thousand
     total = 0.0
@@ -142,26 +120,9 @@ def test_errors_are_as_large_as_the_covariances_say(mapped, logs):
     assert chi2.ppf(0.0005, 15) < total < chi2.ppf(0.9995, 15)
 
 
-def test_wrong_pixels_do_little_harm(mapped, log):
-    result = run(with_wrong(log, 0.1), CONFIGS["smoother_lag"])
-    assert rmse(result, log) < max(2.0 * rmse(mapped("smoother_lag"), log), 0.2)
-    assert result.diagnostics.rejected["camera: does not agree with the others"] > 5
-
-
 def test_an_object_with_most_of_the_points_is_not_taken_for_the_room(mapped, log):
     result = run(with_object(log), CONFIGS["smoother"])
     assert rmse(result, log) < max(2.0 * rmse(mapped("smoother"), log), 0.2)
-
-
-def test_what_the_map_has_holds_the_rest_in_place(log):
-    known = log.world.points
-    rows = np.arange(0, len(known), 4)
-    part = PointMap.of([known.names[i] for i in rows], known.positions[rows])
-    result = run(replace(log, world=World(points=part)), RunConfig("smoother", {"landmarks": "extended"}))
-    assert rmse(result, log) < 0.08
-    learnt = result.learnt.points
-    assert not set(learnt.names) & set(part.names)
-    assert np.median(np.linalg.norm(learnt.positions - truth_of(learnt, log), axis=1)) < 0.1
 
 
 def test_points_leave_the_window_and_are_kept(mapped):

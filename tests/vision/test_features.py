@@ -122,17 +122,11 @@ def test_an_unknown_name_is_an_error_with_the_nearest() -> None:
     ("array", "message"),
     [
         (np.empty((0, 0), dtype=np.uint8), "is empty"),
-        (np.empty((0, 5, 3), dtype=np.uint8), "is empty"),
-        (None, "is NoneType, expected an array"),
         ([[1, 2]], "is list, expected an array"),
         (np.zeros((8, 8, 2), dtype=np.uint8), r"has shape \(8, 8, 2\)"),
-        (np.zeros(8, dtype=np.uint8), r"has shape \(8,\)"),
         (np.zeros((8, 8), dtype=np.int32), "has pixels of type int32"),
-        (np.zeros((8, 8), dtype=complex), "has pixels of type complex128"),
         (np.full((8, 8), np.nan), "has 64 values that are not finite"),
-        (np.full((8, 8), np.inf), "has 64 values that are not finite"),
         (np.full((8, 8), 200.0), "has floating-point values from 200 to 200, expected 0 to 1"),
-        (np.full((8, 8), -0.5), "has floating-point values from -0.5"),
     ],
 )
 def test_what_is_no_image_is_an_error(array: object, message: str) -> None:

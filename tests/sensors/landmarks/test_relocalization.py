@@ -4,8 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from landmark_world import dirty, simulate, swapped, with_sightings
-from recorded_logs import recorded_log
+from landmark_world import simulate, swapped, with_sightings
 
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.landmarks.finder import LandmarkFinder, TrackMonitor, _apart, _insert, _thinned
@@ -64,30 +63,6 @@ def error(log, found):
     difference[2] = se2.wrap_scalar(difference[2])
     squared = difference @ np.linalg.solve(found.covariance, difference)
     return np.hypot(*difference[:2]), abs(difference[2]), squared
-
-
-@pytest.mark.parametrize("disturbed", [lambda log: log, dirty, lambda log: swapped(log, "b", "h")])
-def test_unknown_start(disturbed, log):
-    """From six times; the normalised squared error is above 21 in one of 10,000, of three degrees of freedom."""
-    for start in np.linspace(0.0, 25.0, 6):
-        found = Seeker(disturbed(log), start).until_clear(15.0)
-        assert found is not None
-        position, heading, squared = error(log, found)
-        assert position < 0.5
-        assert heading < 0.2
-        assert squared < 21.0
-
-
-def test_range_alone(log):
-    s = log.streams["bearing_range"]
-    found = Seeker(with_sightings(log, bearing=np.full(len(s.t), np.nan))).until_clear(40.0)
-    assert error(log, found)[0] < 0.5
-
-
-def test_bearing_alone(log):
-    s = log.streams["bearing_range"]
-    found = Seeker(with_sightings(log, range=np.full(len(s.t), np.nan))).until_clear(40.0)
-    assert error(log, found)[0] < 0.5
 
 
 def test_one_landmark_is_ambiguous(log):
@@ -153,16 +128,6 @@ def test_swapped_landmarks_do_not_refute_the_right_track(log):
         if int(t * 4) % 8 == 0:
             seeker.relocalizer.search()
             assert not seeker.relocalizer.refutes(log.reference.at(np.array([t]))[0], covariance)
-
-
-@pytest.mark.parametrize("name", ["mrclam6-robot3", "woods-r5"])
-def test_recorded_starts(name, data_root):
-    log = recorded_log(name, data_root)
-    for start in (20.0, 300.0, 600.0):
-        found = Seeker(log, start).until_clear()
-        position, heading, _ = error(log, found)
-        assert position < 0.5
-        assert heading < np.deg2rad(15.0)
 
 
 def test_sightings_of_a_landmark_are_thinned_as_they_come():

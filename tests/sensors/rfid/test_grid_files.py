@@ -66,16 +66,9 @@ def test_a_grid_with_a_damaged_stream_or_without_its_end_is_one_line(tmp_path):
     ("changed", "words"),
     [
         ({"cell": np.array(np.inf)}, "cell is inf, expected 0.001 to 1000 m"),
-        ({"cell": np.array(1e-300)}, "cell is 1e-300"),
-        ({"cell": np.array((1.0, 1.0))}, "cell is"),
-        ({"origin": np.array((0.0, 1e308))}, "origin is"),
         ({"origin": np.array((0.0, np.nan))}, "origin is"),
-        ({"heights": np.array((0.0, 1e-300))}, "heights is"),
-        ({"heights": np.array((0.0, 1e300))}, "heights is"),
         ({"heights": np.zeros((2, 1))}, "heights is"),
-        ({"heights": np.empty(0), "logits": np.empty((0, 3, 4, 5))}, "logits is"),
         ({"logits": np.empty((2, 0, 4, 5))}, "logits is"),
-        ({"logits": np.zeros((2, 3, 4))}, "logits is"),
     ],
 )
 def test_a_grid_that_is_none_is_one_line(tmp_path, changed, words):
