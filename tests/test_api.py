@@ -94,7 +94,7 @@ def test_an_experiment_gives_its_table(tmp_path):
         out=tmp_path / "out",
         page=tmp_path / "p.html",
     )
-    assert "dead_reckoning" in page.read_text()
+    assert "dead_reckoning" in page.page.read_text()
 
 
 def test_another_rig_and_map_are_values_or_files(office, tmp_path):

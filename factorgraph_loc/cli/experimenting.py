@@ -169,10 +169,9 @@ def report(
     json: Json = False,
 ) -> None:
     """Write the stored results of an experiment as one HTML page; damaged ones are left out."""
-    from factorgraph_loc.experiments.experiment import prepare
-    from factorgraph_loc.experiments.reporting import report_experiment
+    from factorgraph_loc.experiments.reporting import report as write_page
 
-    written = report_experiment(prepare(file, **options.given()), page)
+    written = write_page(file, **options.given(), page=page)
     if json:
         show.document({"page": str(written.page), "damaged": written.damaged})
         return

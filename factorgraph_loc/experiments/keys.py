@@ -216,13 +216,11 @@ class EstimatorFacts:
 
 
 class _Kept(BaseModel):
-    """Facts obtained with code and libraries of this ``version``: ``logs`` by digest, ``estimators`` by name and settings, and
-    valid ``priors``."""
+    """Facts obtained with code and libraries of this ``version``: ``logs`` by digest, ``estimators`` by name and settings."""
 
     version: str
     logs: dict[str, list[LogFacts]] = {}
     estimators: dict[str, EstimatorFacts] = {}
-    priors: list[str] = []
 
 
 class Facts:
@@ -251,15 +249,6 @@ class Facts:
         if key not in self._known.estimators:
             self._known.estimators[key], self._new = _of_estimator(name, settings), True
         return self._known.estimators[key]
-
-    def check_prior(self, prior: str) -> None:
-        """Raise InputError for an invalid prior."""
-        if prior not in self._known.priors:
-            from factorgraph_loc.experiments.preparation import check_prior  # noqa: PLC0415
-
-            check_prior(prior)
-            self._known.priors.append(prior)
-            self._new = True
 
     def save(self) -> None:
         """Save new facts."""

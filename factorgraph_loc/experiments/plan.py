@@ -24,7 +24,7 @@ from factorgraph_loc.experiments.keys import Facts, FileDigests, load_planned, r
 from factorgraph_loc.experiments.log_source import LogSource, RecordedSource, SimulatedSource, recorded_sources
 from factorgraph_loc.files.data_root import named_path
 from factorgraph_loc.files.models import nearest, set_key
-from factorgraph_loc.model.scoring import RunConfig
+from factorgraph_loc.model.scoring import RunConfig, check_prior
 from factorgraph_loc.text import quoted
 
 MOST_RUNS = 100_000
@@ -98,8 +98,7 @@ def plan(
     digests, facts = FileDigests(cache / "digests.json"), Facts(cache / "facts.json")
     experiment = _placed(experiment, folder, data_root)
     sweep = experiment.sweep
-    if experiment.prior is not None:
-        facts.check_prior(experiment.prior)
+    check_prior(experiment.prior)
     recorded: dict[int, Sequence[LogSource]] = {
         place: given[place : place + 1] or _recorded(entry, folder, data_root)
         for place, entry in enumerate(experiment.logs)

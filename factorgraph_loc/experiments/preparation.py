@@ -1,17 +1,17 @@
 """What comes before a run: its start, from the user, the log, or the reference; its sensors, and what their packages prepare before
 an estimator runs."""
 
-import math
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 
 import numpy as np
 
 from factorgraph_loc.errors import FglocError, InputError
-from factorgraph_loc.files.models import FARTHEST, FileModel, nearest
+from factorgraph_loc.files.models import FileModel, nearest
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.belief import EXACT_SIGMA, HEADING_SIGMA, POSITION_SIGMA, PosePrior
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.scoring import PRIORS, parse_position
 from factorgraph_loc.sensors.camera.use import prepare
 from factorgraph_loc.sensors.interfaces import Use, lacking_section
 from factorgraph_loc.sensors.registry import channels, functions, moving, parent_of
@@ -22,7 +22,6 @@ REFERENCE_POSITION_SIGMA = 0.02  # m
 REFERENCE_HEADING_SIGMA = 0.01  # rad
 
 KNOWN = "reference, log or X,Y,HEADING"
-EXPECTED = "reference, log, unknown, X,Y or X,Y,HEADING"
 
 
 def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
@@ -41,11 +40,11 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
         return None, prior
     if prior == "log":
         if log.start is None:
-            raise InputError(f"{log.name}: states no start, expected a prior {EXPECTED}")
+            raise InputError(f"{log.name}: states no start, expected a prior {PRIORS}")
         return PosePrior(log.start.t, np.array(log.start.pose), np.diag(np.square(log.start.sigmas))), prior
     if prior == "reference":
         return _from_reference(log), prior
-    pose, covariance = np.array(_parse(prior)), _covariance(POSITION_SIGMA, HEADING_SIGMA)
+    pose, covariance = np.array(parse_position(prior)), _covariance(POSITION_SIGMA, HEADING_SIGMA)
     if len(pose) == 2:
         return PosePrior.at_position(first_odometry(log), pose, covariance[:2, :2]), prior
     return PosePrior(first_odometry(log), pose, covariance), prior
@@ -54,12 +53,6 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
 def at_origin(log: Log) -> PosePrior:
     """The start (0, 0, 0) of a log without other information, at the first odometry: exact, as it defines the frame."""
     return PosePrior(first_odometry(log), np.zeros(3), _covariance(EXACT_SIGMA, EXACT_SIGMA))
-
-
-def check_prior(prior: str | None) -> None:
-    """Raise InputError for an invalid ``prior`` of :func:`resolve_prior`, without checking the log."""
-    if prior not in (None, "unknown", "log", "reference"):
-        _parse(prior)
 
 
 def first_odometry(log: Log) -> float:
@@ -72,7 +65,7 @@ def first_odometry(log: Log) -> float:
 
 def _from_reference(log: Log) -> PosePrior:
     if log.reference is None:
-        raise InputError(f"{log.name}: has no reference to start from, expected a prior {EXPECTED}")
+        raise InputError(f"{log.name}: has no reference to start from, expected a prior {PRIORS}")
     start = first_odometry(log)
     after = int(np.searchsorted(log.reference.t, start))
     if after == len(log.reference):
@@ -88,19 +81,6 @@ def _from_reference(log: Log) -> PosePrior:
 
 def _covariance(position_sigma: float, heading_sigma: float) -> np.typing.NDArray[np.float64]:
     return np.diag(np.square((position_sigma, position_sigma, heading_sigma)))
-
-
-def _parse(prior: str) -> list[float]:
-    """Position [m], and the heading [rad] if given."""
-    try:
-        x, y, *heading = (float(part) for part in prior.split(","))
-    except ValueError:
-        raise InputError(f"prior is {quoted(prior)}, expected {EXPECTED}") from None
-    if len(heading) > 1:
-        raise InputError(f"prior is {quoted(prior)}, expected {EXPECTED}")
-    if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and all(abs(angle) <= 2.0 * math.pi for angle in heading)):
-        raise InputError(f"prior is {quoted(prior)}, expected metres, at most {FARTHEST:g}, and a heading in radians")
-    return [x, y, *heading]
 
 
 def columns_of(streams: Iterable[str]) -> tuple[str, ...]:

@@ -35,15 +35,14 @@ def report(
     out: str | Path | None = None,
     data_root: str | Path | None = None,
     page: str | Path | None = None,
-) -> Path:
-    """Write the results of an experiment as an HTML page, and return its path: ``page``, by default ``report.html`` in its
-    folder.
+) -> Report:
+    """Write the results of an experiment as an HTML page: ``page``, by default ``report.html`` in its folder.
 
     Damaged results are listed on the page and left out. For the other arguments see
     :func:`~factorgraph_loc.experiments.experiment.prepare`.
     """
     prepared = prepare(file, changes, out=out, data_root=data_root)
-    return report_experiment(prepared, None if page is None else Path(page)).page
+    return report_experiment(prepared, None if page is None else Path(page))
 
 
 def report_experiment(prepared: Prepared, out: Path | None = None) -> Report:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.models import FARTHEST
+from factorgraph_loc.text import quoted
 
 MAX_GAP = 0.5  # s between estimates across which scoring interpolates
 MAX_DIFF = 0.01  # s between stamps that are taken for one
@@ -16,6 +18,7 @@ Alignment = Literal["none", "origin", "se2", "se3", "sim3"]
 ALIGNMENTS: tuple[Alignment, ...] = ("none", "origin", "se2", "se3", "sim3")
 Association = Literal["nearest", "interpolate"]
 ASSOCIATIONS: tuple[Association, ...] = ("nearest", "interpolate")
+PRIORS = "reference, log, unknown, X,Y or X,Y,HEADING"
 RATE = 10  # Hz
 TICK_GAP = 60.0  # s; gaps without measurements above this length have no ticks
 SHORTEST, LONGEST = 1.0, 86400.0  # s; bounds of the setting
@@ -53,6 +56,25 @@ def check_tick_gap(gap: float) -> None:
     """InputError if ``gap`` is out of bounds."""
     if not SHORTEST <= gap <= LONGEST:
         raise InputError(f"tick_gap is {gap:g}, expected {SHORTEST:g} to {LONGEST:g} s")
+
+
+def check_prior(prior: str | None) -> None:
+    """InputError for a text that is no start of a run, whatever its log."""
+    if prior not in (None, "unknown", "log", "reference"):
+        parse_position(prior)
+
+
+def parse_position(prior: str) -> list[float]:
+    """Position [m], and the heading [rad] if it is given, of a start ``X,Y`` or ``X,Y,HEADING``. InputError if it is neither."""
+    try:
+        x, y, *heading = (float(part) for part in prior.split(","))
+    except ValueError:
+        raise InputError(f"prior is {quoted(prior)}, expected {PRIORS}") from None
+    if len(heading) > 1:
+        raise InputError(f"prior is {quoted(prior)}, expected {PRIORS}")
+    if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and all(abs(angle) <= 2.0 * math.pi for angle in heading)):
+        raise InputError(f"prior is {quoted(prior)}, expected metres, at most {FARTHEST:g}, and a heading in radians")
+    return [x, y, *heading]
 
 
 class Ticks:
