@@ -88,8 +88,8 @@ def compare(
     Written into ``out``: ``results.parquet`` and ``results.csv`` (the rows), ``differences.csv`` (see
     :func:`~factorgraph_loc.evaluation.inference.differences`), ``table.md``, ``report.html`` (see
     :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png``, and the files of each run in the folder ``store``, by
-    its key (see :class:`~factorgraph_loc.experiments.store.Store`). ``rpe``: also show relative errors, as further tables in
-    ``table.md`` and further scores in the report. ``progress`` is called with the number of runs done and of all.
+    its key (see :class:`~factorgraph_loc.experiments.store.Store`). ``rpe``: also show relative errors, in ``table.md`` and in
+    the report. ``progress`` is called with the number of runs done and of all.
 
     Raises InputError, before anything runs, for invalid or missing input, and for results in ``out`` without ``overwrite``.
     """
@@ -114,8 +114,7 @@ def compare(
     _find_features(logs, prepared)
     done = run_experiment(prepared, jobs=jobs, again=True, progress=lambda made, total, _: progress(made, total))
     report_experiment(prepared)
-    for log in logs:
-        _plot(log, prepared, out / "plots")
+    _plot(logs, prepared, out / "plots")
     rows = done.rows.to_dicts()
     write_tables(done.rows, pl.DataFrame(differences(rows), schema=DIFFERENCES), _table(rows, rpe=rpe), out)
     return Comparison(rows, done.failures, done.warnings)
@@ -200,15 +199,16 @@ def digest_of_log(log: Log) -> str:
     return total.hexdigest()
 
 
-def _plot(log: Log, prepared: Prepared, folder: Path) -> None:
-    """The plots of a log; the first seed of each estimator represents all."""
-    tracks: dict[str, Track] = {}
-    for run in prepared.runs:
-        store = prepared.store
-        if run.log == log.name and run.label not in tracks and store.state(run.key) == "ok":
-            tracks[run.label] = Track.read(partial(store.read, run.key), log.t0_ns, run.max_gap)
-    if tracks:
-        plot_log(log, tracks, folder, file_name(log.name))
+def _plot(logs: Sequence[Log], prepared: Prepared, folder: Path) -> None:
+    """The plots of each log; the first seed of each estimator represents all."""
+    store = prepared.store
+    for log in logs:
+        tracks: dict[str, Track] = {}
+        for run in prepared.runs:
+            if run.log == log.name and run.label not in tracks and store.state(run.key) == "ok":
+                tracks[run.label] = Track.read(partial(store.read, run.key), log.t0_ns, run.max_gap)
+        if tracks:
+            plot_log(log, tracks, folder, file_name(log.name))
 
 
 def _table(rows: Sequence[Mapping[str, Any]], *, rpe: bool) -> str:

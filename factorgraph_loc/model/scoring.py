@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.models import FARTHEST
 from factorgraph_loc.text import quoted
 
 MAX_GAP = 0.5  # s between estimates across which scoring interpolates
@@ -66,6 +65,8 @@ def check_prior(prior: str | None) -> None:
 
 def parse_position(prior: str) -> list[float]:
     """Position [m], and the heading [rad] if it is given, of a start ``X,Y`` or ``X,Y,HEADING``. InputError if it is neither."""
+    from factorgraph_loc.files.models import FARTHEST  # noqa: PLC0415 - imports pydantic
+
     try:
         x, y, *heading = (float(part) for part in prior.split(","))
     except ValueError:
