@@ -42,15 +42,6 @@ def test_what_the_estimator_accepts_and_what_it_refuses_is_listed_with_its_figur
     assert "Selection" in report.read_text()
 
 
-def test_what_is_there_is_not_replaced_unasked(fgloc, short_log, calibrated):
-    out, _, _ = calibrated
-    before = out.read_bytes()
-    result = fgloc("calibrate", short_log, "-o", out)
-    assert result.exit_code == 2
-    assert "exists already" in result.stderr
-    assert out.read_bytes() == before
-
-
 def test_a_log_without_reference_is_calibrated_by_itself(fgloc, short_log, tmp_path):
     """Of ranges and wheels, the constants that the input rig is uncertain of; in place of what was there."""
     (log,) = load(str(short_log))

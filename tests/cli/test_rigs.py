@@ -73,11 +73,3 @@ def test_wrong_options_are_one_line(fgloc, tmp_path, monkeypatch, options, why):
     assert done.stderr.startswith(f"error: {why}")
     assert done.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
-
-
-def test_a_run_uses_the_new_rig(fgloc, short_log, tmp_path):
-    fgloc("rigs", "new", "--landmarks", 0.3, "-o", tmp_path / "mower.rig.toml")
-    done = fgloc("run", short_log, "-e", "ekf", "--rig", tmp_path / "mower.rig.toml", "-o", tmp_path / "out", "--json")
-    assert done.exit_code == 0
-    assert json.loads(done.stdout)["nis.bearing_range.count"] > 10
-    assert json.loads(done.stdout)["causal.position_rmse"] < 10.0

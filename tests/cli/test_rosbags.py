@@ -53,14 +53,3 @@ def test_the_wheels_and_what_is_not_read(recorded, fgloc, monkeypatch):
     moved = [log.streams["odometry"] for log in (by_wheels, by_poses)]
     np.testing.assert_allclose(moved[0].dtheta, moved[1].dtheta, atol=1e-6)
     assert "not read" in fgloc("info", "wheels.toml").stdout
-
-
-def test_what_is_no_bag(fgloc, tmp_path):
-    (tmp_path / "drive.bag").write_text("nothing")
-    for command in ("info", "manifest", "run"):
-        found = fgloc(
-            command, tmp_path / "drive.bag", *(["-e", "ekf", "-o", tmp_path / "out"] if command == "run" else [])
-        )
-        assert found.exit_code == 2
-        assert found.stderr.startswith("error: ")
-        assert len(found.stderr.splitlines()) == 1

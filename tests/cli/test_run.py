@@ -7,7 +7,6 @@ import polars as pl
 import pytest
 from tum_files import read_tum
 
-from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.experiments.run import run
 from factorgraph_loc.model.belief import Learnt
 
@@ -39,15 +38,6 @@ def test_run_writes_its_files_and_says_where(fgloc, short_log, tmp_path):
     assert set(pl.read_parquet(out / "estimates.parquet")["kind"]) == {"causal", "final"}
 
 
-def test_run_takes_settings_sensors_and_a_start(fgloc, short_log, tmp_path):
-    options = ["--set", "ekf.max_delay=0.25", "--sensors", "odometry", "--prior", "0,0,0.5"]
-    result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out", *options)
-    assert result.exit_code == 0, result.output
-    config = tomllib.loads((tmp_path / "out/config.toml").read_text())
-    assert config["settings"]["max_delay"] == 0.25
-    assert config["sensors"] == ["odometry"]
-
-
 def test_run_says_how_consistent_it_was_and_what_it_learnt(fgloc, short_log, tmp_path, monkeypatch):
     def eventful(log, config, progress):
         result = run(log, config, progress)
@@ -69,14 +59,3 @@ def test_run_says_how_consistent_it_was_and_what_it_learnt(fgloc, short_log, tmp
     assert lines[i + 1 : i + 6] == [f"  at {10.0 * k:.1f} s: event number {k}" for k in range(5)]
     assert "event number 5" not in result.stdout
     assert len(pl.read_csv(tmp_path / "out/events.csv")) == 7
-
-
-def test_a_run_that_fails_has_exit_code_1(fgloc, short_log, tmp_path, monkeypatch):
-    def fail(*_):
-        raise RunFailedError("short: the estimate at 3.000 s is not finite")
-
-    monkeypatch.setattr("factorgraph_loc.experiments.run.run", fail)
-    result = fgloc("run", short_log, "-e", "ekf", "-o", tmp_path / "out")
-    assert result.exit_code == 1
-    assert result.stderr == "error: short: the estimate at 3.000 s is not finite\n"
-    assert not (tmp_path / "out").exists()

@@ -58,11 +58,3 @@ def test_the_folder_holds_a_report(fgloc, tmp_path, suffix):
     assert sorted(path.name for path in (out / "plots").iterdir()) == ["errors.png", "trajectories.png"]
     assert_refused(fgloc("score", *pair, "-o", out), "holds results already (errors.csv)")
     assert fgloc("score", *pair, "-o", out, "--overwrite").exit_code == 0
-
-
-def test_a_run_against_its_log(fgloc, short_log, tmp_path):
-    run = json.loads(fgloc("run", short_log, "-e", "dead_reckoning", "-o", tmp_path / "run", "--json").stdout)
-    result = json.loads(fgloc("score", tmp_path / "run", short_log, "--associate", "interpolate", "--json").stdout)
-    assert result["pairs"] == run["final.scored"]
-    assert result["ape.position_rmse"] == pytest.approx(run["final.position_rmse"], rel=1e-6)
-    assert result["rpe_per_m.position_rmse"] == pytest.approx(run["final.rpe_position_per_m"], rel=1e-6)

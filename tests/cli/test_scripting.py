@@ -61,11 +61,3 @@ def test_exit_codes(raised, code, said, debug, monkeypatch, capsys):
     else:
         assert printed.err.endswith(said)
     assert ("Traceback" in printed.err) == (code == 70 or (debug and code != 130))
-
-
-def test_an_unknown_command_is_bad_input(monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["fgloc", "no-such-command"])
-    with pytest.raises(SystemExit) as left:
-        main()
-    assert left.value.code == 2
-    assert capsys.readouterr().out == ""

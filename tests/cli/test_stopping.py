@@ -1,6 +1,5 @@
 """Commands that a signal ends: with one line, an exit code, and nothing left behind; after `kill -9` the same command goes on."""
 
-import contextlib
 import os
 import signal
 import subprocess
@@ -63,21 +62,6 @@ def test_a_killed_comparison_leaves_no_process_and_can_be_made_again(processes, 
     assert other.exit_code == 0, other.output
     assert temporary(tmp_path) == []
     assert [list((tmp_path / "out" / "store" / name).iterdir()) for name in ("tmp", "claims")] == [[], []]
-
-
-def test_a_conversion_is_whole_or_not_there(processes, short_log, tmp_path, fgloc):
-    """It is killed while it writes; the same command then gives what it gives undisturbed, and removes what was left."""
-    fgloc("convert", short_log, tmp_path / "expected")
-    running = processes.start(*COMMAND, "convert", short_log, tmp_path / "copy")
-    processes.wait_until(lambda: temporary(tmp_path) or running.poll() is not None)
-    with contextlib.suppress(ProcessLookupError):  # it has just ended
-        os.killpg(running.pid, signal.SIGKILL)
-    running.wait()
-    if not (tmp_path / "copy").exists():
-        assert fgloc("convert", short_log, tmp_path / "copy").exit_code == 0
-    expected, copy = ({file.name: file.read_bytes() for file in (tmp_path / n).iterdir()} for n in ("expected", "copy"))
-    assert copy == expected
-    assert temporary(tmp_path) == []
 
 
 # in a process of its own: a test runner would take the exception for its own interrupt

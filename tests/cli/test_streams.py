@@ -1,24 +1,15 @@
 """The command with standard output and standard error of all kinds. Where the interpreter's own end counts, a case is a process."""
 
 import os
-import resource
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import Result
 
-from factorgraph_loc.io.native.native import write_native
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream
-
 Fgloc = Callable[..., Result]
-NAME = "Gärtnerstraße ± 廊下 🤖"
 FGLOC = f"{sys.executable} -c 'from factorgraph_loc.cli.main import main; main()'"
 REFUSED = "error: standard output: cannot be written: "
 
@@ -28,16 +19,6 @@ def shell(line: str, **environment: str) -> subprocess.CompletedProcess[bytes]:
     command = f"set -o pipefail; {FGLOC} {line}"
     environment = {**os.environ, **environment}
     return subprocess.run(["bash", "-c", command], capture_output=True, check=False, env=environment, timeout=60)
-
-
-@pytest.fixture(scope="module")
-def named_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a log with a name that ASCII does not have."""
-    t = np.arange(200) * 0.1
-    odometry = IncrementStream(t, np.full(200, 0.05), np.zeros(200), np.zeros(200))
-    folder = tmp_path_factory.mktemp("logs") / "named"
-    write_native(Log(NAME, Rig(sensors=("odometry",)), World(), {"odometry": odometry}, None), folder)
-    return folder
 
 
 @pytest.mark.parametrize(
@@ -71,17 +52,3 @@ def test_file_names_of_all_kinds_are_told(fgloc: Fgloc, tmp_path: Path) -> None:
     assert done.exit_code == 2
     assert "caf\\udce9 \\x1b[31mred \\u202e" in done.stderr
     assert done.stderr.removesuffix("\n").isprintable()
-
-
-def test_a_full_disk_is_one_line_and_leaves_nothing(fgloc: Fgloc, named_log: Path, tmp_path: Path) -> None:
-    """The limit is on the size of files; Python ignores its signal, so that writing fails as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
-    try:
-        done = fgloc("convert", named_log, tmp_path / "out")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert done.exit_code == 2
-    assert done.stderr.count("\n") == 1
-    assert "File too large" in done.stderr
-    assert list(tmp_path.iterdir()) == []

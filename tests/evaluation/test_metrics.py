@@ -44,16 +44,6 @@ def result_of(t, poses, status, final=None, diagnostics=None, learnt=None, confi
     return RunResult("log", config or {}, t, poses, covariances, status, final, diagnostics, learnt, TIMINGS, {})
 
 
-def test_constant_offset():
-    t, truth, _ = drive()
-    figures = accuracy(Trajectory(t, truth + np.array((3.0, 4.0, 0.0))), Trajectory(t, truth))
-    for how in ("rmse", "median", "p95", "max"):
-        assert figures[f"position_{how}"] == pytest.approx(5.0)
-        assert figures[f"heading_{how}"] == pytest.approx(0.0)
-    assert figures["rpe_position_per_m"] == pytest.approx(0.0, abs=1e-9)
-    assert figures["anees"] is None
-
-
 def test_heading_errors_wrap():
     t = np.arange(3) * 0.1
     truth = np.array([(0.0, 0.0, math.pi - 0.01)] * 3)

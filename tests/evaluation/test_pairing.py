@@ -1,7 +1,5 @@
 """What is compared with what: stamps of the reference, and estimates between those of the grid."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -39,12 +37,6 @@ def test_stamps_that_jitter_by_less_than_a_millisecond_are_all_kept():
     t = 0.1 * np.arange(1000) + rng.uniform(-4e-4, 4e-4, 1000)
     assert len(thinned(t)) == 1000
     assert np.diff(t[thinned(t)]).min() >= 0.099
-
-
-def test_of_a_dense_reference_no_two_poses_are_nearer_than_a_tenth_of_a_second():
-    t = np.sort(np.random.default_rng(1).uniform(0.0, 20.0, 3000))
-    assert np.diff(t[thinned(t)]).min() >= 0.099
-    assert len(thinned(t)) > 180
 
 
 def test_the_same_stamps_are_scored_whatever_the_estimate():
@@ -87,22 +79,6 @@ def test_beside_a_covariance_that_is_none_none_is_made_up():
     e = errors(estimate, Trajectory(np.array([0.0, 0.15]), np.zeros((2, 3))))
     assert np.isfinite(e.nees).tolist() == [True, False]
     assert e.invalid.tolist() == [False, True]
-
-
-def test_a_reference_without_headings_is_met_between_estimates_too():
-    t = np.arange(0.03, 20.0, 0.7)
-    reference = Trajectory(t, np.column_stack((circle(t).poses[:, :2], np.zeros(len(t)))), has_heading=False)
-    figures = accuracy(circle(GRID, np.eye(3)), reference)
-    assert figures["scored"] == len(t)
-    assert figures["position_max"] < 1e-9
-    assert figures["heading_rmse"] is None
-    assert figures["nees_bounds"] is not None
-
-
-def test_turns_across_pi_are_interpolated_the_short_way():
-    estimate = Trajectory(np.array([0.0, 0.1]), np.array([(0.0, 0.0, math.pi - 0.1), (0.0, 0.0, 0.1 - math.pi)]))
-    found = pairs(estimate, Trajectory(np.array([0.05]), np.zeros((1, 3)))).poses[0, 2]
-    assert abs(found) == pytest.approx(math.pi)
 
 
 def test_a_pause_is_longer_than_what_is_usual():

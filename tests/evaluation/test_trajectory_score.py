@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tum_files import read_tum
 
 from factorgraph_loc import InputError, Trajectory, Trajectory3, score
-from factorgraph_loc.evaluation import metrics, pairing
+from factorgraph_loc.evaluation import metrics
 from factorgraph_loc.model.scoring import ALIGNMENTS
 
 OPTIONS = {
@@ -184,16 +184,3 @@ def test_positions_without_headings_have_absolute_errors_only():
 def test_what_cannot_be_scored_is_refused(estimate, options, message):
     with pytest.raises(InputError, match=message.replace("(", "\\(")):
         score(estimate, along_x(), **options)
-
-
-def test_pieces_of_all_pairs_are_those_of_a_search():
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        steps = rng.choice((0.0, 0.25, 0.5, 2.0), 30)
-        covered = np.concatenate(([0.0], np.cumsum(steps)))
-        expected = []
-        for i in range(30):
-            far = np.abs(covered[i + 1 :] - covered[i] - 1.0)
-            if far.min() <= 0.1:
-                expected.append((i, i + 1 + int(np.argmin(far))))
-        assert pairing.all_pairs(steps, 1.0) == expected

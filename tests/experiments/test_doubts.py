@@ -122,16 +122,6 @@ def with_reference(log, t):
     return replace(log, reference=Trajectory(t, log.reference.at(t)))
 
 
-def test_a_reference_of_a_few_poses_a_second_is_scored_by(log):
-    sparse = with_reference(log, np.arange(0.07, 2.0, 0.128))
-    result = run(sparse, RunConfig("dead_reckoning", prior="0,0,0"))
-    assert result.warnings == ()
-    scores = score(result, sparse)
-    assert scores["causal.scored"] == scores["final.scored"] == len(sparse.reference) == 16
-    # the robot goes straight ahead, and so does the estimate between its ticks
-    assert scores["causal.position_max"] == pytest.approx(0.0, abs=1e-6)
-
-
 def test_fewer_poses_than_tell_anything_are_warned_of(log):
     sparse = with_reference(log, np.arange(0.0, 2.0, 0.4))
     result = run(sparse, RunConfig("dead_reckoning", prior="0,0,0"))

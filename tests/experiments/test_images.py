@@ -78,14 +78,6 @@ def test_an_estimator_that_takes_no_pixels_waits_for_no_features(seeing, fake, m
     assert "straight: fake does not use images: all 8 are ignored" in result.warnings
 
 
-@pytest.mark.usefixtures("sees")
-def test_a_calibration_of_another_resolution_is_an_error(seeing):
-    other = CAMERA.model_copy(update={"width": 320, "height": 240})
-    log = replace(seeing, rig=seeing.rig.model_copy(update={"camera": other}))
-    with pytest.raises(InputError, match="calibrated for images of 320 x 240 px, those of the log have 160 x 120 px"):
-        run(log, RunConfig("fake"))
-
-
 def test_a_rig_without_camera_leaves_images_out_unless_they_are_asked_for(seeing, sees):
     rig = seeing.rig.model_copy(update={"camera": None, "sensors": ("odometry", "camera", "sightings")})
     pixels = SightingStream(np.array([0.3]), ["door"], np.array([1.0]), np.array([2.0]))

@@ -100,16 +100,6 @@ def test_results_are_not_overwritten_unless_told(result, log, tmp_path):
     assert {path.name for path in out.iterdir()} == {*FILES, "notes.txt"}
 
 
-def test_nothing_is_left_half_written(result, log, tmp_path, monkeypatch):
-    def fail(*_):
-        raise OSError("no space left")
-
-    monkeypatch.setattr("factorgraph_loc.experiments.output.write_toml", fail)
-    with pytest.raises(InputError, match="out: cannot be written: no space left"):
-        write_run(result, log, tmp_path / "out")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_run_that_cannot_be_written_is_kept_elsewhere(result, log, tmp_path, monkeypatch):
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))

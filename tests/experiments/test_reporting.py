@@ -67,17 +67,6 @@ def test_a_damaged_result_is_named_and_left_out(prepared):
 
 
 @pytest.mark.usefixtures("blank_pictures")
-def test_a_damaged_result_is_made_again_where_all_is_verified(prepared, tmp_path):
-    some = prepared()
-    damage(some.runs[0], some.store)
-    assert prepare(tmp_path / "tiny.toml", out=tmp_path / "out").todo() == []
-    (again,) = prepare(tmp_path / "tiny.toml", out=tmp_path / "out", verify=True).todo()
-    assert again == some.runs[0]
-    assert run_planned(again, tmp_path / "out").status == "ok"
-    assert report_experiment(some).damaged == []
-
-
-@pytest.mark.usefixtures("blank_pictures")
 def test_what_is_kept_beside_the_results_is_made_again_where_it_is_damaged(prepared, tmp_path):
     first = report_experiment(prepared()).page.read_bytes()
     (scene,) = (tmp_path / "out/store/scenes").iterdir()

@@ -1,15 +1,10 @@
 """Trajectories as other programs read them: evo does as they are."""
 
 import numpy as np
-import pytest
-from evo.core import metrics, sync
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.exports.runs import find_runs, read_runs
 from factorgraph_loc.exports.trajectories import matrices, write_kitti
-from factorgraph_loc.model.trajectory import write_tum
 from factorgraph_loc.model.trajectory3 import Trajectory3
 
 
@@ -24,26 +19,9 @@ def test_evo_reads_poses_of_kitti(log, tmp_path):
     assert np.allclose(np.loadtxt(times), log.reference.t, atol=1e-9)
 
 
-def test_evo_gets_our_error_from_our_files(log, results, tmp_path):
-    """The final.tum of a run against the reference as TUM: evo's error is that of estimates.parquet."""
-    ekf = next(run for run in read_runs(find_runs(results), log) if run.name == "ekf")
-    write_tum(log.reference, tmp_path / "reference.tum", log.t0_ns)
-    truth = file_interface.read_tum_trajectory_file(str(tmp_path / "reference.tum"))
-    causal = file_interface.read_tum_trajectory_file(str(ekf.folder.path / "causal.tum"))
-    error = metrics.APE(metrics.PoseRelation.translation_part)
-    error.process_data(sync.associate_trajectories(truth, causal, max_diff=0.001))
-    ours = np.sqrt(np.mean(ekf.series["error_position"][1] ** 2))
-    assert error.get_statistic(metrics.StatisticsType.rmse) == pytest.approx(ours, abs=1e-8)
-
-
 def test_poses_in_space():
     turns = Rotation.from_rotvec([(0.1, 0.2, 0.3), (0.0, -0.5, 1.0)]).as_matrix()
     positions = np.array(((1.0, 2.0, 3.0), (4.0, 5.0, 6.0)))
     poses = matrices(Trajectory3(np.array((0.0, 1.0)), positions, turns))
     assert np.array_equal(poses[:, :, :3], turns)
     assert np.array_equal(poses[:, :, 3], positions)
-
-
-def test_a_folder_that_is_missing(log, tmp_path):
-    with pytest.raises(InputError, match=r"arc.kitti: cannot be written: No such file"):
-        write_kitti(log.reference, tmp_path / "missing" / "arc.kitti")

@@ -49,20 +49,6 @@ def found():
     return {setting.key: setting for setting in settings_in(Everything)}
 
 
-def test_all_settings_are_found_with_those_of_parts(found):
-    assert list(found) == [
-        "count",
-        "on",
-        "growth.per_time",
-        "models",
-        "models.*.kind",
-        "models.*.reach",
-        "models.*.file",
-        "line",
-        "pair",
-    ]
-
-
 def test_a_setting_has_bounds_unit_and_meaning(found):
     growth = found["growth.per_time"]
     assert (growth.low, growth.high, growth.unit, growth.default) == (0.0, 5.0, "m", 0.5)

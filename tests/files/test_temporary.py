@@ -122,24 +122,6 @@ def test_a_lock_lets_one_process_in_at_a_time(tmp_path, processes):
         pass
 
 
-@pytest.fixture
-def deleted(tmp_path, monkeypatch):
-    """The working folder, which no longer exists."""
-    folder = tmp_path / "deleted"
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    folder.rmdir()
-
-
-@pytest.mark.usefixtures("deleted")
-@pytest.mark.parametrize("make", [temporary_file, temporary_folder])
-@pytest.mark.parametrize("path", ["a.txt", "/proc/a.txt"])
-def test_a_folder_that_holds_no_files_is_told_by_the_name_of_the_target(make, path):
-    with pytest.raises(FileNotFoundError) as caught, make(Path(path)):
-        pass
-    assert caught.value.filename == path
-
-
 def test_an_error_without_a_file_gets_the_name_of_the_target(tmp_path):
     with pytest.raises(OSError, match="No space left") as caught, replacing(tmp_path / "a.txt"):
         raise OSError(28, "No space left on device")

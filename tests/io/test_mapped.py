@@ -52,19 +52,6 @@ def test_poses_are_odometry_by_the_motion_between_them(hall, with_options, one, 
     np.testing.assert_allclose(odometry.dtheta, (0.0, np.pi / 2, 0.0), atol=1e-9)
 
 
-def test_ticks_of_two_wheels_are_metres_by_a_factor(hall, with_options, one):
-    (hall.parent / "run" / "ticks.csv").write_text("t,l,r\n0,100,100\n1,1100,1100\n2,1100,1257.0796326794897\n")
-    log = one(
-        with_options(
-            '[options.odometry]\nfile = "ticks.csv"\ntrack = 0.1\ncolumns = { t = "t", left = "l", right = "r" }\n'
-            'units = { t = "s", left = 0.001, right = 0.001 }\n'
-        )
-    )
-    odometry = log.streams["odometry"]
-    np.testing.assert_allclose(odometry.dx[1], 1.0)
-    np.testing.assert_allclose(odometry.dtheta, (0.0, 0.0, np.pi / 2))
-
-
 def test_a_gyro_by_its_three_axes(hall, with_options, one, refused):
     (hall.parent / "run" / "gyro.csv").write_text("t,a,b,c\n1,10,20,90\n2,0,30,0\n")
     options = f"""{WHEELS}

@@ -117,18 +117,6 @@ def test_strengths_in_columns(hall, with_options, one, refused, head, columns, m
     refused(twice, f"wide.csv:1: has the column '{first}' more than once")
 
 
-def test_rows_of_one_kind(hall, with_options, one):
-    rows = "kind,timestamp,antenna,rssi,epc\nread,1.1,1,-60,aa\nkeepalive,1.2,,,\nread,1.3,1,-61,bb\n"
-    (hall.parent / "run" / "log.csv").write_text(rows)
-    log = one(
-        with_options(
-            f'{WHEELS}\n[options.rfid]\nfile = "log.csv"\npreset = "sllurp_log"\nwhere = {{ kind = "read" }}\n'
-        )
-    )
-    assert log.streams["rfid"].epc == ["aa", "bb"]
-    assert any(line.endswith("log.csv: 1 of 3 rows have another kind than where says") for line in log.warnings)
-
-
 def test_reports_of_sllurp_with_several_reads_in_a_row(hall, with_options, one):
     report = {
         "EPC": "b'e2001'",

@@ -48,19 +48,6 @@ def test_plaza_2_has_its_heading_turned(read_plaza):
     assert log.reference.poses[1, 2] == pytest.approx(np.pi)
 
 
-def test_plaza_ranges_are_put_in_order(read_plaza):
-    log = read_plaza(TD=np.array([[12.0, 2, 1, 5.0], [10.5, 2, 6, 7.0], [12.0, 2, 1, 6.0]]))
-    np.testing.assert_array_equal(log.streams["bearing_range"].range, (7.0, 6.0))
-    assert "1 rows are older than one before them: sorted by time" in log.warnings[0]
-    assert "1 rows see a landmark that a later row sees" in log.warnings[1]
-
-
-def test_plaza_odometry_of_one_stamp_is_one_motion(read_plaza):
-    log = read_plaza(DR=np.array([[10.1, 0.5, 0.0], [10.1, 0.25, 0.0]]))
-    np.testing.assert_array_equal(log.streams["odometry"].dx, (0.0, 0.75))
-    assert ":DR: 1 increments have the timestamp of the row before them" in log.warnings[0]
-
-
 PLAZA_BAD = {
     "field missing": ({"DR": None}, "DR is missing"),
     "shape": ({"TL": np.zeros((2, 2))}, "TL has shape (2, 2)"),

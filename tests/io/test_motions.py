@@ -95,10 +95,3 @@ def test_headings_in_degrees_are_refused_unless_the_unit_says_so(hall):
         hall(columns.replace("UNIT", ""), rows)
     log = hall(columns.replace("UNIT", ', heading = "deg"'), rows)
     np.testing.assert_allclose(log.streams["odometry"].dtheta, np.deg2rad((0.0, 9.0, 9.0)), atol=1e-9)
-
-
-def test_a_log_that_was_recorded_twice_is_refused_at_the_row_where_it_begins_again(hall):
-    columns = 'columns = { t = "t", v = "v", w = "w" }\nunits = { t = "s" }\n'
-    rows = ["t,v,w", "0,1,0", "1,1,0", "0,1,0", "1,1,0"]
-    with pytest.raises(InputError, match=r"wheels.csv:4: time is .* expected a timestamp not before"):
-        hall(columns, rows)

@@ -39,13 +39,6 @@ def test_what_is_read(mrclam, read):
     assert "no rig is given" in no_rig
 
 
-def test_duplicate_odometry_stamps_the_last_wins(mrclam, read):
-    (mrclam / "Robot1_Odometry.dat").write_text("1248444187.1 1 0\n1248444187.1 2 0\n1248444187.5 3 0\n")
-    log = read(mrclam)
-    np.testing.assert_array_equal(log.streams["odometry"].v, (2.0, 3.0))
-    assert "Robot1_Odometry.dat: 1 rows" in log.warnings[0]
-
-
 BAD = {
     "word": ("Robot1_Odometry.dat", "1 0 0\n\n2 0 x\n", ":3: 3 is 'x'", "a number"),
     "short row": ("Robot1_Odometry.dat", "# c\n1 0 0\n2 0\n", ":3: row is '2,0'", "3 values"),

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from recorded_logs import recorded_log
 
 from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.io.readers import load
-from factorgraph_loc.model.log import Log, cut
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
@@ -104,13 +103,6 @@ def test_inventories_of_antennas_that_read_nothing(hall, one):
     assert [(scan.t, scan.antennas, scan.tags) for scan in scans] == [(0.5, ("left",), ()), (1.0, ("left",), ())]
 
 
-def test_a_clock_that_jumps_is_kept_and_told(hall, one):
-    (hall / "inventories.csv").write_text(INVENTORIES + "9000000000,left,0.05\n1150000000,right,0.05\n")
-    log = one(hall)
-    assert log.streams["rfid"].t.tolist() == [8.0, 0.15]
-    assert any("1 rows are late, by at most 7.850 s" in warning for warning in log.warnings)
-
-
 BAD = {
     "no tag": ("rfid.csv", READS + "1,left,,,,\n", "rfid.csv:2: epc is ''", "EPC of a tag"),
     "degrees": ("rfid.csv", READS + "1,left,E1,,90,\n", "rfid.csv:2: phase is 90.0", "radians"),
@@ -182,19 +174,3 @@ def test_what_is_written_comes_back(tmp_path_factory, stream, format, t0_ns):
     assert (back.rig, back.world, back.t0_ns) == (rig, world, t0_ns)
     for field in dataclasses.fields(stream):
         np.testing.assert_array_equal(getattr(back.streams["rfid"], field.name), getattr(stream, field.name))
-
-
-def test_a_recorded_run_comes_back(data_root, tmp_path):
-    log = recorded_log("rfid-aisle-run16", data_root)
-    log = cut(log, 0.0, 60.0)
-    write_native(log, tmp_path / "out")
-    (back,) = load(str(tmp_path / "out"))
-    assert back.world == log.world
-    for field in dataclasses.fields(RfidStream):
-        np.testing.assert_array_equal(
-            getattr(back.streams["rfid"], field.name), getattr(log.streams["rfid"], field.name)
-        )
-    # without the table of rounds the gaps tell the same ones
-    (tmp_path / "out" / "inventories.csv").unlink()
-    (again,) = load(str(tmp_path / "out"))
-    np.testing.assert_array_equal(again.streams["rfid"].round, log.streams["rfid"].round)

@@ -3,7 +3,6 @@
 import sys
 
 import numpy as np
-import pytest
 from rosbag_reads import FIELDS, MS, OPTIONS, POSES, T0
 from rosbags.typesys import get_types_from_msg
 
@@ -54,17 +53,6 @@ def test_a_bag_without_a_manifest_says_what_to_do(bag, refused):
     refused(bag.parent / "gone.bag", "is neither a file, nor a folder")
 
 
-@pytest.mark.usefixtures("mcap")
-def test_a_manifest_beside_the_bag(tmp_path):
-    text = 'title = "t"\nreader = "rosbag"\nlicence = "l"\norigin = "o"\npath = "drive"\n'
-    text += '[options.odometry]\ntopic = "/odom"\nuse = "twist"\n'
-    (tmp_path / "run.toml").write_text(text)
-    (log,) = load(str(tmp_path / "run.toml"))
-    assert log.name == "drive"
-    assert log.streams["odometry"].v.tolist() == [1.0, 2.0, 3.0, 4.0]
-    assert load(str(tmp_path))[0].name == "drive"
-
-
 def test_a_field_that_the_message_lacks(mcap, refuse):
     fields = FIELDS | {"epc": "reads[].tag"}
     message = refuse(
@@ -79,14 +67,6 @@ def test_a_field_that_the_message_lacks(mcap, refuse):
 def test_an_antenna_that_is_not_told(mcap, refuse):
     refuse(
         mcap, "expected either fields.antenna, or antenna", rfid={"topic": "/rfid", "fields": {"epc": "reads[].epc"}}
-    )
-
-
-def test_degrees_for_radians(mcap, refuse):
-    refuse(
-        mcap,
-        "drive /rfid:1: phase is 90.0, expected a finite number of radians",
-        rfid={"topic": "/rfid", "fields": FIELDS},
     )
 
 

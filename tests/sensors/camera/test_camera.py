@@ -250,17 +250,3 @@ def test_an_update_is_taken_to_the_optimum():
     update = image_update(factor, start, covariance, ITERATIONS, SETTLED)
     error = se2.log(se2.between(pose, se2.compose(start, se2.exp(update.delta))))
     assert np.all(np.abs(error) < 0.3 * np.sqrt(np.diag(update.covariance)))
-
-
-def test_more_pixels_tell_more(log):
-    """With every second sighting the pose is known less well."""
-    stream = log.streams["sightings"]
-    some = replace(
-        log,
-        streams={
-            **log.streams,
-            "sightings": SightingStream(stream.t[::2], stream.point[::2], stream.u[::2], stream.v[::2]),
-        },
-    )
-    half, whole = run(some, CONFIGS["smoother"]), run(log, CONFIGS["smoother"])
-    assert np.median(half.final.covariances[:, 0, 0]) > 1.2 * np.median(whole.final.covariances[:, 0, 0])

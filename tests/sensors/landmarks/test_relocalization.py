@@ -7,13 +7,11 @@ import pytest
 from landmark_world import simulate, swapped, with_sightings
 
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.sensors.landmarks.finder import LandmarkFinder, TrackMonitor, _apart, _insert, _thinned
+from factorgraph_loc.sensors.landmarks.finder import LandmarkFinder, TrackMonitor
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange
 from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks
-from factorgraph_loc.sensors.landmarks.window import Sighting
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2
-from factors.motion import ChainState
 
 
 @pytest.fixture(scope="module")
@@ -98,12 +96,6 @@ def test_nothing_is_left_to_search(log):
     assert (relocalizer.best, relocalizer.hypotheses) == (None, ())
 
 
-def test_nowhere_to_search_is_no_hypothesis():
-    """Where no candidate has a finite loss there is none to refine."""
-    chosen = _apart(np.zeros((2, 3)), np.full(2, np.nan), np.ones(3), 5)
-    assert np.zeros((2, 3))[chosen].shape == (0, 3)
-
-
 def test_a_wrong_track_is_suspected_and_refuted_and_a_right_one_is_not(log):
     seeker, covariance = Seeker(log, 10.0), np.diag((0.05, 0.05, 0.02)) ** 2
     right, wrong = TrackMonitor(), TrackMonitor()
@@ -128,16 +120,3 @@ def test_swapped_landmarks_do_not_refute_the_right_track(log):
         if int(t * 4) % 8 == 0:
             seeker.relocalizer.search()
             assert not seeker.relocalizer.refutes(log.reference.at(np.array([t]))[0], covariance)
-
-
-def test_sightings_of_a_landmark_are_thinned_as_they_come():
-    """In order of time, late, and with equal stamps: as if all were thinned at once each time."""
-    rng = np.random.default_rng(2)
-    times = np.sort(rng.uniform(0.0, 20.0, 60))
-    times[30], times[45], times[50] = times[25], times[44], 3.0
-    kept, expected = [], []
-    for t in times.tolist():
-        row = Sighting(ChainState(t, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), np.zeros(2), 1.0, 0.0)
-        _insert(kept, row)
-        expected = _thinned(sorted([*(r for r in expected if r.odometry.t != t), row], key=lambda r: r.odometry.t))
-        assert kept == expected
