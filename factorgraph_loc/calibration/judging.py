@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_loc.io.results import KINDS
 from factors.se2 import Array
 
-KINDS = ("causal", "final")
 WORSE = 1.02  # relative increase of the error beyond which a parameter is refused, whatever the consistency
 LEAST = 0.005  # nats per pose that a parameter has to gain
 SMALLEST = 1e-8  # mean squared error [m^2, rad^2]

@@ -8,12 +8,12 @@ from factorgraph_loc.calibration.calibrate import Calibration, Scores, estimator
 from factorgraph_loc.drawing.pages import Part, Rows, sectioned
 from factorgraph_loc.files.settings import settings_in
 from factorgraph_loc.fitting.constants import FittedConstant
+from factorgraph_loc.io.results import KINDS
 from factorgraph_loc.model.sections import sections
 from factorgraph_loc.plugins import load
 from factorgraph_loc.text import number
 from factors.se2 import Array
 
-KINDS = ("causal", "final")
 FIGURES = {"position RMSE [m]": ("position_rmse", 3), "heading RMSE [rad]": ("heading_rmse", 4), "ANEES": ("anees", 1)}
 
 

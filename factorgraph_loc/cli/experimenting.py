@@ -232,10 +232,11 @@ def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[li
     from statistics import median
 
     from factorgraph_loc.evaluation.tables import SCORED, counted
+    from factorgraph_loc.evaluation.warned import SWEEP
 
     groups: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
-        swept = [f"{k.removeprefix('sweep.')}={v}" for k, v in row.items() if k.startswith("sweep.") and v is not None]
+        swept = [f"{k.removeprefix(SWEEP)}={v}" for k, v in row.items() if k.startswith(SWEEP) and v is not None]
         groups.setdefault(" ".join([row["label"], *([row["sensors"]] if row["sensors"] else []), *swept]), []).append(
             row
         )

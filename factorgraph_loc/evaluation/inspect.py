@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_loc.files.checks import ROUNDING
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.interfaces import Summary
 from factorgraph_loc.sensors.registry import functions
@@ -13,7 +14,6 @@ from factorgraph_loc.text import one_line
 from factors.se2 import Array
 
 LONG_GAP = 5.0  # s
-_ROUNDING = 1e-6  # s, tolerance of differences between stamps
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def _summary(t: Array) -> StreamSummary:
         return StreamSummary(0, 0.0, 0.0, 0.0, ())
     stamps = np.unique(t)
     steps = np.diff(stamps)
-    gaps = tuple((float(stamps[i]), float(steps[i])) for i in np.flatnonzero(steps > LONG_GAP + _ROUNDING))
+    gaps = tuple((float(stamps[i]), float(steps[i])) for i in np.flatnonzero(steps > LONG_GAP + ROUNDING))
     rate = 1.0 / float(np.median(steps)) if len(steps) else 0.0
     return StreamSummary(len(t), rate, float(stamps[0]), float(stamps[-1]), gaps)
 

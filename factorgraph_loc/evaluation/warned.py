@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 WARNINGS = "warnings"  # key of the scores (a list), and of a row (one text, one line each; None without any)
+SWEEP = "sweep."  # columns of rows: the swept settings of a run
 
 Row = Mapping[str, Any]
 

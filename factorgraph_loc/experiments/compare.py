@@ -29,13 +29,13 @@ from factorgraph_loc.files.models import file_name, parse_model
 from factorgraph_loc.files.temporary import of_system, require_free, temporary_folder
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, load_all
-from factorgraph_loc.io.results import FILES
+from factorgraph_loc.io.results import FILES, INDEX
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
 from factorgraph_loc.text import listed, plain
 
 # without results.parquet, which an unfinished comparison has
-_WRITTEN = (*(name for name in TABLES if name != "results.parquet"), PAGE)
+_WRITTEN = (*(name for name in TABLES if name != INDEX), PAGE)
 
 
 @dataclass(frozen=True)

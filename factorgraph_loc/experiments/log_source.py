@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import kind
-from factorgraph_loc.files.data_root import find_data_root, named_path
+from factorgraph_loc.files.data_root import RUN_FILE, find_data_root, named_path
 from factorgraph_loc.files.models import DEEPEST, read_toml
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.files.yaml import read_yaml
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 VISITED = 100_000  # maximum number of files and folders visited for a pattern
 ANY_DEPTH = "**"
 _MAGIC = re.compile(r"[*?[]")
-RUN_FILE = "run.toml"
 NAMING = {".toml": read_toml, ".yaml": read_yaml, ".yml": read_yaml}  # files that name others
 
 

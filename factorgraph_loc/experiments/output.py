@@ -24,7 +24,7 @@ from factorgraph_loc.files.models import write_text, write_toml
 from factorgraph_loc.files.tables import write_parquet
 from factorgraph_loc.files.temporary import of_system, require_free, sweep, temporary_folder, writing
 from factorgraph_loc.io.native.world_file import write_world
-from factorgraph_loc.io.results import EVENTS, FILES, INNOVATIONS
+from factorgraph_loc.io.results import EVENTS, FILES, INDEX, INNOVATIONS
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
@@ -35,7 +35,7 @@ from factorgraph_loc.text import plain_lines, quoted
 from factors.se2 import Array
 
 MAP = "map.world.toml"
-TABLES = ("results.parquet", "results.csv", "differences.csv", "table.md")
+TABLES = (INDEX, "results.csv", "differences.csv", "table.md")
 
 
 def write_run(
@@ -271,4 +271,4 @@ def write_tables(table: pl.DataFrame, differences: pl.DataFrame, text: str, out:
     write_text(out / "results.csv", plain_lines(table.write_csv()))
     write_text(out / "differences.csv", plain_lines(differences.write_csv()))
     write_text(out / "table.md", plain_lines(text))
-    write_parquet(table, out / "results.parquet")
+    write_parquet(table, out / INDEX)

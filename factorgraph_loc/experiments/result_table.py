@@ -7,15 +7,14 @@ from typing import Any
 import polars as pl
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.warned import WARNINGS
+from factorgraph_loc.evaluation.warned import SWEEP, WARNINGS
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.store import Store, StoreError
 from factorgraph_loc.files.bounded import kind
 from factorgraph_loc.files.tables import read_parquet, write_parquet
+from factorgraph_loc.io.results import INDEX
 from factorgraph_loc.text import told
 
-INDEX = "results.parquet"
-SWEEP = "sweep."
 TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "reason", "key", "scoring.align", WARNINGS}
 
 

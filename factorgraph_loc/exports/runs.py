@@ -13,15 +13,15 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import DATA, foreign, read_bytes
 from factorgraph_loc.files.models import FileModel, parse_model, read_json, read_toml
 from factorgraph_loc.files.tables import read_parquet
-from factorgraph_loc.io.results import ESTIMATES, EVENTS, FILES, by_kind, parse_estimates, parse_events, trajectory_of
+from factorgraph_loc.io import results
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.text import told
 from factors.se2 import Array
 
-TABLE, STORE = "results.parquet", "store"  # of several runs
-COMPLETE = FILES[-1]  # written last, so that its presence marks a complete run
+STORE = "store"  # of several runs
+COMPLETE = results.FILES[-1]  # written last, so that its presence marks a complete run
 OUTSIDE = 60.0  # s that an estimate may lie outside of its log
 SERIES = ("error_position", "error_heading", "nees")
 
@@ -89,7 +89,7 @@ class StoredRun:
 
 def is_results(path: Path) -> bool:
     """Whether ``path`` is a result folder of a run, a comparison or an experiment."""
-    return (path / COMPLETE).is_file() or ((path / TABLE).is_file() and (path / STORE).is_dir())
+    return (path / COMPLETE).is_file() or ((path / results.INDEX).is_file() and (path / STORE).is_dir())
 
 
 def find_runs(path: Path) -> list[RunFolder]:
@@ -102,8 +102,8 @@ def find_runs(path: Path) -> list[RunFolder]:
 
 def _stored(path: Path) -> list[Path]:
     """The folders of the successful runs in the table of a comparison or an experiment."""
-    table = read_parquet(path / TABLE)
-    with foreign(path / TABLE, "is no table of runs"):
+    table = read_parquet(path / results.INDEX)
+    with foreign(path / results.INDEX, "is no table of runs"):
         keys = table.filter(pl.col("status") == "ok")["key"].cast(pl.String).unique(maintain_order=True)
     return [path / STORE / key[:2] / key for key in keys]
 
@@ -127,12 +127,12 @@ def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
 def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
     if folder.log != log.name:
         raise InputError(f"{folder.path}: is a run of the log {folder.log}, expected one of {log.name}")
-    path = folder.path / ESTIMATES
-    table = parse_estimates(read_bytes(path, DATA), path)
+    path = folder.path / results.ESTIMATES
+    table = results.parse_estimates(read_bytes(path, DATA), path)
     table = table.filter(pl.all_horizontal(pl.col(key).is_finite() for key in ("x", "y", "heading")))
-    causal, final = by_kind(table).values()
+    causal, final = results.by_kind(table).values()
     try:
-        of_causal, of_final = trajectory_of(causal, log.t0_ns), trajectory_of(final, log.t0_ns)
+        of_causal, of_final = results.trajectory_of(causal, log.t0_ns), results.trajectory_of(final, log.t0_ns)
     except ValueError as error:
         raise InputError(f"{path}: holds no trajectory: {told(error)}") from error
     run = StoredRun(
@@ -142,7 +142,7 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
         of_final,
         {key: _series(causal if len(causal) else final, key, log.t0_ns) for key in SERIES},
         _landmarks(folder.path / "learnt.json"),
-        parse_events(read_bytes(folder.path / EVENTS, DATA), folder.path / EVENTS, log.t0_ns),
+        results.parse_events(read_bytes(folder.path / results.EVENTS, DATA), folder.path / results.EVENTS, log.t0_ns),
     )
     _check_times(run, log)
     return run

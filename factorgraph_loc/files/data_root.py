@@ -7,6 +7,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import inside
 
 DATA_ROOT = "FGLOC_DATA"
+RUN_FILE = "run.toml"  # of a log in the native format; a manifest may have this name too
 EXPECTED = f"one below it, or below the data folder (--data-root, {DATA_ROOT})"
 
 

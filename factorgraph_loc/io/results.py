@@ -12,6 +12,7 @@ from factorgraph_loc.files.columns import LATEST
 from factorgraph_loc.files.tables import parse_parquet
 from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory
 
+INDEX = "results.parquet"  # of several runs
 ESTIMATES, INNOVATIONS, EVENTS = "estimates.parquet", "innovations.parquet", "events.csv"
 KINDS = ("causal", "final")
 TEXTS, STAMP = ("kind", "status"), "t_ns"

@@ -25,7 +25,7 @@ from factorgraph_loc.evaluation.report import tracks
 from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.report.scene import Scene
 from factorgraph_loc.evaluation.report.tracks import Series
-from factorgraph_loc.evaluation.warned import label_of
+from factorgraph_loc.evaluation.warned import SWEEP, label_of
 from factorgraph_loc.io.results import KINDS
 from factors.se2 import Array
 
@@ -33,7 +33,6 @@ POSES = 120_000  # on the page, shared by all trajectories
 FEWEST, MOST = 60, 1000  # bounds for one trajectory
 TRACKS = 1000  # maximum number of runs with trajectories; further logs appear in tables only
 _ESTIMATES, _CONFIG = "estimates.parquet", "config.toml"
-SWEEP = "sweep."
 SIMULATION = "simulation"  # first word of swept settings that change the log
 
 Row = Mapping[str, Any]

@@ -10,6 +10,7 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.columns import require_span
+from factorgraph_loc.files.data_root import RUN_FILE
 from factorgraph_loc.files.models import FileModel, file_name, inside, parse_model, read_toml, write_toml
 from factorgraph_loc.files.tables import TableRows, read_table, write_table
 from factorgraph_loc.files.temporary import sweep, temporary_folder, writing
@@ -28,7 +29,6 @@ from factorgraph_loc.sensors.registry import Channel, channel
 from factorgraph_loc.sensors.tables import Reading, Writing, assemble, disassemble, native_tables
 from factorgraph_loc.text import listed
 
-RUN_FILE = "run.toml"
 REFERENCE = "reference.tum"
 SUFFIXES = (".csv", ".parquet")
 OF_LOGS = (*SUFFIXES, ".toml", ".tum")

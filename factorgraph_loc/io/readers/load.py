@@ -10,7 +10,7 @@ from typing import Any
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import kind
 from factorgraph_loc.files.column_mapping import JSON_SUFFIXES
-from factorgraph_loc.files.data_root import EXPECTED, find_data_root, named_path
+from factorgraph_loc.files.data_root import EXPECTED, RUN_FILE, find_data_root, named_path
 from factorgraph_loc.files.models import FileModel, nearest, parse_model, read_toml
 from factorgraph_loc.files.settings import first_sentence
 from factorgraph_loc.files.shipped import manifests
@@ -30,7 +30,6 @@ from factorgraph_loc.text import listed, one_line, quoted
 LogLike = Log | str | Path
 RigLike = Rig | str | Path
 WorldLike = World | str | Path
-RUN_FILE = "run.toml"
 MOST = 1000  # maximum number of logs from lists of options
 TABLES = (".csv", *JSON_SUFFIXES)
 

@@ -16,6 +16,8 @@ import numpy as np
 import scipy
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.checks import ROUNDING
+from factorgraph_loc.fitting.robust import MAD_TO_SIGMA
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors import interfaces
@@ -29,11 +31,9 @@ from factors.se2 import Array
 MIN_SIGHTINGS = 10  # minimum for a statement about a landmark
 MIN_OFFSET = 0.5  # m; smaller survey errors are harmless for robust estimators
 MIN_PASSES = 3
-MAD_TO_SIGMA = 1.4826  # of a Gaussian
 PASS = 10.0  # s; errors within a pass are correlated, so passes are counted, not sightings
 MOST = 2000  # sightings that are compared at time shifts
 _REFERENCE_GAP = 0.1  # s; longest interpolated gap between reference poses
-_ROUNDING = 1e-6  # s; tolerance of differences of timestamps
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def _seen_from_reference(log: Log) -> dict[str, _Seen]:
         return {}
     model = log.rig.of(BearingRangeSettings).model()
     t = stream.t + log.rig.time_offset("bearing_range")
-    sensors = se2.compose(log.reference.at(t, max_gap=_REFERENCE_GAP + _ROUNDING), np.array(model.mounting))
+    sensors = se2.compose(log.reference.at(t, max_gap=_REFERENCE_GAP + ROUNDING), np.array(model.mounting))
     ranges = stream.range / model.range_scale
     bearings = stream.bearing - model.bearing_bias
     if not log.reference.has_heading:
