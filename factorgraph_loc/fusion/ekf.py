@@ -18,12 +18,13 @@ from pydantic import Field
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.search import Refuted, Search, Tracked, is_doubted, laplace_evidence
+from factorgraph_loc.fusion.slipping import SlipMonitor
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import Binding, EarlierPose, Link, NewVariable, bound_sensors
+from factorgraph_loc.sensors.base import Binding, EarlierPose, Link, NewVariable, Observation, bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import positive, se2
 from factors.motion import Increment
@@ -144,6 +145,7 @@ class Ekf(Filter):
         self._search = Search({n: s for n, s in self._sensors.items() if n not in slow}, self._motion, setup.rng)
         if self._search.possible:
             self._search.remember()
+        self._slips = SlipMonitor(self._motion, self.diagnostics)
         self._headings = Search(finders, self._motion, setup.rng)
         self.supports_unknown_start = len(slow) < len(finders)
         self.supports_unknown_heading = self._headings.possible
@@ -236,11 +238,12 @@ class Ekf(Filter):
             correction = seen.correct(
                 s.pose, s.covariance, values, s.layout.columns, seen.iterations or self._iterations
             )
-            if seen.is_judged and not sensor.judge(seen, correction, view):
-                continue
+            if seen.is_judged:
+                if not sensor.judge(seen, correction, view):
+                    continue
+                self._slips.add(partial(_at_its_time, seen, s), self._odometry, view, correction)
             if self._search.serves(sensor):
-                spreads = {name: view.spread(name) for name in seen.blocks}
-                here = seen.on_pose({name: values[name] for name in seen.blocks}, spreads)
+                here = _on_pose(seen, s)
                 self._search.expect(sensor, here, self._odometry, view)
                 evidence = partial(laplace_evidence, here, s.pose, s.covariance[:POSE, :POSE], correction)
                 self._search.keep(sensor, here, self._odometry, evidence)
@@ -307,3 +310,15 @@ class Ekf(Filter):
     def _standstill(self) -> _Step:
         """The step to a second measurement of the same time."""
         return _Step(self._state.pose, np.eye(3, len(self._state.covariance)), np.zeros((3, 3)))
+
+
+def _on_pose(seen: Observation, state: _State) -> Observation:
+    """An observation of the pose alone, with the blocks of a state."""
+    values, columns = state.layout.values(state.rest), state.layout.columns
+    spreads = {name: state.covariance[columns[name], columns[name]] for name in seen.blocks}
+    return seen.on_pose({name: values[name] for name in seen.blocks}, spreads)
+
+
+def _at_its_time(seen: Observation, state: _State) -> Observation | None:
+    """:func:`_on_pose` at the time of the observation, if that is possible."""
+    return _on_pose(seen, state).at_its_time()

@@ -39,6 +39,7 @@ from factorgraph_loc.fusion.filter import Filter, FilterSettings, twin
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.search import Change, Search, Tracked, is_known
+from factorgraph_loc.fusion.slipping import SlipMonitor
 from factorgraph_loc.fusion.timeline import Taken
 from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -94,6 +95,7 @@ class ParticleFilter(Filter):
         # where they lie in the constants of the particles
         self._parts = {name: slice(part.start - POSE, part.stop - POSE) for name, part in columns.items()}
         self._search = Search(self._sensors, self._motion, setup.rng)
+        self._slips = SlipMonitor(self._motion, self.diagnostics)
         self._search.remember()
         self._lost = False
         self._changes: list[tuple[float, Change]] = []  # of the robot's place, each with when it was found out
@@ -275,6 +277,7 @@ class ParticleFilter(Filter):
                 correction = here.correct(view.pose, view.covariance, {}, {}, 1)
                 if not sensor.judge(here, correction, view):
                     continue
+                self._slips.add(here.at_its_time, self._odometry, view, correction)
                 self._search.expect(sensor, here, self._odometry, view)
             evidence = self._weigh(seen)
             self._search.keep(sensor, here, self._odometry, partial(float, evidence))

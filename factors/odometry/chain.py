@@ -24,6 +24,7 @@ from factors.odometry.chain_kernels import (
     LAG,
     PATH,
     ROW,
+    SLIPPING,
     STATE,
     STILL,
     TURN,
@@ -75,7 +76,7 @@ class OdometryChain:
             m.turn_slowdown,
         )
         direction = math.cos(m.direction), math.sin(m.direction)
-        self._constants = np.array((*scales, *direction, m.lag, m.max_hold, m.gyro_bias, use_gyro), dtype=float)
+        self._constants = np.array((*scales, *direction, m.lag, m.max_hold, m.gyro_bias, use_gyro, False), dtype=float)
         self._noise = np.array(m.noise())
 
     def add_velocity(self, t: float, v: float, w: float) -> bool:
@@ -127,6 +128,21 @@ class OdometryChain:
         out = np.empty((len(t), STATE))
         states_at(self._knots, self._count, np.asarray(t, dtype=float), self._constants, out)
         return out
+
+    def begin_slip(self, since: float) -> None:
+        """The wheels slip since then: how the robot moves is not known, until :meth:`end_slip`."""
+        if not self._constants[SLIPPING] and self._count:
+            self._knots[self._count - 1, UNKNOWN] += max(0.0, self._knots[self._count - 1, T] - since)
+            self._constants[SLIPPING] = 1.0
+
+    def end_slip(self) -> None:
+        """The wheels slip no more."""
+        self._constants[SLIPPING] = 0.0
+
+    @property
+    def is_slipping(self) -> bool:
+        """Whether the wheels slip."""
+        return bool(self._constants[SLIPPING])
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:
         """The motion from ``start`` to ``end``. ``start`` may be an earlier result of :meth:`state`; the motion then includes
@@ -243,7 +259,7 @@ def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
         k = knots[0]
         return t, k[X], k[Y], k[HEADING], k[PATH], k[TURN], k[UNKNOWN] - (k[T] - t), k[STILL]
     k = np.empty(KNOT)
-    move(knots[i], t - knots[i, T], constants[LAG], constants[HOLD], k)
+    move(knots[i], t - knots[i, T], constants[LAG], constants[HOLD], constants[SLIPPING], k)
     return t, k[X], k[Y], k[HEADING], k[PATH], k[TURN], k[UNKNOWN], k[STILL]
 
 

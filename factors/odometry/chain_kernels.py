@@ -19,7 +19,7 @@ KNOT, STATE = 16, 8
 _REST, _GYRO_REST = 1e-3, 0.02
 
 # indices in the array of the model's constants: an array, because a tuple is slower to pass to compiled code
-_COS, _SIN, LAG, HOLD, _GYRO_BIAS, _USES_GYRO = range(6, 12)  # behind scales and biases
+_COS, _SIN, LAG, HOLD, _GYRO_BIAS, _USES_GYRO, SLIPPING = range(6, 13)  # behind scales and biases
 
 
 @compiled
@@ -95,7 +95,7 @@ def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array)
     scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
     heading_rate_bias, heading_drift, turn_slowdown = constants[3], constants[4], constants[5]
     c, s, lag, hold = constants[_COS], constants[_SIN], constants[LAG], constants[HOLD]
-    gyro_bias, use_gyro = constants[_GYRO_BIAS], constants[_USES_GYRO] > 0.0
+    gyro_bias, use_gyro, slipping = constants[_GYRO_BIAS], constants[_USES_GYRO] > 0.0, constants[SLIPPING]
     for i in range(begin, end):
         t, kind, a, b, phi = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4]
         knot = knots[i]
@@ -117,11 +117,11 @@ def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array)
                 previous[_UY] = scale_distance * (s * forward + c * sideways)
                 speed = math.hypot(previous[_UX], previous[_UY])
                 previous[_UW] = scale_rotation * turn + heading_drift * speed
-            move(previous, duration, 0.0, duration, knot)
+            move(previous, duration, 0.0, duration, slipping, knot)
             knot[UNKNOWN] += max(0.0, duration - hold)
         else:
             previous = knots[i - 1]
-            move(previous, t - previous[T], lag, hold, knot)
+            move(previous, t - previous[T], lag, hold, slipping, knot)
         if kind == VELOCITY:
             stands = abs(a - speed_bias) <= _REST and abs(b - heading_rate_bias) <= _REST
             knot[_STANDS] = stands
@@ -173,15 +173,16 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
             elif stands and abs(knot[_UW]) <= _GYRO_REST:
                 knot[_UW] = 0.0
         step = rows[k + 1, 0] - knot[T]
-        move(knot, step, 0.0, step, following)
+        move(knot, step, 0.0, step, constants[SLIPPING], following)
         if rows[k + 1, 1] == GYRO:
             _take_gyro(following, rows[k + 1, 0], rows[k + 1, 2] - gyro_bias)
     knots[i, UNKNOWN] += max(0.0, duration - hold)
 
 
 @compiled
-def move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> None:
-    """The knot after ``duration`` seconds: the motion continues for at most ``hold`` seconds, then it is unknown."""
+def move(knot: Array, duration: float, lag: float, hold: float, slipping: float, out: Array) -> None:
+    """The knot after ``duration`` seconds: the motion continues for at most ``hold`` seconds, then it is unknown. If ``slipping``
+    is 1 all motion is unknown."""
     ux, uy, uw = knot[_UX], knot[_UY], knot[_UW]
     moving = min(duration, hold)
     rests = knot[_STANDS] and uw == 0.0
@@ -208,5 +209,5 @@ def move(knot: Array, duration: float, lag: float, hold: float, out: Array) -> N
     out[HEADING] = knot[HEADING] + dtheta
     out[PATH] = knot[PATH] + math.hypot(dx, dy)
     out[TURN] = knot[TURN] + abs(dtheta)
-    out[UNKNOWN] = knot[UNKNOWN] + duration - moving
+    out[UNKNOWN] = knot[UNKNOWN] + duration - (moving if rests else (1.0 - slipping) * moving)
     out[STILL] = knot[STILL] + (moving if rests else 0.0)

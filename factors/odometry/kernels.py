@@ -19,6 +19,10 @@ from factors.se2 import (
 # tenth of a millimetre in any direction; otherwise its covariance would be numerically singular.
 ROUNDING, FAR = 1e-12, 1e4  # m^2
 
+# s: variance of the share of its way that a robot goes while its wheels slip, uniform over a width of one, times the second for
+# which the share is the same
+SHARE_VARIANCE, SHORTEST = 1.0 / 12.0, 1e-6
+
 NO_CONSTANTS = np.zeros((3, 0))  # the derivative of an increment by no constants
 
 # direction of travel; variances per distance, rotation and time of longitudinal, lateral and heading error; variances per time
@@ -40,6 +44,8 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
     along = max(noise[1] * distance + noise[2] * rotation + noise[3] * moving, least_position) + noise[10] * unknown
     lateral = max(noise[4] * distance + noise[5] * rotation + noise[6] * moving, least_position) + noise[10] * unknown
     heading = max(noise[7] * distance + noise[8] * rotation + noise[9] * moving, least_heading) + noise[11] * unknown
+    if unknown > 0.0:  # the robot went an unknown share of what its speed was
+        along += unknown * SHARE_VARIANCE * (distance / max(duration, SHORTEST)) ** 2
     # the start seen from the end, rotated by 90 degrees: displacement of the end by a heading change at the start
     c, s = math.cos(turned), math.sin(turned)
     nx, ny = s * x - c * y, c * x + s * y

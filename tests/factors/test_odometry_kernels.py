@@ -43,6 +43,9 @@ def test_relative_motion(start, end):
     way = abs(end.path - start.path), abs(end.turn - start.turn), abs(end.t - start.t)
     unknown = max(0.0, end.unknown - start.unknown)
     along, lateral = (g.variance(*way) + MODEL.unknown_distance**2 * unknown for g in (MODEL.along, MODEL.lateral))
+    along += (
+        unknown * (way[0] / max(way[2], 1e-6)) ** 2 / 12.0
+    )  # a share of the way that is uniform over a width of one
     heading = MODEL.heading.variance(*way) + MODEL.unknown_rotation**2 * unknown
     travel = MODEL.direction - delta[2] / 2.0
     turn = np.array(((math.cos(travel), -math.sin(travel)), (math.sin(travel), math.cos(travel))))

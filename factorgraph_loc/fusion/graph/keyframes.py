@@ -25,6 +25,7 @@ from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.graph.settings import GraphSettings
 from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.search import Search, laplace_evidence
+from factorgraph_loc.fusion.slipping import SlipMonitor
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation, Sensor
 from factors import se2
@@ -93,6 +94,7 @@ class Builder:
 
     def __init__(self, graph: Graph, backend: Backend, search: Search, settings: GraphSettings) -> None:
         self._graph, self._backend, self._search, self._settings = graph, backend, search, settings
+        self._slips = SlipMonitor(graph.motion, graph.diagnostics)
         self._waiting: list[Observation] = []  # of a sensor that gathers, on the newest keyframe
         self._gatherer: Sensor | None = None  # that sensor
 
@@ -197,6 +199,8 @@ class Builder:
                 for term in seen.terms:
                     addition.hang(view.keyframe, self._graph.node(view.keyframe, term, sensor.name))
             if view.newest:
+                if seen.is_judged:
+                    self._slips.add(here.at_its_time, odometry, view, correction)
                 self._search.expect(sensor, here, odometry, view)
                 evidence = partial(laplace_evidence, here, view.pose, view.covariance, correction)
                 self._search.keep(sensor, here, odometry, evidence)

@@ -1,0 +1,126 @@
+"""Whether the wheels slip: recent observations agree that the robot moved less, or more, than its odometry.
+
+One observation that contradicts the track may be wrong. Several that agree on another length of the way are not. So the hypothesis
+that the wheels have been slipping since some time competes with the track and with the odometry for the same observations, by
+their robust likelihoods. While the wheels slip the motion is unknown, for all estimators. That ends when the odometry explains the
+observations since then better than any other length of the way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from factorgraph_loc.fusion.search import laplace_evidence
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.sensors.base import Observation, View
+from factorgraph_loc.sensors.motion import Motion
+from factors import se2
+from factors.motion import ChainState, Increment
+from factors.se2 import Array
+from factors.update import Correction
+
+WINDOW = 3.0  # s of observations that are compared
+ONSETS = (0.75, 1.5, 3.0)  # s ago, when the wheels may have begun to slip, or to hold again
+SHARES = (0.0, 0.33, 0.67, 1.5)  # of the way that the odometry reports
+SURPRISING, ENOUGH = 1.0, 2  # standard deviations of a surprising innovation; how many of these start a comparison
+CLEAR = 3.0  # standard deviations of the start that the way must be long
+RARE, MOST = (
+    7.0,
+    3.0,
+)  # log-odds that slipping wheels need: they slip about once in 100 s; most that one observation adds
+EVERY, HOLDS = 1.0, 1.0  # s between comparisons while the wheels slip; log-odds of wheels that hold again
+
+
+class _Row(NamedTuple):
+    """An observation, computed when it is compared; the odometry there; and the correction of a predicted ``pose`` (3,) with its
+    body-frame ``covariance`` (3, 3). The robot has moved by ``offset`` from that pose."""
+
+    odometry: ChainState
+    observed: Callable[[], Observation | None]
+    pose: Array
+    covariance: Array
+    offset: Increment | None
+    correction: Correction
+
+    def evidence(self, observation: Observation) -> float:
+        """The log-probability of the observation under the track."""
+        pose = self.pose if self.offset is None else se2.compose(self.pose, self.offset.delta)
+        return laplace_evidence(observation, pose, self.covariance, self.correction)
+
+    def corrected(self) -> Array:
+        """The pose (3,) of the robot after the correction."""
+        pose = se2.moved(self.pose, self.correction.delta[:3])
+        return pose if self.offset is None else se2.compose(pose, self.offset.delta)
+
+
+class SlipMonitor:
+    """Detects from the observations of a track when the wheels slip, and marks the ``motion`` as unknown. It is an event."""
+
+    def __init__(self, motion: Motion, diagnostics: Diagnostics) -> None:
+        self._motion, self._diagnostics = motion, diagnostics
+        self._rows: deque[_Row] = deque()
+        self._surprises: deque[float] = deque()  # times of surprising observations
+        self._compared = -math.inf  # time
+
+    def add(
+        self, observed: Callable[[], Observation | None], odometry: ChainState, view: View, correction: Correction
+    ) -> None:
+        """Process an observation and the correction of a track by it. ``observed()``: the observation of the pose alone at its own
+        time; None if there is none."""
+        t = odometry.t
+        while self._rows and self._rows[-1].odometry.t > t:  # late measurements are processed again
+            self._rows.pop()
+        while self._rows and self._rows[0].odometry.t < t - WINDOW:
+            self._rows.popleft()
+        self._rows.append(_Row(odometry, observed, view.pose, view.covariance, view.offset, correction))
+        if self._motion.is_slipping:
+            if t >= self._compared + EVERY:
+                self._compared = t
+                if min(self._log_odds(t - ago)[0] for ago in ONSETS) < -HOLDS:
+                    self._motion.end_slip()
+                    self._rows.clear()
+        elif surprise(correction) > SURPRISING:
+            self._surprises.append(t)
+            while not t - WINDOW <= self._surprises[0] <= t:
+                self._surprises.popleft()
+            if len(self._surprises) >= ENOUGH:
+                odds, onset = max(self._log_odds(t - ago) for ago in ONSETS)
+                if odds > RARE:
+                    self._diagnostics.event(t, f"the wheels slip since {onset:.1f} s: the motion is not known")
+                    self._motion.begin_slip(onset)
+                    self._surprises.clear()
+                    self._compared = t
+
+    def _log_odds(self, begin: float) -> tuple[float, float]:
+        """The log-odds that the wheels slip since the first observation after ``begin`` that is not surprising, and the time of
+        that; zero odds if the pose is not known well enough there."""
+        rows = [row for row in self._rows if row.odometry.t >= begin]
+        while rows and surprise(rows[0].correction) > SURPRISING:
+            del rows[0]
+        seen = [row.observed() for row in rows]
+        if len(rows) <= ENOUGH or None in seen:
+            return 0.0, begin
+        states = np.array([row.odometry for row in rows])[:, 1:4]
+        ways, start = se2.log(se2.between(states[0], states)), rows[0].corrected()
+        if np.hypot(*ways[-1, :2]) < CLEAR * math.sqrt(np.trace(rows[0].correction.covariance[:2, :2])):
+            return 0.0, begin
+        poses = se2.compose(start, se2.exp(np.array((1.0, *SHARES))[:, None, None] * ways))
+        by_share = np.array([one.log_likelihood(poses[:, i], {}) for i, one in enumerate(seen[1:], 1)])
+        holds, slips = by_share[:, :1], by_share[:, 1:]
+        odds = np.minimum(slips - holds, MOST).sum(axis=0)
+        if not self._motion.is_slipping:  # else the track follows the observations
+            track = np.array([row.evidence(one) for row, one in zip(rows[1:], seen[1:], strict=True)])
+            odds = np.minimum(odds, np.minimum(slips - track[:, None], MOST).sum(axis=0))
+        return float(odds.max()), rows[0].odometry.t
+
+
+def surprise(correction: Correction) -> float:
+    """By how many standard deviations an innovation exceeds its expected size."""
+    if correction.dof:
+        return (correction.nis - correction.dof) / math.sqrt(2.0 * correction.dof)
+    return correction.excess_nll / math.sqrt(correction.variance) if correction.variance > 0.0 else 0.0
