@@ -102,8 +102,8 @@ class SlipMonitor:
         rows = [row for row in self._rows if row.odometry.t >= begin]
         while rows and surprise(rows[0].correction) > SURPRISING:
             del rows[0]
-        seen = [row.observed() for row in rows]
-        if len(rows) <= ENOUGH or None in seen:
+        seen = [one for row in rows if (one := row.observed()) is not None]
+        if not ENOUGH < len(rows) == len(seen):
             return 0.0, begin
         states = np.array([row.odometry for row in rows])[:, 1:4]
         ways, start = se2.log(se2.between(states[0], states)), rows[0].corrected()
