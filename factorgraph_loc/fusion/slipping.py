@@ -36,7 +36,7 @@ RARE, MOST = (
 EVERY, HOLDS = 1.0, 1.0  # s between comparisons while the wheels slip; log-odds of wheels that hold again
 
 
-class _Row(NamedTuple):
+class _Compared(NamedTuple):
     """An observation, computed when it is compared; the odometry there; and the correction of a predicted ``pose`` (3,) with its
     body-frame ``covariance`` (3, 3). The robot has moved by ``offset`` from that pose."""
 
@@ -63,7 +63,7 @@ class SlipMonitor:
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics) -> None:
         self._motion, self._diagnostics = motion, diagnostics
-        self._rows: deque[_Row] = deque()
+        self._rows: deque[_Compared] = deque()
         self._surprises: deque[float] = deque()  # times of surprising observations
         self._compared = -math.inf  # time
 
@@ -77,7 +77,7 @@ class SlipMonitor:
             self._rows.pop()
         while self._rows and self._rows[0].odometry.t < t - WINDOW:
             self._rows.popleft()
-        self._rows.append(_Row(odometry, observed, view.pose, view.covariance, view.offset, correction))
+        self._rows.append(_Compared(odometry, observed, view.pose, view.covariance, view.offset, correction))
         if self._motion.is_slipping:
             if t >= self._compared + EVERY:
                 self._compared = t
