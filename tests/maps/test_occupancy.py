@@ -139,14 +139,3 @@ def test_a_map_without_walls(hall):
     Image.fromarray(np.full((9, 9), 254, dtype=np.uint8)).save(hall.parent / "hall.pgm")
     with pytest.raises(InputError, match="no occupied cells"):
         read_walls(hall)
-
-
-def test_a_map_of_nav2_with_a_hash_in_its_name(hall):
-    """As Nav2's map_saver writes it, of an image whose name needs quotes."""
-    (hall.parent / "hall.pgm").rename(hall.parent / "floor #2.pgm")
-    expected = {"mode": "trinary", "map_type": "occupancy"}
-    lines = YAML.replace("hall.pgm", '"floor #2.pgm"  # second floor') + "".join(
-        f"{k}: {v}\n" for k, v in expected.items()
-    )
-    hall.write_text(lines)
-    assert len(read_walls(hall)) >= 4

@@ -40,12 +40,6 @@ def test_a_run_ends_where_the_place_is_known() -> None:
     assert run.seconds == run.truth.t[-1]
 
 
-def test_the_same_seed_is_the_same_run() -> None:
-    again = run_active(preset("office"), "information", "active_mcl", 1)
-    assert np.array_equal(again.truth.poses, office().truth.poses)
-    assert again.error_position == office().error_position
-
-
 @pytest.mark.parametrize("estimator", ["particle_filter", "smoother"])
 def test_policies_stand_on_any_estimator(estimator: str) -> None:
     run = office(estimator=estimator)

@@ -75,13 +75,6 @@ def test_entropy_of_particles_is_that_of_the_density():
     assert particle_entropy(area, even, ALL, coarse) == pytest.approx(math.log(40.0 * 2.0 * math.pi), abs=0.01)
 
 
-def test_entropy_of_particles_of_a_gaussian_is_its_own():
-    for scale in (1.0, 3.0):
-        poses, weights = drawn(50_000, scale**2 * SPREAD)
-        expected = gaussian_entropy(scale**2 * SPREAD, ("x", "y"))
-        assert particle_entropy(poses, weights, ("x", "y")) == pytest.approx(expected, abs=0.06)
-
-
 def test_weights_count_as_particles_do():
     poses, _ = drawn(5000)
     weights = np.random.default_rng(1).random((3, 5000))

@@ -37,13 +37,6 @@ def test_reads_follow_the_law_of_the_recording(looks):
         assert abs(hits[chosen].mean() - p[chosen].mean()) < 0.06, (low, high)
 
 
-def test_the_same_seed_draws_the_same(looks):
-    settings = preset("sparse", {"drive": {"duration": 30.0}})
-    a, b, c = (simulate(settings, seed, looks).streams["rfid"] for seed in (1, 1, 2))
-    assert a.epc == b.epc
-    assert a.epc != c.epc
-
-
 def test_recorded_rounds_keep_what_the_antennas_missed(office, looks):
     """As many looks as rounds, antennas and tags that were ever read, but for those out of reach; as many reads as in the log."""
     reads = sum(map(bool, office.streams["rfid"].epc))

@@ -86,11 +86,6 @@ def test_tags_are_spread_wider_than_at_random():
     assert min(gaps) > 1.5
 
 
-def test_another_seed_is_another_world():
-    assert world(0) == world(0)
-    assert world(0) != world(1)
-
-
 def test_landmarks_are_in_the_map():
     made = world(landmarks=7)
     assert len(made.landmarks) == 7

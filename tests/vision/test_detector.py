@@ -86,13 +86,6 @@ def test_the_direction_is_that_of_the_gradient(angle: float) -> None:
     assert abs(np.angle(np.exp(1j * (found - angle)))) < 0.02
 
 
-def test_directions_are_within_one_turn(picture: np.ndarray) -> None:
-    angles = extractor("colour").detect(picture).angles
-    assert np.all((angles > -np.pi) & (angles <= np.pi))
-    assert angles.min() < -2.5
-    assert angles.max() > 2.5
-
-
 def test_points_of_another_detector_get_a_direction(picture: np.ndarray) -> None:
     features = extractor("colour", 100)
     own = features.detect(picture)
@@ -110,11 +103,3 @@ def test_points_outside_the_image_are_not_described(picture: np.ndarray) -> None
     kept, descriptors = features.compute(picture, Keypoints(points, own.sizes, own.angles, own.responses, own.levels))
     assert len(kept) == len(descriptors) == 3
     assert np.array_equal(kept.points, own.points[[0, 2, 4]])
-
-
-def test_images_of_different_sizes_follow_each_other(picture: np.ndarray) -> None:
-    features = extractor("colour", 50)
-    first = features.detect(picture)
-    features.detect(cv2.resize(picture, (100, 90)))
-    features.detect(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
-    assert np.array_equal(features.detect(picture).points, first.points)

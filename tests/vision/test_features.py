@@ -150,12 +150,6 @@ def test_files_that_are_no_images_are_errors(tmp_path: Path) -> None:
         read_image(tmp_path / "missing.png")
 
 
-def test_an_image_is_read_as_it_was_written(tmp_path: Path) -> None:
-    image = np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8)
-    cv2.imwrite(str(tmp_path / "a.png"), image)
-    assert np.array_equal(read_image(tmp_path / "a.png"), image)
-
-
 def test_keypoints_go_to_opencv_and_back() -> None:
     rng = np.random.default_rng(2)
     keypoints = Keypoints(

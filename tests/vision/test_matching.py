@@ -48,21 +48,6 @@ def test_bits_are_compared_by_how_many_differ() -> None:
     assert np.array_equal(distance_matrix(a, b, binary=True), expected)
 
 
-def test_noisy_copies_find_their_originals() -> None:
-    rng = np.random.default_rng(2)
-    a = rng.normal(size=(500, 35)).astype(np.float32)
-    order = rng.permutation(500)
-    found = match(a, a[order] + rng.normal(scale=0.1, size=a.shape).astype(np.float32), binary=False)
-    assert len(found) == 500
-    assert np.array_equal(order[found.indices[:, 1]], found.indices[:, 0])
-
-
-def test_two_alike_are_no_match() -> None:
-    a, b = np.zeros((1, 4), dtype=np.float32), np.zeros((2, 4), dtype=np.float32)
-    assert len(match(a, b, binary=False)) == 0
-    assert len(match(a, b[:1], binary=False)) == 1
-
-
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 512.0])
 @pytest.mark.parametrize("columns", [16, 35, 128])
 def test_equal_descriptors_are_no_distance_apart_and_no_match(scale: float, columns: int) -> None:

@@ -40,12 +40,6 @@ def lens(distance):
     return 2.0 * np.arccos(half) - distance * np.sqrt(1.0 - half**2)
 
 
-@given(distance=st.floats(0.0, 2.0), direction=st.floats(0.0, 6.3))
-def test_shared_area_of_discs(distance, direction):
-    centre = distance * np.array(((np.cos(direction), np.sin(direction)),))
-    assert shared_area(centre, np.eye(2)[None]) == pytest.approx(lens(distance), abs=0.006)
-
-
 @given(st.integers(0, 10_000))
 def test_shared_area_of_ellipses_is_that_of_pixels(seed):
     rng = np.random.default_rng(seed)
@@ -95,12 +89,6 @@ def test_no_pair_is_missed():
         close = pairs.error < OVERLAP_ERROR
         assert set(zip(pairs.first[close].tolist(), pairs.second[close].tolist(), strict=True)) == every
         assert every
-
-
-def test_the_same_points_repeat_fully():
-    points = scattered(100, np.random.default_rng(3))
-    found = repeatability(points, points, np.eye(3), SHAPES)
-    assert (found.regions, found.repeatability, found.strict) == (100, 1.0, 1.0)
 
 
 def test_only_the_common_part_counts():

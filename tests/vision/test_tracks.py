@@ -162,10 +162,3 @@ def test_where_no_geometry_is_found_the_looks_decide(monkeypatch):
     monkeypatch.setattr(tracking.cv2, "findEssentialMat", fail)
     _, looks, views = drive(np.random.default_rng(12), steps=2)
     assert len(paired(views[0], looks, views[1], looks)) > 140
-
-
-def test_the_same_again():
-    _, looks, views = drive(np.random.default_rng(11))
-    once, again = (followed([(pixels, looks) for pixels in views]) for _ in range(2))
-    for a, b in zip(once, again, strict=True):
-        np.testing.assert_array_equal(a, b)
