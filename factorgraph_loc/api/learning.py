@@ -15,8 +15,6 @@ from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.temporary import of_system, temporary_folder, writing
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, load_all, read_log
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.plugins import FEATURES, MAP_ESTIMATORS
 
 RIG = ".rig.toml"
@@ -38,7 +36,7 @@ def calibrate(
     # learnt grids are kept here until the rig is written, so that a failed calibration leaves nothing behind
     with temporary_folder(of_system("grids")) as folder:
         grids = folder / file.name.removesuffix(RIG)
-        found = calibration.calibrate(loaded, _score, progress=progress, smooth=smoothed, grids=grids)
+        found = calibration.calibrate(loaded, run, progress=progress, grids=grids)
         with writing(file), replacing(page) as temporary:  # write both files or none
             temporary.write_text(rig_report.page(found), encoding="utf-8")
             write_rig(found.rig, file)
@@ -78,16 +76,6 @@ def build_map(
     made = maps.make_map(read_log(log, rig=rig, world=world), options, stages)
     made.write(Path(out), overwrite=overwrite)
     return made
-
-
-def smoothed(log: Log) -> RunResult:
-    """The smoother's result on a log, with the log's rig and its sensors."""
-    return run(log, "smoother").result
-
-
-def _score(log: Log) -> dict[str, Any]:
-    """Scores of the EKF, or of the smoother if the log has RFID, with the log's rig and its sensors."""
-    return run(log, calibration.estimator_for(log.rig)).scores
 
 
 def features(

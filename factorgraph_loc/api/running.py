@@ -11,7 +11,7 @@ from factorgraph_loc.experiments import output
 from factorgraph_loc.experiments import run as running
 from factorgraph_loc.experiments.compare import told
 from factorgraph_loc.experiments.learning import run_and_learn
-from factorgraph_loc.fitting.constants import FittedConstant
+from factorgraph_loc.fitting.posterior import FittedConstant
 from factorgraph_loc.fusion.registry import for_final_only
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, read_log
 from factorgraph_loc.model.result import RunResult

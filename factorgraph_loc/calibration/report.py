@@ -1,73 +1,90 @@
-"""The report of a calibration, as a self-contained HTML page and as a document for programs."""
+"""The report of a calibration: a few lines, a self-contained HTML page, and a document for programs."""
 
 import math
 from collections.abc import Sequence
 from typing import Any
 
-from factorgraph_loc.calibration.calibrate import Calibration, Scores, estimator_for
+from factorgraph_loc.calibration.calibrate import Calibration
+from factorgraph_loc.calibration.held_out import ESTIMATORS, Trial, growth, pooled
+from factorgraph_loc.calibration.learn import calibrators
 from factorgraph_loc.drawing.pages import Part, Rows, sectioned
 from factorgraph_loc.files.settings import settings_in
-from factorgraph_loc.fitting.constants import FittedConstant
+from factorgraph_loc.fitting.posterior import FittedConstant
 from factorgraph_loc.io.results import KINDS
 from factorgraph_loc.model.sections import sections
 from factorgraph_loc.plugins import load
-from factorgraph_loc.text import number
-from factors.se2 import Array
+from factorgraph_loc.text import listed, number
 
 FIGURES = {"position RMSE [m]": ("position_rmse", 3), "heading RMSE [rad]": ("heading_rmse", 4), "ANEES": ("anees", 1)}
+MOST = 8  # lines of constants
+CLEAR = 2.0  # standard deviations; smaller changes are within chance
 
 
 def constants_table(constants: Sequence[FittedConstant]) -> Rows:
-    """The constants before and after, with standard errors."""
-    header = ("constant", "input rig", "fitted", "standard error", "in the rig")
+    """The constants before and after, with standard deviations, those of the priors too."""
+    header = ("constant", "input rig", "learnt", "standard deviation", "before", "")
     rows: list[tuple[str, ...]] = [
-        (_label(c), number(c.before), number(c.fitted), number(c.error), number(c.value) if c.kept else "as before")
+        (
+            _label(c),
+            number(c.before),
+            number(c.fitted),
+            number(c.error),
+            number(c.prior),
+            "" if c.is_determined else "hardly determined",
+        )
         for c in constants
     ]
     return header, rows
 
 
-def judgements_table(calibration: Calibration) -> Rows:
-    """The verdict on each learnt parameter, with results on held-out stretches with and without it."""
-    figures_of = (f"{how} {name}" for name in FIGURES for how in ("new", "old"))
-    header = ("parameter", "judged", "gain", "standard error", *figures_of)
-    rows: list[tuple[str, ...]] = []
-    for one in calibration.judgements:
-        pairs = zip(one.new[0].tolist(), one.old[0].tolist(), [n for _, n in FIGURES.values()], strict=True)
-        figures = [number(value, digits) for new, old, digits in pairs for value in (new, old)]
-        verdict = "accepted" if one.accepted else "refused"
-        rows.append((_parameters(one.names), verdict, number(one.gain, 3), number(one.error, 3), *figures))
-    return header, rows
-
-
 def accuracy_table(calibration: Calibration) -> Rows:
-    """Accuracy on each log with the input rig, the new rig, and a rig learnt from the other logs."""
-    header = ("log", "rig", *(f"{kind} {name}" for kind in KINDS for name in FIGURES))
-    rigs: list[tuple[str, tuple[Scores, ...]]] = [("input", calibration.before), ("calibrated", calibration.after)]
-    if calibration.held_out:
-        rigs.append(("from the other logs", calibration.held_out))
+    """Errors on each held-out log, and pooled, with the input rig and with a rig learnt from the rest."""
+    header = ("held-out log", "estimator", "rig", *(f"{kind} {name}" for kind in KINDS for name in FIGURES))
     rows = []
-    for i, log in enumerate(calibration.logs):
-        for name, scores in rigs:
-            if not scores:
-                continue
-            found = [number(scores[i][f"{k}.{figure}"], n) for k in KINDS for figure, n in FIGURES.values()]
-            rows.append((log, name, *found))
+    logs = dict.fromkeys(t.log for t in calibration.trials)
+    for log in (*logs, "all") if len(logs) > 1 else logs:
+        for estimator in ESTIMATORS:
+            trials = [t for t in calibration.trials if t.estimator == estimator and log in (t.log, "all")]
+            for which, name in enumerate(("input", "learnt")):
+                found = [number(pooled(trials, which, f"{k}.{f}"), n) for k in KINDS for f, n in FIGURES.values()]
+                rows.append((log, estimator, name, *found))
     return header, rows
 
 
-def sensor_tables(calibration: Calibration) -> list[Rows]:
-    """The tables of the sensors, such as survey, mounting and detection models."""
-    return [table for calibrator, told in calibration.told() for table in calibrator.tables(told)]
+def summary(calibration: Calibration) -> list[str]:
+    """What was learnt and what was not, in about ten lines."""
+    constants = calibration.knowledge.constants
+    clear = [c for c in constants if c.is_determined and abs(c.fitted - c.before) > CLEAR * c.error]
+    same = [_name(c) for c in constants if c.is_determined and c not in clear]
+    lines = [f"learnt: {_name(c)} {number(c.before)} -> {number(c.fitted)} +- {number(c.error)}" for c in clear[:MOST]]
+    if more := [_name(c) for c in clear[MOST:]]:
+        lines.append(f"learnt, see the report: {listed(more)}")
+    if same:
+        lines.append(f"as in the input rig, within chance: {listed(same)}")
+    if vague := [_name(c) for c in constants if not c.is_determined]:
+        lines.append(f"hardly determined, so near the input rig: {listed(vague)}")
+    if alike := [f"{a} and {b} ({rho:+.2f})" for a, b, rho in _correlations(calibration)]:
+        lines.append(f"told by their sum or difference (correlation): {listed(alike)}")
+    for estimator in ESTIMATORS if calibration.trials else ():
+        trials = [t for t in calibration.trials if t.estimator == estimator]
+        figures = [
+            f"{k} {_change(trials, f'{k}.position_rmse')} m, ANEES {_change(trials, f'{k}.anees', 1)}" for k in KINDS
+        ]
+        lines.append(f"held-out errors of {estimator}: {'; '.join(figures)}")
+    if calibration.turns:
+        lines.append(f"learnt without a reference, in {len(calibration.turns)} turns with the smoother")
+    elif calibration.refused:
+        lines.append(f"the input rig is kept: {calibration.refused}")
+    elif math.isfinite(ratio := growth(calibration.trials)):
+        lines.append(f"the position errors are {number(ratio, 2)} times those with the input rig")
+    else:
+        lines.append("the input rig lacks what its sensors need, so that its errors are not known")
+    return lines
 
 
 def document(calibration: Calibration) -> dict[str, Any]:
     """The report as plain values."""
     wanted = [f"{kind}.{figure}" for kind in KINDS for figure, _ in FIGURES.values()]
-
-    def scores(found: Sequence[Scores]) -> dict[str, Any]:
-        return {log: {key: s[key] for key in wanted} for log, s in zip(calibration.logs, found, strict=False)}
-
     return {
         "logs": list(calibration.logs),
         "constants": [
@@ -75,134 +92,95 @@ def document(calibration: Calibration) -> dict[str, Any]:
                 "sensor": c.sensor,
                 "name": c.name,
                 "before": c.before,
-                "fitted": c.fitted,
-                "standard_error": c.error,
-                "kept": c.kept,
-                "why": c.why,
+                "learnt": c.fitted,
+                "standard_deviation": c.error,
+                "prior": c.prior,
+                "determined": c.is_determined,
                 "per_log": list(c.per_log),
                 "uncertainty": c.uncertainty,
             }
             for c in calibration.knowledge.constants
         ],
-        "judged": [
-            {
-                "parameters": list(one.names),
-                "accepted": one.accepted,
-                "why": one.why,
-                "gain": one.gain,
-                "gain_error": one.error,
-                "new": _figures(one.new),
-                "old": _figures(one.old),
+        "correlations": [{"constants": [a, b], "correlation": rho} for a, b, rho in _correlations(calibration)],
+        **{
+            key: value
+            for name, found in calibration.knowledge.found.items()
+            for key, value in calibrators()[name].document(found, calibration.rig).items()
+        },
+        "held_out": [
+            {"log": t.log, "estimator": t.estimator}
+            | {
+                name: s and {key: s.get(key) for key in wanted}
+                for name, s in (("before", t.before), ("after", t.after))
             }
-            for one in calibration.judgements
+            for t in calibration.trials
         ],
-        **{key: value for calibrator, told in calibration.told() for key, value in calibrator.document(told).items()},
-        "before": scores(calibration.before),
-        "after": scores(calibration.after),
-        "held_out": scores(calibration.held_out),
+        "growth": growth(calibration.trials),
+        "refused": calibration.refused,
         "turns": list(calibration.turns),
         "doubts": list(calibration.doubts),
         "rig": calibration.rig.model_dump(mode="json", exclude_none=True),
     }
 
 
-def _parameters(names: Sequence[str]) -> str:
-    """Names of parameters of one section, with the section named once."""
-    section = names[0].partition(".")[0]
-    return f"{section}." + ", ".join(name.removeprefix(f"{section}.") for name in names)
-
-
-def _figures(values: Array) -> dict[str, float]:
-    names = (figure for figure, _ in FIGURES.values())
-    return {f"{kind}.{name}": float(values[k, i]) for i, name in enumerate(names) for k, kind in enumerate(KINDS)}
-
-
 def page(calibration: Calibration) -> str:
     """The report as one HTML page with embedded plots."""
-    sections: dict[str, list[Part]] = {"Constants": [_how(calibration), _long_constants(calibration)], "Noise": []}
-    for calibrator, told in calibration.told():
-        for title, parts in calibrator.report(told).items():
-            sections.setdefault(title, []).extend(parts)
-    for title, parts in (_judgements(calibration) | _accuracy(calibration)).items():
-        sections[title] = list(parts)
-    lead = f"From {', '.join(calibration.logs)}. {_verdict(calibration)}"
-    return sectioned(f"Calibration of {calibration.rig.name}", lead, calibration.doubts, sections)
+    content: dict[str, list[Part]] = {"Summary": list(summary(calibration)), "Constants": [], "Noise": []}
+    content["Constants"] = [_how(calibration), _long_constants(calibration)]
+    if calibration.trials:
+        explained = (
+            "Each log is held out, or each half of a single one: the learnt rig is that of the rest. ANEES is ideal at 3 (at 2 "
+            "without the reference's heading); above it the estimator is overconfident."
+        )
+        content["Accuracy"] = [explained, accuracy_table(calibration)]
+    for name, found in calibration.knowledge.found.items():
+        for title, parts in calibrators()[name].report(found, calibration.rig).items():
+            content.setdefault(title, []).extend(parts)
+    lead = f"From {', '.join(calibration.logs)}."
+    return sectioned(f"Calibration of {calibration.rig.name}", lead, calibration.doubts, content)
 
 
 def _how(calibration: Calibration) -> str:
     """How the constants were found."""
-    each = "The fits to each log show how much it differs between runs." if len(calibration.logs) > 1 else ""
     if calibration.turns:
         turns = ", ".join(number(one, 1) for one in calibration.turns)
         return (
             "The logs have no reference. Smoothing the logs, and learning from the smoothed trajectories, took turns: the "
-            f"largest change of a constant in each was {turns} of its standard errors. One of the odometry or of landmarks is kept "
-            f"if its mean over the logs differs from the input beyond chance. {each}"
+            f"largest change of a constant in each was {turns} of its standard deviations."
         )
-    whose = "the other logs" if len(calibration.logs) > 1 else "another fifth of the log"
     return (
-        f"A constant is kept if it improves the prediction of held-out data: {whose}, and if it improves the "
-        f"{_estimator(calibration)}. Otherwise the rig keeps the input value. {each}"
+        "All constants of a sensor are estimated together from all logs, with priors about the input rig. Where the standard "
+        "deviation is not much smaller than that of the prior, before, the logs hardly determine a constant."
     )
-
-
-def _accuracy(calibration: Calibration) -> dict[str, Sequence[Part]]:
-    """The accuracy of the judging estimator, if there is a reference."""
-    if calibration.turns:
-        return {}
-    unseen = (
-        "The rows from the other logs are cross-validated: only the factor on the noise has used the log."
-        if calibration.held_out
-        else "With one log there is no cross-validation: test the rig on another log."
-    )
-    explained = (
-        "ANEES is ideal at 3 (at 2 without the reference's heading); above it the estimator is overconfident. " + unseen
-    )
-    return {f"Accuracy of the {_estimator(calibration)}": [explained, accuracy_table(calibration)]}
-
-
-def _verdict(calibration: Calibration) -> str:
-    change = [
-        after["causal.position_rmse"] / before["causal.position_rmse"]
-        for before, after in zip(calibration.before, calibration.after, strict=False)
-        if before["causal.position_rmse"] and after["causal.position_rmse"]
-    ]
-    kept = sum(c.kept for c in calibration.knowledge.constants)
-    told = f"{kept} of {len(calibration.knowledge.constants)} constants were worth changing."
-    if change:
-        mean = math.exp(sum(map(math.log, change)) / len(change))
-        told += f" The {_estimator(calibration)}'s position error is {mean:.2f} times that with the input rig."
-    return told
 
 
 def _long_constants(calibration: Calibration) -> Rows:
     header, rows = constants_table(calibration.knowledge.constants)
-    parts = calibration.logs if len(calibration.logs) > 1 else ("first half", "second half")
+    parts = calibration.logs if len(calibration.logs) > 1 else ()
     long = []
     for row, c in zip(rows, calibration.knowledge.constants, strict=True):
-        each = [number(v) for v in c.per_log] or ["-"] * len(parts)
-        long.append((*row, *each, number(c.uncertainty), c.why))
-    return (*header, *parts, "differs between logs by", "why"), long
+        each = [number(v) for v in c.per_log] if len(c.per_log) == len(parts) else ["-"] * len(parts)
+        long.append((*row, *each, number(c.uncertainty)))
+    return (*header, *parts, "differs between logs by"), long
 
 
-def _judgements(calibration: Calibration) -> dict[str, Sequence[Part]]:
-    if not calibration.judgements:
-        return {}
-    whose = "the other logs" if len(set(calibration.logs)) > 1 else "the other parts of the log"
-    explained = (
-        f"The {_estimator(calibration)} ran on held-out stretches with each parameter as learnt from {whose} (new), and without "
-        "it (old). A parameter is accepted if it improves the score, which combines accuracy and consistency [nats per pose], "
-        "significantly, and increases no error by more than 2 %. Otherwise the rig keeps the input value."
-    )
-    return {"Selection": [explained, judgements_table(calibration)]}
+def _correlations(calibration: Calibration) -> list[tuple[str, str, float]]:
+    return [
+        (f"{calibrators()[name].section}.{a}", f"{calibrators()[name].section}.{b}", rho)
+        for name, found in calibration.knowledge.found.items()
+        for a, b, rho in found.correlations
+    ]
 
 
-def _estimator(calibration: Calibration) -> str:
-    name = estimator_for(calibration.rig)
-    return name.upper() if name == "ekf" else name
+def _change(trials: Sequence[Trial], key: str, digits: int = 3) -> str:
+    return " -> ".join(number(pooled(trials, which, key), digits) for which in (0, 1))
+
+
+def _name(c: FittedConstant) -> str:
+    return f"{c.sensor}.{c.name}"
 
 
 def _label(c: FittedConstant) -> str:
     settings = settings_in(load(sections()[c.sensor].kind))
     unit = next((one.unit for one in settings if one.key == c.name), "")
-    return f"{c.sensor}.{c.name} [{unit}]" if unit else f"{c.sensor}.{c.name}"
+    return f"{_name(c)} [{unit}]" if unit else _name(c)

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from factorgraph_loc.calibration.learn import Knowledge, calibrators
+from factorgraph_loc.calibration.learn import Knowledge, calibrators, learn
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.fitting.constants import FittedConstant
+from factorgraph_loc.fitting.posterior import FittedConstant
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.smoothed import Smoothed
+from factorgraph_loc.sensors.smoothed import Traced
 
 Smooth = Callable[[Log], RunResult]
 """Runs the smoother on a log, with the log's rig."""
@@ -74,15 +74,20 @@ def learn_by_turns(
             smoothed.append(_smoothed(replace(log, rig=rig, reference=None), smooth))
             if progress is not None:
                 progress(len(changed) * len(logs) + len(smoothed), TURNS * len(logs))
-        knowledge = _learnt(smoothed, rig, start, grids)
+        knowledge = learn(smoothed, rig, start, grids)
+        if not knowledge.constants and not knowledge.notes:
+            raise InputError(
+                f"{logs[0].name}: nothing of the rig {start.name} can be learnt without a reference: it has no detection model, "
+                "and no constant with an uncertainty, that the log's sensors use"
+            )
         rig = knowledge.rig
         changed.append(max((_change(one, before) for one in knowledge.constants), default=0.0))
-        before = {(one.sensor, one.name): one.value for one in knowledge.constants}
+        before = {(one.sensor, one.name): one.fitted for one in knowledge.constants}
         if len(changed) == TURNS or changed[-1] < SETTLED:
             return Turns(knowledge, tuple(changed))
 
 
-def _smoothed(log: Log, smooth: Smooth) -> Smoothed:
+def _smoothed(log: Log, smooth: Smooth) -> Traced:
     """The log with its smoothed trajectory as reference."""
     result = smooth(log)
     final = result.final
@@ -97,29 +102,10 @@ def _smoothed(log: Log, smooth: Smooth) -> Smoothed:
             "to learn from it without a reference"
         )
     doubted = frozenset[str]().union(*result.diagnostics.doubted.values())
-    return Smoothed(replace(log, reference=final), result.learnt.values, doubted)
-
-
-def _learnt(smoothed: Sequence[Smoothed], rig: Rig, start: Rig, grids: Path | None) -> Knowledge:
-    """What one turn learns."""
-    constants: list[FittedConstant] = []
-    notes: list[str] = []
-    for calibrator in calibrators().values():
-        if calibrator.channel not in rig.sensors:
-            continue
-        found = calibrator.relearn(smoothed, rig, start, grids)
-        constants += found.constants
-        notes += found.notes
-        rig = rig.model_copy(update=dict(found.sections))
-    if not constants and not notes:
-        raise InputError(
-            f"{smoothed[0].log.name}: nothing of the rig {start.name} can be learnt without a reference: it has no detection "
-            "model, and no constant with an uncertainty, that the log's sensors use"
-        )
-    return Knowledge(rig, tuple(constants), tuple(notes), {}, {})
+    return Traced(replace(log, reference=final), result.learnt.values, doubted)
 
 
 def _change(one: FittedConstant, before: Mapping[tuple[str, str], float]) -> float:
     """How far a constant went in a turn, in its standard errors."""
-    way = abs(one.value - before.get((one.sensor, one.name), one.before))
+    way = abs(one.fitted - before.get((one.sensor, one.name), one.before))
     return way / one.error if way > 0.0 else 0.0

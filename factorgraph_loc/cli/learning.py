@@ -54,18 +54,8 @@ def calibrate(
     if json:
         show.document(report.document(found) | {"files": {"rig": str(out), "report": str(page)}})
         return
-    show.table(*report.constants_table(found.knowledge.constants))
-    show.line()
-    for table in report.sensor_tables(found):
-        show.table(*table)
-        show.line()
-    if found.turns:
-        show.line(f"learnt without a reference, in {len(found.turns)} turns with the smoother")
-    else:
-        show.table(*report.judgements_table(found))
-        show.line()
-        show.table(*report.accuracy_table(found))
-    show.line()
+    for line in report.summary(found):
+        show.line(line)
     show.line(f"the rig is in {out}, the report in {page}")
 
 

@@ -1,3 +1,3 @@
-"""Robust fits of constants, and intervals of shares."""
+"""Maximum a posteriori estimates of shared parameters, and intervals of shares."""
 
-__all__ = ["constants", "robust", "shares"]
+__all__ = ["posterior", "shares"]

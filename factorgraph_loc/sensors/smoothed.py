@@ -1,7 +1,7 @@
-"""What is learnt from logs without a reference, which an estimator has smoothed instead.
+"""Trajectories along which sensors are calibrated: those of references, or of an estimator that has smoothed logs without any.
 
-Each log has constants of its own, which scatter about those of the installation. An estimator finds each as a correction of the
-rig's value, with a standard deviation. Their mean over the logs becomes the rig's value, and their scatter its uncertainty
+Each smoothed log has constants of its own, which scatter about those of the installation. An estimator finds each as a correction
+of the rig's value, with a standard deviation. Their mean over the logs becomes the rig's value, and their scatter its uncertainty
 (empirical Bayes: Efron and Morris, "Data analysis using Stein's estimator and its generalizations", JASA 70, 1975).
 """
 
@@ -11,27 +11,26 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.fitting.constants import FittedConstant
+from factorgraph_loc.fitting.posterior import FittedConstant
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factors.se2 import Array
 
 WORTH = 2.0  # logs that the uncertainty of the input rig counts as: few logs tell little of a scatter
 REFERENCE_GAP = 0.35  # s; longest interpolated gap between reference poses
-CLEARLY = 2.0  # standard errors; a mean that is nearer to the rig's value is chance
 
 
 @dataclass(frozen=True)
-class Smoothed:
-    """A log that an estimator has smoothed.
+class Traced:
+    """A log with the trajectory along which is learnt, as its reference.
 
-    ``log``: with the final trajectory and its covariances as reference; ``constants``: those that were estimated, by their names
-    in :class:`~factorgraph_loc.model.learnt.Learnt`, each the correction of the rig's value with its standard deviation;
-    ``doubted``: names of things that are probably not where the map has them.
+    ``constants``: None for a reference proper. For a smoothed trajectory, which has covariances, the constants that were estimated,
+    by their names in :class:`~factorgraph_loc.model.belief.Learnt`, each the correction of the rig's value with its standard
+    deviation. ``doubted``: names of things that are probably not where the map has them.
     """
 
     log: Log
-    constants: Mapping[str, tuple[float, float]]
+    constants: Mapping[str, tuple[float, float]] | None = None
     doubted: frozenset[str] = frozenset()
 
 
@@ -62,28 +61,26 @@ def pooled(found: Sequence[tuple[float, float]], known: float) -> Corrections:
 
 
 def pooled_constants(
-    section: str, prefix: str, settings: Any, first: Any, names: Mapping[str, float], smoothed: Sequence[Smoothed]
+    section: str, prefix: str, settings: Any, first: Any, names: Mapping[str, float], smoothed: Sequence[Traced]
 ) -> tuple[Any, list[FittedConstant]]:
     """The ``settings`` of a section with those of its constants ``names`` (with upper bounds of their uncertainties) that were
     estimated in all logs, and what was found. ``first``: the settings before anything was learnt.
 
-    Scales are corrected by factors, others by sums. A constant whose mean is within chance has the first value; the uncertainty
-    is written in any case if there are several logs.
+    Scales are corrected by factors, others by sums. The uncertainty is written if there are several logs.
     """
     values: dict[str, float] = {}
     uncertainties: dict[str, float] = {}
     out = []
     for name, most in names.items():
-        found = [one.constants[prefix + name] for one in smoothed if prefix + name in one.constants]
+        told = [one.constants or {} for one in smoothed]
+        found = [constants[prefix + name] for constants in told if prefix + name in constants]
         if len(found) < len(smoothed):
             continue
         before, now = float(getattr(first, name)), float(getattr(settings, name))
         unit, unit_now = (before, now) if "scale" in name else (1.0, 1.0)
         changes = [((now + unit_now * c - before) / unit, s) for c, s in found]
         result = pooled(changes, float(getattr(first.uncertainty, name)))
-        kept = abs(result.mean) > CLEARLY * result.error
-        fitted = before + unit * result.mean
-        values[name] = fitted if kept else before
+        values[name] = before + unit * result.mean
         if len(found) > 1:
             uncertainties[name] = min(result.spread, most)
         out.append(
@@ -91,13 +88,8 @@ def pooled_constants(
                 section,
                 name,
                 before=before,
-                fitted=fitted,
+                fitted=values[name],
                 error=abs(unit) * result.error,
-                gain=0.0,
-                kept=kept,
-                why="kept: the smoothed logs agree on it"
-                if kept
-                else "not kept: its mean over the logs is within chance",
                 per_log=tuple((before + unit * result.each).tolist()),
                 uncertainty=uncertainties.get(name),
             )

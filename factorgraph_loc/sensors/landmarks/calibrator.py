@@ -1,101 +1,85 @@
-"""Calibration of constants and noise of a landmark sensor, from sightings at reference poses and the EKF's errors."""
+"""Calibration of constants and noise of a landmark sensor, from sightings along trajectories."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import nnls
 
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
 from factorgraph_loc.drawing.pages import Part, Picture
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.fitting.constants import FittedConstant
-from factorgraph_loc.fitting.robust import Constant, Fit, Integers, folds, gains, spread
+from factorgraph_loc.files.models import bounds
+from factorgraph_loc.fitting.posterior import (
+    LikelihoodTerms,
+    Parameter,
+    Posterior,
+    blocks,
+    independent_share,
+    least_squares,
+    spread,
+)
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import (
-    BLOCKS,
-    ConstantsCalibrator,
-    ConstantsFound,
-    Settled,
-    Told,
-    Unit,
-    upper_bounds,
-)
+from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, SensorKnowledge, upper_bounds
 from factorgraph_loc.sensors.landmarks.measurement import (
     BearingRangeSettings,
     BearingRangeStream,
     BearingRangeUncertainty,
 )
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
-from factorgraph_loc.text import number, plain
+from factorgraph_loc.text import number
+from factors import se2
 from factors.landmarks import model as bearing_range
 from factors.se2 import Array
 
 MAX_OFFSET = 0.5  # s between the clocks of the sensor and the reference
-INLIER = 4.0  # standard deviations above which a sighting is excluded from the scatter
-LAGS = np.concatenate(([0.0], np.geomspace(0.15, 60.0, 16)))  # s, edges of the bins of the autocorrelation
-NEIGHBOURS = 200  # sightings of the same landmark used for the autocorrelation of each
-MIN_PAIRS = 30  # minimum number per bin
+GROSS = 4.0  # least standard deviation of gross errors, in those of the others
+SEPARATIONS = 20  # steps of expectation-maximisation
+SMALLEST = 1e-3  # m, rad, m per m; standard deviation
 
 
 @dataclass(frozen=True)
 class Sightings:
     """K sightings of landmarks of the map: timestamps ``t`` (K,) by the sensor's clock, ``points`` (K, 2), ``ranges`` and
-    ``bearings`` (K,), and ``track`` (K,), the index of the landmark in the map."""
+    ``bearings`` (K,). ``sound`` (K, 2): probability of range and bearing not to be gross errors."""
 
     log: Log
     t: Array
     points: Array
     ranges: Array
     bearings: Array
-    track: Integers
+    sound: Array
 
     def thinned(self, count: int) -> Sightings:
         """About ``count`` of the sightings, by keeping every n-th timestamp."""
         _, stamp = np.unique(self.t, return_inverse=True)
-        return self._part(stamp % max(1, round(len(self.t) / count)) == 0)
+        rows = stamp % max(1, round(len(self.t) / count)) == 0
+        columns = ("t", "points", "ranges", "bearings", "sound")
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
-    def halves(self) -> tuple[Sightings, Sightings]:
-        """The first and the second half in time."""
-        early = np.arange(len(self.t)) < len(self.t) // 2
-        return self._part(early), self._part(~early)
-
-    def residuals(self, settings: BearingRangeSettings) -> Array:
-        """Range and bearing residuals (K, 2), predicted minus measured, in standard deviations; zero if not measured."""
+    def whitened(self, settings: BearingRangeSettings, moved: Array | float = 0.0) -> Array:
+        """Range and bearing residuals (K, 2), predicted minus measured, in standard deviations; zero if not measured. ``moved``
+        (3,): a body-frame perturbation of the poses."""
         assert self.log.reference is not None
         poses = self.log.reference.at(self.t + settings.time_offset)
+        if np.any(moved):
+            poses = se2.compose(poses, np.asarray(moved))
         return bearing_range.residuals(settings.model(), poses, self.points, self.ranges, self.bearings)
+
+    def residuals(self, settings: BearingRangeSettings, moved: Array | float = 0.0) -> Array:
+        """Those, weighted by the probability not to be gross."""
+        return np.sqrt(self.sound) * self.whitened(settings, moved)
 
     def errors(self, settings: BearingRangeSettings) -> Array:
         """The residuals in m and rad, NaN if not measured."""
-        out = self.residuals(settings) * bearing_range.sigmas(settings.model(), self.ranges)
+        out = self.whitened(settings) * bearing_range.sigmas(settings.model(), self.ranges)
         out[np.isnan(self.ranges), 0] = np.nan
         out[np.isnan(self.bearings), 1] = np.nan
         return out
-
-    def _part(self, rows: NDArray[np.bool_]) -> Sightings:
-        ranges, bearings = self.ranges[rows], self.bearings[rows]
-        return Sightings(self.log, self.t[rows], self.points[rows], ranges, bearings, self.track[rows])
-
-
-@dataclass(frozen=True)
-class Correlation:
-    """Autocorrelation of the residuals of a landmark, for range and bearing (2,).
-
-    ``next_one``: correlation of consecutive sightings; ``time`` [s]: until it falls below 1/e; ``lags`` (B,) [s] and ``function``
-    (B, 2). NaN if there are too few sightings.
-    """
-
-    next_one: Array
-    time: Array
-    lags: Array
-    function: Array
 
 
 def sightings_of(log: Log) -> Sightings:
@@ -104,251 +88,199 @@ def sightings_of(log: Log) -> Sightings:
     assert isinstance(stream, BearingRangeStream)
     assert log.reference is not None
     numbers = {name: i for i, name in enumerate(log.world.landmarks)}
-    track = np.array([numbers.get(name, -1) for name in stream.landmark], dtype=np.int64)
-    good = (track >= 0) & np.isfinite(log.reference.at(stream.t, max_gap=REFERENCE_GAP)[:, 0])
+    landmark = np.array([numbers.get(name, -1) for name in stream.landmark], dtype=np.int64)
+    good = (landmark >= 0) & np.isfinite(log.reference.at(stream.t, max_gap=REFERENCE_GAP)[:, 0])
     good &= (stream.t > log.reference.t[0] + MAX_OFFSET) & (stream.t < log.reference.t[-1] - MAX_OFFSET)
     bearings = stream.bearing if log.reference.has_heading else np.full_like(stream.bearing, np.nan)
     good &= np.isfinite(stream.range) | np.isfinite(bearings)
     if (count := np.count_nonzero(good)) < MIN_SIGHTINGS:
         found = f"has {count} sightings of mapped landmarks within the reference"
         raise InputError(f"{log.name}: {found}, expected {MIN_SIGHTINGS} or more")
-    points = log.world.positions()[track[good]]
-    return Sightings(log, stream.t[good], points, stream.range[good], bearings[good], track[good])
+    points = log.world.positions()[landmark[good]]
+    return Sightings(log, stream.t[good], points, stream.range[good], bearings[good], np.ones((count, 2)))
 
 
-def constants_of(seen: Sequence[Sightings], settings: BearingRangeSettings) -> tuple[Constant, ...]:
-    """The constants that may be fitted, with the rig's values as neutral ones; only the range scale without reference headings."""
+def parameters_of(seen: Sequence[Sightings], settings: BearingRangeSettings) -> list[Parameter]:
+    """The constants, with priors about the rig's values; only the range scale without reference headings."""
     has_range = any(np.isfinite(one.ranges).any() for one in seen)
     has_bearing = any(np.isfinite(one.bearings).any() for one in seen)
     has_heading = all(one.log.reference is not None and one.log.reference.has_heading for one in seen)
     candidates = (
-        (has_heading, "x", 0.05, -10.0, 10.0),
-        (has_heading, "y", 0.05, -10.0, 10.0),
-        (has_bearing, "bearing_bias", 0.02, -np.pi, np.pi),
-        (has_range, "range_scale", 0.02, 0.2, 5.0),
-        (settings.range_kind == "depth", "depth_axis", 0.02, -np.pi, np.pi),
-        (has_heading, "time_offset", 0.05, -MAX_OFFSET, MAX_OFFSET),
+        (has_heading, "x", 0.2, -10.0, 10.0),
+        (has_heading, "y", 0.2, -10.0, 10.0),
+        (has_bearing, "bearing_bias", 0.1, -np.pi, np.pi),
+        (has_range, "range_scale", 0.1, 0.2, 5.0),
+        (settings.range_kind == "depth", "depth_axis", 0.1, -np.pi, np.pi),
+        (has_heading, "time_offset", 0.1, -MAX_OFFSET, MAX_OFFSET),
     )
-    return tuple(Constant(name, getattr(settings, name), *scale) for use, name, *scale in candidates if use)
+    return [Parameter(name, getattr(settings, name), *scale) for use, name, *scale in candidates if use]
 
 
-def with_scatter(seen: Sequence[Sightings], settings: BearingRangeSettings) -> BearingRangeSettings:
-    """The settings with noise set to the maximum-likelihood scatter of the inliers.
-
-    The variance of a range is that of a constant error plus that of an error proportional to the range.
-    """
+def with_scatter(
+    seen: Sequence[Sightings], settings: BearingRangeSettings
+) -> tuple[list[Sightings], BearingRangeSettings]:
+    """The sightings with their probabilities not to be gross, and the settings with the scatter of the others as noise."""
     errors = np.concatenate([one.errors(settings) for one in seen])
-    ranges = np.concatenate([one.ranges for one in seen])
-    found: dict[str, float] = {}
-    if (measured := np.isfinite(errors[:, 0])).any():
-        constant, relative = _range_scatter(errors[measured, 0], ranges[measured])
-        found |= {"range_sigma": constant, "range_sigma_relative": relative}
-    bearings = errors[np.isfinite(errors[:, 1]), 1]
-    if len(bearings):
-        sigma = float(spread(bearings[:, None])[0])
-        for _ in range(5):
-            sigma = float(np.std(bearings[np.abs(bearings) < INLIER * sigma]))
-        found |= {"bearing_sigma": float(np.clip(sigma, 1e-4, 0.5))}
-    return settings.model_copy(update=found)
+    ranges = np.nan_to_num(np.concatenate([one.ranges for one in seen]))
+    found, sound = dict[str, float](), np.ones(errors.shape)
+    if np.isfinite(errors[:, 0]).any():
+        (constant, relative), sound[:, 0] = separated(errors[:, 0], ranges)
+        found |= {"range_sigma": constant, "range_sigma_relative": relative if relative > 1e-3 else 0.0}
+    if np.isfinite(errors[:, 1]).any():
+        (sigma, _), sound[:, 1] = separated(errors[:, 1], 0.0 * ranges)
+        found["bearing_sigma"] = sigma
+    ends = np.cumsum([len(one.t) for one in seen])[:-1]
+    parts = [replace(one, sound=rows) for one, rows in zip(seen, np.split(sound, ends), strict=True)]
+    return parts, settings.model_copy(update=_bounded(found))
 
 
-def correlation(seen: Sightings, settings: BearingRangeSettings) -> Correlation:
-    """Autocorrelation of the residuals of each landmark in one log, without outliers."""
-    whitened = seen.errors(settings) / bearing_range.sigmas(settings.model(), seen.ranges)
-    whitened[np.abs(whitened) > INLIER] = np.nan
-    count = len(LAGS) - 1
-    products, pairs = np.zeros((count, 2)), np.zeros((count, 2))
-    neighbour, neighbours = np.zeros(2), np.zeros(2)
-    for track in np.unique(seen.track):
-        t, values = seen.t[seen.track == track], whitened[seen.track == track]
-        for step in range(1, min(NEIGHBOURS, len(t))):
-            product = values[step:] * values[:-step]
-            bins = np.searchsorted(LAGS, t[step:] - t[:-step]) - 1
-            inside, known = (bins >= 0) & (bins < count), np.isfinite(product)
-            np.add.at(products, bins[inside], np.nan_to_num(product[inside]))
-            np.add.at(pairs, bins[inside], known[inside])
-            if step == 1:
-                neighbour += np.nansum(product, axis=0)
-                neighbours += known.sum(axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        variance = np.nansum(whitened**2, axis=0) / np.isfinite(whitened).sum(axis=0)
-        function = np.where(pairs >= MIN_PAIRS, products / pairs, np.nan) / variance
-        next_one = np.where(neighbours >= MIN_PAIRS, neighbour / neighbours, np.nan) / variance
-    lags = 0.5 * (LAGS[1:] + LAGS[:-1])
-    return Correlation(next_one, np.array([_falls(lags, values) for values in function.T]), lags, function)
+def _bounded(values: Mapping[str, float]) -> dict[str, float]:
+    """Standard deviations within the bounds of the settings."""
+    kind = BearingRangeSettings.model_fields
+    return {name: float(np.clip(value, *bounds(kind[name].metadata))) for name, value in values.items()}
 
 
-def _falls(lags: Array, function: Array) -> float:
-    """The lag at which the correlation falls below 1/e, or the last lag."""
-    known = np.flatnonzero(np.isfinite(function))
-    if not len(known):
-        return float("nan")
-    below = known[function[known] < np.exp(-1.0)][:1]
-    if not len(below):
-        return float(lags[known[-1]])
-    rows = [*below, *known[known < below][-1:]]
-    return float(np.interp(np.exp(-1.0), function[rows], lags[rows]))
+def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]:
+    """Standard deviation of errors (K,), constant and relative to ``ranges`` (K,), and the probability (K,) of each not to be
+    gross; NaN is not measured.
+
+    A mixture of two Gaussians about zero, of which the wider one has the gross errors, by expectation-maximisation (McLachlan and
+    Peel, "Finite mixture models", 2000, section 3.2) from the median absolute error.
+    """
+    known = np.isfinite(errors)
+    error, near = errors[known], ranges[known]
+    constant, relative = max(float(spread(error[:, None])[0]), SMALLEST), SMALLEST
+    gross, wide = 0.05, GROSS**2 * np.mean(np.hypot(constant, relative * near) ** 2) + np.mean(error**2)
+    inside = np.ones(len(error))
+    for _ in range(SEPARATIONS):
+        variance = constant**2 + (relative * near) ** 2
+        likely = (1.0 - gross) * np.exp(-0.5 * error**2 / variance) / np.sqrt(variance)
+        unlikely = gross * np.exp(-0.5 * error**2 / wide) / np.sqrt(wide)
+        inside = likely / np.maximum(likely + unlikely, 1e-300)
+        gross = float(np.clip(np.mean(1.0 - inside), 1e-4, 0.9))
+        constant, relative = _scatter(error, near, inside, (constant, relative))
+        widest = GROSS**2 * np.mean(constant**2 + (relative * near) ** 2)
+        wide = max(float(np.sum((1.0 - inside) * error**2) / max(np.sum(1.0 - inside), 1e-9)), widest)
+    out = np.ones(len(errors))
+    out[known] = inside
+    return (constant, relative), out
 
 
-def _range_scatter(errors: Array, ranges: Array) -> tuple[float, float]:
-    """Standard deviation of a range: constant part [m] and relative part."""
-    constant, relative = float(spread(errors[:, None])[0]), 0.0
-    for _ in range(5):
-        inside = np.abs(errors) < INLIER * np.hypot(constant, relative * ranges)
-        inliers, near = errors[inside], ranges[inside]
-
-        def cost(logs: Array, inliers: Array = inliers, near: Array = near) -> float:
-            variance = np.exp(2.0 * logs[0]) + np.exp(2.0 * logs[1]) * near**2
-            return float(np.mean(np.log(variance) + inliers**2 / variance))
-
-        start = np.log((max(constant, 1e-3), max(relative, 0.01)))
-        constant, relative = np.exp(minimize(cost, start, method="Nelder-Mead").x).tolist()
-    return float(np.clip(constant, 1e-3, 10.0)), 0.0 if relative < 1e-3 else min(relative, 1.0)
+def _scatter(errors: Array, ranges: Array, weights: Array, start: tuple[float, float]) -> tuple[float, float]:
+    """Standard deviation of weighted errors: constant and relative part, by scoring (Nelder and Pregibon, "An extended
+    quasi-likelihood function", Biometrika 74(2), 1987)."""
+    design = np.column_stack((np.ones(len(errors)), ranges**2))
+    variances = np.array((start[0] ** 2, start[1] ** 2))
+    for _ in range(3):
+        weight = weights / (design @ variances) ** 2
+        variances = nnls((design * np.sqrt(weight)[:, None]), errors**2 * np.sqrt(weight))[0]
+        variances[0] = max(variances[0], SMALLEST**2)
+    return float(np.sqrt(variances[0])), float(np.sqrt(variances[1]))
 
 
 MIN_SIGHTINGS = 100
-MOST_SIGHTINGS = 12000  # per log in fits
+MOST_SIGHTINGS = 12000  # per log
 BETTER_KIND = 0.9  # share of the spread below which ranges are of the other kind, distance or depth
-ROUNDS = 2  # of fitting constants and scatter in turn
-RANGE_KIND = "range_kind"
 SIGMAS = {"range_sigma": "m", "range_sigma_relative": "m per m", "bearing_sigma": "rad"}
+WINDOW = 10.0  # s; errors of the sightings in different windows are independent
 FIRST = BearingRangeSettings(range_sigma=0.1)  # settings of an unknown sensor
-SCATTER = Unit("bearing_range", tuple(SIGMAS))
 _SHOWN = 3000  # dots per log and panel
 _VIEW = 5.0  # robust standard deviations; larger residuals are drawn at the edge
 
 
 @dataclass(frozen=True)
-class SensorFit(ConstantsFound):
-    """The parts are thinned from all sightings ``seen``. ``settings``: with all constants and the scatter, for the kind of ranges
-    that fits best."""
+class SensorFit:
+    """The sightings ``seen``, the settings with their ``scatter`` as noise, and the ``share`` of independent ones."""
 
-    settings: BearingRangeSettings = FIRST
-    seen: tuple[Sightings, ...] = ()
+    seen: Sequence[Sightings]
+    scatter: BearingRangeSettings
+    share: float
 
 
 class LandmarkCalibrator(ConstantsCalibrator):
     """The calibrator of a landmark sensor."""
 
-    section, channel, is_consistent = "bearing_range", "bearing_range", True
-    noise = (SCATTER,)
-    uncertain = upper_bounds(BearingRangeUncertainty)
-    together = (("x", "y"),)
+    section, channel = "bearing_range", "bearing_range"
+    uncertain, rounds = upper_bounds(BearingRangeUncertainty), 4
     first = FIRST
 
-    def learn(self, logs: Sequence[Log], rig: Rig, _grids: Path | None, _like: Any) -> SensorFit | None:
-        """The constants of the sensor, from logs with sightings."""
-        if self.channel not in logs[0].streams:
-            return None
-        seen, before = tuple(map(sightings_of, logs)), self.settings(rig)
-        thinned = [one.thinned(MOST_SIGHTINGS) for one in seen]
-        everything, settings = self._fitted(thinned, before)
-        if any(np.any(np.isfinite(one.ranges) & np.isfinite(one.bearings)) for one in thinned):
-            other = before.model_copy(update={RANGE_KIND: "distance" if before.range_kind == "depth" else "depth"})
-            found, changed = self._fitted(thinned, other)
-            new, old = (spread(np.concatenate([one.errors(s) for one in thinned]))[0] for s in (changed, settings))
-            if new < BETTER_KIND * old:
-                everything, settings = found, changed
-        gain = gains(everything, folds([one.t for one in thinned], BLOCKS))
-        return SensorFit(tuple(thinned), everything, gain, everything.as_dict(), (), settings, seen)
+    def part(self, log: Log) -> Sightings:
+        """The sightings of mapped landmarks; InputError if there are too few."""
+        return sightings_of(log).thinned(MOST_SIGHTINGS)
 
-    def _fitted(self, seen: Sequence[Sightings], before: BearingRangeSettings) -> tuple[Fit, BearingRangeSettings]:
-        """Fit all constants and the scatter in turn."""
-        constants = constants_of(seen, before)
-        start = {c.name: c.neutral for c in constants}
-        settings = with_scatter(seen, before)
-        for _ in range(ROUNDS):
-            everything = self.fit(None, seen, settings, constants, start)
-            start = everything.as_dict()
-            settings = with_scatter(seen, self.changed(settings, start))
-        return everything, settings
+    def parameters(self, parts: Sequence[Sightings], settings: BearingRangeSettings) -> list[Parameter]:
+        """The constants of the sensor."""
+        return parameters_of(parts, settings)
 
-    def base(self, found: SensorFit, rig: Rig, accepted: Collection[str] | None) -> BearingRangeSettings:
-        """The settings with the scatter of all constants, for the accepted kind of ranges."""
-        settings = found.settings.model_copy(update={c.name: c.neutral for c in found.everything.constants})
-        if accepted is None or f"{self.section}.{RANGE_KIND}" in accepted:
-            return settings
-        return settings.model_copy(update={RANGE_KIND: self.settings(rig).range_kind})
+    def with_noise(
+        self, parts: Sequence[Sightings], settings: BearingRangeSettings
+    ) -> tuple[Sequence[Sightings], BearingRangeSettings]:
+        """The settings with the scatter of the sightings."""
+        return with_scatter(parts, settings)
+
+    def estimated(
+        self, parts: Sequence[Sightings], settings: BearingRangeSettings
+    ) -> tuple[Sequence[Sightings], BearingRangeSettings, Posterior | None]:
+        """Those for the kind of ranges, distance or depth, that has the smaller scatter."""
+        found = super().estimated(parts, settings)
+        if not any(np.any(np.isfinite(one.ranges) & np.isfinite(one.bearings)) for one in parts):
+            return found
+        kind = "distance" if settings.range_kind == "depth" else "depth"
+        other = super().estimated(parts, settings.model_copy(update={"range_kind": kind}))
+        new, old = (spread(np.concatenate([p.errors(one[1]) for p in parts]))[0] for one in (other, found))
+        return other if new < BETTER_KIND * old else found
 
     def finished(
-        self,
-        found: SensorFit,
-        _logs: Sequence[Log],
-        rig: Rig,
-        base: BearingRangeSettings,
-        learnt: Sequence[FittedConstant],
-        *,
-        by_log: bool,
-    ) -> Settled:
-        """The result with the remaining scatter and the autocorrelation of errors."""
-        settings = with_scatter(found.parts, base)
-        before, notes = rig.bearing_range, []
-        if before is not None and settings.range_kind != before.range_kind:
-            notes.append(f"The ranges fit better as the {settings.range_kind} than as the {before.range_kind}.")
-        correlations = tuple(correlation(one, settings) for one in found.seen if by_log)
-        return Settled({self.section: settings}, learnt, notes, correlations)
-
-    def constant_units(
-        self, found: SensorFit, kept: Sequence[FittedConstant], learnt: Rig, start: Rig
-    ) -> dict[Unit, float]:
-        """The units; constants of another kind of ranges are left out."""
-        if learnt.bearing_range.range_kind == self.settings(start).range_kind:
-            return super().constant_units(found, kept, learnt, start)
-        return {Unit(self.section, (*(c.name for c in kept), RANGE_KIND)): float("inf")}
-
-    def inflated(self, rig: Rig, factor: float) -> Rig:
-        """The rig with the sensor's standard deviations multiplied, limited to their bounds."""
-        settings = rig.bearing_range
-        update = {name: factor * getattr(settings, name) for name in SIGMAS}
-        return rig.model_copy(update={self.section: settings.model_copy(update=update)})
-
-    def document(self, told: Told) -> dict[str, Any]:
-        """The factor on the noise, and the autocorrelation of errors."""
-        return {
-            "noise_factor": None if told.trial is None else told.trial.factor,
-            "correlation": {
-                log: {"next": c.next_one.tolist(), "time": c.time.tolist()}
-                for log, c in zip(told.logs, told.details or (), strict=False)
-            },
-        }
-
-    def report(self, told: Told) -> dict[str, Sequence[Part]]:
-        """The scatter and the noise in the rig; the residuals of the sightings and their autocorrelation."""
-        scatter, settings, trial = told.learnt.bearing_range, told.rig.bearing_range, told.trial
-        if told.found is None or scatter is None or settings is None:
-            return {}
-        out: list[Part] = []
-        if SCATTER not in told.accepted:
-            out.append("The noise of the sightings is rejected: the rig keeps that of the input.")
-        rows: list[tuple[str, ...]] = [
-            (f"{n} [{unit}]", number(getattr(scatter, n)), number(getattr(settings, n))) for n, unit in SIGMAS.items()
-        ]
-        out.append((("noise of the sightings", "scatter", "in the rig"), rows))
-        if trial is not None and SCATTER in told.accepted:
-            out.append(
-                f"The scatter was multiplied by {trial.factor:.2f} to make the EKF consistent "
-                f"(ANEES over its ideal value: {trial.causal:.2f} causal, {trial.final:.2f} final)."
-            )
-        explained = (
-            "Estimators assume independent errors. If the correlation is far above 0, many sightings contain little more "
-            "information than one, and the noise in the rig must be larger than the scatter."
+        self, _logs: Sequence[Log], parts: Sequence[Sightings], rig: Rig, learnt: SensorKnowledge
+    ) -> SensorKnowledge:
+        """The result with the scatter widened for errors that are correlated."""
+        scatter = rig.bearing_range
+        share = pose_share(parts, scatter)
+        wider = _bounded({name: share**-0.5 * getattr(scatter, name) for name in SIGMAS})
+        return replace(
+            learnt,
+            sections={self.section: scatter.model_copy(update=wider)},
+            details=SensorFit(parts, scatter, share),
         )
-        header = ("log", "range: next sighting", "falls to 1/e in [s]", "bearing: next sighting", "falls to 1/e in [s]")
-        rows = [
-            (log, number(c.next_one[0], 2), number(c.time[0], 1), number(c.next_one[1], 2), number(c.time[1], 1))
-            for log, c in zip(told.logs, told.details, strict=True)
+
+    def document(self, found: SensorKnowledge, _rig: Rig) -> dict[str, Any]:
+        """The factor on the noise."""
+        return {"noise_factor": None if found.details is None else found.details.share**-0.5}
+
+    def report(self, found: SensorKnowledge, rig: Rig) -> dict[str, Sequence[Part]]:
+        """The scatter and the noise in the rig, and the residuals of the sightings."""
+        if found.details is None:
+            return {}
+        fit: SensorFit = found.details
+        rows: list[tuple[str, ...]] = [
+            (f"{n} [{unit}]", number(getattr(fit.scatter, n)), number(getattr(rig.bearing_range, n)))
+            for n, unit in SIGMAS.items()
         ]
+        text = (
+            f"Errors of sightings last: by what they say of the pose in {WINDOW:g} s, {1.0 / fit.share:.1f} sightings are worth an "
+            "independent one. Estimators take them as independent, so that the noise in the rig is larger than the scatter."
+        )
         return {
-            "Noise": out,
-            "Correlation of consecutive errors": [explained, (header, rows)],
-            "Residuals of the sightings": [
-                sightings_figure(told.found.seen, told.learnt.bearing_range),
-                correlation_figure(told.found.seen, told.details),
-            ],
+            "Noise": [(("noise of the sightings", "scatter", "in the rig"), rows), text],
+            "Residuals of the sightings": [sightings_figure(fit.seen, fit.scatter)],
         }
 
 
 CALIBRATOR = LandmarkCalibrator()
+
+
+def pose_share(seen: Sequence[Sightings], settings: BearingRangeSettings) -> float:
+    """The share of the sightings that are worth independent ones, for the pose."""
+
+    def scored(one: Sightings) -> LikelihoodTerms:
+        dimensions = [Parameter(name, 0.0, 1.0) for name in ("x", "y", "heading")]
+        evidence = least_squares(lambda moved: one.residuals(settings, moved), dimensions, blocks([one.t], WINDOW))
+        return evidence(np.zeros(3))
+
+    found = [scored(one) for one in seen]
+    return independent_share(
+        np.concatenate([one.scores for one in found]), np.sum([one.information for one in found], axis=0)
+    )
 
 
 def sightings_figure(seen: Sequence[Sightings], settings: BearingRangeSettings) -> Picture:
@@ -378,23 +310,5 @@ def sightings_figure(seen: Sequence[Sightings], settings: BearingRangeSettings) 
         panels[0].set(xlabel=f"{what} residual [{unit}]", ylabel=f"density [1/{unit}]")
         panels[1].set(xlabel="measured range [m]", ylabel=f"{what} residual [{unit}]")
         panels[2].set(xlabel="time [s]", ylabel=f"{what} residual [{unit}]")
-    legend(figure, axes.flat, markers=3.0)
-    return png(figure)
-
-
-def correlation_figure(seen: Sequence[Sightings], correlations: Sequence[Correlation]) -> Picture:
-    """Autocorrelation of the residuals of one landmark, for each log."""
-    columns = [(0, "range"), (1, "bearing")]
-    columns = [c for c in columns if any(np.isfinite(one.function[:, c[0]]).any() for one in correlations)]
-    figure, axes = grid(1, max(1, len(columns)), 4.0)
-    for axis, (column, what) in zip(axes[0], columns, strict=False):
-        for i, (one, of) in enumerate(zip(correlations, seen, strict=True)):
-            known, colour = np.isfinite(one.function[:, column]), COLOURS[i % len(COLOURS)]
-            label = plain(of.log.name.lstrip("_"), 40) or "log"
-            axis.plot(one.lags[known], one.function[known, column], "o-", color=colour, label=label)
-        axis.axhline(np.exp(-1.0), color="0.3", linestyle="--", label="1/e")
-        axis.axhline(0.0, color="0.5", linewidth=0.8)
-        time = "time between two sightings of a landmark [s]"
-        axis.set(xscale="log", xlabel=time, ylabel=f"correlation of {what} residuals")
     legend(figure, axes.flat, markers=3.0)
     return png(figure)

@@ -17,7 +17,7 @@ import scipy
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.checks import ROUNDING
-from factorgraph_loc.fitting.robust import MAD_TO_SIGMA
+from factorgraph_loc.fitting.posterior import MAD_TO_SIGMA
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors import interfaces

@@ -8,13 +8,12 @@ lengths separate growing errors from the constant ones of the reference.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import minimize
 
-from factorgraph_loc.fitting.robust import Constant, Fit, blocks, fit, loss, spread
+from factorgraph_loc.fitting.posterior import Parameter, spread
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.motion import odometry_model
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
@@ -33,45 +32,45 @@ from factors.odometry.model import (
 from factors.se2 import Array
 
 BEFORE = 1.0  # s before a window in which the odometry must be complete too, because of its lag
-WINDOW = 2.0  # s
-BLOCK = 20.0  # s; errors within a block may be correlated
-LAGGING_START = 0.05  # s; at a lag of zero the derivative vanishes
-
-
+WINDOW = 2.0  # s, for the constants
 # error of the reference over a window: m, m, rad; lower bound of the residuals' standard deviations
 REFERENCE_SIGMAS = np.array((0.005, 0.005, 0.003))
-MIN_STOOD = 5  # minimum number of windows at rest
-MOVING = np.array((0.05, 0.1))  # m/s, rad/s above which a window is used for the scatter
+MOVING = np.array((0.05, 0.1))  # m/s, rad/s above which the robot moves in a window
 
 
 @dataclass(frozen=True)
 class Windows:
-    """M segments of a log: ``begin`` and ``end`` (M,) [s], and ``motion`` (M, 3) of the reference over them."""
+    """M segments of a log: ``begin`` and ``end`` (M,) [s], and ``motion`` (M, 3) of the reference over them. ``sigmas`` (M, 3) of
+    the residuals."""
 
     log: Log
     begin: Array
     end: Array
     motion: Array
+    sigmas: Array = field(default_factory=lambda: np.ones(3))
 
-    def halves(self) -> tuple[Windows, Windows]:
-        """The first and the second half in time."""
-        half = len(self.begin) // 2
-        first, second = (
-            Windows(self.log, self.begin[part], self.end[part], self.motion[part])
-            for part in (slice(None, half), slice(half, None))
-        )
-        return first, second
+    @property
+    def t(self) -> Array:
+        return self.begin
 
     def states(self, model: OdometryModel) -> tuple[Array, Array]:
         """States of the odometry (M, 8) at both ends."""
         chain = integrated(self.log, model)
         return chain.states(self.begin), chain.states(self.end)
 
-    def residuals(self, model: OdometryModel) -> Array:
+    def errors(self, model: OdometryModel) -> Array:
         """Motion of the reference relative to the odometry (M, 3): a body-frame perturbation at the end, [m, m, rad]."""
         start, end = self.states(model)
         odometry = se2.between(start[:, 1:4], end[:, 1:4])
         return se2.log(se2.between(odometry, self.motion))
+
+    def residuals(self, settings: OdometrySettings) -> Array:
+        """The errors (M, 3) in standard deviations."""
+        return self.errors(self.model(settings)) / self.sigmas
+
+    def model(self, settings: OdometrySettings) -> OdometryModel:
+        """The model with these settings."""
+        return odometry_model(self.log.rig.model_copy(update={"odometry": settings}))
 
     def covariances(self, model: OdometryModel) -> Array:
         """The model's covariances (M, 3, 3) of the residuals."""
@@ -115,75 +114,39 @@ def integrated(log: Log, model: OdometryModel) -> OdometryChain:
     return chain
 
 
-def scatter(windows: Sequence[Windows], model: OdometryModel) -> Array:
-    """Robust standard deviations (3,) of the residuals of windows with motion: longitudinal, lateral [m], heading [rad]."""
-    each = []
+def with_scatter(windows: Sequence[Windows], settings: OdometrySettings) -> list[Windows]:
+    """The windows with robust standard deviations of their errors, apart for motion and rest. Weights are equal in motion: those
+    of the noise model would favour windows with little motion."""
+    errors, moves = [], []
     for one in windows:
-        start, end = one.states(model)
-        moved = (end - start)[:, 4:6] / (end - start)[:, :1]
-        each.append(one.residuals(model)[np.any(moved > MOVING, axis=1)])
-    residuals = np.concatenate(each)
-    return np.asarray(np.maximum(spread(residuals) if len(residuals) else 0.0, REFERENCE_SIGMAS))
+        start, end = one.states(one.model(settings))
+        moves.append(np.any((end - start)[:, 4:6] > MOVING * (end - start)[:, :1], axis=1))
+        errors.append(one.errors(one.model(settings)))
+    every, moving = np.concatenate(errors), np.concatenate(moves)
+    sigmas = [spread(every[mine]) if mine.any() else np.zeros(3) for mine in (~moving, moving)]
+    known = np.maximum(sigmas, REFERENCE_SIGMAS)
+    return [replace(one, sigmas=known[mine.astype(int)]) for one, mine in zip(windows, moves, strict=True)]
 
 
-def constants_of(windows: Windows, settings: OdometrySettings) -> tuple[Constant, ...]:
-    """The constants that may be fitted, with the rig's values as neutral ones."""
+def parameters_of(windows: Windows, settings: OdometrySettings) -> list[Parameter]:
+    """The constants, with priors about the rig's values: wheels that report turns have hardly any bias by time."""
+    commanded = isinstance(odometry_of(windows.log), VelocityStream)
+    by_speed, by_turn = (0.005, 0.002) if commanded else (0.0005, 0.0005)  # m/s, rad/s
     found = [
-        Constant("scale_distance", settings.scale_distance, 0.05, 0.2, 5.0),
-        Constant("scale_rotation", settings.scale_rotation, 0.05, 0.2, 5.0),
-        Constant("speed_bias", settings.speed_bias, 0.01, -1.0, 1.0),
-        Constant("heading_rate_bias", settings.heading_rate_bias, 0.005, -1.0, 1.0),
-        Constant("heading_drift", settings.heading_drift, 0.02, -1.0, 1.0),
-        Constant("direction", settings.direction, 0.05, -np.pi, np.pi),
+        Parameter("scale_distance", settings.scale_distance, 0.05, 0.2, 5.0),
+        Parameter("scale_rotation", settings.scale_rotation, 0.05, 0.2, 5.0),
+        Parameter("speed_bias", settings.speed_bias, by_speed, -1.0, 1.0),
+        Parameter("heading_rate_bias", settings.heading_rate_bias, by_turn, -1.0, 1.0),
+        Parameter("heading_drift", settings.heading_drift, 0.03, -1.0, 1.0),
+        Parameter("direction", settings.direction, 0.1, -np.pi, np.pi),
     ]
-    if isinstance(odometry_of(windows.log), VelocityStream):
+    if commanded:
         found += [
-            Constant("delay", settings.delay, 0.1, 0.0, 2.0),
-            Constant("lag", settings.lag, 0.1, 0.0, 5.0),
-            Constant("turn_slowdown", settings.turn_slowdown, 0.05, 0.0, 5.0),
+            Parameter("delay", settings.delay, 0.1, 0.0, 2.0),
+            Parameter("lag", settings.lag, 0.1, 0.0, 5.0),
+            Parameter("turn_slowdown", settings.turn_slowdown, 0.05, 0.0, 5.0),
         ]
-    return tuple(found)
-
-
-def denied_at_rest(found: Fit, windows: Sequence[Windows]) -> tuple[str, ...]:
-    """Names of biases that contradict the windows at rest, where biases are known best.
-
-    ``found``: the fit to all ``windows``. Commanded velocities, for instance, are zero at rest, whatever their error in motion.
-    """
-    stood = np.all(np.abs(np.concatenate([one.motion for one in windows])) < REFERENCE_SIGMAS, axis=1)
-    denied = []
-    for p, c in enumerate(found.constants):
-        if c.name in ("speed_bias", "heading_rate_bias") and np.sum(stood) >= MIN_STOOD:
-            without = found.residuals + found.jacobian[..., p] * (c.neutral - found.values[p])
-            if loss(without[stood]) < loss(found.residuals[stood]):
-                denied.append(c.name)
-    return tuple(denied)
-
-
-def with_constants(model: OdometryModel, values: Mapping[str, float]) -> OdometryModel:
-    """The model with some constants changed."""
-    changed: dict[str, Any] = dict(values)
-    return replace(model, **changed)
-
-
-def fit_odometry(
-    windows: Sequence[Windows],
-    model: OdometryModel,
-    constants: Sequence[Constant],
-    sigmas: Array,
-    start: Mapping[str, float],
-) -> Fit:
-    """Fit ``constants`` to one or several logs jointly, the others as in ``model``; ``sigmas`` (3,) of the residuals.
-
-    All windows have equal weight; weights from the fitted noise would favour windows with little motion.
-    """
-    names = [c.name for c in constants]
-
-    def whitened(values: Array) -> Array:
-        changed = with_constants(model, dict(zip(names, values.tolist(), strict=True)))
-        return np.concatenate([one.residuals(changed) for one in windows]) / sigmas
-
-    return fit(constants, np.array([start[n] for n in names]), whitened, blocks([w.begin for w in windows], BLOCK))
+    return found
 
 
 LENGTHS = (1.0, 3.0, 10.0)  # s
@@ -223,7 +186,7 @@ def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
     """
     windows = [cut(log, length) for log in logs for length in LENGTHS]
     bases = np.concatenate([_bases(one, model) for one in windows])
-    residuals = np.concatenate([one.residuals(model) for one in windows])
+    residuals = np.concatenate([one.errors(model) for one in windows])
     lengths = np.concatenate([one.end - one.begin for one in windows])
     weights = lengths / lengths.mean()
     size = np.median(np.abs(residuals), axis=0) ** 2 / np.median(lengths)
@@ -243,7 +206,7 @@ def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
 def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
     """Factor by which the errors over a blackout exceed the model; 1 if they do not or there are too few windows."""
     windows = [cut(log, BLACKOUT) for log in logs]
-    residuals = np.concatenate([one.residuals(model) for one in windows])
+    residuals = np.concatenate([one.errors(model) for one in windows])
     if len(residuals) < MIN_BLACKOUTS:
         return 1.0
     covariances = np.concatenate([one.covariances(model) for one in windows])

@@ -1,7 +1,7 @@
 """The calibrator of wheel odometry, from the motion of the reference over short windows."""
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +10,10 @@ import numpy as np
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
 from factorgraph_loc.drawing.pages import Part, Picture, Rows
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.fitting.constants import FittedConstant
-from factorgraph_loc.fitting.robust import Constant, Fit, folds, gains
+from factorgraph_loc.fitting.posterior import Parameter
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import (
-    BLOCKS,
-    ConstantsCalibrator,
-    ConstantsFound,
-    Settled,
-    Told,
-    Unit,
-    upper_bounds,
-)
+from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, SensorKnowledge, upper_bounds
 from factorgraph_loc.sensors.motion import odometry_model
 from factorgraph_loc.sensors.odometry import calibration as odometry
 from factorgraph_loc.sensors.odometry.calibration import (
@@ -41,32 +32,31 @@ from factorgraph_loc.sensors.odometry.settings import (
     OdometrySettings,
     OdometryUncertainty,
 )
+from factorgraph_loc.sensors.smoothed import Traced
 from factorgraph_loc.text import number
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 
-MIN_WINDOWS = 20
-ROUNDS = 2  # of fitting constants and scatter in turn
+MIN_WINDOWS = 15
 MOST_OUTLIERS = 0.05  # share of the windows
-NOISE = Unit("odometry", ("noise",))
 KINDS = {VelocityStream: "velocities", IncrementStream: "increments"}
 _VIEW = 5.0  # robust standard deviations; larger residuals are drawn at the edge
 
 
 @dataclass(frozen=True)
-class WheelsFit(ConstantsFound):
-    """The parts are windows of 2 s. ``sigmas`` (3,) of the residuals."""
+class WheelsFit:
+    """The ``windows`` of 2 s, and the ``noise`` of the odometry ``model``."""
 
-    sigmas: Array = field(default_factory=lambda: np.ones(3))
+    windows: Sequence[Windows]
+    model: OdometryModel
+    noise: NoiseFit
 
 
 class OdometryCalibrator(ConstantsCalibrator):
     """The calibrator of wheel odometry."""
 
     section, channel, senses = "odometry", "odometry", False
-    noise = (NOISE,)
     uncertain = upper_bounds(OdometryUncertainty)
-    together = (("delay", "lag"),)
 
     def check_alike(self, first: Log, log: Log) -> None:
         """InputError if one log reports velocities and the other increments."""
@@ -76,118 +66,88 @@ class OdometryCalibrator(ConstantsCalibrator):
                 f"{log.name}: its odometry has {ours}, that of {first.name} {theirs}; expected logs of one robot type"
             )
 
-    def learn(self, logs: Sequence[Log], rig: Rig, _grids: Path | None, _like: Any) -> WheelsFit | None:
-        """Fit the constants of the odometry if the reference has headings."""
-        if logs[0].reference is None or not logs[0].reference.has_heading:
-            return None
-        windows = tuple(cut(log, odometry.WINDOW) for log in logs)
-        for one in windows:
-            if len(one.begin) < MIN_WINDOWS:
-                raise InputError(
-                    f"{one.log.name}: odometry and reference overlap in {len(one.begin)} windows of {odometry.WINDOW:g} s, "
-                    f"expected {MIN_WINDOWS} or more"
-                )
-        constants, model = odometry.constants_of(windows[0], rig.odometry), odometry_model(rig)
-        start = {c.name: c.neutral for c in constants}
-        start |= {name: max(start[name], odometry.LAGGING_START) for name in ("delay", "lag") if name in start}
-        for _ in range(ROUNDS):
-            sigmas = odometry.scatter(windows, odometry.with_constants(model, start))
-            everything = odometry.fit_odometry(windows, model, constants, sigmas, start)
-            start = everything.as_dict()
-        denied = odometry.denied_at_rest(everything, windows)
-        gain = gains(everything, folds([one.begin for one in windows], BLOCKS), denied)
-        return WheelsFit(windows, everything, gain, start, denied, sigmas)
+    def learn(
+        self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
+    ) -> SensorKnowledge:
+        """The constants and the noise, if the reference has headings."""
+        reference = traced[0].log.reference
+        has_heading = reference is not None and reference.has_heading
+        return super().learn(traced, rig, first, grids, like) if has_heading else SensorKnowledge()
 
-    def base(self, _found: WheelsFit, rig: Rig, _accepted: Collection[str] | None) -> OdometryModel:
-        """The odometry model of the input rig."""
-        return odometry_model(rig)
+    def part(self, log: Log) -> Windows:
+        """Windows of the log; InputError if there are too few."""
+        found = cut(log, odometry.WINDOW)
+        if len(found.begin) < MIN_WINDOWS:
+            raise InputError(
+                f"{log.name}: odometry and reference overlap in {len(found.begin)} windows of {odometry.WINDOW:g} s, expected "
+                f"{MIN_WINDOWS} or more"
+            )
+        return found
 
-    def changed(self, base: OdometryModel, values: Mapping[str, float]) -> OdometryModel:
-        """The model with changed constants."""
-        return odometry.with_constants(base, values)
+    def parameters(self, parts: Sequence[Windows], settings: OdometrySettings) -> list[Parameter]:
+        """The constants, of velocities also their delay, lag and slowdown."""
+        return odometry.parameters_of(parts[0], settings)
 
-    def fit(
-        self,
-        found: WheelsFit,
-        parts: Sequence[Windows],
-        base: OdometryModel,
-        constants: Sequence[Constant],
-        start: Mapping[str, float],
-    ) -> Fit:
-        """Fit with the scatter of all constants."""
-        return odometry.fit_odometry(parts, base, constants, found.sigmas, start)
+    def with_noise(
+        self, parts: Sequence[Windows], settings: OdometrySettings
+    ) -> tuple[Sequence[Windows], OdometrySettings]:
+        """The windows with the scatter of their errors."""
+        return odometry.with_scatter(parts, settings), settings
 
     def finished(
-        self,
-        _found: WheelsFit,
-        logs: Sequence[Log],
-        rig: Rig,
-        base: OdometryModel,
-        learnt: Sequence[FittedConstant],
-        *,
-        by_log: bool,
-    ) -> Settled:
-        """The result with the remaining noise."""
-        noise = fit_noise(logs, base)
+        self, logs: Sequence[Log], parts: Sequence[Windows], rig: Rig, learnt: SensorKnowledge
+    ) -> SensorKnowledge:
+        """The result with the noise that remains."""
+        noise = fit_noise(logs, odometry_model(rig))
         growth = {
             error: GrowthSettings.bounded(per_distance=g.per_distance, per_rotation=g.per_rotation, per_time=g.per_time)
             for error, g in noise.growth.items()
         }
-        changed: dict[str, Any] = {one.name: one.value for one in learnt} | {"noise": OdometryNoise(**growth)}
-        return Settled({"odometry": rig.odometry.model_copy(update=changed)}, learnt, details=noise)
+        settings = rig.odometry.model_copy(update={"noise": OdometryNoise(**growth)})
+        details = WheelsFit(parts, odometry_model(rig.model_copy(update={"odometry": settings})), noise)
+        return replace(learnt, sections={self.section: settings}, details=details)
 
-    def doubts(self, _found: WheelsFit, details: NoiseFit | None) -> list[str]:
+    def doubts(self, found: SensorKnowledge) -> list[str]:
         """Warnings about outliers and implausibly low noise."""
         doubts = []
-        if details is not None and details.outliers > MOST_OUTLIERS:
+        noise = None if found.details is None else found.details.noise
+        if noise is not None and noise.outliers > MOST_OUTLIERS:
             doubts.append(
-                f"{100.0 * details.outliers:.0f} % of the odometry windows are outliers: check for slip, collisions, and gaps in "
+                f"{100.0 * noise.outliers:.0f} % of the odometry windows are outliers: check for slip, collisions, and gaps in "
                 "the reference."
             )
-        if details is not None and details.floored:
+        if noise is not None and noise.floored:
             doubts.append(
-                f"The fitted noise of the odometry ({', '.join(details.floored)}) is lower than wheels can achieve and was raised: "
+                f"The fitted noise of the odometry ({', '.join(noise.floored)}) is lower than wheels can achieve and was raised: "
                 "the reference is probably not independent of the odometry."
             )
         return doubts
 
-    def document(self, told: Told) -> dict[str, Any]:
+    def document(self, found: SensorKnowledge, rig: Rig) -> dict[str, Any]:
         """The share of outliers, and the factor by which the noise was widened."""
-        noise: NoiseFit | None = told.details
+        noise = None if found.details is None else found.details.noise
         return {
             "odometry_outliers": None if noise is None else noise.outliers,
             "odometry_widened": None if noise is None else noise.widened,
-            "wheels": {name: calibrated for name, _, calibrated in _wheels(told.rig)} or None,
+            "wheels": {name: calibrated for name, _, calibrated in _wheels(rig)} or None,
         }
 
-    def tables(self, told: Told) -> list[Rows]:
-        """Radius and track of the wheels, if the rig tells of any."""
-        rows: list[tuple[str, ...]] = [
-            (f"{name} [m]", number(given), number(found)) for name, given, found in _wheels(told.rig)
-        ]
-        return [(("wheels", "in the rig", "with its scales"), rows)] if rows else []
-
-    def report(self, told: Told) -> dict[str, Sequence[Part]]:
+    def report(self, found: SensorKnowledge, rig: Rig) -> dict[str, Sequence[Part]]:
         """The growth of each error, and plots of the residuals of the windows."""
-        noise: NoiseFit | None = told.details
-        out: list[Part] = []
-        if noise is not None:
-            if NOISE not in told.accepted:
-                out.append("The noise of the odometry below is rejected: the rig keeps that of the input.")
-            rows = [
-                (error, *(number(v) for v in (g.per_distance, g.per_rotation, g.per_time)))
-                for error, g in noise.growth.items()
-            ]
-            header = ("error of the odometry [m, m, rad]", "per sqrt(m)", "per sqrt(rad)", "per sqrt(s)")
-            out += [(header, rows), *self.tables(told)]
-            out.append(
-                f"{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise was multiplied by "
-                f"{noise.widened:.2f}, so that it is valid for half a minute without landmarks."
-            )
-        if told.found is None:
-            return {"Noise": out}
-        figure = odometry_figure(told.found.parts, odometry_model(told.learnt))
-        return {"Noise": out, "Residuals of the odometry": [figure]}
+        if found.details is None:
+            return {}
+        noise: NoiseFit = found.details.noise
+        rows = [
+            (error, *(number(v) for v in (g.per_distance, g.per_rotation, g.per_time)))
+            for error, g in noise.growth.items()
+        ]
+        header = ("error of the odometry [m, m, rad]", "per sqrt(m)", "per sqrt(rad)", "per sqrt(s)")
+        text = (
+            f"{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise was multiplied by "
+            f"{noise.widened:.2f}, so that it is valid for half a minute without landmarks."
+        )
+        figure = odometry_figure(found.details.windows, found.details.model)
+        return {"Noise": [(header, rows), *_wheels_table(rig), text], "Residuals of the odometry": [figure]}
 
 
 def _wheels(rig: Rig) -> list[tuple[str, float, float]]:
@@ -200,13 +160,19 @@ def _wheels(rig: Rig) -> list[tuple[str, float, float]]:
     return [*known, ("track", drive.track, track)]
 
 
+def _wheels_table(rig: Rig) -> list[Rows]:
+    """Radius and track of the wheels, if the rig tells of any."""
+    rows: list[tuple[str, ...]] = [(f"{name} [m]", number(given), number(found)) for name, given, found in _wheels(rig)]
+    return [(("wheels", "in the rig", "with its scales"), rows)] if rows else []
+
+
 CALIBRATOR = OdometryCalibrator()
 
 
 def odometry_figure(windows: Sequence[Windows], model: OdometryModel) -> Picture:
     """Residuals over windows: in time, over distance, and their growth with the length of the window."""
     figure, axes = grid(3, 3, 12.0)
-    residuals = [one.residuals(model) for one in windows]
+    residuals = [one.errors(model) for one in windows]
     lengths = (*LENGTHS, BLACKOUT)
     growth = [_growth([cut(one.log, length) for one in windows], model) for length in lengths]
     for row, (panels, (what, unit)) in enumerate(
@@ -233,7 +199,7 @@ def odometry_figure(windows: Sequence[Windows], model: OdometryModel) -> Picture
 
 def _growth(windows: Sequence[Windows], model: OdometryModel) -> tuple[Array, Array]:
     """Root mean squares (3,) of the residuals and of the model's prediction for them."""
-    squares = np.concatenate([one.residuals(model) for one in windows]) ** 2
+    squares = np.concatenate([one.errors(model) for one in windows]) ** 2
     stated = np.concatenate([np.diagonal(one.covariances(model), axis1=1, axis2=2) for one in windows])
     if not len(squares):
         return np.full(3, np.nan), np.full(3, np.nan)

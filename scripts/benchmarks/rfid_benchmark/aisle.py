@@ -18,7 +18,6 @@ from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid
-from factorgraph_loc.sensors.rfid.calibration.tempering import tempered
 
 RUNS = (13, 16)
 SEEDS = 3
@@ -123,8 +122,10 @@ def learnt_on(job: Learning) -> Rig:
     assert log.rig.rfid is not None
     job.out.mkdir(parents=True, exist_ok=True)
     name = f"learnt-on-run{job.run}"
-    rig, _ = learn_rfid([log], read_rig(PLACES), job.out / name)
-    rig = tempered(rig, log.rig.rfid.tempering**-0.5)
+    given = read_rig(PLACES)
+    sections = dict(learn_rfid([log], given, job.out / name).sections)
+    sections["rfid"] = sections["rfid"].model_copy(update={"tempering": log.rig.rfid.tempering})
+    rig = given.model_copy(update=sections)
     write_rig(rig, job.out / f"{name}.rig.toml")
     return rig
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from benchmarking.report import Options, Report
 
+import factorgraph_loc as fgloc
 from factorgraph_loc.calibration.calibrate import calibrate
-from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import preset
@@ -89,5 +89,5 @@ def timed(job: Job) -> Times | float:
 def calibration_seconds(out: Path) -> float:
     log = simulate(preset("office", {"drive": {"duration": CALIBRATED}}), 0)
     started = time.perf_counter()
-    calibrate([log], lambda log: score(run(log, RunConfig("smoother")), log), grids=out)
+    calibrate([log], fgloc.run, grids=out)
     return time.perf_counter() - started

@@ -14,7 +14,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit, fit_phase
-from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi, rssi_nll
+from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import (
@@ -159,15 +159,15 @@ def test_logs_are_focused_together(log: Log, fit: PhaseFit) -> None:
 
 
 def test_rssi_is_found() -> None:
-    """Learnt from 12,000 reads it is as good on others as the truth, to 0.003 a read (six parameters cost about 0.0003)."""
+    """The mean strength of other reads is known to 8 % of the noise, which is worth 0.003 a read."""
     antennas = {
         name: a.model_copy(update={"x": a.x + LEVER_ARM[0], "y": a.y + LEVER_ARM[1]})
         for name, a in SETTINGS.antennas.items()
     }
     rfid = SETTINGS.model_copy(update={"antennas": antennas})
     fit = fit_rssi([simulated(1)], rfid, SURVEY)
-    others = [simulated(2)]
-    assert fit.reads == READS
-    assert fit.settings.sigma == pytest.approx(RSSI.sigma, rel=0.05)
-    assert rssi_nll(others, rfid, SURVEY, fit.settings) < rssi_nll(others, rfid, SURVEY, RSSI) + 0.003
-    assert fit.nll < fit.nll_constant - 0.2
+    assert fit.sigma == pytest.approx(RSSI.sigma, rel=0.05)
+    d, w, c = np.random.default_rng(0).uniform((0.5, 0.0, -0.9), (2.0, 0.6, 0.9), (200, 3)).T
+    table = np.column_stack((np.ones(200), -10.0 * np.log10(d), w, w**2, c, c**2))
+    error = table @ np.subtract(fit.coefficients, RSSI.coefficients)
+    assert np.sqrt(np.mean(error**2)) < 0.08 * RSSI.sigma

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -22,18 +21,7 @@ ITERATIONS = 30
 DOF = (1.0, 100.0)
 
 
-@dataclass(frozen=True)
-class RssiFit:
-    """``settings``: the model; ``nll``: mean negative log-likelihood per read; ``nll_constant``: that of a constant model;
-    ``reads``: their number."""
-
-    settings: RssiSettings
-    nll: float
-    nll_constant: float
-    reads: int
-
-
-def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> RssiFit:
+def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> RssiSettings:
     """Fit the RSSI model to all ``logs`` by maximum likelihood. InputError if a log has no reference, or too few reads have an
     RSSI.
 
@@ -44,16 +32,7 @@ def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) ->
         names = listed(log.name for log in logs)
         raise InputError(f"{names}: hold {len(y)} reads with an RSSI, expected at least {ENOUGH_READS}")
     coefficients, sigma, dof = _fit(x, y)
-    _, sigma_0, dof_0 = flat = _fit(x[:, :1], y)
-    settings = RssiSettings.bounded(coefficients=tuple(coefficients.tolist()), sigma=sigma, dof=dof)
-    constant = _nll(y - x[:, :1] @ flat[0], sigma_0, dof_0)
-    return RssiFit(settings, _nll(y - x @ coefficients, sigma, dof), constant, len(y))
-
-
-def rssi_nll(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings, settings: RssiSettings) -> float:
-    """Mean untempered negative log-likelihood per read, on ``logs`` that may be held out."""
-    x, y = _table(logs, rfid, survey)
-    return _nll(y - x @ np.array(settings.coefficients), settings.sigma, settings.dof)
+    return RssiSettings.bounded(coefficients=tuple(coefficients.tolist()), sigma=sigma, dof=dof)
 
 
 def _table(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> tuple[Array, Array]:

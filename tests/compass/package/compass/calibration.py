@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compass.settings import CompassSettings
-from factorgraph_loc.fitting.robust import Constant
+from factorgraph_loc.fitting.posterior import Parameter
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.calibrating import ConstantsCalibrator
 from factors import se2
@@ -21,11 +21,6 @@ class Headings:
     t: Array
     errors: Array
 
-    def halves(self) -> tuple[Headings, Headings]:
-        """The first and the second half in time."""
-        half = len(self.t) // 2
-        return Headings(self.t[:half], self.errors[:half]), Headings(self.t[half:], self.errors[half:])
-
     def residuals(self, settings: CompassSettings) -> Array:
         """Residuals in standard deviations (K, 1)."""
         return se2.wrap(settings.bias - self.errors)[:, None] / settings.sigma
@@ -35,7 +30,7 @@ class CompassCalibrator(ConstantsCalibrator):
     """The calibrator of the bias."""
 
     section, channel, senses = "compass", "compass", False
-    uncertain, units, first = {"bias": 1.0}, {"bias": "rad"}, CompassSettings()
+    uncertain, first = {"bias": 1.0}, CompassSettings()
 
     def part(self, log: Log) -> Headings:
         """The headings within the reference."""
@@ -45,9 +40,9 @@ class CompassCalibrator(ConstantsCalibrator):
         known = np.isfinite(errors)
         return Headings(t[known], errors[known])
 
-    def constants(self, _parts: object, settings: CompassSettings) -> tuple[Constant, ...]:
+    def parameters(self, _parts: object, settings: CompassSettings) -> tuple[Parameter, ...]:
         """The bias."""
-        return (Constant("bias", settings.bias, 0.02, -np.pi, np.pi),)
+        return (Parameter("bias", settings.bias, 0.3, -np.pi, np.pi),)
 
 
 CALIBRATOR = CompassCalibrator()

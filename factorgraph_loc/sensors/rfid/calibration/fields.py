@@ -1,132 +1,31 @@
-"""Fits of detection models to pairs of an antenna and a tag, and the selection of the one that predicts held-out data best.
+"""Detection fields, and the selection of the detection model that predicts held-out reads best.
 
-A parametric model whose logit is linear in its parameters is fitted by penalised maximum likelihood with Fisher scoring (McCullagh
-and Nelder, "Generalized Linear Models", 1989, section 2.5), using the derivatives of the likelihood with its floor.
-
-A grid of logits in an antenna's frame is fitted as a difference to a parametric field: smooth by a penalty on second differences
-(Eilers and Marx, "Flexible smoothing with B-splines and penalties", Statistical Science 11(2), 1996), and zero where there are no
-data. Logits are interpolated as in :mod:`factors.rfid.model`.
+A field is a grid of logits in an antenna's frame, fitted as a difference to a parametric model: smooth by a penalty on second
+differences (Eilers and Marx, "Flexible smoothing with B-splines and penalties", Statistical Science 11(2), 1996), and zero where
+there are no data. Logits are interpolated as in :mod:`factors.rfid.model`.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy import sparse
 from scipy.optimize import minimize
-from scipy.sparse.linalg import splu
 
-from factorgraph_loc.sensors.rfid.calibration.pairs import REACH, TagPairs, modelled, terms
-from factors.least_squares import descended
+from factorgraph_loc.sensors.rfid.calibration.pairs import Floor, TagPairs, modelled, terms
+from factorgraph_loc.sensors.rfid.calibration.parametric import beam, fit_model, logistic
 from factors.rfid import knots
-from factors.rfid.model import FEATURES, NEAR, BeamModel, DetectionModel, GridModel, LogisticModel, bake, logits
+from factors.rfid.model import BeamModel, DetectionModel, GridModel, bake, logits
 from factors.se2 import Array
-
-FACING = tuple(i for i, name in enumerate(FEATURES) if "c" in name)
-RIDGE = 1.0  # penalty on coefficients of features with unit standard deviation, in nats
-EDGE = 5.0  # pseudo-rounds without reads at the maximum range, so that extrapolations do not grow with distance
-ITERATIONS = 50
-CONVERGED = 1e-4  # relative decrease of the cost in the last step
-
-
-@dataclass(frozen=True)
-class Floor:
-    """Probabilities of a false read, and of a miss at any position."""
-
-    false_read: float = 0.02
-    miss: float = 0.02
-
-
-def features(points: Array, facing: Array) -> Array:
-    """The features (M, 11) of :data:`factors.rfid.model.FEATURES`."""
-    x, y, z = points.T
-    r = np.sqrt(x**2 + y**2 + NEAR**2)
-    w, c = 1.0 - x / r, facing
-    return np.column_stack((np.ones_like(r), r, r**2, w, w**2, r * w, np.abs(z), c, c**2, r * c, w * c))
-
-
-def fit_linear(
-    design: Array | sparse.csr_array,
-    offset: Array,
-    hits: Array,
-    count: Array,
-    penalty: Array | sparse.csc_array,
-    floor: Floor,
-) -> Array:
-    """Parameters (P,) of the logit ``offset + design @ p`` (M,) that maximise the likelihood minus ``p @ penalty @ p / 2``."""
-
-    def cost(p: Array) -> float:
-        found = terms(offset + design @ p, hits, count, floor.false_read, floor.miss)
-        return float(np.sum(found.nll) + 0.5 * p @ (penalty @ p))
-
-    def moved(p: Array, damping: float) -> tuple[Array, float]:
-        found = terms(offset + design @ p, hits, count, floor.false_read, floor.miss)
-        gradient = design.T @ found.gradient + penalty @ p
-        if not sparse.issparse(design):
-            curvature = design.T @ (found.information[:, None] * design) + penalty
-            step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
-            return p - step, float(np.abs(step).max())
-        curvature = design.T @ sparse.diags_array(found.information) @ design + penalty
-        damped = sparse.csc_matrix(curvature + damping * sparse.diags_array(curvature.diagonal()))
-        factor = splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        step = np.asarray(factor.solve(gradient))
-        return p - step, float(np.abs(step).max())
-
-    return descended(cost, moved, np.zeros(design.shape[1]), ITERATIONS, CONVERGED)[0]
-
-
-def fit_logistic(pairs: TagPairs, floor: Floor, *, with_facing: bool) -> LogisticModel:
-    """Fit a logistic model, with or without the features of the tags' facing."""
-    edge, edge_facing = _edge()
-    design = np.vstack((features(pairs.points, pairs.facing), features(edge, edge_facing)))
-    hits = np.concatenate((pairs.hits, np.zeros(len(edge))))
-    count = np.concatenate((pairs.count, np.full(len(edge), EDGE / len(edge))))
-    if not with_facing:
-        design[:, FACING] = 0.0
-    mean, spread = np.mean(design, axis=0), np.std(design, axis=0)
-    used = np.flatnonzero(spread > 1e-6)
-    whitened = np.column_stack((np.ones(len(design)), (design[:, used] - mean[used]) / spread[used]))
-    penalty = RIDGE * np.eye(len(used) + 1)
-    penalty[0, 0] = 1e-9
-    found = fit_linear(whitened, np.zeros(len(design)), hits, count, penalty, floor)
-    coefficients = np.zeros(len(FEATURES))
-    coefficients[used] = found[1:] / spread[used]
-    coefficients[0] = found[0] - float(mean[used] @ coefficients[used])
-    return LogisticModel(tuple(coefficients.tolist()), REACH)
-
-
-def fit_beam(pairs: TagPairs, floor: Floor) -> BeamModel:
-    """Fit a beam model."""
-    bounds = [(-3.0, 7.0), (np.log(0.3), np.log(2.0 * REACH)), (np.log(0.05), np.log(5.0)), (np.log(0.1), np.log(9.0))]
-
-    def model(p: Array) -> BeamModel:
-        return BeamModel(float(1.0 / (1.0 + np.exp(-p[0]))), *np.exp(p[1:]).tolist())
-
-    def cost(p: Array) -> float:
-        logit, _ = logits(model(p), pairs.points, pairs.facing)
-        return float(np.mean(terms(logit, pairs.hits, pairs.count, floor.false_read, floor.miss).nll))
-
-    start = np.array((2.0, np.log(4.5), np.log(0.5), np.log(0.7)))
-    return model(minimize(cost, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60}).x)
-
-
-def _edge() -> tuple[Array, Array]:
-    """Positions (E, 3) around the antenna at the maximum range, and facings (E,)."""
-    bearing, height, facing = (
-        a.ravel()
-        for a in np.meshgrid(
-            np.linspace(-np.pi, np.pi, 24, endpoint=False), (-1.0, 0.0, 1.0), np.linspace(-1.0, 1.0, 5), indexing="ij"
-        )
-    )
-    return np.column_stack((REACH * np.cos(bearing), REACH * np.sin(bearing), height)), facing
-
 
 CELL = 0.5  # m
 EXTENT = 6.0  # m
 FACINGS = 5  # knots, if the facing is used
 HEIGHT_STEP = 0.5  # m
 PULL = 0.3  # penalty of a knot's difference to the parametric field, in nats
+GRADIENT = 0.01  # nats per logit, at which a field is found
 FINE = (0.2, 0.2, 0.25, 0.2)  # m, m, m and cosine; closer pairs are merged
 
 
@@ -152,8 +51,27 @@ def fit_grid(pairs: TagPairs, parametric: DetectionModel, smoothness: float, axe
     offset, _ = logits(base, few.points, few.facing)
     change = replace(base, logits=np.zeros(varied), heights=base.heights if axes.by_height else np.zeros(1))
     penalty = (smoothness * _roughness(varied) + PULL * sparse.eye_array(change.logits.size)).tocsc()
-    found = fit_linear(design_of(change, few.points, few.facing), offset, few.hits, few.count, penalty, floor)
-    return replace(base, logits=base.logits + found.reshape(varied))
+    design = design_of(change, few.points, few.facing)
+
+    def cost(p: Array) -> tuple[float, Array]:
+        found = terms(offset + design @ p, few.hits, few.count, floor)
+        return float(np.sum(found.nll) + 0.5 * p @ (penalty @ p)), design.T @ found.gradient + penalty @ p
+
+    @lru_cache(maxsize=1)
+    def curvature(p: bytes) -> sparse.csr_array:
+        information = terms(offset + design @ np.frombuffer(p), few.hits, few.count, floor).information
+        return design.T @ sparse.diags_array(information) @ design + penalty
+
+    start = np.zeros(change.logits.size)
+    found = minimize(
+        cost,
+        start,
+        jac=True,
+        hessp=lambda p, v: curvature(p.tobytes()) @ v,
+        method="trust-ncg",
+        options={"gtol": GRADIENT},
+    )
+    return replace(base, logits=base.logits + found.x.reshape(varied))
 
 
 def _heights(pairs: TagPairs) -> list[float]:
@@ -223,7 +141,7 @@ def _together(pairs: TagPairs) -> TagPairs:
 
 SMOOTHNESS = (5.0, 25.0, 125.0)
 WORTH = 1e-3  # nats per pair; minimum gain of a more complex model
-BEAM_PAIRS = 20000  # enough for its four parameters
+MODEL_PAIRS = 40000  # enough for a parametric model
 
 
 PLANE = Axes()
@@ -254,25 +172,11 @@ class Kind:
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Held-out negative log-likelihood [nats per pair] of a model, per fold and over all; ``predicted`` (M,): probabilities of the
-    pairs, floor included, from fits to the other folds."""
+    """Held-out negative log-likelihood [nats per pair] of a model, per fold and over all."""
 
     kind: Kind
     by_fold: tuple[float, ...]
     nll: float
-    predicted: Array
-
-
-@dataclass(frozen=True)
-class ModelSelection:
-    """The ``best`` trial, and all ``trials``."""
-
-    best: CrossValidation
-    trials: tuple[CrossValidation, ...]
-
-    @property
-    def kind(self) -> Kind:
-        return self.best.kind
 
 
 def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[DetectionModel, ...], tuple[int, ...]]:
@@ -286,8 +190,8 @@ def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple
     return tuple(models), tuple(heard.index(a) if a in heard else len(heard) for a in range(antennas))
 
 
-def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> ModelSelection:
-    """Select the model by its likelihood on held-out folds of ``pairs``.
+def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> tuple[Kind, tuple[CrossValidation, ...]]:
+    """The kind of model that is best by its likelihood on held-out folds of ``pairs``, and all trials.
 
     A more complex model must gain :data:`WORTH` over a simpler one. ``facing``: whether the tags' facing is known.
     """
@@ -317,7 +221,7 @@ def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> Mod
         field = better(field, Kind("grid", uses_facing, axes=Axes(by_height=True), smoothness=smoothness))
     if field.nll < best.nll - WORTH:
         best = field
-    return ModelSelection(best, tuple(trials))
+    return best.kind, tuple(trials)
 
 
 def held_out(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> Array:
@@ -326,15 +230,15 @@ def held_out(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> Array:
     for fold in np.unique(pairs.fold):
         test = pairs.fold == fold
         models, which = fit(pairs.part(~test), kind, floor, antennas)
-        logit = modelled(models, which, pairs.part(test))
-        out[test] = floor.false_read + (1.0 - floor.false_read - floor.miss) / (1.0 + np.exp(-logit))
+        out[test] = floor.probability(modelled(models, which, pairs.part(test)))
     return out
 
 
 def _fit_one(pairs: TagPairs, kind: Kind, floor: Floor) -> DetectionModel:
+    some = pairs.part(np.arange(len(pairs.facing)) % (1 + len(pairs.facing) // MODEL_PAIRS) == 0)
     if kind.name == "beam":
-        return fit_beam(pairs.part(np.arange(len(pairs.facing)) % (1 + len(pairs.facing) // BEAM_PAIRS) == 0), floor)
-    parametric = fit_logistic(pairs, floor, with_facing=kind.facing)
+        return fit_model(some, beam(BeamModel()), floor)[0]
+    parametric = fit_model(some, logistic(some, with_facing=kind.facing), floor)[0]
     return parametric if kind.name == "logistic" else fit_grid(pairs, parametric, kind.smoothness, kind.axes, floor)
 
 
@@ -343,4 +247,4 @@ def _trial(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> CrossVal
     nll = -(pairs.hits * np.log(q) + (pairs.count - pairs.hits) * np.log1p(-q))
     folds = [pairs.fold == fold for fold in np.unique(pairs.fold)]
     each = tuple(float(np.sum(nll[one]) / np.sum(pairs.count[one])) for one in folds)
-    return CrossValidation(kind, each, float(np.sum(nll) / np.sum(pairs.count)), q)
+    return CrossValidation(kind, each, float(np.sum(nll) / np.sum(pairs.count)))

@@ -1,0 +1,58 @@
+"""Maximum a posteriori estimates on a straight line."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorgraph_loc.fitting.posterior import Parameter, independent_share, least_squares, maximise
+
+LINE = (Parameter("slope", 0.0, 1.0, -10.0, 10.0), Parameter("offset", 0.0, 1.0, -10.0, 10.0))
+
+
+def line(seed, slope, offset, outliers=0.0, count=400):
+    """Residuals of a line through noisy points, in standard deviations, as a function of slope and offset; and blocks."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-1.0, 1.0, count)
+    y = slope * x + offset + 0.1 * rng.standard_normal(count)
+    y[rng.random(count) < outliers] = 50.0
+    return lambda values: ((values[0] * x + values[-1] * (len(values) > 1) - y) / 0.1)[:, None], np.arange(count)
+
+
+def fitted(parameters, whitened, blocks):
+    return maximise(parameters, least_squares(whitened, parameters, blocks))
+
+
+def test_outliers_move_the_fit_by_little():
+    """3 % of outliers, all on one side, move the offset by about 0.1 * 2 * 0.03; the mean would move by 1.5."""
+    np.testing.assert_allclose(fitted(LINE, *line(1, 2.0, 0.5, outliers=0.03)).values, (2.0, 0.5), atol=0.04)
+
+
+def test_standard_deviations_are_those_of_repetitions():
+    """The ratio over 200 repetitions has a standard error of 5 %: 20 % are four."""
+    runs = [fitted(LINE, *line(seed, 2.0, 0.5, count=100)) for seed in range(200)]
+    spread = np.std([run.values for run in runs], axis=0)
+    np.testing.assert_allclose(np.mean([run.errors for run in runs], axis=0), spread, rtol=0.2)
+
+
+def test_parameters_that_do_the_same_move_together():
+    """Their sum is known, each by its prior only; without data a parameter keeps the prior."""
+    whitened, blocks = line(1, 2.0, 0.0)
+    twins = [LINE[0], replace(LINE[0], name="twin", sigma=2.0), replace(LINE[0], name="unseen", mean=3.0)]
+    found = fitted(twins, lambda values: whitened(values[:1] + values[1:2]), blocks)
+    np.testing.assert_allclose(found.values, (0.4, 1.6, 3.0), atol=0.02)
+    assert found.errors[2] == pytest.approx(1.0)
+    ((first, second, correlation),) = found.correlations()
+    assert (first, second) == ("slope", "twin")
+    assert correlation < -0.99
+
+
+def test_measurements_that_are_repeated_count_once():
+    """Each four times over, in its block: the share is a quarter, with a standard error of a tenth."""
+    whitened, blocks = line(3, 2.0, 0.5)
+    once, often = (
+        fitted(LINE, lambda values, n=n: np.repeat(whitened(values), n, axis=0), np.repeat(blocks, n)) for n in (1, 4)
+    )
+    assert often.share == pytest.approx(0.25, rel=0.3)
+    np.testing.assert_allclose(often.errors, once.errors, rtol=0.15)
+    assert independent_share(np.zeros((3, 2)), np.eye(2)) == 1.0
