@@ -88,14 +88,14 @@ def calibrate(
         )
     doubts += _doubted(trials)
     if refused:
-        doubts.append(f"The rig stays as it was: {refused}.")
+        doubts.append(f"The input rig is kept: {refused}.")
     return Calibration(
         names, start, start if refused else knowledge.rig, knowledge, tuple(trials), refused, tuple(doubts)
     )
 
 
 def _doubted(trials: Sequence[Trial]) -> list[str]:
-    """What the smoother doubts of the map on held-out logs, one line for each kind."""
+    """Elements of the map that the smoother doubts on held-out logs, one line for each kind."""
     found: dict[str, dict[str, None]] = {}
     for trial in trials:
         for kind, names in trial.doubted.items() if trial.estimator == "smoother" else ():

@@ -127,7 +127,7 @@ def _known(trial: Trial, key: str) -> bool:
 
 
 def growth(trials: Sequence[Trial]) -> float:
-    """The factor by which the position error grew: geometric mean of causal and final ones of the estimators; NaN if unknown."""
+    """Position error after, divided by that before: geometric mean over estimators, causal and final poses; NaN if unknown."""
     ratios = [
         pooled(mine, 1, key) / max(pooled(mine, 0, key), 1e-9)
         for estimator in ESTIMATORS

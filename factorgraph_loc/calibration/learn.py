@@ -1,4 +1,4 @@
-"""What all sensors learn from logs along given trajectories."""
+"""Learning of a rig from logs along given trajectories, by the calibrators of all sensors."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ class Knowledge:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What could not be learnt, one line each."""
+        """Messages on parameters that were not learnt, one line each."""
         return tuple(note for found in self.found.values() for note in found.notes)
 
 
@@ -49,8 +49,8 @@ def learn(
     like: Knowledge | None = None,
 ) -> Knowledge:
     """Learn a rig from logs along their trajectories, starting from ``rig``: see
-    :meth:`~factorgraph_loc.sensors.calibrating.Calibrator.learn`. Along a given trajectory the sensors tell nothing of each other's
-    constants, so that each is a problem of its own."""
+    :meth:`~factorgraph_loc.sensors.calibrating.Calibrator.learn`. Along a given trajectory the sensors are independent, so
+    that each is a problem of its own."""
     traced = [replace(one, log=replace(one.log, rig=rig)) for one in traced]
     found, changed = {}, rig
     for name, calibrator in calibrators().items():

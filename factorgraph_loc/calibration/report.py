@@ -52,7 +52,7 @@ def accuracy_table(calibration: Calibration) -> Rows:
 
 
 def summary(calibration: Calibration) -> list[str]:
-    """What was learnt and what was not, in about ten lines."""
+    """The result in about ten lines: changed constants, undetermined ones, correlations, and held-out errors."""
     constants = calibration.knowledge.constants
     clear = [c for c in constants if c.is_determined and abs(c.fitted - c.before) > CLEAR * c.error]
     same = [_name(c) for c in constants if c.is_determined and c not in clear]
@@ -64,7 +64,7 @@ def summary(calibration: Calibration) -> list[str]:
     if vague := [_name(c) for c in constants if not c.is_determined]:
         lines.append(f"hardly determined, so near the input rig: {listed(vague)}")
     if alike := [f"{a} and {b} ({rho:+.2f})" for a, b, rho in _correlations(calibration)]:
-        lines.append(f"told by their sum or difference (correlation): {listed(alike)}")
+        lines.append(f"known mainly by their sum or difference (correlation): {listed(alike)}")
     for estimator in ESTIMATORS if calibration.trials else ():
         trials = [t for t in calibration.trials if t.estimator == estimator]
         figures = [

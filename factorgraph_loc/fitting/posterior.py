@@ -1,7 +1,7 @@
 """Maximum a posteriori estimates of the parameters that several logs share.
 
 The cost is the negative log-likelihood of all logs, plus that of Gaussian priors. All parameters take each damped Gauss-Newton step
-together, so that those which nearly do the same, such as two kinds of drift, are told by their sum.
+together. Parameters with nearly the same effect, such as two kinds of drift, may be correlated.
 
 Measurements are correlated within a block of time. The likelihood is weighted by the share of them that is worth independent ones
 (Pauli, Racugno, Ventura, "Bayesian composite marginal likelihoods", Statistica Sinica 21, 2011), and the covariance is that of the

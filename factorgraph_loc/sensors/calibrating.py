@@ -34,7 +34,7 @@ def upper_bounds(kind: type[FileModel]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class SensorKnowledge:
-    """What is learnt of a sensor: ``sections`` of the rig, the ``constants`` with their ``correlations`` (see
+    """The result for a sensor: ``sections`` of the rig, the ``constants`` with their ``correlations`` (see
     :meth:`~factorgraph_loc.fitting.posterior.Posterior.correlations`), ``notes`` (one line each) on what could not be learnt, and
     ``details`` for its report."""
 
@@ -73,7 +73,7 @@ class Calibrator:
 
         ``first``: the rig before all turns of smoothing and learning, the same as ``rig`` where logs have references; ``grids``:
         path and name prefix of files that may be written; ``like``: the result from all logs if these are some of them, whose
-        choices are kept. InputError if a log does not tell enough.
+        choices are kept. InputError if a log is too short.
         """
         raise NotImplementedError
 

@@ -57,7 +57,7 @@ def test_a_rig_with_larger_errors_is_refused(logs, tmp_path, factor, refused):
     found, _ = calibrated(logs, tmp_path, factor)
     assert bool(found.refused) == refused
     assert found.rig == (found.input_rig if refused else found.knowledge.rig)
-    assert any("stays as it was" in doubt for doubt in found.doubts) == refused
+    assert any("input rig is kept" in doubt for doubt in found.doubts) == refused
     assert ("input rig is kept" in report.summary(found)[-1]) == refused
 
 

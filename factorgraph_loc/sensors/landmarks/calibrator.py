@@ -144,8 +144,8 @@ def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]
     """Standard deviation of errors (K,), constant and relative to ``ranges`` (K,), and the probability (K,) of each not to be
     gross; NaN is not measured.
 
-    A mixture of two Gaussians about zero, of which the wider one has the gross errors, by expectation-maximisation (McLachlan and
-    Peel, "Finite mixture models", 2000, section 3.2) from the median absolute error.
+    A mixture of two Gaussians about zero, by expectation-maximisation from the median absolute error (McLachlan and Peel,
+    "Finite mixture models", 2000, section 3.2). The wider one has the gross errors.
     """
     known = np.isfinite(errors)
     error, near = errors[known], ranges[known]
@@ -257,8 +257,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
             for n, unit in SIGMAS.items()
         ]
         text = (
-            f"Errors of sightings last: by what they say of the pose in {WINDOW:g} s, {1.0 / fit.share:.1f} sightings are worth an "
-            "independent one. Estimators take them as independent, so that the noise in the rig is larger than the scatter."
+            f"Errors of sightings are correlated: {1.0 / fit.share:.1f} sightings contain as much information on the pose as an "
+            "independent one. Estimators assume independence, so that the noise in the rig is larger than the scatter."
         )
         return {
             "Noise": [(("noise of the sightings", "scatter", "in the rig"), rows), text],
@@ -270,7 +270,7 @@ CALIBRATOR = LandmarkCalibrator()
 
 
 def pose_share(seen: Sequence[Sightings], settings: BearingRangeSettings) -> float:
-    """The share of the sightings that are worth independent ones, for the pose."""
+    """The share of independent information on the pose in the sightings: see :func:`independent_share`."""
 
     def scored(one: Sightings) -> LikelihoodTerms:
         dimensions = [Parameter(name, 0.0, 1.0) for name in ("x", "y", "heading")]

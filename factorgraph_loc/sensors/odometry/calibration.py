@@ -32,7 +32,7 @@ from factors.odometry.model import (
 from factors.se2 import Array
 
 BEFORE = 1.0  # s before a window in which the odometry must be complete too, because of its lag
-WINDOW = 2.0  # s, for the constants
+WINDOW = 2.0  # s; length of a window that constants are estimated from
 # error of the reference over a window: m, m, rad; lower bound of the residuals' standard deviations
 REFERENCE_SIGMAS = np.array((0.005, 0.005, 0.003))
 MOVING = np.array((0.05, 0.1))  # m/s, rad/s above which the robot moves in a window

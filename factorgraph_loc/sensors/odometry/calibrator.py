@@ -161,7 +161,7 @@ def _wheels(rig: Rig) -> list[tuple[str, float, float]]:
 
 
 def _wheels_table(rig: Rig) -> list[Rows]:
-    """Radius and track of the wheels, if the rig tells of any."""
+    """Radius and track of the wheels, if the rig has them."""
     rows: list[tuple[str, ...]] = [(f"{name} [m]", number(given), number(found)) for name, given, found in _wheels(rig)]
     return [(("wheels", "in the rig", "with its scales"), rows)] if rows else []
 

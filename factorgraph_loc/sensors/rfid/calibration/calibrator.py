@@ -66,8 +66,8 @@ class RfidCalibrator(Calibrator):
             return {}
         fit: RfidFit = found.details
         text = (
-            f"By what they say of the pose along the reference, {1.0 / fit.share:.0f} consecutive reads are worth an independent "
-            "one: that is the tempering."
+            f"Reads are correlated: {1.0 / fit.share:.1f} of them contain as much information as an independent one. The tempering "
+            "of the likelihood is the inverse."
         )
         picture = "Probability of a read around the antenna (triangle): observed on the left, the model on the right."
         return {"RFID": [text, report.models_table(fit), picture, report.field_figure(fit)]}

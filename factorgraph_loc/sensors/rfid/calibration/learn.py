@@ -62,7 +62,7 @@ BURSTS = 1.3  # rounds that are worth one; less is no reason to change the tempe
 
 @dataclass(frozen=True)
 class RfidFit:
-    """What was learnt along references.
+    """The result along references.
 
     ``models``, and ``which`` of them each antenna has; their ``kind``, and the ``trials`` of others; ``phase``: the focus, if logs
     have phases; ``share`` of reads that are worth independent ones; ``pairs``: the data.
@@ -130,7 +130,7 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
                 f"The antennas of model {quoted(name)} read {part.hits.sum():.0f} tags, expected {MIN_READS:.0f}: it stays."
             )
         elif (found := _refitted(part, started.models[name].model(), name, floor)) is None:
-            notes.append(f"The logs hardly tell the model {quoted(name)} of the antennas: it stays.")
+            notes.append(f"The logs hardly determine the model {quoted(name)} of the antennas: it stays.")
         else:
             constants += found[1]
             models[name] = written(found[0], name, grids).model_copy(update={"prior": _prior(traced, labels)})
@@ -203,7 +203,7 @@ def _place_constants(placing: Placing) -> list[FittedConstant]:
 
 def bursts(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
     """How many rounds are worth an independent one, at least 1, and its standard error: by the scatter of each tag's reads by each
-    antenna in blocks of time, for a model with ``logit`` (M,).
+    antenna in blocks of time. ``logit`` (M,): of the model.
 
     Unlike the gradient by the pose, this scatter hardly depends on trajectories that were found by the same reads. It is a ratio
     of variances (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5), with the error of a ratio over blocks.
@@ -227,7 +227,7 @@ def pose_share(
     which: Sequence[int],
     floor: Floor,
 ) -> float:
-    """The share of reads in unmerged rounds that are worth independent ones, for the pose."""
+    """The share of independent information on the pose in the reads of unmerged rounds."""
     scores, information = [], np.zeros((3, 3))
     for log in logs:
         chosen = nearby(log, settings, survey)

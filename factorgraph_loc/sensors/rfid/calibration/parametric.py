@@ -156,15 +156,16 @@ class Placing:
     found: Posterior
 
 
-def places_of(settings: RfidSettings, told: Sequence[Parameter] = ()) -> tuple[Parameter, ...]:
-    """The changes of survey and mounting: of all antennas, and of each if there are several. ``told``: better priors of some."""
+def places_of(settings: RfidSettings, better: Sequence[Parameter] = ()) -> tuple[Parameter, ...]:
+    """The changes of survey and mounting: of all antennas, and of each if there are several. ``better``: priors that replace the
+    usual ones."""
     places = [Parameter(f"survey.{name}", 0.0, sigma) for name, sigma in SURVEY.items()]
     places += [Parameter(f"{ALL}.{name}", 0.0, sigma) for name, sigma in MOUNTING.items()]
     names = list(settings.all_antennas())
     for antenna in names if len(names) > 1 else ():
         places += [Parameter(f"{antenna}.{name}", 0.0, APART * sigma) for name, sigma in MOUNTING.items()]
-    better = {p.name: p for p in told}
-    return tuple(better.get(p.name, p) for p in places)
+    replaced = {p.name: p for p in better}
+    return tuple(replaced.get(p.name, p) for p in places)
 
 
 def place(
@@ -172,14 +173,14 @@ def place(
     settings: RfidSettings,
     survey: SurveySettings,
     floor: Floor,
-    told: Sequence[Parameter] = (),
+    better: Sequence[Parameter] = (),
     *,
     with_facing: bool,
 ) -> Placing:
     """Survey and mounting of maximal posterior density, together with a logistic model of all antennas."""
     count = max(len(nearby(log, settings, survey)) for log in logs)
     logs = [log.part(np.arange(len(log.t)) % (1 + count // MOST_PAIRS) == 0) for log in logs]
-    places = places_of(settings, told)
+    places = places_of(settings, better)
     within = [nearby(log, settings, survey) for log in logs]
     pairs = pairs_of(logs, settings, survey, within)
     family = logistic(pairs, with_facing=with_facing)
