@@ -220,9 +220,10 @@ class Search:
         return poses, now if reached is None or reached.t >= now.t else reached
 
     def is_unsure(self, t: float, covariance: Array) -> bool:
-        """Whether a track that particles found has never been known to :data:`NEAR` with probability :data:`SURE`, nor is by its
-        ``covariance`` (3, 3) at ``t``; or whether the last one was rejected less than :data:`PROBATION` ago."""
-        if self._rejected <= t < self._rejected + PROBATION:
+        """Whether a track that particles found, or whose motion was unknown, has not been known since to :data:`NEAR` with
+        probability :data:`SURE`, nor is by its ``covariance`` (3, 3) at ``t``; whether its motion is unknown; or whether the last
+        track was rejected less than :data:`PROBATION` ago."""
+        if self._motion.is_slipping or self._rejected <= t < self._rejected + PROBATION:
             return True
         return self._unsure and beyond(covariance, NEAR) > 1.0 - SURE
 

@@ -1,9 +1,9 @@
-"""Whether the wheels slip: recent observations agree that the robot moved less, or more, than its odometry.
+"""Whether the odometry contradicts the observations: the wheels slip, or the robot is carried.
 
-One observation that contradicts the track may be wrong. Several that agree on another length of the way are not. So the hypothesis
-that the wheels have been slipping since some time competes with the track and with the odometry for the same observations, by
-their robust likelihoods. While the wheels slip the motion is unknown, for all estimators. That ends when the odometry explains the
-observations since then better than any other length of the way.
+One observation that contradicts the track may be wrong. Several that agree on another way of the robot are not. So two hypotheses
+compete with the track and with the odometry for the same observations, by their robust likelihoods: the robot goes another share of
+the way that the odometry reports, or, if the wheels are at rest, it moves at a constant velocity. When one of them wins the motion
+is unknown, for all estimators. That ends when the odometry explains the observations better than the hypotheses.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factorgraph_loc.fusion.search import laplace_evidence
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.base import Observation, View
 from factorgraph_loc.sensors.motion import Motion
-from factors import se2
+from factors import positive, se2
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
 from factors.update import Correction
@@ -28,6 +27,10 @@ WINDOW = 3.0  # s of observations that are compared
 ONSETS = (0.75, 1.5, 3.0)  # s ago, when the wheels may have begun to slip, or to hold again
 SHARES = (0.0, 0.33, 0.67, 1.5)  # of the way that the odometry reports
 SURPRISING, ENOUGH = 1.0, 2  # standard deviations of a surprising innovation; how many of these start a comparison
+STILL, SPEED = 0.05, 0.5  # m: a way that wheels at rest report; m/s: of a robot that is carried
+_ANGLES = np.arange(8) * math.pi / 4.0
+# velocities (9, 3) of a robot whose wheels are at rest: none, or carried in some direction
+CARRIED = np.concatenate((np.zeros((1, 3)), SPEED * np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(8)))))
 CLEAR = 3.0  # standard deviations of the start that the way must be long
 RARE, MOST = (
     7.0,
@@ -47,10 +50,11 @@ class _Compared(NamedTuple):
     offset: Increment | None
     correction: Correction
 
-    def evidence(self, observation: Observation) -> float:
-        """The log-probability of the observation under the track."""
-        pose = self.pose if self.offset is None else se2.compose(self.pose, self.offset.delta)
-        return laplace_evidence(observation, pose, self.covariance, self.correction)
+    def fit(self, observation: Observation) -> float:
+        """The log-likelihood of the observation at the corrected pose, less what the correction moved it by."""
+        delta = self.correction.delta[:3]
+        moved = float(positive.squared(delta, self.covariance))
+        return float(observation.log_likelihood(self.corrected()[None], {})[0]) - 0.5 * moved
 
     def corrected(self) -> Array:
         """The pose (3,) of the robot after the correction."""
@@ -59,7 +63,7 @@ class _Compared(NamedTuple):
 
 
 class SlipMonitor:
-    """Detects from the observations of a track when the wheels slip, and marks the ``motion`` as unknown. It is an event."""
+    """Detects from the observations of a track when the odometry is wrong, and marks the ``motion`` as unknown. It is an event."""
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics) -> None:
         self._motion, self._diagnostics = motion, diagnostics
@@ -91,13 +95,15 @@ class SlipMonitor:
             if len(self._surprises) >= ENOUGH:
                 odds, onset = max(self._log_odds(t - ago) for ago in ONSETS)
                 if odds > RARE:
-                    self._diagnostics.event(t, f"the wheels slip since {onset:.1f} s: the motion is not known")
+                    self._diagnostics.event(
+                        t, f"the odometry contradicts the observations since {onset:.1f} s: the motion is not known"
+                    )
                     self._motion.begin_slip(onset)
                     self._surprises.clear()
                     self._compared = t
 
     def _log_odds(self, begin: float) -> tuple[float, float]:
-        """The log-odds that the wheels slip since the first observation after ``begin`` that is not surprising, and the time of
+        """The log-odds that the odometry is wrong since the first observation after ``begin`` that is not surprising, and the time of
         that; zero odds if the pose is not known well enough there."""
         rows = [row for row in self._rows if row.odometry.t >= begin]
         while rows and surprise(rows[0].correction) > SURPRISING:
@@ -107,14 +113,20 @@ class SlipMonitor:
             return 0.0, begin
         states = np.array([row.odometry for row in rows])[:, 1:4]
         ways, start = se2.log(se2.between(states[0], states)), rows[0].corrected()
-        if np.hypot(*ways[-1, :2]) < CLEAR * math.sqrt(np.trace(rows[0].correction.covariance[:2, :2])):
+        length = float(np.hypot(*ways[-1, :2]))
+        if length < STILL:
+            passed = np.array([row.odometry.t - rows[0].odometry.t for row in rows])
+            length = SPEED * passed[-1]
+            poses = start + passed[None, :, None] * CARRIED[:, None, :]
+        else:
+            poses = se2.compose(start, se2.exp(np.array((1.0, *SHARES))[:, None, None] * ways))
+        if length < CLEAR * math.sqrt(np.trace(rows[0].correction.covariance[:2, :2])):
             return 0.0, begin
-        poses = se2.compose(start, se2.exp(np.array((1.0, *SHARES))[:, None, None] * ways))
         by_share = np.array([one.log_likelihood(poses[:, i], {}) for i, one in enumerate(seen[1:], 1)])
         holds, slips = by_share[:, :1], by_share[:, 1:]
         odds = np.minimum(slips - holds, MOST).sum(axis=0)
         if not self._motion.is_slipping:  # else the track follows the observations
-            track = np.array([row.evidence(one) for row, one in zip(rows[1:], seen[1:], strict=True)])
+            track = np.array([row.fit(one) for row, one in zip(rows[1:], seen[1:], strict=True)])
             odds = np.minimum(odds, np.minimum(slips - track[:, None], MOST).sum(axis=0))
         return float(odds.max()), rows[0].odometry.t
 

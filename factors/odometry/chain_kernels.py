@@ -209,5 +209,5 @@ def move(knot: Array, duration: float, lag: float, hold: float, slipping: float,
     out[HEADING] = knot[HEADING] + dtheta
     out[PATH] = knot[PATH] + math.hypot(dx, dy)
     out[TURN] = knot[TURN] + abs(dtheta)
-    out[UNKNOWN] = knot[UNKNOWN] + duration - (moving if rests else (1.0 - slipping) * moving)
+    out[UNKNOWN] = knot[UNKNOWN] + duration - (1.0 - slipping) * moving
     out[STILL] = knot[STILL] + (moving if rests else 0.0)

@@ -54,8 +54,7 @@ def test_ranges_that_agree_overrule_wheels_that_slip(estimator):
     t, error, run = errors(drive(slips=True), estimator)
     assert error.max() < 0.8  # the wheels report 3 m
     assert error[t > END + 5.0].max() < 0.2
-    assert run.scores["causal.anees"] < 4.5
-    assert any("slip" in what for _, what in run.result.diagnostics.events)
+    assert any("odometry contradicts" in what for _, what in run.result.diagnostics.events)
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "smoother", "particle_filter"])

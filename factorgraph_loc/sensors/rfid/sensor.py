@@ -13,6 +13,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
+from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags, TagEvidence, TagSignals, extent
 from factorgraph_loc.sensors.rfid.monitor import (
     DURATION,
@@ -123,9 +124,11 @@ class TagSensor(Sensor):
     gathers = True
     evidence_every = 0.0
 
-    def __init__(self, setup: Setup, diagnostics: Diagnostics, constants: Estimated = NOTHING) -> None:
+    def __init__(
+        self, setup: Setup, diagnostics: Diagnostics, constants: Estimated = NOTHING, motion: Motion | None = None
+    ) -> None:
         super().__init__()
-        self.constants = constants
+        self.constants, self._wheels = constants, motion
         self._blocks = (self.name,) if constants.names else ()
         self.tags = KnownTags(setup, diagnostics)
         self.bounds = None
@@ -174,8 +177,10 @@ class TagSensor(Sensor):
                     yield TagObservation(m.t, window, 1)
 
     def _learns(self, t: float) -> bool:
-        """Whether models and states of tags are learnt: not on a track that is suspicious, or that has just been found."""
-        return self.suspicious_since is None and t >= self._confirmed
+        """Whether models and states of tags are learnt: not on a track that is suspicious, or that has just been found, or whose
+        motion is unknown."""
+        slips = self._wheels is not None and self._wheels.is_slipping
+        return not slips and self.suspicious_since is None and t >= self._confirmed
 
     def _detection(self, m: RfidScan, moved: TagReadCounts, looks: TagReadCounts) -> TagObservation:
         assert self.tags.likelihood is not None
@@ -306,5 +311,5 @@ def bind(binding: Binding) -> TagSensor | None:
     """The sensor of a run; None where it is not used."""
     settings = binding.setup.rig.rfid
     constants = NOTHING if settings is None or binding.calibration == "none" else settings.estimated()
-    sensor = TagSensor(binding.setup, binding.diagnostics, constants)
+    sensor = TagSensor(binding.setup, binding.diagnostics, constants, binding.motion)
     return sensor if sensor.tags.likelihood is not None else None
