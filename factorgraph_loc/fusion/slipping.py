@@ -32,10 +32,7 @@ _ANGLES = np.arange(8) * math.pi / 4.0
 # velocities (9, 3) of a robot whose wheels are at rest: none, or carried in some direction
 CARRIED = np.concatenate((np.zeros((1, 3)), SPEED * np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(8)))))
 CLEAR = 3.0  # standard deviations of the start that the way must be long
-RARE, MOST = (
-    7.0,
-    3.0,
-)  # log-odds that slipping wheels need: they slip about once in 100 s; most that one observation adds
+RARE, MOST = 7.0, 3.0  # log-odds that a hypothesis needs, as odometry is seldom wrong; most that one observation adds
 EVERY, HOLDS = 1.0, 1.0  # s between comparisons while the wheels slip; log-odds of wheels that hold again
 
 
@@ -103,8 +100,8 @@ class SlipMonitor:
                     self._compared = t
 
     def _log_odds(self, begin: float) -> tuple[float, float]:
-        """The log-odds that the odometry is wrong since the first observation after ``begin`` that is not surprising, and the time of
-        that; zero odds if the pose is not known well enough there."""
+        """The log-odds that the odometry is wrong since the first observation after ``begin`` that is not surprising, and its time.
+        The odds are zero if the pose is not known well enough there."""
         rows = [row for row in self._rows if row.odometry.t >= begin]
         while rows and surprise(rows[0].correction) > SURPRISING:
             del rows[0]
