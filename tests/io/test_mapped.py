@@ -135,16 +135,16 @@ def test_poses_of_a_data_set(hall, with_options, one, refused, form):
     )
     (folder / "times.txt").write_text("1.0\n2.0\n")
     times = 'times = "times.txt"\n' if form == "kitti" else ""
-    log = one(with_options(f'{WHEELS}\n[options.reference]\nfile = "poses.txt"\n{times}'))
+    log = one(with_options(f'{WHEELS}\n[options.reference]\nfile = "poses.txt"\nformat = "{form}"\n{times}'))
     np.testing.assert_allclose(log.reference.t, (0.0, 1.0))
     np.testing.assert_allclose(log.reference.poses, ((0, 0, 0), (3, 1, np.pi / 2)), atol=1e-6)
-    as_odometry = f'[options.odometry]\nfile = "poses.txt"\n{times}'
+    as_odometry = f'[options.odometry]\nfile = "poses.txt"\nformat = "{form}"\n{times}'
     moved = one(with_options(as_odometry)).streams["odometry"]
     np.testing.assert_allclose(moved.t, (0.0, 1.0))
     np.testing.assert_allclose(np.stack((moved.dx, moved.dy, moved.dtheta))[:, 1], (3, 1, np.pi / 2), atol=1e-6)
-    refused(with_options(f"{as_odometry}track = 0.5\n"), "a file of poses has no wheels, expected no track")
-    if times:
-        refused(with_options(as_odometry.replace(times, "")), "is in KITTI format, which has no stamps, expected times")
+    refused(with_options(f"{as_odometry}track = 0.5\n"), f"format {form} has no wheels, expected no track")
+    other = 'times = "times.txt"\n' if not times else ""
+    refused(with_options(as_odometry.replace(times, "") + other), "format kitti and times, the file of the stamps, are")
 
 
 def test_stamps_keep_their_nanoseconds():
@@ -157,11 +157,17 @@ def test_stamps_keep_their_nanoseconds():
     ("old", "new", "fragments"),
     [
         ('t = "time_ms"', 't = "time"', ("wheels.csv:1", "no column 'time'", "time_ms, speed, turn")),
+        ('t = "ms", v', "v", ("wheels.csv", "unit of t is None", "iso")),
         ('w = "deg/s" }', 'w = "degrees" }', ("wheels.csv", "unit of w is 'degrees'", "rad/s, deg/s")),
         (', w = "turn" }', " }", ("wheels.csv", "maps t, v, expected t, v, w or")),
         ('v = "speed"', 'speed = "speed"', ("wheels.csv", "no field 'speed'")),
+        ('units = { t = "ms", v', 'units = { t = "ms", rssi', ("units.rssi", "no field")),
         ('file = "truth.csv"', 'file = "../../truth.csv"', ("leaves its folder",)),
+        ('file = "truth.csv"', 'file = "trut.csv"', ("trut.csv: cannot be read",)),
+        ('preset = "impinj_itemtest"', 'preset = "impinj"', ("options of reader mapped", "rfid.preset", "impinj_iot")),
         ('"impinj_itemtest"', '"impinj_itemtest"\nantenn = "1"', ("unknown key rfid.antenn: did you mean antenna",)),
+        ('"impinj_itemtest"', '"impinj_itemtest"\nchannels = [866.3]', ("channels", "together")),
+        (', heading = "yaw" }', " }", ("truth.csv", "units.heading belongs to no field")),
         ('decimal = ","', 'decimal = "."', ("wheels.csv:2", "speed is '1,8', expected a number")),
     ],
 )
@@ -175,19 +181,24 @@ def test_a_wrong_manifest(hall, refused, old, new, fragments):
     ("file", "content", "fragments"),
     [
         ("wheels.csv", "", ("wheels.csv: contains no rows",)),
+        ("wheels.csv", ODOMETRY.splitlines()[0] + "\n", ("wheels.csv: contains no rows",)),
         ("wheels.csv", ODOMETRY + "9000;1", ("wheels.csv:5", "'9000,1'", "3 values")),
         ("wheels.csv", ODOMETRY + "yesterday;1;0\n", ("wheels.csv:5", "time_ms is 'yesterday'", "a number of ms")),
         ("wheels.csv", ODOMETRY + "2000;1;0\n", ("wheels.csv:5", "2000000000 ns", "not before")),
+        ("wheels.csv", ODOMETRY + "3000;;0\n", ("wheels.csv:5", "speed", "finite")),
         (
             "reads.csv",
             READS + "4/9/2026 2:15 PM,e2001,,1,-60,866.3,r,1,0,\n",
             ("reads.csv:6", "Timestamp", "2026-01-31"),
         ),
+        ("reads.csv", READS.replace(",e2002,", ",,"), ("reads.csv:4", "EPC is ''", "the EPC of a tag")),
+        ("reads.csv", READS.replace(",1.5,", ",150,"), ("reads.csv:3", "PhaseAngle is 150.0", "radians")),
         (
             "reads.csv",
             READS.replace("866.3", "866300000"),
             ("reads.csv:3", "Frequency is 866300000.0", "MHz in 100 to 10000"),
         ),
+        ("reads.csv", '"' + READS, ("reads.csv",)),
     ],
 )
 def test_a_wrong_file(hall, refused, file, content, fragments):

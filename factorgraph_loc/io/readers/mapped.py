@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -53,16 +53,18 @@ RATE = replace(IMU["w"], may_lack=True)  # about one of three axes, of which som
 
 
 class PosesFile(TimedMapping, Turned):
-    """A file with poses: with columns by a mapping, or in TUM, EuRoC or KITTI format."""
+    """A file with poses."""
 
+    format: Literal["columns", "tum", "kitti", "euroc"] = "columns"
+    """columns by a mapping, a TUM or EuRoC file, or a KITTI file with its times"""
     columns: dict[str, str] = Field(default_factory=dict)
-    """column of the file for each field; without it the first row tells the format"""
+    """column of the file for each field, if the format is columns"""
     times: str | None = None
     """file of the times of a KITTI file"""
 
-    def is_mapped(self) -> bool:
-        """Whether the columns of the file are mapped."""
-        return bool(self.columns) and self.times is None
+    def in_format(self) -> bool:
+        """Whether the file is in the format of another program."""
+        return self.format != "columns" or self.times is not None
 
 
 class OdometryFile(PosesFile, motions.WheelSizes):
@@ -270,10 +272,10 @@ def _rounds(folder: TableFolder, options: Options) -> ReadsByRound | None:
 def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Array]:
     """Timestamps (N,), and velocities (N, 2) or increments (N, 3). InputError names file and row."""
     path, warnings = folder.file(options.file), folder.warnings
-    if not options.is_mapped():
+    if options.in_format():
         if options.track is not None or options.radius is not None:
-            raise InputError(f"{path}: a file of poses has no wheels, expected no track or radius")
-        t_ns, poses = _poses(folder, options)
+            raise InputError(f"{path}: format {options.format} has no wheels, expected no track or radius")
+        t_ns, poses = _in_format(folder, options)
         return t_ns, motions.after_rest(motions.between_poses(path, t_ns, poses, warnings))
     mapped = folder.read(options, ODOMETRY)
     side = next((name for name in WHEELS if name in mapped.columns), None)
@@ -305,8 +307,8 @@ def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Arr
 def _reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> Trajectory:
     """The reference in seconds after ``t0_ns``; InputError names file and row of an invalid value."""
     path, warnings = folder.file(options.file), folder.warnings
-    if not options.is_mapped():
-        t_ns, poses = _poses(folder, options)
+    if options.in_format():
+        t_ns, poses = _in_format(folder, options)
         return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=options.has_heading)
     mapped = folder.read(options, (*POSES, ("t", "x", "y")))
     if "heading" not in mapped.columns and "qw" not in mapped.columns and options.has_heading:
@@ -317,21 +319,22 @@ def _reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> Traje
     return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=options.has_heading)
 
 
-def _poses(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array]:
+def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array]:
     """Timestamps (N,) and planar poses (N, 3) of a file in the format of another program."""
     path = folder.file(options.file)
     if options.columns or options.units:
-        raise InputError(f"{path}: a file of poses has no columns or units to map, expected columns without times")
+        raise InputError(f"{path}: format {options.format} has no columns or units to map")
+    if (options.format == "kitti") != (options.times is not None):
+        raise InputError(f"{path}: format kitti and times, the file of the stamps, are needed together")
     turned: Turned = options
-    if options.times is None:
-        found = read_pose_file(path)
-    else:
+    if options.times is not None:
         found = read_kitti(path, folder.file(options.times))
         if not options.axes:
             turned = Turned(axes="body", mounting=options.mounting)  # the format defines the axes
-    if found.t_ns is None:
-        raise InputError(f"{path}: is in KITTI format, which has no stamps, expected times, the file of the stamps")
+    else:
+        found = read_pose_file(path, "euroc" if options.format == "euroc" else "tum")
     folder.warnings += found.warnings
+    assert found.t_ns is not None
     return found.t_ns + round(options.clock_offset * 1e9), found.on_floor(folder.warnings, turned)
 
 
