@@ -71,8 +71,8 @@ class ParticleFilterSettings(FilterSettings):
     smoothing_interval: Annotated[float, Field(ge=0.1, le=60.0), InUnit("s")] = 1.0
     """time between the clouds through which these are drawn"""
     self_calibration: bool = True
-    """whether constants to which the rig gives an uncertainty travel with each particle; not time offsets, and not those of
-    a camera, which widen its noise"""
+    """whether constants to which the rig gives an uncertainty travel with each particle; not the time offset of landmarks, and
+    not constants of a camera, which widen its noise"""
 
 
 class ParticleFilter(Filter):

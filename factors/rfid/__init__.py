@@ -12,6 +12,7 @@ __all__ = [
     "kernels",
     "knots",
     "model",
+    "parameters",
     "signals",
     "tag_states",
 ]

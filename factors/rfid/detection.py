@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from factors.rfid import kernels, weighing
 from factors.rfid.index import MapTags, Seen, moved, tag_index
 from factors.rfid.model import Packed, RfidModel
+from factors.rfid.parameters import adjusted
 from factors.rfid.places import Places, RobotTables, antennas_of, in_reach, is_wide, robot_tables
 from factors.rfid.tables import Tables, make_tables
 from factors.se2 import Array, Integers
 
-ROUNDING = 0.02, 0.05  # of the parameters of a detection model, in tables of places
+ROUNDING = 0.02, 0.05, 0.05  # of the parameters of a detection model, and of the others, in tables of places
 KEPT = 3  # such tables, those of the rig among them
 
 
@@ -46,9 +47,10 @@ class TagArray:
 class TagReadCounts:
     """Read counts of tags by K antennas, each at its own pose.
 
-    ``offsets`` (K, 3): the robot's pose at the measurement, in the frame of the likelihood's pose; ``antennas`` (K,): indices in
-    the model; ``rounds`` (K,): inventory rounds. ``tags`` (C,): places in the map, ascending, of the tags that are listed; None,
-    the default, if all of the map are. ``hits`` (K, C): number of rounds that read each of them; the others were not read.
+    ``offsets`` (K, 3): the robot's pose at the measurement, in the frame of the likelihood's pose; ``twists`` (K, 3): its
+    velocity [m/s, rad/s] there, 0 by default; ``antennas`` (K,): indices in the model; ``rounds`` (K,): inventory rounds.
+    ``tags`` (C,): places in the map, ascending, of the tags that are listed; None, the default, if all of the map are.
+    ``hits`` (K, C): number of rounds that read each of them; the others were not read.
     ``odds`` (C,): prior log-odds that each is dead or moved (:class:`~factors.rfid.tag_states.TagStates`), ``-inf`` for as
     surveyed, the default; ``others``: those of the tags that are not listed. ``elsewhere`` (C,): tempered log-likelihood of what
     was seen of the tag if so, relative to a silence out of reach; by default that of a dead tag: 0, or ``-inf`` if it was read.
@@ -62,18 +64,21 @@ class TagReadCounts:
     elsewhere: Array = field(default_factory=lambda: np.empty(0))
     tags: Integers | None = None
     others: float = -np.inf
+    twists: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     def __post_init__(self) -> None:
         if not len(self.odds):
             object.__setattr__(self, "odds", np.full(self.hits.shape[1], -np.inf))
         if not len(self.elsewhere):
             object.__setattr__(self, "elsewhere", np.where(self.hits.any(axis=0), -np.inf, 0.0))
+        if not len(self.twists):
+            object.__setattr__(self, "twists", np.zeros(self.offsets.shape))
 
     @cached_property
     def seen(self) -> Seen:
         """The counts for compiled code."""
         counts = self.offsets, self.antennas, self.rounds, self.hits
-        return (*counts, self.odds, self.elsewhere, self.listed, self.others)
+        return (*counts, self.odds, self.elsewhere, self.listed, self.others, self.twists)
 
     @cached_property
     def listed(self) -> Integers:
@@ -116,17 +121,11 @@ def together(parts: list[TagReadCounts]) -> TagReadCounts:
         odds[at] = part.odds
         elsewhere[at] += part.elsewhere
         hits.append(own)
-    offsets, antennas, rounds = zip(*[(p.offsets, p.antennas, p.rounds) for p in parts], strict=True)
-    return TagReadCounts(
-        np.concatenate(offsets),
-        np.concatenate(antennas),
-        np.concatenate(rounds),
-        np.concatenate(hits[::-1]),
-        odds,
-        elsewhere,
-        None if first.tags is None else tags,
-        first.others,
-    )
+    rows = zip(*[(p.offsets, p.antennas, p.rounds, p.twists) for p in parts], strict=True)
+    offsets, antennas, rounds, twists = map(np.concatenate, rows)
+    listed = None if first.tags is None else tags
+    counts = offsets, antennas, rounds, np.concatenate(hits[::-1])
+    return TagReadCounts(*counts, odds, elsewhere, listed, first.others, twists)
 
 
 class Score(NamedTuple):
@@ -158,9 +157,10 @@ class ExpectedReads(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RfidLikelihood:
-    """The likelihood of an antenna model of M detection models with a map of tags.
+    """The likelihood of an antenna model with M detection models and A antennas, and a map of tags.
 
-    ``parameters`` (2 M,): of the detection models (:mod:`factors.rfid.kernels`); ``packed``: the models for compiled code.
+    ``parameters`` (Q,), Q = 2 M + A + 2: of models, mounting and clock (:mod:`factors.rfid.parameters`); ``packed``: the models
+    with them, for compiled code.
     """
 
     model: RfidModel
@@ -172,13 +172,13 @@ class RfidLikelihood:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "packed", self.model.packed())
-        object.__setattr__(self, "parameters", np.zeros(2 * len(self.model.models)))
+        object.__setattr__(self, "parameters", np.zeros(2 * len(self.model.models) + len(self.model.antennas) + 2))
         object.__setattr__(self, "_unadjusted", self)
 
     def adjusted(self, parameters: Array) -> RfidLikelihood:
-        """The same with other parameters (2 M,) of the detection models."""
+        """The same with other parameters (Q,)."""
         out = copy.copy(self)
-        object.__setattr__(out, "packed", kernels.adjusted(self._unadjusted.packed, parameters))
+        object.__setattr__(out, "packed", adjusted(self._unadjusted.packed, parameters))
         object.__setattr__(out, "parameters", np.asarray(parameters, dtype=float))
         return out
 
@@ -202,7 +202,7 @@ class RfidLikelihood:
         self, pose: Array, parameters: Array, looks: TagReadCounts, estimated: Sequence[int] | None = None
     ) -> Score:
         """Likelihood, gradient (1, 3 + P) and information (1, 3 + P, 3 + P) at one pose (3,), by its body-frame perturbation and
-        those of the ``parameters`` (2 M,) of the detection models that are ``estimated`` (P,), by default all."""
+        those of the ``parameters`` (Q,) that are ``estimated`` (P,), by default all."""
         places = np.array(range(len(parameters)) if estimated is None else estimated, dtype=np.int64)
         pose, alpha = np.ascontiguousarray(pose, dtype=float), float(self.model.tempering)
         nll, gradient, information, *moments = kernels.score(*self.arrays, looks.seen, alpha, pose, parameters, places)
@@ -222,7 +222,7 @@ class RfidLikelihood:
         """The tags (U,) within a ``margin`` [m] of the reach from any of the poses (N, 3), or read, whose ``odds`` (T,) are not
         ``-inf``; the tempered log-likelihood (U, K) of what was seen of each if it were ``shifts`` (K, 2) from where the map has
         it, relative to a silence out of reach: the mean of the likelihood over the poses; and which of them were read.
-        ``parameters`` (2 M,): of the detection models."""
+        ``parameters``: (Q,)."""
         alpha = float(self.model.tempering)
         return weighing.displaced(*self._tabled, looks.seen, poses, margin, odds, shifts, alpha, parameters)
 
@@ -230,7 +230,8 @@ class RfidLikelihood:
         """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.weighing`, :mod:`factors.rfid.places`):
         for particles.
 
-        ``parameters`` (N, 2 M): of the detection models at each pose, by default its own.
+        ``parameters`` (N, Q): at each pose, by default its own; where time offsets differ, all looks have the
+        velocity of the first.
         """
         poses = np.ascontiguousarray(poses, dtype=float)
         if parameters is None and not looks.offsets.any() and is_wide(poses, self.reach):
@@ -268,13 +269,14 @@ class RfidLikelihood:
     @property
     def _places(self) -> Places:
         """Those of the parameters, which are rounded."""
-        steps = np.tile(ROUNDING, len(self.model.models))
+        steps = np.full(len(self.parameters), ROUNDING[2])
+        steps[: 2 * len(self.model.models)] = np.tile(ROUNDING[:2], len(self.model.models))
         rounded = np.rint(self.parameters / steps)
         kept, key = self._unadjusted._of_parameters, tuple(rounded.tolist())
         if key not in kept:
             if len(kept) >= KEPT:
                 del kept[next(k for k in kept if any(k))]
-            packed = kernels.adjusted(self._unadjusted.packed, steps * rounded)
+            packed = adjusted(self._unadjusted.packed, steps * rounded)
             antennas = antennas_of(packed, self._unadjusted._tables)
             kept[key] = Places.of(antennas, self._unadjusted._map, uses_facing=self.uses_facing)
         return kept[key]
@@ -299,7 +301,7 @@ class RfidLikelihood:
 
     def expected(self, pose: Array, looks: TagReadCounts, parameters: Array) -> ExpectedReads:
         """What was seen from a pose (3,) of the tags that are in reach of it or listed, and what is expected with ``parameters``
-        (2 M,) of the detection models."""
+        (Q,)."""
         return ExpectedReads(*kernels.predicted(*self.arrays, looks.seen, pose, parameters))
 
     def probabilities(self, poses: Array, antenna: int) -> Array:

@@ -58,7 +58,7 @@ class TagLikelihood(Protocol):
 
 
 class TagProblem(NamedTuple):
-    """Reads and misses for compiled code: models without adjustment, their ``parameters`` (2 M,), and which are ``estimated``."""
+    """Reads and misses for compiled code: models without adjustment, their ``parameters`` (Q,), and which are ``estimated``."""
 
     packed: Packed
     of_map: MapTags
@@ -74,8 +74,8 @@ class RfidFactor:
     there are four residuals, whose squares have the value, the gradient and the expected curvature of the likelihood. ``seen``:
     :class:`~factors.rfid.detection.TagReadCounts` for an :class:`~factors.rfid.detection.RfidLikelihood`, reads for the other two.
 
-    ``estimated`` (P,): places, among the parameters of the detection models (:mod:`factors.rfid.kernels`), of those that are a
-    second variable (P,) of read counts; there are P residuals more then.
+    ``estimated`` (P,): places of those parameters of the likelihood (:mod:`factors.rfid.parameters`) that are a second variable
+    (P,) of read counts; there are P residuals more then.
     """
 
     likelihood: TagLikelihood
@@ -106,7 +106,7 @@ class RfidFactor:
         return replace(self, likelihood=self.likelihood.adjusted(self._parameters(values)), estimated=())
 
     def _parameters(self, values: Array) -> Array:
-        """All parameters (..., 2 M) of the detection models for ``values`` (..., P) of those that are estimated."""
+        """All parameters (..., Q) for ``values`` (..., P) of those that are estimated."""
         assert isinstance(self.likelihood, RfidLikelihood)
         out = np.zeros((*values.shape[:-1], len(self.likelihood.parameters)))
         out[..., list(self.estimated)] = values

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.se2 import Array, Integers, wrap_scalar
+from factors.se2 import Array, Integers, exp_scalars, wrap_scalar
 
 CELL = 2.0  # m
 SPARE = 0.5  # m: tags are found in a box on a grid of this size, which neighbouring poses share
 Corner = tuple[float, float]
 MOST_CELLS = 1 << 20  # a map that is wider has larger cells
-# offsets, antennas, rounds, hits, odds and elsewhere; the places in the map that are listed, and the odds of the others
-Seen = tuple[Array, Integers, Integers, Integers, Array, Array, Integers, float]
+# offsets, antennas, rounds, hits, odds and elsewhere; the places in the map that are listed, the odds of the others, and the twists
+Seen = tuple[Array, Integers, Integers, Integers, Array, Array, Integers, float, Array]
 
 
 class TagIndex(NamedTuple):
@@ -113,7 +113,7 @@ def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
 def near_tags(of_map: MapTags, seen: Seen, poses: Array, reach: float) -> NearTags:
     """The tags within ``reach`` [m] of poses (N, 3), or in the same cells, and those that are listed in what was ``seen``
     (:attr:`factors.rfid.detection.TagReadCounts.seen`)."""
-    _, _, _, hits, odds, elsewhere, listed, others = seen
+    _, _, _, hits, odds, elsewhere, listed, others, _ = seen
     low, high = _box(poses, reach)
     tags = union(within(of_map.cells, low, high), listed)
     hits, odds, elsewhere = listing(listed, hits, odds, elsewhere, others, tags)
@@ -134,6 +134,21 @@ def moved(offset: Array, offsets: Array) -> Array:
         out[k, 0] = offset[0] + c * offsets[k, 0] - s * offsets[k, 1]
         out[k, 1] = offset[1] + s * offsets[k, 0] + c * offsets[k, 1]
         out[k, 2] = wrap_scalar(offset[2] + offsets[k, 2])
+    return out
+
+
+@compiled
+def delayed(poses: Array, twists: Array, delays: Array) -> Array:
+    """The poses (K, 3) ``delays`` [s] (K or 1,) later, of a robot with velocities ``twists`` (K or 1, 3)."""
+    if not delays.any():
+        return poses
+    out = np.empty_like(poses)
+    for k in range(len(poses)):
+        twist, delay = twists[min(k, len(twists) - 1)], delays[min(k, len(delays) - 1)]
+        x, y, turn = exp_scalars(delay * twist[0], delay * twist[1], delay * twist[2])
+        c, s = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+        out[k, 0], out[k, 1] = poses[k, 0] + c * x - s * y, poses[k, 1] + s * x + c * y
+        out[k, 2] = wrap_scalar(poses[k, 2] + turn)
     return out
 
 

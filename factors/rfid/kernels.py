@@ -2,17 +2,8 @@
 
 An antenna reads a tag in k of n inventory rounds with probability q each (:mod:`factors.rfid.model`), so the negative
 log-likelihood is ``-sum(k log q + (n - k) log(1 - q))``. Its Hessian is replaced by the Fisher information, which is positive
-semi-definite. Derivatives are by the body-frame perturbation of the pose, by parameters of the detection models, and by the
-position of a tag.
-
-Two parameters of each detection model describe what differs between installations (power, cables, kinds of tags). With ``a``, the
-logarithm of a factor of the range, and ``b``, a shift of the logit of the largest read probability ``peak``, the model's
-``p(x, y, z)`` of a tag in the antenna's frame becomes
-
-    rate * p(x / scale, y / scale, z),    scale = exp(a),    rate = sigmoid(logit(peak) + b) / peak,
-
-which for a beam is another ``r_max`` (with its ``s_r`` in proportion) and another ``p0``. The parameters of M models are a vector
-(2 M,): ``a`` and ``b`` of the first model, then of the second. With zeros the model is as it was.
+semi-definite. Derivatives are by the body-frame perturbation of the pose, by the parameters of the likelihood
+(:mod:`factors.rfid.parameters`), and by the position of a tag.
 """
 
 import math
@@ -21,46 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid.index import MapTags, Seen, moved, near_tags
+from factors.rfid.index import MapTags, Seen, delayed, moved, near_tags
 from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed, logit
+from factors.rfid.parameters import MOST_CERTAIN, adjusted
 from factors.se2 import Array, Integers
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}  # fast-math flags that keep infinities
-PARAMETERS = ("range_scale", "read_rate")  # of each detection model
-MOST_CERTAIN = 0.99  # limit of the peak of a model: a larger one would leave the rate nothing to change
 ROW = 8  # numbers of each row of placed antennas
-
-
-@compiled
-def rate_of(peak: float, shift: float) -> float:
-    """The factor of the probabilities of a model with largest probability ``peak``, whose logit shifts by ``shift``."""
-    certain = min(peak, MOST_CERTAIN)
-    return float(1.0 / (certain + (1.0 - certain) * math.exp(-shift)))
-
-
-@compiled
-def adjusted(packed: Packed, parameters: Array) -> Packed:
-    """The models with these parameters (2 M,); ``packed``: the models without adjustment."""
-    models = len(packed.reach)
-    scale, reach, rate = np.empty(models), np.empty(models), np.empty(models)
-    for m in range(models):
-        scale[m] = math.exp(parameters[2 * m])
-        reach[m] = packed.reach[m] * scale[m]
-        rate[m] = rate_of(packed.peak[m], parameters[2 * m + 1])
-    return Packed(
-        packed.antennas,
-        packed.which,
-        packed.kinds,
-        packed.parameters,
-        packed.shapes,
-        packed.knots,
-        reach,
-        packed.false_read,
-        packed.span,
-        scale,
-        rate,
-        packed.peak,
-    )
+OF_READ, PLACE = 5, 7  # derivatives of one look at a tag, without and with those by the tag's position
+MOST_COLUMNS = 8  # of the pose and the parameters that one look depends on
 
 
 @compiled(inline="always")
@@ -191,11 +151,13 @@ def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, floa
     return nll, gradient, information, expected, variance
 
 
-@compiled(inline="always")
-def _unread(packed: Packed, rounds: int) -> tuple[float, float, float]:
-    """Negative log-likelihood of misses of a tag out of range, its mean and variance."""
-    nll, _, _, expected, variance = outcome(detection(packed, NEGLIGIBLE_LOGIT, 1.0)[0], 0, rounds)
-    return nll, expected, variance
+@compiled
+def _unread(packed: Packed, rounds: Integers) -> Array:
+    """Negative log-likelihood of misses of a tag out of range, its mean and variance, (K, 3)."""
+    out, q = np.empty((len(rounds), 3)), detection(packed, NEGLIGIBLE_LOGIT, 1.0)[0]
+    for k in range(len(rounds)):
+        out[k, 0], _, _, out[k, 1], out[k, 2] = outcome(q, 0, rounds[k])
+    return out
 
 
 @compiled(inline="always")
@@ -208,110 +170,146 @@ def _add_tag(
     point: Array,
     normal: Array,
     far: Array,
-    columns: Integers,
     by: Array,
     slope: Array,
     curve: Array,
 ) -> tuple[float, float, float]:
     """Negative log-likelihood of one tag as surveyed in all measurements, its mean and variance over all outcomes.
 
-    The gradient ``slope`` (D,) and the lower triangle of the information ``curve`` (D, D) are filled: by the pose, then by the
-    parameters that have a column, then by the tag's position in the world if D leaves room for it. ``far`` (K, 3): what a miss out
-    of range contributes; ``by`` (D,) is work space.
+    Filled for each measurement: its derivative ``slope`` (K,) by the probability of a read and Fisher's information ``curve`` (K,)
+    on that, both 0 out of reach; and the derivatives ``by`` (K, 7) of the probability by the antenna's position in the frame of the
+    pose, its yaw, ``a`` and ``b`` of its model, and the tag's position in the world. ``far`` (K, 3): what a miss out of range
+    contributes.
     """
-    size, estimated = len(slope), 0
-    for i in range(len(columns)):
-        estimated += columns[i] >= 0
-    slope[:], curve[:] = 0.0, 0.0
     nll = mean = variance = 0.0
     for k in range(len(antennas)):
         x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
         z, by_p, by_q, by_heading, by_range = of_tag(packed, antennas[k], x, y, c, s, point, normal)
         if z == NEGLIGIBLE_LOGIT and hits[k] == 0:  # out of reach and not read, as most are
             nll, mean, variance = nll + far[k, 0], mean + far[k, 1], variance + far[k, 2]
+            slope[k] = curve[k] = 0.0
             continue
         m = packed.which[antennas[k]]
         rate = packed.rate[m]
         q, by_z, by_rate = detection(packed, z, rate)
-        e, gradient, information, expected, spread = outcome(q, hits[k], rounds[k])
+        e, slope[k], curve[k], expected, spread = outcome(q, hits[k], rounds[k])
         nll, mean, variance = nll + e, mean + expected, variance + spread
         # the antenna moves, the tag does not
-        by[0] = by_z * (at[k, 5] * by_q - at[k, 4] * by_p)
-        by[1] = -by_z * (at[k, 5] * by_p + at[k, 4] * by_q)
-        by[2] = by_z * by_heading - by[0] * at[k, 7] + by[1] * at[k, 6]
-        if estimated > 0:
-            by[3:] = 0.0
-            if columns[2 * m] >= 0:
-                by[columns[2 * m]] = by_z * by_range
-            if columns[2 * m + 1] >= 0:
-                by[columns[2 * m + 1]] = by_rate * (1.0 - rate * min(packed.peak[m], MOST_CERTAIN))
-        if size > 3 + estimated:
-            by[size - 2], by[size - 1] = by_z * (c * by_p - s * by_q), by_z * (s * by_p + c * by_q)
-        for i in range(size):
-            slope[i] += gradient * by[i]
-            for j in range(i + 1):
-                curve[i, j] += information * by[i] * by[j]
+        by[k, 0] = by_z * (at[k, 5] * by_q - at[k, 4] * by_p)
+        by[k, 1] = -by_z * (at[k, 5] * by_p + at[k, 4] * by_q)
+        by[k, 2], by[k, 3] = by_z * by_heading, by_z * by_range
+        by[k, 4] = by_rate * (1.0 - rate * min(packed.peak[m], MOST_CERTAIN))
+        by[k, 5], by[k, 6] = by_z * (c * by_p - s * by_q), by_z * (s * by_p + c * by_q)
     return nll, mean, variance
+
+
+@compiled
+def _add_look(
+    packed: Packed,
+    antenna: int,
+    at: Array,
+    offset: Array,
+    twist: Array,
+    columns: Integers,
+    pull: Array,
+    curve: Array,
+    gradient: Array,
+    information: Array,
+) -> None:
+    """Add the ``pull`` (5,) and the lower triangle of the ``curve`` (5, 5) of a measurement, by what :func:`_add_tag` derives by,
+    to the ``gradient`` (D,) and the ``information`` (D, D) by the pose and the parameters that have a column.
+
+    ``at`` (8,): the antenna, of a robot at ``offset`` (3,) from the pose with velocity ``twist`` (3,).
+    """
+    own, by, count = np.empty(MOST_COLUMNS, np.int64), np.zeros((MOST_COLUMNS, OF_READ)), 3
+    own[0], own[1], own[2] = 0, 1, 2
+    by[0, 0] = by[1, 1] = by[2, 2] = 1.0
+    by[2, 0], by[2, 1] = -at[7], at[6]
+    model, turn = 2 * packed.which[antenna], 2 * len(packed.reach)
+    for place, local in ((model, 3), (model + 1, 4), (turn, 2), (turn + 1 + antenna, 2)):
+        if columns[place] >= 0:
+            own[count], by[count, local] = columns[place], 1.0
+            count += 1
+    if columns[-1] >= 0:
+        c, s = math.cos(offset[2]), math.sin(offset[2])
+        own[count], by[count, 2] = columns[-1], twist[2]
+        by[count, 0] = c * twist[0] - s * twist[1] - twist[2] * (at[7] - offset[1])
+        by[count, 1] = s * twist[0] + c * twist[1] + twist[2] * (at[6] - offset[0])
+        count += 1
+    for a in range(count):
+        row = np.zeros(OF_READ)
+        for i in range(OF_READ):
+            gradient[own[a]] += by[a, i] * pull[i]
+            for j in range(OF_READ):
+                row[j] += by[a, i] * curve[max(i, j), min(i, j)]
+        for b in range(a + 1):
+            value = 0.0
+            for j in range(OF_READ):
+                value += row[j] * by[b, j]
+            information[own[a], own[b]] += value
+            if b < a:
+                information[own[b], own[a]] += value
 
 
 @compiled(error_model="numpy", fastmath=FAST)
 def scores(
     packed: Packed, of_map: MapTags, seen: Seen, tempering: float, poses: Array, columns: Integers
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """The fields of a :class:`~factors.rfid.detection.Score` of poses (N, 3) for adjusted models. ``columns`` (2 M,): of the
-    parameters of the detection models in the derivatives, -1 for those that have none."""
-    offsets, antennas, rounds = seen[:3]
+    """The fields of a :class:`~factors.rfid.detection.Score` of poses (N, 3) for adjusted models. ``columns``: of the parameters in
+    the derivatives, -1 for those that have none."""
+    antennas, rounds, twists = seen[1], seen[2], seen[8]
+    offsets = delayed(seen[0], twists, packed.delay)
     count, looks, size = len(poses), len(antennas), 3
     for i in range(len(columns)):
         size += columns[i] >= 0
+    local = OF_READ if size > 3 else 3
     near = near_tags(of_map, seen, poses, reach_of(packed, offsets))
     hits, tags = near.hits, len(near.tags)
-    heard = np.zeros(tags, np.int64)
-    far, none, none_mean, none_variance = np.empty((looks, 3)), 0.0, 0.0, 0.0
+    heard, far, none = np.zeros(tags, np.int64), _unread(packed, rounds), np.zeros(3)
     for k in range(looks):
-        far[k, 0], far[k, 1], far[k, 2] = _unread(packed, rounds[k])
-        none, none_mean, none_variance = none + far[k, 0], none_mean + far[k, 1], none_variance + far[k, 2]
-        for t in range(tags):
-            heard[t] += hits[k, t]
+        none += far[k]
+        heard += hits[k]
     nll, expected, variance = np.empty(count), np.empty(count), np.empty(count)
     gradient, information = np.zeros((count, size)), np.zeros((count, size, size))
-    at, by, slope, curve = np.empty((looks, ROW)), np.empty(size), np.empty(size), np.empty((size, size))
+    at, by, slope, curve = np.empty((looks, ROW)), np.empty((looks, PLACE)), np.empty(looks), np.empty(looks)
+    pulls, curves = np.empty((looks, OF_READ)), np.empty((looks, OF_READ, OF_READ))
     for n in range(count):
         farthest = _place_antennas(packed, poses[n], offsets, antennas, at)
         # tags that are not listed are out of reach and not read
         beyond = len(of_map.points) - tags
         e_sum = mean_sum = variance_sum = 0.0
+        pulls[:], curves[:] = 0.0, 0.0
         for t in range(tags):
             dx, dy = near.points[t, 0] - poses[n, 0], near.points[t, 1] - poses[n, 1]
             if heard[t] == 0 and dx * dx + dy * dy >= farthest * farthest:
                 beyond += 1
                 continue
-            e, mean, spread = _add_tag(
-                packed,
-                at,
-                antennas,
-                rounds,
-                hits[:, t],
-                near.points[t],
-                near.normals[t],
-                far,
-                columns,
-                by,
-                slope,
-                curve,
-            )
-            share, e, mean, spread = mixture(near.odds[t], near.elsewhere[t], e, mean, spread, none, tempering)
+            point, normal = near.points[t], near.normals[t]
+            e, mean, spread = _add_tag(packed, at, antennas, rounds, hits[:, t], point, normal, far, by, slope, curve)
+            share, e, mean, spread = mixture(near.odds[t], near.elsewhere[t], e, mean, spread, none[0], tempering)
             e_sum, mean_sum, variance_sum = e_sum + e, mean_sum + mean, variance_sum + spread
-            for i in range(size):
-                gradient[n, i] += share * slope[i]
-                for j in range(i + 1):
-                    information[n, i, j] += share * curve[i, j]
-        nll[n] = e_sum + tempering * beyond * none
-        expected[n] = mean_sum + tempering * beyond * none_mean
-        variance[n] = variance_sum + tempering * beyond * none_variance
-        for i in range(size):
-            for j in range(i):
-                information[n, j, i] = information[n, i, j]
+            for k in range(looks):
+                if curve[k] > 0.0:
+                    for i in range(local):
+                        pulls[k, i] += share * slope[k] * by[k, i]
+                        for j in range(i + 1):
+                            curves[k, i, j] += share * curve[k] * by[k, i] * by[k, j]
+        nll[n] = e_sum + tempering * beyond * none[0]
+        expected[n] = mean_sum + tempering * beyond * none[1]
+        variance[n] = variance_sum + tempering * beyond * none[2]
+        for k in range(looks):
+            _add_look(
+                packed,
+                antennas[k],
+                at[k],
+                offsets[k],
+                twists[k],
+                columns,
+                pulls[k],
+                curves[k],
+                gradient[n],
+                information[n],
+            )
     return nll, gradient, information, expected, variance
 
 
@@ -319,7 +317,7 @@ def scores(
 def score(
     packed: Packed, of_map: MapTags, seen: Seen, tempering: float, pose: Array, parameters: Array, estimated: Integers
 ) -> tuple[float, Array, Array, float, float]:
-    """Of one pose (3,) and models without adjustment, with ``parameters`` (2 M,): negative log-likelihood; its gradient (3 + P,)
+    """Of one pose (3,) and models without adjustment, with their ``parameters``: negative log-likelihood; its gradient (3 + P,)
     and information (3 + P, 3 + P) by the pose and the ``estimated`` (P,) parameters; mean and variance."""
     columns = np.full(len(parameters), -1, np.int64)
     for i in range(len(estimated)):
@@ -343,20 +341,20 @@ def by_tag(
     """Of each of T tags as surveyed, at one pose (3,): negative log-likelihood (T,); gradient (T, 5) and information (T, 5, 5) by
     the pose and by the tag's position in the world."""
     looks, tags, size = len(antennas), len(points), 5
-    nll, gradient, information = np.empty(tags), np.empty((tags, size)), np.empty((tags, size, size))
-    at, far, by = np.empty((looks, ROW)), np.empty((looks, 3)), np.empty(size)
-    columns = np.full(2 * len(packed.reach), -1, np.int64)
+    nll, gradient, information = np.empty(tags), np.zeros((tags, size)), np.zeros((tags, size, size))
+    at, far, by = np.empty((looks, ROW)), _unread(packed, rounds), np.empty((looks, PLACE))
+    slope, curve, own = np.empty(looks), np.empty(looks), np.empty(size)
     _place_antennas(packed, pose, offsets, antennas, at)
-    for k in range(looks):
-        far[k, 0], far[k, 1], far[k, 2] = _unread(packed, rounds[k])
     for t in range(tags):
-        slope, curve = gradient[t], information[t]
-        nll[t] = _add_tag(
-            packed, at, antennas, rounds, hits[:, t], points[t], normals[t], far, columns, by, slope, curve
-        )[0]
-        for i in range(size):
-            for j in range(i):
-                curve[j, i] = curve[i, j]
+        nll[t] = _add_tag(packed, at, antennas, rounds, hits[:, t], points[t], normals[t], far, by, slope, curve)[0]
+        for k in range(looks):
+            if curve[k] > 0.0:
+                own[0], own[1], own[3], own[4] = by[k, 0], by[k, 1], by[k, 5], by[k, 6]
+                own[2] = by[k, 2] - by[k, 0] * at[k, 7] + by[k, 1] * at[k, 6]
+                for i in range(size):
+                    gradient[t, i] += slope[k] * own[i]
+                    for j in range(size):
+                        information[t, i, j] += curve[k] * own[i] * own[j]
     return nll, gradient, information
 
 
@@ -382,10 +380,10 @@ def probabilities(
 def predicted(
     packed: Packed, of_map: MapTags, seen: Seen, pose: Array, parameters: Array
 ) -> tuple[Integers, Integers, Array, Array]:
-    """With ``parameters`` (2 M,) of models without adjustment, of the tags near a pose (3,) or listed: their indices in the map
-    (C,), and for each measurement the hits, the probability of a read and the distance [m] from the antenna, (K, C)."""
-    offsets, antennas = seen[:2]
-    own = adjusted(packed, parameters)
+    """With ``parameters`` of models without adjustment, of the tags near a pose (3,) or listed: their indices in the map (C,), and
+    for each measurement the hits, the probability of a read and the distance [m] from the antenna, (K, C)."""
+    own, antennas = adjusted(packed, parameters), seen[1]
+    offsets = delayed(seen[0], seen[8], own.delay)
     near = near_tags(of_map, seen, pose.copy().reshape(1, 3), reach_of(own, offsets))
     p, distance = probabilities(own, antennas, moved(pose, offsets), near.points, near.normals)
     return near.tags, near.hits, p, distance

@@ -153,8 +153,8 @@ class Antenna:
 class Packed(NamedTuple):
     """A :class:`RfidModel` as compiled code takes it. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw and pitch;
     ``which`` (A,): their models; ``kinds`` (M,); ``parameters`` (M, 12); ``shapes`` (M, 5): H, F, NX, NY and the first place in
-    ``knots``; ``reach`` (M,); ``span``: what the floor leaves to the model. ``scale`` and ``rate`` (M,): factors of each model's
-    ranges and probabilities (:mod:`factors.rfid.kernels`); ``peak`` (M,): its largest probability."""
+    ``knots``; ``reach`` (M,); ``span``: what the floor leaves to the model. ``scale`` and ``rate`` (M,), ``delay`` (1,)
+    [s]: :mod:`factors.rfid.parameters`; ``peak`` (M,): largest probability of a model."""
 
     antennas: Array
     which: NDArray[np.int64]
@@ -168,6 +168,7 @@ class Packed(NamedTuple):
     scale: Array
     rate: Array
     peak: Array
+    delay: Array
 
 
 @dataclass(frozen=True)
@@ -207,6 +208,7 @@ class RfidModel:
             np.ones(len(self.models)),
             np.ones(len(self.models)),
             np.array([model.peak for model in self.models]),
+            np.zeros(1),
         )
 
 

@@ -189,7 +189,7 @@ class Places:
 
     def _scan(self, seen: Seen) -> Scan:
         """The reads, with the tags listed that are not as most are."""
-        _, antennas, rounds, hits, odds, elsewhere, listed, others = seen
+        _, antennas, rounds, hits, odds, elsewhere, listed, others, _ = seen
         rows = np.arange(len(odds))
         if len(odds) == len(self.points) > 0:
             others = float(np.sort(odds)[len(odds) // 2])

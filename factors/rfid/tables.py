@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from factors import se2
 from factors.compiled import compiled
 from factors.rfid import knots
-from factors.rfid.kernels import MOST_CERTAIN, placed, seen
+from factors.rfid.kernels import placed, seen
 from factors.rfid.model import (
     GRID,
     LOGISTIC,
@@ -23,6 +23,7 @@ from factors.rfid.model import (
     RfidModel,
     logistic_value,
 )
+from factors.rfid.parameters import MOST_CERTAIN
 from factors.se2 import Array, Integers
 
 Array32 = NDArray[np.float32]
@@ -197,7 +198,8 @@ def relevant(
     near: NDArray[np.bool_],
     tempering: float,
 ) -> NDArray[np.bool_]:
-    """Which measurements of which tags (K, T) matter to some of the poses (N, 3) with ``parameters`` (N or 1, 2 M).
+    """Which measurements of which tags (K, T) matter to some of the poses (N, 3) with ``parameters`` (N or 1, Q). The yaw
+    of antennas in ``packed`` is that of the first row.
 
     These are measurements of tags that are ``near`` (T,), and were read or, by the blocks of the tables, could have been. In a
     dense map most others do not matter.
@@ -211,7 +213,9 @@ def relevant(
         turned = max(turned, abs(se2.wrap_scalar(poses[n, 2] - middle[2])))
     apart = 0.5 * math.hypot(high_x - low_x, high_y - low_y)
     for k in range(len(antennas)):
-        m, antenna = packed.which[antennas[k]], packed.antennas[antennas[k]]
+        m, antenna, yaw = packed.which[antennas[k]], packed.antennas[antennas[k]], 2 * len(packed.reach)
+        yaws = parameters[:, yaw] + parameters[:, yaw + 1 + antennas[k]]
+        scattered = turned + np.abs(yaws - yaws[0]).max()
         x, y, c, s, _, _ = placed(packed, antennas[k], middle, offsets[k])
         lever = math.hypot(antenna[0], antenna[1]) + math.hypot(offsets[k, 0], offsets[k, 1])
         small, large = math.exp(-parameters[:, 2 * m].max()), math.exp(-parameters[:, 2 * m].min())
@@ -223,7 +227,7 @@ def relevant(
             elif near[t]:
                 ex, ey = points[t, 0] - x, points[t, 1] - y
                 distance = math.hypot(ex, ey)
-                radius = large * (apart + (lever + distance) * turned) + (large - unit) * distance
+                radius = large * (apart + (lever + distance) * scattered) + (large - unit) * distance
                 along, across = unit * (c * ex + s * ey), unit * (c * ey - s * ex)
                 level = levels[antennas[k], t]
                 out[k, t] = radius > SCATTERED or _largest(tables, level, along, across, radius) > least

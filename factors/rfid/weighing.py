@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid.index import MapTags, NearTags, Seen, near_tags
-from factors.rfid.kernels import FAST, MOST_CERTAIN, adjusted, reach_of
+from factors.rfid.index import MapTags, NearTags, Seen, delayed, near_tags
+from factors.rfid.kernels import FAST, reach_of
 from factors.rfid.model import LOGISTIC, NEGLIGIBLE_LOGIT, Packed
+from factors.rfid.parameters import MOST_CERTAIN, adjusted
 from factors.rfid.tables import CELL, NEGLIGIBLE, Measured, Tables, Tags, relevant, row_of
 from factors.se2 import Array, Integers
 
@@ -37,19 +38,21 @@ def log_likelihood(
     tempering: float,
     parameters: Array,
 ) -> Array:
-    """The tempered log-likelihood (N,) of what was ``seen`` of a map's tags, for poses (N, 3) with ``parameters`` (N or 1, 2 M) of
-    the detection models."""
-    looks = seen[:3]
+    """The tempered log-likelihood (N,) of what was ``seen`` of a map's tags, for poses (N, 3) with ``parameters`` (N or 1, Q)."""
+    first_row = adjusted(packed, parameters[0])
+    looks = delayed(seen[0], seen[8], first_row.delay), seen[1], seen[2]
     widest = parameters[0].copy()
     for n in range(1, len(parameters)):
         for i in range(len(widest)):
             widest[i] = max(widest[i], parameters[n, i])
     reach = reach_of(adjusted(packed, widest), looks[0])
+    if len(parameters) > 1:
+        poses = delayed(poses, seen[8], parameters[:, -1] - parameters[0, -1])
     near = near_tags(of_map, seen, poses, reach)
     tags, odds, elsewhere = _tabled(tables, near), near.odds, near.elsewhere
     near_enough = np.empty(len(odds), np.bool_)
     _near(poses, tags, reach, near_enough)
-    matters = relevant(packed, tables, poses, looks, parameters, tags, near_enough, tempering)
+    matters = relevant(first_row, tables, poses, looks, parameters, tags, near_enough, tempering)
     base = tempering * len(of_map.points) * _silence(packed, looks[2])
     none = packed.false_read + packed.span / (1.0 + math.exp(-NEGLIGIBLE_LOGIT))
     for t in range(len(odds)):
@@ -64,7 +67,7 @@ def log_likelihood(
         count = min(size, len(poses) - first)
         found = out[first : first + count]
         own_parameters = parameters[first : first + count] if len(parameters) > 1 else parameters
-        _place(packed, poses[first : first + count], looks, own_parameters, at, models)
+        _place(first_row, poses[first : first + count], looks, own_parameters, parameters[0], at, models)
         factors = 0
         for t in range(len(odds)):
             if not near_enough[t]:
@@ -102,8 +105,9 @@ def displaced(
     parameters: Array,
 ) -> tuple[Integers, Array, NDArray[np.bool_]]:
     """See :meth:`factors.rfid.detection.RfidLikelihood.displaced`."""
-    looks = seen[:3]
-    reach = margin + reach_of(adjusted(packed, parameters), looks[0])
+    placed = adjusted(packed, parameters)
+    looks = delayed(seen[0], seen[8], placed.delay), seen[1], seen[2]
+    reach = margin + reach_of(placed, looks[0])
     near = near_tags(of_map, seen, poses, reach)
     tags, heard = _tabled(tables, near), np.zeros(len(near.tags), np.bool_)
     for u in range(len(heard)):
@@ -124,7 +128,7 @@ def displaced(
         moved[i, 0], moved[i, 1], moved[i, 2] = pose[0] - shift[0], pose[1] - shift[1], pose[2]
     at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
     own, product, room = np.empty(size), np.empty(size), np.empty(size)
-    _place(packed, moved, looks, parameters.reshape(1, -1), at, models)
+    _place(placed, moved, looks, parameters.reshape(1, -1), parameters, at, models)
     matters = np.ones(len(looks[1]), np.bool_)
     for u in range(len(found)):
         _of_tag(packed, tables, at, models, size, looks, tags, found[u], matters, own, product, room)
@@ -183,11 +187,14 @@ def _near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) -> Non
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def _place(packed: Packed, poses: Array, looks: Measured, parameters: Array, at: Array, models: Array) -> None:
+def _place(
+    packed: Packed, poses: Array, looks: Measured, parameters: Array, placed: Array, at: Array, models: Array
+) -> None:
     """For each look ``at`` (K, 4, N): place of the antenna, cosine and sine of its heading; and for each of ``models`` (M, 2, N):
-    one over the scale of the range, and rate of the probabilities, at poses (N, 3) with ``parameters`` (N or 1, 2 M)."""
+    one over the scale of the range, and rate of the probabilities, at poses (N, 3) with ``parameters`` (N or 1, Q). ``placed``
+    (Q,): those of the mounting in ``packed``; others differ from it by half a radian at most."""
     offsets, antennas, _ = looks
-    cosine, sine = np.empty(len(poses)), np.empty(len(poses))
+    cosine, sine, yaw = np.empty(len(poses)), np.empty(len(poses)), 2 * len(models)
     for n in range(len(poses)):
         cosine[n], sine[n] = math.cos(poses[n, 2]), math.sin(poses[n, 2])
         row = n if len(parameters) > 1 else 0
@@ -205,6 +212,13 @@ def _place(packed: Packed, poses: Array, looks: Measured, parameters: Array, at:
         for n in range(len(poses)):
             x[n], y[n] = poses[n, 0] + cosine[n] * dx - sine[n] * dy, poses[n, 1] + sine[n] * dx + cosine[n] * dy
             c[n], s[n] = cosine[n] * c1 - sine[n] * s1, sine[n] * c1 + cosine[n] * s1
+        if len(parameters) == len(poses):
+            own, other = yaw + 1 + antennas[k], placed[yaw] + placed[yaw + 1 + antennas[k]]
+            for n in range(len(poses)):
+                d = parameters[n, yaw] + parameters[n, own] - other
+                c2 = 1.0 - d * d / 2.0 * (1.0 - d * d / 12.0)
+                s2 = d * (1.0 - d * d / 6.0 * (1.0 - d * d / 20.0))
+                c[n], s[n] = c2 * c[n] - s2 * s[n], s2 * c[n] + c2 * s[n]
 
 
 @compiled

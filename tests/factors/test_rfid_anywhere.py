@@ -63,7 +63,7 @@ FACING = bake(LOGISTIC, 6.0, 0.3, (-0.8, 0.0, 0.8), 5)
 )
 def test_models_that_are_adjusted_or_use_facings_are_looked_at_anywhere_as_well(detection, parameters):
     plain, looks, near, anywhere = scene((0.4, 1.2, 2.0), 0.7, detection)
-    likelihood = plain.adjusted(np.array(parameters))
+    likelihood = plain.adjusted(np.array((*parameters, *plain.parameters[2:])))
     poses = np.concatenate((near, anywhere))
     together = likelihood.log_likelihood(poses, looks)
     exact = -likelihood.score(poses, looks).nll
@@ -76,7 +76,7 @@ def test_tables_of_adjusted_models_are_few():
     plain, looks, _, anywhere = scene((1.2,))
     first = plain.log_likelihood(anywhere, looks)
     for shift in np.linspace(-1.0, 1.0, 9):
-        plain.adjusted(np.array((0.0, shift))).log_likelihood(anywhere, looks)
+        plain.adjusted(np.array((0.0, shift, *plain.parameters[2:]))).log_likelihood(anywhere, looks)
     assert len(plain._of_parameters) == 3
     tables = plain._places
     np.testing.assert_array_equal(plain.log_likelihood(anywhere, looks), first)

@@ -114,7 +114,8 @@ def test_what_is_left_out_of_many_tags_does_not_matter(tempering: float) -> None
     hits = (rng.random(chance.shape) < chance).astype(np.int64)
     looks = TagReadCounts(np.zeros((8, 3)), np.arange(8), np.ones(8, dtype=np.int64), hits, np.full(1500, -2.8))
     poses = truth + rng.normal(size=(300, 3)) * (0.3, 0.3, 0.1)
-    parameters = rng.normal(size=(300, 2)) * (0.02, 0.1)
+    parameters = np.zeros((300, len(likelihood.parameters)))
+    parameters[:, :2] = rng.normal(size=(300, 2)) * (0.02, 0.1)
     found = likelihood.log_likelihood(poses, looks, parameters)
     exact = np.array(
         [-likelihood.joint_score(pose, own, looks).nll[0] for pose, own in zip(poses, parameters, strict=True)]
@@ -125,7 +126,7 @@ def test_what_is_left_out_of_many_tags_does_not_matter(tempering: float) -> None
 
 def test_no_tables_of_places_are_made_for_a_single_pose() -> None:
     likelihood, looks = scene(BeamModel())
-    likelihood.adjusted(np.array((0.1, 0.3))).log_likelihood(POSE[None], looks.moved(np.zeros(3)))
+    likelihood.adjusted(0.1 + likelihood.parameters).log_likelihood(POSE[None], looks.moved(np.zeros(3)))
     assert not likelihood._of_parameters
 
 

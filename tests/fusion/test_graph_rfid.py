@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from short_logs import mounted_exactly
 
 from factorgraph_loc.evaluation.metrics import errors as evaluated
 from factorgraph_loc.evaluation.metrics import score
@@ -67,7 +68,7 @@ def test_a_silence_of_all_tags_is_no_place() -> None:
 def test_a_place_that_was_found_is_claimed_when_its_covariance_says_so(estimator: str, seed: int) -> None:
     """Among few tags one place is clear seconds before it is known to half a metre."""
     result = run(
-        simulate(preset("sparse", {"drive": {"duration": 17.0}}), seed),
+        mounted_exactly(simulate(preset("sparse", {"drive": {"duration": 17.0}}), seed)),
         RunConfig(estimator, prior="unknown", seed=seed),
     )
     found = next(t for t, what in result.diagnostics.events if what == "localized")

@@ -12,7 +12,7 @@ from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.measurement import columns_of
 from factorgraph_loc.sensors.odometry.measurement import YawRateStream
 from factorgraph_loc.sensors.odometry.settings import ImuSettings
-from factorgraph_loc.sensors.rfid.settings import PhaseSettings, RssiSettings
+from factorgraph_loc.sensors.rfid.settings import PhaseSettings, RfidUncertainty, RssiSettings
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation import simulate as simulate_office
 
@@ -39,6 +39,17 @@ def with_signals(log):
     phase = PhaseSettings(tempering=0.5, max_range=4.0)
     rfid = log.rig.rfid.model_copy(update={"phase": phase, "rssi": strength})
     return replace(log, rig=log.rig.model_copy(update={"rfid": rfid}))
+
+
+def mounted_exactly(log):
+    """The log with a rig that says that mounting and clock of the RFID reader are known exactly."""
+    exact = RfidUncertainty(yaw=0.0, antenna_yaw=0.0, time_offset=0.0)
+    return log if log.rig.rfid is None else with_reader(log, uncertainty=exact)
+
+
+def with_reader(log, **changes):
+    """The log with a rig of which the section of the RFID reader is another one."""
+    return replace(log, rig=log.rig.model_copy(update={"rfid": log.rig.rfid.model_copy(update=changes)}))
 
 
 def late(log, sensor):

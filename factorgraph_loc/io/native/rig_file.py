@@ -25,7 +25,11 @@ Drive = Literal["differential", "omnidirectional", "none"]
 AROUND, HEIGHT = 0.25, 1.0  # m: distance of antennas from the robot's centre, height of antennas and camera
 FIELD_OF_VIEW = math.radians(60.0)
 # reads of antennas that nobody has calibrated: five in a row count as one, and few are read from behind
-READS = {"tempering": 0.2, "models": {"default": {"kind": "beam", "behind": 0.05}}}
+READS = {
+    "tempering": 0.2,
+    "models": {"default": {"kind": "beam", "behind": 0.05}},
+    "uncertainty": {"yaw": 0.035, "antenna_yaw": 0.025, "time_offset": 0.04},
+}
 # standard deviations of the constants of wheels that nobody has calibrated
 UNCALIBRATED = {"scale_distance": 0.03, "scale_rotation": 0.05, "heading_drift": 0.03}
 

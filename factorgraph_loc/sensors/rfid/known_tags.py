@@ -35,6 +35,7 @@ CONFIRMED = (
     1.0  # s until a read counts as evidence on the state of its tag: a track that it contradicts may be doubted by then
 )
 WIDENED = 4.0  # times the standard deviations of the pose for what scans tell of tags: scans in a row have its error in common
+STANDING = np.zeros(3)  # velocity
 EXACT = 0.2  # a survey is exact if its sigma is below this share of `pass_sigma`
 
 
@@ -136,9 +137,9 @@ class KnownTags:
         self.likelihood = self.likelihood.tempered(new)
         return True
 
-    def looks(self, m: RfidScan, *, count: bool = True) -> TagReadCounts | None:
-        """Reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time. Without ``count``,
-        ignored reads are not counted, because the scan will be processed again."""
+    def looks(self, m: RfidScan, twist: Array = STANDING, *, count: bool = True) -> TagReadCounts | None:
+        """Reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time, with the robot's
+        velocity ``twist`` (3,). Without ``count``, ignored reads are not counted, because the scan will be processed again."""
         diagnostics = self._diagnostics if count else Diagnostics()
         if self.likelihood is None:
             diagnostics.ignore("rfid", len(m.antennas))
@@ -169,11 +170,12 @@ class KnownTags:
         # what is read of a tag that is believed to have moved tells nothing of an unknown pose
         elsewhere = np.where(hits.any(axis=0) & (odds <= 0.0), -np.inf, 0.0)
         prior = self.states.prior
-        return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere, tags, prior)
+        twists = np.tile(twist, (len(used), 1))
+        return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere, tags, prior, twists)
 
     def told(self, looks: TagReadCounts, pose: Array, covariance: Array, parameters: Array) -> TagEvidence:
         """What looks tell of the tags in reach at a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3); ``parameters``
-        (2 M,): the detection models as they are estimated to be."""
+        (Q,): those of the likelihood, as they are estimated to be."""
         assert self.likelihood is not None
         poses = sigma_poses(pose, WIDENED * math.sqrt(3.0) * positive.root(covariance))
         places = self.states.places, FARTHEST, parameters, self.states.odds

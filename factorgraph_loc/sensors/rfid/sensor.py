@@ -14,7 +14,7 @@ from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
 from factorgraph_loc.sensors.motion import Motion
-from factorgraph_loc.sensors.rfid.known_tags import KnownTags, TagEvidence, TagSignals, extent
+from factorgraph_loc.sensors.rfid.known_tags import STANDING, KnownTags, TagEvidence, TagSignals, extent
 from factorgraph_loc.sensors.rfid.monitor import (
     DURATION,
     KNOWN,
@@ -147,7 +147,9 @@ class TagSensor(Sensor):
         self._confirmed = -math.inf  # time [s] from which on a new track is believed, and models are learnt on it
 
     def observe(self, m: RfidScan, view: View) -> Iterator[TagObservation]:
-        looks, likelihood = self.tags.looks(m), self.tags.likelihood
+        is_late = "time_offset" in self.constants.names
+        twist = self._wheels.twist(m.t) if is_late and self._wheels is not None else STANDING
+        looks, likelihood = self.tags.looks(m, twist), self.tags.likelihood
         if looks is None or likelihood is None:
             return
         here = looks if view.offset is None else looks.moved(view.offset.delta)
@@ -227,7 +229,7 @@ class TagSensor(Sensor):
         return {name: value for name, value in found.items() if value is not None}
 
     def _estimated(self, view: View) -> Array:
-        """The parameters (2 M,) of the detection models as they are estimated to be."""
+        """The parameters (Q,) of the likelihood as they are estimated to be."""
         assert self.tags.likelihood is not None
         out = self.tags.likelihood.parameters.copy()
         for value in self._values(view).values():

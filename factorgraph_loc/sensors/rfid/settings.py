@@ -17,8 +17,8 @@ from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, inside, 
 from factorgraph_loc.model.settings import Estimated, SensorSettings
 from factorgraph_loc.text import listed, quoted
 from factors import se2
-from factors.rfid.kernels import PARAMETERS
 from factors.rfid.model import Antenna, BeamModel, DetectionModel, GridModel, LogisticModel, RfidModel
+from factors.rfid.parameters import OF_MODEL
 from factors.rfid.signals import PhaseModel, RssiModel
 from factors.se2 import Array
 
@@ -29,13 +29,28 @@ Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 
 
 class PriorSettings(FileModel):
-    """How well a detection model is known, as standard deviations (:mod:`factors.rfid.kernels`); what is above 0 is learnt on
+    """How well a detection model is known, as standard deviations (:mod:`factors.rfid.parameters`); what is above 0 is learnt on
     the way by every estimator that uses tags."""
 
     range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
     """standard deviation of the logarithm of a factor of its range"""
     read_rate: Annotated[float, Field(ge=0.0, le=3.0)] = 0.5
     """standard deviation of the logit of its largest probability"""
+
+
+class RfidUncertainty(FileModel):
+    """Standard deviations of mounting and clock; those above 0 are estimated. Those that are not given are in proportion to the
+    largest `prior.range_scale` of the models: a calibration of these is one of the mounting, too."""
+
+    yaw: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] | None = None
+    """standard deviation of the yaw of all antennas in common; by default 0.35 times range_scale"""
+    antenna_yaw: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] | None = None
+    """standard deviation of the yaw of each antenna in addition, where there are several; by default 0.25 times range_scale"""
+    time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] | None = None
+    """standard deviation of the time offset; by default 0.4 times range_scale"""
+
+
+BY_RANGE = {"yaw": 0.35, "antenna_yaw": 0.25, "time_offset": 0.4}  # rad, rad, s for a `range_scale` of 1
 
 
 class BeamSettings(FileModel):
@@ -207,6 +222,8 @@ class RfidSettings(SensorSettings):
     """prior share of broken, hidden or missing tags of a map"""
     moved_tags: Share = 0.03
     """prior share of tags that are half a metre or more from where the map has them"""
+    uncertainty: RfidUncertainty = Field(default_factory=RfidUncertainty)
+    """standard deviations of the antennas' yaw and of the time offset"""
     rssi: RssiSettings | None = None
     """model of the strength of a read, for the sensor rssi"""
     phase: PhaseSettings | None = None
@@ -238,17 +255,25 @@ class RfidSettings(SensorSettings):
                 write_grid(model.model(), folder / model.file)
 
     def estimated(self) -> Estimated:
-        """The parameters of the models of the antennas that are not known exactly, among those of all models."""
-        used = self.parameter_names()
-        names = [used[model][i] if model in used else "" for model in self.models for i in range(len(PARAMETERS))]
-        sigmas = [getattr(m.prior, name) * (k in used) for k, m in self.models.items() for name in PARAMETERS]
+        """The parameters of the likelihood (:mod:`factors.rfid.parameters`) that are not known exactly."""
+        used, known, antennas = self.parameter_names(), self.uncertainties(), list(self.all_antennas())
+        names = [used[model][i] if model in used else "" for model in self.models for i in range(len(OF_MODEL))]
+        sigmas = [getattr(m.prior, name) * (k in used) for k, m in self.models.items() for name in OF_MODEL]
+        names += ["yaw", *(f"antennas.{antenna}.yaw" for antenna in antennas), "time_offset"]
+        sigmas += [known["yaw"], *(known["antenna_yaw"] * (len(antennas) > 1) for _ in antennas), known["time_offset"]]
         return Estimated.among(names, np.array(sigmas))
+
+    def uncertainties(self) -> dict[str, float]:
+        """The standard deviations of mounting and clock, given or by default."""
+        largest = max(self.models[antenna.model].prior.range_scale for antenna in self.all_antennas().values())
+        given = self.uncertainty.model_dump(exclude_none=True)
+        return {name: share * largest for name, share in BY_RANGE.items()} | given
 
     def parameter_names(self) -> dict[str, tuple[str, ...]]:
         """The names of the parameters of each model that an antenna has; with the model's name where there are several."""
         used = {antenna.model for antenna in self.all_antennas().values()}
         prefixes = {model: "" if len(used) == 1 else f"{model}." for model in self.models if model in used}
-        return {model: tuple(prefix + name for name in PARAMETERS) for model, prefix in prefixes.items()}
+        return {model: tuple(prefix + name for name in OF_MODEL) for model, prefix in prefixes.items()}
 
     def model(self) -> RfidModel:
         """The model of all antennas, in the order of :meth:`all_antennas`. InputError if a grid cannot be read."""

@@ -18,7 +18,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import Reliability
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.interfaces import Ending, Marks, Paragraph, Review, Summary, Use
+from factorgraph_loc.sensors.interfaces import Ending, Marks, Paragraph, Review, Summary, Use, line
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.monitor import BAND, BLOCK, DIFFERENT, FEWEST, POSSIBLE, ReadGroups
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
@@ -26,8 +26,8 @@ from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, possible_poses
 from factorgraph_loc.text import listed, quoted
 from factors.rfid.detection import ExpectedReads, RfidLikelihood
-from factors.rfid.kernels import MOST_CERTAIN, rate_of
-from factors.se2 import Array, Integers, transform_from
+from factors.rfid.parameters import MOST_CERTAIN, rate_of
+from factors.se2 import Array, Integers, transform_from, wrap_scalar
 
 STOPPED = 10.0  # s; an antenna without rounds for longer before the end has stopped
 CLOCK_STEP = 1.0  # s
@@ -173,6 +173,7 @@ def _clock_trouble(log: Log, found: RfidSummary) -> list[str]:
 
 CLEARLY = 3.0  # standard deviations
 CHANGED = 0.1  # of a range or of a probability: less is nothing to warn of
+TURNED, LATE = math.radians(3.0), 0.05  # rad, s: likewise of the yaw of an antenna, and of a time offset
 
 
 def review(use: Use, ending: Ending) -> Review:
@@ -202,7 +203,7 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
             yield f"{log.name}: {len(suspects)} of {len(tags)} tags of the map {why}: {suspected(suspects)}"
     settings = log.rig.find(RfidSettings)
     if settings is not None:
-        yield from (f"{log.name}: {line}" for line in _differences(settings, learnt))
+        yield from (f"{log.name}: {what}" for what in _differences(settings, learnt))
 
 
 def suspected(tags: Mapping[str, float]) -> str:
@@ -226,6 +227,25 @@ def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
         found = peak * rate_of(peak, rate[0])
         if abs(rate[0]) > CLEARLY * rate[1] and abs(found - peak) > CHANGED:
             yield f"{of} read {100.0 * found:.0f} % of the tags next to them, where the rig says {100.0 * peak:.0f} %"
+    yield from _mounting(settings, learnt)
+
+
+def _mounting(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
+    """The yaw of antennas and the time offset that were estimated and are clearly not what the rig says, with the lines for it."""
+    common, turned = learnt.values.get("rfid.yaw", (0.0, 0.0)), dict[str, float]()
+    for name in settings.all_antennas():
+        own = learnt.values.get(f"rfid.antennas.{name}.yaw", (0.0, 0.0))
+        turn = common[0] + own[0]
+        if abs(turn) > max(CLEARLY * math.hypot(common[1], own[1]), TURNED):
+            turned[name] = turn
+    if turned:
+        told = ", ".join(f"{name} by {math.degrees(turn):+.1f} degrees" for name, turn in turned.items())
+        yaws = {name: wrap_scalar(settings.all_antennas()[name].yaw + turn) for name, turn in turned.items()}
+        lines = ", ".join(f"rfid.antennas.{name}.yaw = {yaw:.3f}" for name, yaw in yaws.items())
+        yield f"antennas are turned from the yaw in the rig ({told}): set {lines} in the rig"
+    later, sigma = learnt.values.get("rfid.time_offset", (0.0, 0.0))
+    if abs(later) > max(CLEARLY * sigma, LATE):
+        yield line("rfid", -later, "the odometry", "rfid", settings.time_offset + later)
 
 
 def _percent(probability: float) -> str:
@@ -280,7 +300,7 @@ def _looks(
     found = np.array([learnt.values.get(f"rfid.{name}", (0.0, 0.0))[0] for name in estimated.names])
     likelihood = likelihood.adjusted(estimated.full(found, len(likelihood.parameters)))
     first, inverse = np.unique(np.rec.fromarrays((stream.t, stream.round)), return_index=True, return_inverse=True)[1:]
-    t = stream.t[first] + log.rig.time_offset("rfid")
+    t = stream.t[first] + log.rig.time_offset("rfid") + likelihood.packed.delay[0]
     block = ((t - t.min()) // BLOCK).astype(np.int64)
     read = np.array([epc in tags.index for epc in stream.epc], dtype=bool)
     heard = np.zeros(int(block.max()) + 1, dtype=bool)

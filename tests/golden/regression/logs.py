@@ -109,6 +109,14 @@ def tags(faults: Mapping[str, Any]) -> Log:
     return simulate(preset("office", {"drive": {"duration": 14.0}, "world": {"tags": 20}, "faults": faults}), 2)
 
 
+def tags_of_turned_antennas() -> Log:
+    """The rig says that all antennas are turned by 0.15 rad, and that stamps are 0.1 s earlier, than is true."""
+    log = simulate(preset("office", {"drive": {"duration": 30.0}}), 2)
+    assert log.rig.rfid is not None
+    antennas = {k: a.model_copy(update={"yaw": a.yaw - 0.15}) for k, a in log.rig.rfid.all_antennas().items()}
+    return short_logs.with_reader(log, preset=None, antennas=antennas, time_offset=0.1)
+
+
 def tags_kidnapped() -> Log:
     log = simulate(preset("office", {"drive": {"duration": 60.0}}), 1)
     return join(cut(log, 0.0, 6.0), cut(log, 50.0, 60.0))

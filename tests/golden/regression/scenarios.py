@@ -51,7 +51,8 @@ UNKNOWN = {"landmarks": "unknown"}
 class Scenario:
     """A log, made when it is needed, and the ``labels`` of what is run on it; ``settings`` go over those of :data:`RUNS`.
 
-    ``data``: the name of the recorded log that it is from, if any.
+    ``data``: the name of the recorded log that it is from, if any; ``mounted``: whether the rig says that mounting and clock of
+    the RFID reader are known exactly.
     """
 
     log: Callable[[], Log]
@@ -60,13 +61,14 @@ class Scenario:
     prior: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     data: str | None = None
+    mounted: bool = True
 
     def cases(self) -> tuple[str, ...]:
         return (LOG, *self.labels)
 
     def record(self, label: str) -> Record:
         """Run one case."""
-        log = _made(self.log)
+        log = short_logs.mounted_exactly(_made(self.log)) if self.mounted else _made(self.log)
         if label == LOG:
             return record_log(log)
         estimator, settings = RUNS[label]
@@ -144,6 +146,9 @@ SCENARIOS: Mapping[str, Scenario | ActiveScenario] = {
     "landmarks-depths": Scenario(partial(logs.landmarks_miscalibrated, depth=True), FINDERS),
     "plaza-ranges": Scenario(short_logs.plaza, (*ON_FLOOR, LAG)),
     "tags": Scenario(short_logs.office, (*READERS, LAG, "particle_filter_kld", "ekf"), TAGS),
+    "tags-turned": Scenario(
+        logs.tags_of_turned_antennas, ("ekf", "particle_filter", "smoother", "batch"), mounted=False
+    ),
     "tags-strength": Scenario(short_logs.office, READERS, (*TAGS, "rssi")),
     "tags-phase": Scenario(short_logs.office, (*READERS, LAG), (*TAGS, "phase")),
     "tags-landmarks": Scenario(

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from short_logs import mounted_exactly
 
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -16,7 +17,8 @@ from factorgraph_loc.simulation import preset, simulate
 @cache
 def office(seed: int, misplaced: float) -> Log:
     """Two minutes, with some tags 1 m off in the map."""
-    return simulate(preset("office", {"drive": {"duration": 120.0}, "faults": {"misplaced": misplaced}}), seed)
+    changes = {"drive": {"duration": 120.0}, "faults": {"misplaced": misplaced}}
+    return mounted_exactly(simulate(preset("office", changes), seed))
 
 
 def truth(seed: int, misplaced: float) -> Log:

@@ -1,4 +1,4 @@
-"""Antennas that are not as the rig says: each estimator learns their range and read probability on the way."""
+"""Antennas that are not as the rig says: each estimator learns range, read probability, yaw and time offset on the way."""
 
 import re
 from dataclasses import replace
@@ -10,8 +10,15 @@ import pytest
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.rfid.settings import AntennaSettings, BeamSettings, PriorSettings, RfidSettings
+from factorgraph_loc.sensors.rfid.settings import (
+    AntennaSettings,
+    BeamSettings,
+    PriorSettings,
+    RfidSettings,
+    RfidUncertainty,
+)
 from factorgraph_loc.simulation import preset, simulate
+from factors import se2
 
 ESTIMATORS = ("ekf", "smoother", "particle_filter")
 EXACT = PriorSettings(range_scale=0.0, read_rate=0.0)
@@ -71,6 +78,32 @@ def test_a_read_probability_that_is_too_low_is_found(estimator):
     assert any("of the tags next to them, where the rig says 50 %" in line for line in result.warnings)
 
 
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_antennas_that_are_turned_and_a_late_clock_are_found(estimator):
+    log, turn = office(), np.radians(10.0)
+    rfid = log.rig.of(RfidSettings)
+    turned = {
+        name: a.model_copy(update={"yaw": se2.wrap_scalar(a.yaw + turn)}) for name, a in rfid.all_antennas().items()
+    }
+    changes = {
+        "preset": None,
+        "antennas": turned,
+        "time_offset": 0.15,
+        "uncertainty": RfidUncertainty(yaw=0.1, time_offset=0.2),
+    }
+    wrong = replace(log, rig=log.rig.model_copy(update={"rfid": rfid.model_copy(update=changes)}))
+    result, found = outcome(wrong, estimator)
+    _, best = exact(estimator)
+    assert found["causal.position_rmse"] < 1.35 * best["causal.position_rmse"]
+    assert found["causal.anees"] < 5.0
+    learnt = result.learnt.values
+    yaws = [learnt["rfid.yaw"][0] + learnt[f"rfid.antennas.{name}.yaw"][0] for name in turned]
+    assert np.mean(yaws) == pytest.approx(-turn, abs=np.radians(2.5))
+    assert learnt["rfid.time_offset"][0] == pytest.approx(-0.15, abs=0.05)
+    assert any("rfid.antennas.3.yaw = 1.5" in line or "rfid.antennas.3.yaw = 1.6" in line for line in result.warnings)
+    assert any("later than the odometry: set rfid.time_offset" in line for line in result.warnings)
+
+
 def test_what_is_known_exactly_is_not_learnt():
     result, _ = exact("smoother")
     assert not [name for name in result.learnt.values if name.startswith("rfid")]
@@ -93,6 +126,7 @@ def test_parameters_are_named_after_their_models_where_antennas_have_several():
     )
     assert several.estimated().names == (
         *("default.range_scale", "default.read_rate", "narrow.range_scale", "narrow.read_rate"),
+        *("yaw", "antennas.a.yaw", "antennas.b.yaw", "time_offset"),
     )
-    assert one.estimated().names == ("range_scale", "read_rate")
-    assert one.estimated().indices == (0, 1)
+    assert one.estimated().names == ("range_scale", "read_rate", "yaw", "time_offset")
+    assert one.estimated().indices == (0, 1, 6, 8)

@@ -40,6 +40,7 @@ from factorgraph_loc.sensors.rfid.settings import (
     PhaseSettings,
     PriorSettings,
     RfidSettings,
+    RfidUncertainty,
     SurveySettings,
     write_grid,
 )
@@ -47,8 +48,8 @@ from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, Traced, pooled, possible_poses
 from factorgraph_loc.text import quoted
 from factors import se2
-from factors.rfid.kernels import PARAMETERS
 from factors.rfid.model import FEATURES, BeamModel, DetectionModel, GridModel, LogisticModel, logits
+from factors.rfid.parameters import OF_MODEL
 from factors.se2 import Array
 
 DEFAULT = "default"
@@ -140,6 +141,7 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
     tempering = 1.0 / together if together > BURSTS and together * before > 1.0 else before
     constants.append(FittedConstant("rfid", "tempering", before, tempering, max(error / together**2, 1e-4)))
     changes = {"models": models, "false_read": floor.false_read, "miss": floor.miss, "tempering": tempering}
+    changes["uncertainty"] = RfidUncertainty(**started.uncertainties())  # nothing was learnt of mounting and clock
     return SensorKnowledge({"rfid": settings.model_copy(update=changes)}, constants, notes)
 
 
@@ -169,7 +171,7 @@ def _refitted(
 def _prior(traced: Sequence[Traced], labels: Sequence[str]) -> PriorSettings:
     """The scatter between logs of the range and rate that the smoother estimated, by their ``labels``."""
     spreads = {}
-    for kind, label in zip(PARAMETERS, labels, strict=True):
+    for kind, label in zip(OF_MODEL, labels, strict=True):
         told = [one.constants[f"rfid.{label}"] for one in traced if one.constants and f"rfid.{label}" in one.constants]
         if len(told) == len(traced):
             spreads[kind] = min(pooled(told, getattr(CALIBRATED, kind)).spread, 1.0)
@@ -303,6 +305,7 @@ def _with_models(
             "antennas": antennas,
             "preset": None,
             "models": models_of,
+            "uncertainty": RfidUncertainty(),  # as well as the models
             "false_read": floor.false_read,
             "miss": floor.miss,
         }

@@ -22,8 +22,8 @@ from factorgraph_loc.sensors.rfid.calibration.pairs import REACH, Floor, TagPair
 from factorgraph_loc.sensors.rfid.calibration.rounds import Integers, Rounds
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings, SurveySettings
 from factors import se2
-from factors.rfid.kernels import MOST_CERTAIN, PARAMETERS, rate_of
 from factors.rfid.model import FEATURES, NEAR, BeamModel, DetectionModel, GridModel, LogisticModel, logits
+from factors.rfid.parameters import MOST_CERTAIN, OF_MODEL, rate_of
 from factors.se2 import Array
 
 FACING = tuple(i for i, name in enumerate(FEATURES) if "c" in name)
@@ -113,7 +113,7 @@ def beam(start: BeamModel) -> Family:
 
 
 def scaled(start: GridModel) -> Family:
-    """Grids with the shape of ``start`` and another range and rate: see :mod:`factors.rfid.kernels`."""
+    """Grids with the shape of ``start`` and another range and rate: see :mod:`factors.rfid.parameters`."""
     peak = min(start.peak, MOST_CERTAIN)
 
     def built(values: Array) -> GridModel:
@@ -122,7 +122,7 @@ def scaled(start: GridModel) -> Family:
         cells = {name: factor * getattr(start, name) for name in ("x0", "y0", "cell")}
         return replace(start, logits=np.log(p / (1.0 - p)), **cells)
 
-    parameters = tuple(Parameter(name, 0.0, 0.5, -2.0, 2.0) for name in PARAMETERS)
+    parameters = tuple(Parameter(name, 0.0, 0.5, -2.0, 2.0) for name in OF_MODEL)
     return Family(parameters, built, lambda values: (values, np.ones(2)))
 
 

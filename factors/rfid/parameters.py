@@ -1,0 +1,58 @@
+"""The parameters of the likelihood of reads: what differs between installations.
+
+Two belong to each detection model (power, cables, kinds of tags). With ``a``, the logarithm of a factor of the range, and ``b``, a
+shift of the logit of the largest read probability ``peak``, the model's ``p(x, y, z)`` of a tag in the antenna's frame becomes
+
+    rate * p(x / scale, y / scale, z),    scale = exp(a),    rate = sigmoid(logit(peak) + b) / peak,
+
+which for a beam is another ``r_max`` (with its ``s_r`` in proportion) and another ``p0``. The parameters of M models and A antennas
+are a vector (Q,), Q = 2 M + A + 2: ``a`` and ``b`` of each model; the common change of yaw [rad] of all antennas; the additional
+change of yaw of each antenna; and the time offset [s], which is added to the stamps. Zeros change nothing.
+"""
+
+import math
+
+import numpy as np
+
+from factors.compiled import compiled
+from factors.rfid.model import Packed
+from factors.se2 import Array
+
+OF_MODEL = ("range_scale", "read_rate")  # of each detection model
+MOST_CERTAIN = 0.99  # limit of the peak of a model: a larger one would leave the rate nothing to change
+
+
+@compiled
+def rate_of(peak: float, shift: float) -> float:
+    """The factor of the probabilities of a model with largest probability ``peak``, whose logit shifts by ``shift``."""
+    certain = min(peak, MOST_CERTAIN)
+    return float(1.0 / (certain + (1.0 - certain) * math.exp(-shift)))
+
+
+@compiled
+def adjusted(packed: Packed, parameters: Array) -> Packed:
+    """The models with these parameters; ``packed``: the models without adjustment."""
+    models, antennas = len(packed.reach), packed.antennas.copy()
+    scale, reach, rate = np.empty(models), np.empty(models), np.empty(models)
+    for m in range(models):
+        scale[m] = math.exp(parameters[2 * m])
+        reach[m] = packed.reach[m] * scale[m]
+        rate[m] = rate_of(packed.peak[m], parameters[2 * m + 1])
+    for row, turn in zip(antennas, parameters[2 * models + 1 :]):  # noqa: B905 - compiled
+        c, s = math.cos(parameters[2 * models] + turn), math.sin(parameters[2 * models] + turn)
+        row[3], row[4] = c * row[3] - s * row[4], s * row[3] + c * row[4]
+    return Packed(
+        antennas,
+        packed.which,
+        packed.kinds,
+        packed.parameters,
+        packed.shapes,
+        packed.knots,
+        reach,
+        packed.false_read,
+        packed.span,
+        scale,
+        rate,
+        packed.peak,
+        parameters[-1:].copy(),
+    )
