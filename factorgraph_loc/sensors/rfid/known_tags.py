@@ -121,12 +121,19 @@ class KnownTags:
             self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
         dead, moved = (0.0, 0.0) if settings is None else (settings.dead_tags, settings.moved_tags)
         self.states = TagStates(len(self.map.names), dead, moved)
+        self._excluded: set[int | None] = set()  # antennas that are dead
         self._waiting: deque[tuple[float, Integers, Array]] = deque()  # what reads told since `CONFIRMED` ago
 
     @property
     def antennas(self) -> Sequence[str]:
         """The names of the rig's antennas."""
         return list(self._antennas)
+
+    def exclude(self, antenna: int) -> str:
+        """Ignore the rounds of an antenna, which is dead, until it reads a tag; returns its name."""
+        self._excluded.add(antenna)
+        self._rounds = {}
+        return self.antennas[antenna]
 
     def temper(self, tempering: float) -> bool:
         """Use this exponent of the likelihood where it is less than that of the rig; whether it is another one."""
@@ -144,9 +151,17 @@ class KnownTags:
         if self.likelihood is None:
             diagnostics.ignore("rfid", len(m.antennas))
             return None
+        if self._excluded:
+            heard = {self._antennas.get(m.antennas[i]) for i in set(m.antenna.tolist())}
+            if not self._excluded.isdisjoint(heard):
+                self._excluded, self._rounds = self._excluded - heard, {}
         rows, used, rounds = self._listening(m.antennas)
         if -1 in rows:
-            diagnostics.ignore("antenna that the rig lacks", rows.count(-1))
+            lacking = sum(name not in self._antennas for name in m.antennas)
+            if lacking:
+                diagnostics.ignore("antenna that the rig lacks", lacking)
+            if rows.count(-1) > lacking:
+                diagnostics.ignore("dead antenna", rows.count(-1) - lacking)
         if not len(used) or not self.map.names:
             return None
         reads: list[tuple[int, int]] = []
@@ -216,6 +231,7 @@ class KnownTags:
         consecutive scans have the same antennas."""
         if names not in self._rounds:
             antennas = [self._antennas.get(name, -1) for name in names]
+            antennas = [-1 if antenna in self._excluded else antenna for antenna in antennas]
             used = sorted(set(antennas) - {-1})
             rows = [used.index(antenna) if antenna >= 0 else -1 for antenna in antennas]
             counts = [antennas.count(antenna) for antenna in used]

@@ -201,6 +201,7 @@ DIFFERENT = 0.15  # share of the predicted reads by which a model that is doubte
 TINY = 1e-9  # reads: none of them has no logarithm
 WINDOW = 15.0  # s in which what was counted comes to count for 1 / e
 DOUBTED, TRUSTED = 1e-5, 1e-3  # probability of such counts with a right model at which doubts begin, and end
+MANY, NEARLY_NONE = 12.0, 0.05  # predicted reads of an antenna that may be dead, and the share of these that it reads
 KNOWN = BAND / 4.0  # m: standard deviation of the position up to which a scan tells of the model
 
 
@@ -293,12 +294,17 @@ class ConsistencyMonitor:
         told = self._groups.told()
         return self._groups.shares(told if len(told) else self._groups.told(1.0))
 
+    def dead_antennas(self, together: float) -> list[int]:
+        """The antennas that read nothing, or nearly so, although :data:`MANY` independent reads were predicted of each."""
+        observed, predicted, _ = self._groups.sums[:, BANDS:]
+        return np.flatnonzero((predicted > MANY * together) & (observed < NEARLY_NONE * predicted)).tolist()
+
     def accept(self) -> None:
         """Accept the pose: the model is wrong instead."""
         self.suspicious_since = None
 
     def clear(self) -> None:
-        """Forget everything: the track was wrong."""
+        """Forget everything: the track was wrong, or the model changes."""
         self._groups.sums[:] = 0.0
         self.doubted, self._odd_since = False, None
         self.accept()

@@ -220,6 +220,10 @@ class TagSensor(Sensor):
             together = 1.0 / self.tags.likelihood.model.tempering
             doubted = self._consistency.doubted
             self._consistency.add(t, looks, reads, counts, together)
+            for antenna in self._consistency.dead_antennas(together):
+                name = self.tags.exclude(antenna)
+                self._diagnostics.event(t, f"antenna {name} reads no tag where it should: it is ignored until it does")
+                self._consistency.clear()
             if self._consistency.doubted and not doubted:
                 self._diagnostics.event(t, f"{ConsistencyMonitor.EVENT}: {self._consistency.shares}")
 

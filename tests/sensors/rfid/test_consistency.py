@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.monitor import ConsistencyMonitor
@@ -127,3 +128,20 @@ def test_antennas_that_are_not_as_the_rig_says_are_a_doubted_model_not_a_doubted
             assert np.mean(doubts) > 0.9
             assert np.mean(status == "localized") > 0.5
             assert "m: 0." in events[0]
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "smoother"])
+def test_a_dead_antenna_is_named_and_ignored(estimator):
+    """Its rounds go on without reads; the pose is that of a rig without this antenna, but for the first seconds."""
+    log = office()
+    stream = log.streams["rfid"]
+    tags = ["" if antenna == "3" else tag for antenna, tag in zip(stream.antenna, stream.epc, strict=True)]
+    silent = replace(stream, epc=tags)
+    right, found = (
+        run(one, RunConfig(estimator)) for one in (log, replace(log, streams={**log.streams, "rfid": silent}))
+    )
+    (named,) = [text for _, text in found.diagnostics.events if "antenna" in text]
+    assert "antenna 3" in named
+    assert set(np.array(found.status)[found.t > 10.0]) == {"localized"}
+    errors = [score(one, log)["causal.position_rmse"] for one in (right, found)]
+    assert errors[1] < 1.3 * errors[0]
