@@ -28,7 +28,6 @@ from factors.se2 import Array
 # m, rad, s: over which the error of a constant accumulates before other sensors correct it
 WAY, TURN, TIME = 4.0, 4.0, 8.0
 HORIZON = 5.0  # s of odometry that are kept
-TWIST_TIME = 0.1  # s over which the velocity is averaged
 
 
 def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool = False) -> OdometryModel:
@@ -135,11 +134,6 @@ class Motion(OdometryChain):
     def slip(self, increment: Increment) -> tuple[Array, float]:
         """The additional covariance (3, 3) of an increment if wheels slip, and minus the log-probability of that."""
         return slip(self.model, increment, use_gyro=self._use_gyro)
-
-    def twist(self, t: float) -> Array:
-        """The robot's velocity (3,) just before ``t``, in the robot frame."""
-        moved = self.relative(self.state(t - TWIST_TIME), self.state(t))
-        return np.asarray(se2.log(moved.delta) / TWIST_TIME)
 
 
 def whole_motion(log: Log, sensors: Sequence[str]) -> Motion:

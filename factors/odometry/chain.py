@@ -45,6 +45,8 @@ from factors.odometry.kernels import State, carried, predicted, recalibrated, re
 from factors.odometry.model import OdometryModel, composed
 from factors.se2 import Array, Integers, body_to_world_one, compose_scalars
 
+TWIST_TIME = 0.1  # s over which a velocity is averaged
+
 
 class OdometryChain:
     """The integrated odometry of a run, as a chain of knots in its own frame.
@@ -155,6 +157,12 @@ class OdometryChain:
         end, delta, covariance, duration, still = travelled(*known, tuple(start), t)
         return ChainState(*end), Increment(delta, covariance, duration, still)
 
+    def twist(self, t: float) -> Array:
+        """The robot's velocity (3,) just before ``t``, in the robot frame."""
+        if t - TWIST_TIME < self.begin:
+            raise ValueError(f"the motion at {t:.3f} s was asked for, but only that from {self.begin:.3f} s on is kept")
+        return np.array(twist_at(self._knots, self._count, self._constants, t))
+
     def predicted(
         self,
         start: ChainState,
@@ -261,6 +269,15 @@ def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
     k = np.empty(KNOT)
     move(knots[i], t - knots[i, T], constants[LAG], constants[HOLD], constants[SLIPPING], k)
     return t, k[X], k[Y], k[HEADING], k[PATH], k[TURN], k[UNKNOWN], k[STILL]
+
+
+@compiled
+def twist_at(knots: Array, count: int, constants: Array, t: float) -> tuple[float, float, float]:
+    """See :meth:`OdometryChain.twist`."""
+    a, b = state_at(knots, count, t - TWIST_TIME, constants), state_at(knots, count, t, constants)
+    moved = se2.between_scalars(a[1], a[2], a[3], b[1], b[2], b[3])
+    x, y, turned = se2.log_scalars(moved[0], moved[1], moved[2])
+    return x / TWIST_TIME, y / TWIST_TIME, turned / TWIST_TIME
 
 
 @compiled
