@@ -26,7 +26,8 @@ from factors.update import Correction
 WINDOW = 3.0  # s of observations that are compared
 ONSETS = (0.75, 1.5, 3.0)  # s ago, when the wheels may have begun to slip, or to hold again
 SHARES = (0.0, 0.33, 0.67, 1.5)  # of the way that the odometry reports
-SURPRISING, ENOUGH = 1.0, 2  # standard deviations of a surprising innovation; how many of these start a comparison
+SURPRISING = 2.0  # standard deviations of the sum of surprises that starts a comparison
+ENOUGH = 2  # observations, of which more are compared
 STILL, SPEED = 0.05, 0.5  # m: a way that wheels at rest report; m/s: of a robot that is carried
 _ANGLES = np.arange(8) * math.pi / 4.0
 # velocities (9, 3) of a robot whose wheels are at rest: none, or carried in some direction
@@ -65,7 +66,9 @@ class SlipMonitor:
     def __init__(self, motion: Motion, diagnostics: Diagnostics) -> None:
         self._motion, self._diagnostics = motion, diagnostics
         self._rows: deque[_Compared] = deque()
-        self._surprises: deque[float] = deque()  # times of surprising observations
+        self._surprises: deque[tuple[float, float]] = deque(
+            maxlen=100
+        )  # times and surprises of the newest observations
         self._compared = -math.inf  # time
 
     def add(
@@ -85,28 +88,32 @@ class SlipMonitor:
                 if min(self._log_odds(t - ago)[0] for ago in ONSETS) < -HOLDS:
                     self._motion.end_slip()
                     self._rows.clear()
-        elif surprise(correction) > SURPRISING:
-            self._surprises.append(t)
-            while not t - WINDOW <= self._surprises[0] <= t:
-                self._surprises.popleft()
-            if len(self._surprises) >= ENOUGH:
-                odds, onset = max(self._log_odds(t - ago) for ago in ONSETS)
-                if odds > RARE:
-                    self._diagnostics.event(
-                        t, f"the odometry contradicts the observations since {onset:.1f} s: the motion is not known"
-                    )
-                    self._motion.begin_slip(onset)
-                    self._surprises.clear()
-                    self._compared = t
+            return
+        surprised = surprise(correction)
+        self._surprises.append((t, surprised))
+        if surprised > 1.0 and self._are_surprising(t):
+            odds, onset = max(self._log_odds(t - ago) for ago in ONSETS)
+            if odds > RARE:
+                self._diagnostics.event(
+                    t, f"the odometry contradicts the observations since {onset:.1f} s: the motion is not known"
+                )
+                self._motion.begin_slip(onset)
+                self._surprises.clear()
+                self._compared = t
+
+    def _are_surprising(self, t: float) -> bool:
+        """Whether the newest observations together are more surprising than chance allows."""
+        while not t - WINDOW / 2.0 <= self._surprises[0][0] <= t:
+            self._surprises.popleft()
+        return sum(one for _, one in self._surprises) > SURPRISING * math.sqrt(len(self._surprises))
 
     def _log_odds(self, begin: float) -> tuple[float, float]:
         """The log-odds that the odometry is wrong since the first observation after ``begin`` that is not surprising, and its time.
         The odds are zero if the pose is not known well enough there."""
         rows = [row for row in self._rows if row.odometry.t >= begin]
-        while rows and surprise(rows[0].correction) > SURPRISING:
+        while rows and surprise(rows[0].correction) > 1.0:
             del rows[0]
-        seen = [one for row in rows if (one := row.observed()) is not None]
-        if not ENOUGH < len(rows) == len(seen):
+        if len(rows) <= ENOUGH:
             return 0.0, begin
         states = np.array([row.odometry for row in rows])[:, 1:4]
         ways, start = se2.log(se2.between(states[0], states)), rows[0].corrected()
@@ -119,10 +126,13 @@ class SlipMonitor:
             poses = se2.compose(start, se2.exp(np.array((1.0, *SHARES))[:, None, None] * ways))
         if length < CLEAR * math.sqrt(np.trace(rows[0].correction.covariance[:2, :2])):
             return 0.0, begin
+        seen = [one for row in rows if (one := row.observed()) is not None]
+        if len(seen) < len(rows):
+            return 0.0, begin
         by_share = np.array([one.log_likelihood(poses[:, i], {}) for i, one in enumerate(seen[1:], 1)])
         holds, slips = by_share[:, :1], by_share[:, 1:]
         odds = np.minimum(slips - holds, MOST).sum(axis=0)
-        if not self._motion.is_slipping:  # else the track follows the observations
+        if odds.max() > RARE and not self._motion.is_slipping:  # else the track follows the observations
             track = np.array([row.fit(one) for row, one in zip(rows[1:], seen[1:], strict=True)])
             odds = np.minimum(odds, np.minimum(slips - track[:, None], MOST).sum(axis=0))
         return float(odds.max()), rows[0].odometry.t
