@@ -28,7 +28,7 @@ FIELD_OF_VIEW = math.radians(60.0)
 READS = {
     "tempering": 0.2,
     "models": {"default": {"kind": "beam", "behind": 0.05}},
-    "uncertainty": {"yaw": 0.035, "antenna_yaw": 0.025, "time_offset": 0.04},
+    "uncertainty": {"yaw": 0.02, "antenna_yaw": 0.015, "time_offset": 0.02},
 }
 # standard deviations of the constants of wheels that nobody has calibrated
 UNCALIBRATED = {"scale_distance": 0.03, "scale_rotation": 0.05, "heading_drift": 0.03}
