@@ -316,6 +316,9 @@ class TagSensor(Sensor):
 def bind(binding: Binding) -> TagSensor | None:
     """The sensor of a run; None where it is not used."""
     settings = binding.setup.rig.rfid
-    constants = NOTHING if settings is None or binding.calibration == "none" else settings.estimated()
+    constants = NOTHING
+    if settings is not None and binding.calibration != "none":
+        # strength and phase have the mounting of the rig: another one of the reads would contradict them
+        constants = settings.estimated(mounting=not {"rssi", "phase"} & set(binding.setup.sensors))
     sensor = TagSensor(binding.setup, binding.diagnostics, constants, binding.motion)
     return sensor if sensor.tags.likelihood is not None else None

@@ -254,13 +254,18 @@ class RfidSettings(SensorSettings):
             if isinstance(model, GridSettings) and model.path().resolve() != (folder / model.file).resolve():
                 write_grid(model.model(), folder / model.file)
 
-    def estimated(self) -> Estimated:
-        """The parameters of the likelihood (:mod:`factors.rfid.parameters`) that are not known exactly."""
+    def estimated(self, *, mounting: bool = True) -> Estimated:
+        """The parameters of the likelihood (:mod:`factors.rfid.parameters`) that are not known exactly.
+
+        ``mounting``: whether the yaw of antennas and the time offset are among them.
+        """
         used, known, antennas = self.parameter_names(), self.uncertainties(), list(self.all_antennas())
         names = [used[model][i] if model in used else "" for model in self.models for i in range(len(OF_MODEL))]
         sigmas = [getattr(m.prior, name) * (k in used) for k, m in self.models.items() for name in OF_MODEL]
         names += ["yaw", *(f"antennas.{antenna}.yaw" for antenna in antennas), "time_offset"]
         sigmas += [known["yaw"], *(known["antenna_yaw"] * (len(antennas) > 1) for _ in antennas), known["time_offset"]]
+        if not mounting:
+            sigmas = [*sigmas[: len(OF_MODEL) * len(self.models)], *(0.0 for _ in antennas), 0.0, 0.0]
         return Estimated.among(names, np.array(sigmas))
 
     def uncertainties(self) -> dict[str, float]:
