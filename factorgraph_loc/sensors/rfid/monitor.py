@@ -173,9 +173,9 @@ class SettledParameters:
     """The parameters (P,) of detection models as they were estimated some seconds ago: a track that is wrong spoils them before it
     is found out. They are held until they have changed clearly, as each value needs tables of its own in a search."""
 
-    def __init__(self) -> None:
+    def __init__(self, count: int) -> None:
         self._waiting: deque[tuple[float, Array]] = deque()
-        self.values: Array = np.zeros(1)  # as in the rig
+        self.values: Array = np.zeros(count)  # as in the rig
 
     def add(self, t: float, estimated: Array) -> bool:
         """Add an estimate of the time ``t`` [s], later ones are discarded; whether the parameters changed."""

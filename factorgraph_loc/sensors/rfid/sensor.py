@@ -141,7 +141,7 @@ class TagSensor(Sensor):
         self._monitor, self._silence = ScanMonitor(), SilenceMonitor()
         self._bursts = BurstMonitor(len(self.tags.antennas), len(self.tags.map.names))
         self._consistency = ConsistencyMonitor(self.tags.antennas)
-        self._settled = SettledParameters()
+        self._settled = SettledParameters(0 if self.tags.likelihood is None else len(self.tags.likelihood.parameters))
         self._for_search = self.tags.likelihood
         self._heard = -math.inf  # last scan that was checked for silence
         self._confirmed = -math.inf  # time [s] from which on a new track is believed, and models are learnt on it

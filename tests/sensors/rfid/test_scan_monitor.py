@@ -62,7 +62,7 @@ def test_scans_without_variance_are_no_suspicion():
 
 
 def test_parameters_settle_seconds_later_and_change_clearly_or_not_at_all():
-    settled = SettledParameters()
+    settled = SettledParameters(2)
     for t in range(20):
         value = np.array((0.0, -0.5 if t < 10 else -1.5))  # what a wrong track does to them
         assert settled.add(float(t), value) == (t in (6, 16))
