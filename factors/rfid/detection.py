@@ -176,10 +176,12 @@ class RfidLikelihood:
         object.__setattr__(self, "_unadjusted", self)
 
     def adjusted(self, parameters: Array) -> RfidLikelihood:
-        """The same with other parameters (Q,)."""
-        out = copy.copy(self)
+        """The same with other parameters (Q,). ValueError if there is another number of them."""
+        parameters, out = np.asarray(parameters, dtype=float), copy.copy(self)
+        if parameters.shape != self.parameters.shape:
+            raise ValueError(f"{parameters.shape} parameters of a likelihood, expected {self.parameters.shape}")
         object.__setattr__(out, "packed", adjusted(self._unadjusted.packed, parameters))
-        object.__setattr__(out, "parameters", np.asarray(parameters, dtype=float))
+        object.__setattr__(out, "parameters", parameters)
         return out
 
     def tempered(self, tempering: float) -> RfidLikelihood:
