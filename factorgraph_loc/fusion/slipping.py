@@ -25,7 +25,7 @@ from factors.update import Correction
 
 WINDOW = 3.0  # s of observations that are compared
 ONSETS = (0.75, 1.5, 3.0)  # s ago, when the wheels may have begun to slip, or to hold again
-SHARES = (0.0, 0.33, 0.67, 1.5)  # of the way that the odometry reports
+SHARES = (0.0, 0.33, 0.67, 1.5)  # of the way that the odometry reports, which the robot may have gone
 SURPRISING = 2.0  # standard deviations of the sum of surprises that starts a comparison
 ENOUGH = 2  # observations, of which more are compared
 STILL, SPEED = 0.05, 0.5  # m: a way that wheels at rest report; m/s: of a robot that is carried
@@ -38,8 +38,10 @@ EVERY, HOLDS = 1.0, 1.0  # s between comparisons while the wheels slip; log-odds
 
 
 class _Compared(NamedTuple):
-    """An observation, computed when it is compared; the odometry there; and the correction of a predicted ``pose`` (3,) with its
-    body-frame ``covariance`` (3, 3). The robot has moved by ``offset`` from that pose."""
+    """An observation and its correction of a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3).
+
+    ``observed()`` computes the observation. The robot has moved by ``offset`` from ``pose``; ``odometry``: at the observation.
+    """
 
     odometry: ChainState
     observed: Callable[[], Observation | None]
@@ -49,7 +51,7 @@ class _Compared(NamedTuple):
     correction: Correction
 
     def fit(self, observation: Observation) -> float:
-        """The log-likelihood of the observation at the corrected pose, less what the correction moved it by."""
+        """The log-likelihood of the observation at the corrected pose, less half the squared Mahalanobis distance that it moved."""
         delta = self.correction.delta[:3]
         moved = float(positive.squared(delta, self.covariance))
         return float(observation.log_likelihood(self.corrected()[None], {})[0]) - 0.5 * moved
@@ -61,15 +63,15 @@ class _Compared(NamedTuple):
 
 
 class SlipMonitor:
-    """Detects from the observations of a track when the odometry is wrong, and marks the ``motion`` as unknown. It is an event."""
+    """Detects from the observations of a track that the odometry is wrong, and marks the ``motion`` as unknown.
+
+    An event records each time.
+    """
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics) -> None:
         self._motion, self._diagnostics = motion, diagnostics
         self._rows: deque[_Compared] = deque()
-        self._surprises: deque[tuple[float, float]] = deque(
-            maxlen=100
-        )  # times and surprises of the newest observations
-        self._compared = -math.inf  # time
+        self._compared = -math.inf  # s: when the wheels were last compared, while they slip
 
     def add(
         self, observed: Callable[[], Observation | None], odometry: ChainState, view: View, correction: Correction
@@ -89,23 +91,18 @@ class SlipMonitor:
                     self._motion.end_slip()
                     self._rows.clear()
             return
-        surprised = surprise(correction)
-        self._surprises.append((t, surprised))
-        if surprised > 1.0 and self._are_surprising(t):
+        if surprise(correction) > 1.0 and self._are_surprising(t):
             odds, onset = max(self._log_odds(t - ago) for ago in ONSETS)
             if odds > RARE:
-                self._diagnostics.event(
-                    t, f"the odometry contradicts the observations since {onset:.1f} s: the motion is not known"
-                )
+                event = f"the odometry contradicts the observations since {onset:.1f} s: the motion is not known"
+                self._diagnostics.event(t, event)
                 self._motion.begin_slip(onset)
-                self._surprises.clear()
                 self._compared = t
 
     def _are_surprising(self, t: float) -> bool:
-        """Whether the newest observations together are more surprising than chance allows."""
-        while not t - WINDOW / 2.0 <= self._surprises[0][0] <= t:
-            self._surprises.popleft()
-        return sum(one for _, one in self._surprises) > SURPRISING * math.sqrt(len(self._surprises))
+        """Whether the observations of the last seconds together are more surprising than chance allows."""
+        newest = [surprise(row.correction) for row in self._rows if row.odometry.t >= t - WINDOW / 2.0]
+        return sum(newest) > SURPRISING * math.sqrt(len(newest))
 
     def _log_odds(self, begin: float) -> tuple[float, float]:
         """The log-odds that the odometry is wrong since the first observation after ``begin`` that is not surprising, and its time.
@@ -126,14 +123,14 @@ class SlipMonitor:
             poses = se2.compose(start, se2.exp(np.array((1.0, *SHARES))[:, None, None] * ways))
         if length < CLEAR * math.sqrt(np.trace(rows[0].correction.covariance[:2, :2])):
             return 0.0, begin
-        seen = [one for row in rows if (one := row.observed()) is not None]
-        if len(seen) < len(rows):
+        observations = [observation for row in rows if (observation := row.observed()) is not None]
+        if len(observations) < len(rows):
             return 0.0, begin
-        by_share = np.array([one.log_likelihood(poses[:, i], {}) for i, one in enumerate(seen[1:], 1)])
+        by_share = np.array([observations[i].log_likelihood(poses[:, i], {}) for i in range(1, len(rows))])
         holds, slips = by_share[:, :1], by_share[:, 1:]
         odds = np.minimum(slips - holds, MOST).sum(axis=0)
         if odds.max() > RARE and not self._motion.is_slipping:  # else the track follows the observations
-            track = np.array([row.fit(one) for row, one in zip(rows[1:], seen[1:], strict=True)])
+            track = np.array([rows[i].fit(observations[i]) for i in range(1, len(rows))])
             odds = np.minimum(odds, np.minimum(slips - track[:, None], MOST).sum(axis=0))
         return float(odds.max()), rows[0].odometry.t
 

@@ -132,7 +132,10 @@ class OdometryChain:
         return out
 
     def begin_slip(self, since: float) -> None:
-        """The wheels slip since then: how the robot moves is not known, until :meth:`end_slip`."""
+        """The wheels slip since then: the motion is unknown until :meth:`end_slip`.
+
+        A late row from before that takes the time before the newest row as known again.
+        """
         if not self._constants[SLIPPING] and self._count:
             self._knots[self._count - 1, UNKNOWN] += max(0.0, self._knots[self._count - 1, T] - since)
             self._constants[SLIPPING] = 1.0

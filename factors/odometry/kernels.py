@@ -21,7 +21,8 @@ ROUNDING, FAR = 1e-12, 1e4  # m^2
 
 # s: variance of the share of its way that a robot goes while its wheels slip, uniform over a width of one, times the second for
 # which the share is the same
-SHARE_VARIANCE, SHORTEST = 1.0 / 12.0, 1e-6
+SHARE_VARIANCE = 1.0 / 12.0
+SHORTEST = 1e-6  # s: a duration that is not zero
 
 NO_CONSTANTS = np.zeros((3, 0))  # the derivative of an increment by no constants
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from factors import se2
 from factors.motion import ChainState, Increment
 from factors.odometry.kernels import (
+    SHORTEST,
     Noise,
     recalibrate,
     relative,
@@ -27,7 +28,7 @@ from factors.se2 import Array
 # minimum noise of an increment without duration, whose covariance must be invertible
 MINIMUM_POSITION_VARIANCE = 1e-8
 MINIMUM_HEADING_VARIANCE = 1e-8
-SLIPS, SHORTEST = 0.01, 1e-6  # 1/s: how often wheels slip; s: a duration that is not zero
+SLIPS = 0.01  # 1/s: how often wheels slip
 LEAST_POSITION, LEAST_HEADING = 1e-3, 1e-4  # m, rad per sqrt(s): minimum noise
 
 

@@ -23,10 +23,8 @@ NEGLIGIBLE_LOGIT = -14.0  # out of range
 NEAR = 1e-2  # m; minimum distance with a defined direction
 PARAMETERS = 12  # maximum length of a parameter vector of a compiled model
 ALMOST_ONE = 1.0 - 1e-9
-FRONT, SIDE = (
-    0.25,
-    0.15,
-)  # cosines of the facing: where the reads of a beam fall off behind the tag, and over what width
+# of the cosine of a tag's facing: where the reads of a beam decrease behind the tag, and over what width
+FRONT, SIDE = 0.25, 0.15
 
 
 class DetectionModel(Protocol):
