@@ -12,17 +12,9 @@ from in_short import blank_pictures, in_short, leave_blank, runs_here  # noqa: F
 from typer import testing
 from typer.testing import CliRunner, Result
 
+from factorgraph_loc import ImageStream, IncrementStream, Landmark, Log, Rig, Trajectory, World, load, write_native
 from factorgraph_loc.cli.app import app
-from factorgraph_loc.io.native.native import write_native
-from factorgraph_loc.io.readers import load
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.landmarks.measurement import Landmark
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors import se2
 from factors.camera.model import camera_pose

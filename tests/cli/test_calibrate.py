@@ -6,10 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.io.native.native import write_native
-from factorgraph_loc.io.native.rig_file import read_rig
-from factorgraph_loc.io.readers import load
-from factorgraph_loc.model.log import StartPose
+from factorgraph_loc import StartPose, load, read_rig, write_native
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from factorgraph_loc.io.native.native import write_native
-from factorgraph_loc.io.native.world_file import read_world
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc import Tag, World, read_world, write_native
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate
 

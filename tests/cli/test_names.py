@@ -7,17 +7,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from factorgraph_loc import BearingRangeStream, IncrementStream, Landmark, Log, Rig, Trajectory, World, write_native
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.app import app
 from factorgraph_loc.evaluation.tables import comparison_table
 from factorgraph_loc.files.models import read_toml, write_toml
-from factorgraph_loc.io.native.native import write_native
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 
 RIG = Rig(sensors=("odometry", "bearing_range"), bearing_range=BearingRangeSettings(range_sigma=0.1))
 

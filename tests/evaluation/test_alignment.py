@@ -8,14 +8,10 @@ import pytest
 from evo.core.geometry import umeyama_alignment
 from scipy.stats import chi2
 
+from factorgraph_loc import Landmark, Log, Rig, Trajectory, World
 from factorgraph_loc.evaluation.metrics import free_map_figures
 from factorgraph_loc.evaluation.pairing import align_points, pairs
 from factorgraph_loc.model.belief import LearntPoint
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import Landmark
 from factors import se2
 
 FRAME = np.array((4.0, -3.0, 2.5))  # of the world in the estimate's frame

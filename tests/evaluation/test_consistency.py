@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
+from factorgraph_loc import Log, Rig, Trajectory, World
 from factorgraph_loc.evaluation.figures import WINDOW, Track, consistency, running_mean
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
 
 T = np.arange(600) * 0.1
 BAND = "95 % band (of the single NEES, of the mean NIS)"

@@ -5,14 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Trajectory, VelocityStream, World
 from factorgraph_loc.evaluation.inspect import inspect
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factorgraph_loc.sensors.landmarks.summary import find_suspects
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.text import MESSAGE
 from factors.landmarks import model as bearing_range
 

@@ -7,16 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
+from factorgraph_loc import ImageStream, Log, PointMap, Rig, SightingStream, Trajectory, VelocityStream, World
 from factorgraph_loc.evaluation.inspect import inspect
-from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import ImageStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.summary import mounting_problems
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 
 CAMERA = CameraSettings(
     width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5, frontend={"feature": "orb", "count": 30}

@@ -6,15 +6,10 @@ import json
 import numpy as np
 import pytest
 
+from factorgraph_loc import Log, RfidStream, Rig, Tag, VelocityStream, World
 from factorgraph_loc.evaluation.inspect import inspect
-from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import columns_of
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
-from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
-from factorgraph_loc.sensors.rfid.stream import RfidStream
 
 ANTENNAS = ("left", "right")
 

@@ -8,17 +8,14 @@ from evo.core import metrics as evo
 from evo.core.trajectory import PosePath3D
 from scipy.stats import binom, chi2
 
+from factorgraph_loc import Log, Rig, Trajectory, World
 from factorgraph_loc.evaluation.metrics import OF_FREE_MAP, accuracy, errors, score
 from factorgraph_loc.evaluation.pairing import Pairs
 from factorgraph_loc.evaluation.trajectories.association import in_plane
 from factorgraph_loc.evaluation.trajectories.score import pose_errors
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult, Timings
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
 from factors import se2
 
 TIMINGS = Timings(np.array([0.5]), np.array([2.0]), 1.0, 10.0, 0.1, 100.0)

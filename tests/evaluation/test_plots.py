@@ -9,17 +9,11 @@ import pytest
 from in_short import blank_pictures  # noqa: F401 - a fixture
 from typer.testing import CliRunner
 
+from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Tag, Trajectory, VelocityStream, World, write_native
 from factorgraph_loc.cli.app import app
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import error_bands, plot_log, trajectories
-from factorgraph_loc.io.native.native import write_native
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
-from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
 
 

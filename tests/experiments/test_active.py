@@ -7,11 +7,9 @@ import polars as pl
 import pytest
 from computed_here import Here
 
-from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc import InputError, RunFailedError, Trajectory, World
 from factorgraph_loc.experiments import active
 from factorgraph_loc.experiments.active import ROW, jobs_of, run_jobs
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation.settings import preset

@@ -6,16 +6,14 @@ import math
 import numpy as np
 import pytest
 
+from factorgraph_loc import Tag, Trajectory, World
 from factorgraph_loc.experiments.active_results import (
     comparison,
     differences,
     run_picture,
     summaries,
 )
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
-from factorgraph_loc.sensors.rfid.map import Tag
 
 
 def row(policy, seed, metres, *, world="hall", localized=True, **changes):

@@ -6,16 +6,10 @@ import numpy as np
 import pytest
 from landmark_world import with_sightings
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import CameraFrame, FeatureStream, InputError, PointMap, Rig, SightingStream, Trajectory, World
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED, score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import FeatureStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.vision.frame import CameraFrame
 
 NO_POINTS = "straight: the map has no points that a camera could find: give --world"
 STAMPS = np.array([0.3, 0.7])

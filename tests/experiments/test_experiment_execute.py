@@ -10,18 +10,15 @@ import numpy as np
 import pytest
 from computed_here import Here, run_planned
 
-from factorgraph_loc.errors import FglocError
+from factorgraph_loc import FglocError, load, load_results, write_native
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.experiments import keys
 from factorgraph_loc.experiments.execute import execute
 from factorgraph_loc.experiments.experiment import prepare, run_experiment
 from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.plan import plan
-from factorgraph_loc.experiments.result_table import load_results
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.experiments.store import FAILURE, MANIFEST, TIMINGS, Store, StoreError
-from factorgraph_loc.io.native.native import write_native
-from factorgraph_loc.io.readers import load
 
 # a name that would leave the store as a path, and be code in a page
 NASTY = "../../a 'b' \"c\" <script>alert(1)</script>/.."

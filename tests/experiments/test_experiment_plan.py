@@ -6,12 +6,11 @@ import sys
 
 import pytest
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, write_native
 from factorgraph_loc.experiments import keys, log_source
 from factorgraph_loc.experiments import plan as plan_module
 from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.plan import MOST_RUNS, TooManyRunsError, plan
-from factorgraph_loc.io.native.native import write_native
 
 
 @pytest.fixture

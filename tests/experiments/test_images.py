@@ -6,13 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import ImageStream, InputError, PointMap, SightingStream, compare
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.experiments.compare import compare
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.sensors.camera import frontend
-from factorgraph_loc.sensors.camera.measurement import ImageStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.use import frontend_of
 from factorgraph_loc.vision.settings import FrontendSettings

@@ -5,15 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc import BearingRangeStream, InputError, RunFailedError, StartPose, Trajectory, VelocityStream, World
 from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import estimator_type
-from factorgraph_loc.model.log import StartPose
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 
 
 def test_order_of_what_is_fed(log, fake):

@@ -5,14 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, RfidStream, Tag
 from factorgraph_loc.experiments.preparation import use_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import settings_of
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.sensors.rfid.map import Tag
-from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.rfid.summary import doubts
 
 ALL = ("odometry", "rfid", "rssi", "phase")

@@ -6,10 +6,9 @@ import gtsam
 import numpy as np
 import pytest
 
+from factorgraph_loc import Trajectory, World
 from factorgraph_loc.exports.trajectories import pose_graph, write_g2o
 from factorgraph_loc.model.belief import LearntPoint
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
 from factors import se2
 
 SENSORS = ("odometry", "bearing_range")

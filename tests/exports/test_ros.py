@@ -7,11 +7,10 @@ import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, Trajectory
 from factorgraph_loc.exports.ros import write_mcap
 from factorgraph_loc.exports.runs import find_runs, read_runs
 from factorgraph_loc.model.belief import LearntPoint
-from factorgraph_loc.model.trajectory import Trajectory
 
 from .conftest import STEPS, T0_NS
 

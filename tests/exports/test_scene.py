@@ -7,10 +7,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from factorgraph_loc import ImageStream, Trajectory
 from factorgraph_loc.exports import scene
-from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera import summary as pictures_of
-from factorgraph_loc.sensors.camera.measurement import ImageStream
 
 
 def lights_of(log):

@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
+from factorgraph_loc import Log, Rig, VelocityStream, World
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 
 NONE = GrowthSettings()

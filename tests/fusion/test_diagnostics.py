@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from landmark_world import simulate
 
+from factorgraph_loc import BearingRangeStream, PoseEstimate, RfidScan
 from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import create, settings_of
-from factorgraph_loc.model.belief import PoseEstimate, gaussian_belief
+from factorgraph_loc.model.belief import gaussian_belief
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import named_settings
 from factorgraph_loc.simulation import simulate as simulated
 

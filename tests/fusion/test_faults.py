@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from landmark_world import simulate, with_sightings
 
+from factorgraph_loc import StartPose, VelocityStream
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.graph.solver import FullHistory, Window
-from factorgraph_loc.model.log import StartPose
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
 
 CONFIGS = {

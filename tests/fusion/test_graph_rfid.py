@@ -10,17 +10,15 @@ import numpy as np
 import pytest
 from short_logs import mounted_exactly
 
+from factorgraph_loc import IncrementOdometry, IncrementStream, Log, RfidScan, Tick
 from factorgraph_loc.evaluation.metrics import errors as evaluated
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.fusion.search import SURE, beyond
 from factorgraph_loc.model import setup as model_setup
-from factorgraph_loc.model.log import Log, cut, join
-from factorgraph_loc.model.measurement import Tick
+from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.model.result import RunResult
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, IncrementStream
-from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import preset, simulate
 from factors import se2
 

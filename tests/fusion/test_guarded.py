@@ -9,13 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc import BearingRange, InputError, PoseEstimate, RunFailedError, Tick, Trajectory, VelocityOdometry
 from factorgraph_loc.fusion.guarded import Guard, nearest_positive, sound, sound_belief, sound_trajectory
-from factorgraph_loc.model.belief import Belief, Mode, PoseEstimate
-from factorgraph_loc.model.measurement import Tick
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
+from factorgraph_loc.model.belief import Belief, Mode
 
 SEEN = BearingRange(3.25, ("a",), np.ones(1), np.zeros(1))
 

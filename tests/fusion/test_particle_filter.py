@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from landmark_world import simulate, with_sightings
 
-from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc import RunFailedError, Tick
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -14,7 +14,6 @@ from factorgraph_loc.fusion.cloud import Cloud, largest_share, pose_moments, sys
 from factorgraph_loc.fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import cut
-from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeUncertainty
 from factors import se2

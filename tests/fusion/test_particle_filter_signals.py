@@ -6,16 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from factorgraph_loc import RfidScan, Rig, Tag, VelocityOdometry, World
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
-from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, PhaseSettings, RfidSettings, RssiSettings
-from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import preset, simulate
 
 READS = ("odometry", "rfid")

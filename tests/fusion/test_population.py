@@ -5,13 +5,12 @@ import math
 import numpy as np
 import pytest
 
+from factorgraph_loc import Rig, VelocityOdometry
 from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.population import CHUNK, PARTICLE, Population
 from factorgraph_loc.fusion.search import laplace_evidence
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.motion import Motion
-from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factorgraph_loc.sensors.rfid.sensor import TagObservation
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings

@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 from short_logs import frames, late, office, plaza, room, with_gyro
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import ImageStream, InputError, PointMap, World
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import ESTIMATORS
-from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.measurement import selected
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 
 READS = ("odometry", "rfid")

@@ -6,12 +6,10 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
+from factorgraph_loc import BearingRangeStream, VelocityStream, load
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import cut
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 
 
 @pytest.fixture(scope="module")

@@ -6,21 +6,13 @@ import numpy as np
 import pytest
 from landmark_world import DEPTH, TRUTH, miscalibrated, simulate
 
+from factorgraph_loc import BearingRange, IncrementOdometry, Landmark, Rig, Tick, World
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.measurement import Tick
-from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import (
-    BearingRange,
-    BearingRangeSettings,
-    BearingRangeUncertainty,
-    Landmark,
-)
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeUncertainty
 from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,
     OdometryNoise,

@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 
 import factorgraph_loc as fgloc
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
+from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Trajectory, VelocityStream, World
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factors import se2
 
 ANCHORS = {"a": (0.0, 0.0), "b": (12.0, 0.0), "c": (12.0, 8.0), "d": (0.0, 8.0)}

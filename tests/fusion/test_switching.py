@@ -5,14 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from factorgraph_loc import RfidScan, Tick, YawRate
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import cut
-from factorgraph_loc.model.measurement import Tick
-from factorgraph_loc.sensors.odometry.measurement import YawRate
-from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation import simulate as simulate_office
 from factors import se2

@@ -8,18 +8,14 @@ import numpy as np
 import pytest
 from landmark_world import simulate
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import BearingRangeStream, IncrementOdometry, InputError, Rig, Trajectory
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import cut
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.known_position import KnownPosition
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.motion import Motion
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate as simulated
 from factors import se2

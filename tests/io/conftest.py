@@ -9,9 +9,7 @@ from mapped_hall import hall, with_options  # noqa: F401 - fixtures
 from rosbag_drive import maker, read_drive, refuse_drive  # noqa: F401 - fixtures
 from rosbag_reads import bag, mcap, read, refuse  # noqa: F401 - fixtures
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.readers import load
-from factorgraph_loc.model.log import Log
+from factorgraph_loc import InputError, Log, load
 
 RUN = """\
 name = "hall"

@@ -9,14 +9,12 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import IncrementStream, InputError, StartPose, load
 from factorgraph_loc.files.columns import LATEST, STAMP
 from factorgraph_loc.io.checks import require_bounds, require_one_span
-from factorgraph_loc.io.readers import load
-from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.sensors.camera.measurement import SIGHTINGS
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
-from factorgraph_loc.sensors.odometry.measurement import IMU, INCREMENTS, VELOCITIES, IncrementStream
+from factorgraph_loc.sensors.odometry.measurement import IMU, INCREMENTS, VELOCITIES
 from factorgraph_loc.sensors.rfid.stream import INVENTORIES, RFID
 
 UNIX = 1_700_000_000_000_000_000

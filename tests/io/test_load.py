@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, load, read_rig
 from factorgraph_loc.files import shipped
 from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.files.shipped import manifests, readers, rigs
-from factorgraph_loc.io.native.rig_file import read_rig
-from factorgraph_loc.io.readers import READERS, describe, load, read_manifest, reader, verify
+from factorgraph_loc.io.readers import READERS, describe, read_manifest, reader, verify
 
 MANIFEST = 'title = "t"\nreader = "mrclam"\npath = "set"\nlicence = "none"\norigin = "here"\n'
 

@@ -5,9 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.native.native import write_native
-from factorgraph_loc.sensors.camera.measurement import ImageStream, SightingStream
+from factorgraph_loc import ImageStream, InputError, SightingStream, write_native
 
 CAMERA = "t_ns,file\n1100000000,a.png\n1300000000,b.png\n1500000000,c.png\n"
 PIXELS = "t_ns,landmark,u,v\n1200000000,door,10.5,20\n1200000000,lamp,-3,400.25\n1400000000,door,11,21\n"

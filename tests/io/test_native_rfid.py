@@ -7,15 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from factorgraph_loc.io.native.native import write_native
-from factorgraph_loc.io.readers import load
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
-from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc import Log, RfidStream, Rig, Tag, VelocityStream, World, load, write_native
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
-from factorgraph_loc.sensors.rfid.stream import RfidStream
 
 READS = "t_ns,antenna,epc,rssi,phase,frequency\n"
 INVENTORIES = "t_ns,antenna,duration\n"

@@ -5,14 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.native.rig_file import read_rig, write_rig
-from factorgraph_loc.io.native.world_file import read_world, write_world
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, Landmark
+from factorgraph_loc import InputError, Landmark, Rig, Tag, World, read_rig, read_world, write_rig, write_world
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factorgraph_loc.sensors.odometry.settings import ImuSettings, OdometrySettings
-from factorgraph_loc.sensors.rfid.map import Tag
 
 GOOD = "[bearing_range]\nrange_sigma = 0.1\n"
 

@@ -8,8 +8,7 @@ from pose_files import T0, wander, write
 from rosbag_drive import COUNT, MS, add_frames, transform
 from rosbag_drive import T0 as BAG_T0
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.trajectories import read_trajectory
+from factorgraph_loc import InputError, read_trajectory
 
 
 @pytest.fixture(scope="module")

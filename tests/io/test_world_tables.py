@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.native.world_file import read_world, write_world
+from factorgraph_loc import InputError, PointMap, Tag, read_world, write_world
 from factorgraph_loc.maps.markers import Marker
-from factorgraph_loc.maps.points import PointMap, write_points
-from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.maps.points import write_points
 
 SHEET = "Tag ID;Ort;X [cm];Y [cm];Höhe [cm];Richtung\ne2001;Regal;100,5;-20;120;90\nE2002;Tor;0;3;;\n"
 TAGS = """\

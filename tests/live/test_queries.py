@@ -9,16 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import factorgraph_loc as fgloc
+from factorgraph_loc import BearingRange, Log, PointMap, Rig, SightingStream, Trajectory, VelocityStream, World
 from factorgraph_loc.experiments.preparation import resolve_prior
-from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors.camera import model as reprojection
 
 ASKED = ("estimate", "belief", "learnt", "trajectory", "diagnostics")

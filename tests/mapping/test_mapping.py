@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, World, load
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.io.readers import load
 from factorgraph_loc.mapping.mapping import TOLERANCE, align_robustly, make_map
 from factorgraph_loc.model.belief import LearntPoint
-from factorgraph_loc.model.log import Log, cut
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
+from factorgraph_loc.model.log import cut
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factors import se2
 
 FRAME = np.array((3.0, -2.0, 2.0))  # of the run in the map

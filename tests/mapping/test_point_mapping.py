@@ -7,14 +7,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from factorgraph_loc.errors import RunFailedError
+from factorgraph_loc import FeatureStream, Log, Rig, RunFailedError, Trajectory, World
 from factorgraph_loc.mapping.bundle import pose3
 from factorgraph_loc.mapping.point_mapping import PointSettings, PosedFrames, map_points, posed_frames
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import FeatureStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factors.camera.model import camera_pose
 

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, PointMap
 from factorgraph_loc.mapping.point_maps import chosen, merged, thinned
-from factorgraph_loc.maps.points import PointMap
 
 SIGMA = 0.02
 

@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, Log, Tag, World
 from factorgraph_loc.mapping.tag_mapping import map_tags
 from factorgraph_loc.mapping.tag_search import merged, search
 from factorgraph_loc.mapping.tag_slam import INTERVAL, _keyframes
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factorgraph_loc.simulation.settings import preset
 from factorgraph_loc.simulation.simulate import simulate

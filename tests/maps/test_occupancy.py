@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc import InputError, read_world
 from factorgraph_loc.maps.occupancy import read_walls
 
 YAML = """\

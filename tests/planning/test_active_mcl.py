@@ -5,14 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from factorgraph_loc import IncrementOdometry, Tick
 from factorgraph_loc.fusion.population import ELSEWHERE, FRESH
 from factorgraph_loc.maps.free_space import free_space
-from factorgraph_loc.model.measurement import Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.planning.active_mcl import ActiveMcl, LengthsSeen
 from factorgraph_loc.planning.robot import SimulatedRobot
 from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.worlds import make_world
 from factors import se2

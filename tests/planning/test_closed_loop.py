@@ -6,10 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, World
 from factorgraph_loc.maps.free_space import distance_to_walls
 from factorgraph_loc.model.belief import Belief, Mode
-from factorgraph_loc.model.world import World
 from factorgraph_loc.planning import closed_loop
 from factorgraph_loc.planning.closed_loop import ActiveRun, run_active
 from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings

@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
+from factorgraph_loc import Landmark, Rig, World
 from factorgraph_loc.planning.information import FINEST, expected_covariance, expected_gain, gaussian_entropy
 from factorgraph_loc.planning.paths import primitives
 from factorgraph_loc.planning.sensors import Sensors
-from factorgraph_loc.sensors.landmarks.measurement import Landmark, SightingSettings
+from factorgraph_loc.sensors.landmarks.measurement import SightingSettings
 from factorgraph_loc.simulation.settings import RACKHAM_RIG
 from factors.landmarks import model as bearing_range
 

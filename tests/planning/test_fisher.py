@@ -6,9 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
+from factorgraph_loc import Landmark, PointMap, Rig, Tag, World
 from factorgraph_loc.planning.information import (
     FINEST,
     expected_covariance,
@@ -21,9 +19,7 @@ from factorgraph_loc.planning.paths import Path, primitives
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.sensors.camera.settings import PixelSettings
 from factorgraph_loc.sensors.camera.simulation import CameraForecast
-from factorgraph_loc.sensors.landmarks.measurement import Landmark
 from factorgraph_loc.sensors.landmarks.simulation import LandmarkForecast
-from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.simulation.settings import RACKHAM_RIG
 from factors import se2
 from factors.camera import model as reprojection

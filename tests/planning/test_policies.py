@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from factorgraph_loc import Rig, World
 from factorgraph_loc.maps.free_space import free_space
 from factorgraph_loc.model.belief import Mode
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.paths import primitives, waypoint_paths
 from factorgraph_loc.planning.policies import Situation, make_policy, usable
 from factorgraph_loc.planning.sensors import Sensors

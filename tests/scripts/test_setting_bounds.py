@@ -6,11 +6,9 @@ from pathlib import Path
 import pytest
 from limits_tables import ESTIMATORS, FILES, RIG, numbers_of, tables
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, Rig, World
 from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.fusion import registry
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factorgraph_loc.sensors.motion import odometry_model
 from factorgraph_loc.sensors.odometry.settings import (

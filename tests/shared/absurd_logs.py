@@ -8,13 +8,10 @@ from functools import lru_cache
 import numpy as np
 
 import factorgraph_loc as fgloc
-from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc import BearingRangeStream, IncrementStream, InputError, Landmark, Log, RunFailedError, StartPose
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.measurement import Stream, columns_of
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream, Landmark
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
 from factors import se2
 

@@ -4,17 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.model.log import Log, cut, join
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import (
-    BearingRangeSettings,
-    BearingRangeStream,
-    BearingRangeUncertainty,
-    Landmark,
-)
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
+from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Trajectory, VelocityStream, World
+from factorgraph_loc.model.log import cut, join
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeUncertainty
 from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,
     OdometryNoise,

@@ -6,14 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream
-from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc import IncrementStream, Log, RfidStream, Rig, Tag, Trajectory, World
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings, SurveySettings
-from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factors import se2
 from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.model import LogisticModel

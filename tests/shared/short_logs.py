@@ -7,10 +7,9 @@ import numpy as np
 from camera_world import simulate as simulate_room
 from camera_world import with_frames
 
-from factorgraph_loc.io.readers import load
+from factorgraph_loc import YawRateStream, load
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.measurement import columns_of
-from factorgraph_loc.sensors.odometry.measurement import YawRateStream
 from factorgraph_loc.sensors.odometry.settings import ImuSettings
 from factorgraph_loc.sensors.rfid.settings import PhaseSettings, RfidUncertainty, RssiSettings
 from factorgraph_loc.simulation import preset

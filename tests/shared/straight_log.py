@@ -3,12 +3,8 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
+from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Trajectory, VelocityStream, World
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 
 
 @pytest.fixture

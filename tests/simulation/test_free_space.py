@@ -6,9 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, World
 from factorgraph_loc.maps.free_space import CELL, SPACING, crosses, distance_to_walls, free_space, shortest_path
-from factorgraph_loc.model.world import World
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.worlds import make_world
 

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, PointMap, World
 from factorgraph_loc.maps.free_space import distance_to_walls
-from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import PixelSettings
 from factorgraph_loc.sensors.camera.simulation import pixel_stream, surface_normals
 from factorgraph_loc.simulation import preset

@@ -8,10 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from factorgraph_loc.model.rig import Rig
+from factorgraph_loc import RfidScan, Rig
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.simulation import FaultSettings, draw_dead, draw_reads, read_probabilities
-from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import preset
 from factors.rfid.model import BeamModel
 

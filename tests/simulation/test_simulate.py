@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from factorgraph_loc import Landmark, World, write_rig
 from factorgraph_loc.experiments.preparation import resolve_prior
-from factorgraph_loc.io.native.rig_file import write_rig
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import Landmark, SightingSettings
+from factorgraph_loc.sensors.landmarks.measurement import SightingSettings
 from factorgraph_loc.sensors.landmarks.simulation import sighting_stream
 from factorgraph_loc.simulation import PRESETS, read_settings, simulate
 from factors import se2

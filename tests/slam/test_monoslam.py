@@ -7,23 +7,17 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from factorgraph_loc import CameraFrame, FeatureStream, IncrementOdometry, PixelSightings, PointMap, Rig, Tick, World
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import create, settings_of
-from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import cut
-from factorgraph_loc.model.measurement import Tick
-from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import FeatureStream, PixelSightings
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factorgraph_loc.simulation import preset, simulate
 from factorgraph_loc.slam.monoslam_sighting import FeatureMatcher
 from factorgraph_loc.slam.monoslam_state import Innovation
-from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel, TiltScale
 

@@ -8,14 +8,13 @@ import pytest
 from scipy.stats import chi2
 
 import factorgraph_loc as fgloc
+from factorgraph_loc import FeatureStream, World
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.output import map_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.mapping.point_maps import chosen
 from factorgraph_loc.maps.common_error import CommonError
 from factorgraph_loc.model.log import cut
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import FeatureStream
 
 SECONDS, EVERY = 24.0, 0.4  # s
 SEEDS = range(21, 24)

@@ -5,14 +5,11 @@ from dataclasses import replace
 import camera_world
 import numpy as np
 
+from factorgraph_loc import CameraFrame, Rig, VelocityOdometry, World
 from factorgraph_loc.fusion.graph.estimator import Smoother, SmootherSettings
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
 from factorgraph_loc.sensors.odometry.settings import OdometrySettings
-from factorgraph_loc.vision.frame import CameraFrame
 
 
 def keyframe_times(common):

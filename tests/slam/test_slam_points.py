@@ -8,14 +8,11 @@ import pytest
 from scipy.stats import chi2
 
 import factorgraph_loc as fgloc
+from factorgraph_loc import FeatureStream, SightingStream, Trajectory, VelocityStream, World
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.graph.solver import FullHistory
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import FeatureStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
 from factors.graph import pose_key
 

@@ -6,11 +6,10 @@ import gtsam
 import numpy as np
 import pytest
 
-from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc import CameraFrame, PointMap
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import CameraPose, agreeing, compatible
-from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.relocalization import found_on_floor, located
 from factors import se2
 from factors.camera import model as reprojection

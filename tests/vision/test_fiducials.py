@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 import factorgraph_loc as fgloc
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.readers import load
+from factorgraph_loc import InputError, load
 from factorgraph_loc.maps.markers import Marker
 from factorgraph_loc.vision.fiducials import find_markers
 from factors import se2

@@ -17,11 +17,9 @@ from absurd_logs import rows, with_stream
 from camera_world import with_camera, with_frames, with_sightings
 from recorded_logs import recorded_log
 
+from factorgraph_loc import FeatureStream, Log, PointMap, World
 from factorgraph_loc.maps.markers import Marker, corner_points
-from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.model.log import Log, cut, join
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import FeatureStream
+from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
 from factorgraph_loc.simulation import preset, simulate
 

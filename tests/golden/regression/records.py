@@ -11,17 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc import InputError, Log, RunFailedError, Trajectory
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.fusion.base import Estimator
 from factorgraph_loc.model.belief import Belief, Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import columns_of
 from factorgraph_loc.model.result import RunResult
-from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.planning.closed_loop import ActiveRun
 from factors.se2 import Array
 

@@ -6,23 +6,17 @@ import numpy as np
 import pytest
 from camera_world import CAMERA, frame, room, simulate, weave, with_camera, with_views
 
+from factorgraph_loc import CameraFrame, IncrementOdometry, PixelSightings, PointMap, Rig, SightingStream, Tick, World
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import create, settings_of
-from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import Tick
-from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.known_points import ITERATIONS, SETTLED, KnownPoints, Predicted, lifted
-from factorgraph_loc.sensors.camera.measurement import PixelSightings, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
-from factorgraph_loc.vision.frame import CameraFrame
 from factors import se2
 from factors.camera import model as reprojection
 from factors.camera.factor import image_update

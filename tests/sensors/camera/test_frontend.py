@@ -10,13 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
+from factorgraph_loc import FeatureStream, ImageStream, InputError, Log, Rig, World
 from factorgraph_loc.sensors.camera import frontend
 from factorgraph_loc.sensors.camera.frontend import with_features
-from factorgraph_loc.sensors.camera.measurement import FeatureStream, ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.feature_cache import FeatureCache
 from factorgraph_loc.vision.features import EXTRACTORS, extractor

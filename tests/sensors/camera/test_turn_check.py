@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 from camera_world import CAMERA, RIG, room, sightings, weave, with_sightings
 
+from factorgraph_loc import Log, Trajectory, VelocityStream, World
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.settings import NOTHING, Estimated
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.use import TurnCheck
 from factorgraph_loc.sensors.motion import whole_motion
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
 from factors.camera.model import FOCAL, PARAMETERS, TIME_OFFSET
 

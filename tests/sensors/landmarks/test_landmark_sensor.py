@@ -4,11 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from factorgraph_loc import BearingRange, Log, Rig, World
+from factorgraph_loc import BearingRange, BearingRangeStream, Log, Rig, World
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.landmarks.sensor import bind
 from factorgraph_loc.sensors.landmarks.summary import located_landmarks
 from factorgraph_loc.sensors.motion import Motion

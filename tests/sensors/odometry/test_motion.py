@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
+from factorgraph_loc import IncrementOdometry, Rig, VelocityOdometry, YawRate
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.motion import Motion
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, ImuSettings, OdometryNoise, OdometrySettings
 from factors.motion import propagate
 

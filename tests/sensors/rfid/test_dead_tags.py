@@ -8,15 +8,10 @@ import numpy as np
 import pytest
 
 import factorgraph_loc as fgloc
+from factorgraph_loc import Log, RfidScan, Rig, Tag, VelocityOdometry, World
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.odometry.measurement import VelocityOdometry
-from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
-from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import preset, simulate
 
 SENSORS = ("odometry", "rfid")

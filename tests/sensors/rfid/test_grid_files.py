@@ -6,9 +6,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, read_grid, write_grid
 from factorgraph_loc.sensors.rfid import settings as grids
-from factorgraph_loc.sensors.rfid.settings import read_grid, write_grid
 from factors.rfid.model import GridModel
 
 GRID = GridModel(np.zeros((2, 3, 4, 5)), -1.0, -2.0, 0.5, np.array((0.0, 1.0)))

@@ -8,15 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
+from factorgraph_loc import InputError, Log, RfidStream, Rig, Tag, Trajectory, World
 from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit, fit_phase
 from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
-from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import (
     AntennaSettings,
     PhaseSettings,
@@ -24,7 +19,6 @@ from factorgraph_loc.sensors.rfid.settings import (
     RssiSettings,
     SurveySettings,
 )
-from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factors import se2
 from factors.rfid.signals import SPEED_OF_LIGHT, RssiReads, features
 from factors.se2 import Array

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.native.rig_file import read_rig, write_rig
+from factorgraph_loc import InputError, read_rig, write_rig
 from factorgraph_loc.sensors.rfid.calibration import learn as rfid_learn
 from factorgraph_loc.sensors.rfid.calibration.fields import Kind
 from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid, pose_share

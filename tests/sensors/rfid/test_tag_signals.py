@@ -6,17 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, RfidScan, Rig, Tag, World
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags, TagSignals
-from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.sensor import TagSensor
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, PhaseSettings, RfidSettings, RssiSettings
-from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.simulation import preset, simulate
 from factors import se2
 
