@@ -8,28 +8,18 @@ and Ito, "Color Universal Design", 2008, distinguishable by colour-blind readers
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import polars as pl
 
 from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend, save
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.evaluation.pairing import CONFIDENCE, pauses
 from factorgraph_loc.files.models import replacing
-from factorgraph_loc.files.tables import parse_parquet
-from factorgraph_loc.io.results import (
-    ESTIMATES,
-    EVENTS,
-    INNOVATIONS,
-    by_kind,
-    parse_estimates,
-    parse_events,
-    trajectory_of,
-)
+from factorgraph_loc.io.results import ResultFiles
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import Reliability, RunResult
 from factorgraph_loc.model.scoring import MAX_GAP
@@ -76,17 +66,10 @@ class Track:
         return cls(result.causal(), result.final, nis, events, result.max_gap, result.reliability)
 
     @classmethod
-    def read(cls, read: Callable[[str], bytes], t0_ns: int, max_gap: float = MAX_GAP) -> Track:
-        """The data in the files of a run, which ``read`` returns by their name; times count from ``t0_ns``."""
-        rows = by_kind(parse_estimates(read(ESTIMATES), ESTIMATES))
-        causal, final = (trajectory_of(table, t0_ns) for table in rows.values())
-        updates = parse_parquet(read(INNOVATIONS), INNOVATIONS)
-        updates = updates.select("sensor", (pl.col("t_ns") - t0_ns) / 1e9, "nis", "dof")
-        nis = {
-            str(s): table.drop("sensor").to_numpy() for (s,), table in updates.group_by("sensor", maintain_order=True)
-        }
-        events = parse_events(read(EVENTS), EVENTS, t0_ns)
-        return cls(causal if len(causal) else None, final, nis, events, max_gap)
+    def read(cls, files: ResultFiles, max_gap: float = MAX_GAP) -> Track:
+        """The data in the files of a run."""
+        causal, final = (found.trajectory for found in files.estimates().values())
+        return cls(causal if len(causal) else None, final, files.innovations(), files.events(), max_gap)
 
     def kinds(self) -> tuple[tuple[str, Trajectory | None], tuple[str, Trajectory | None]]:
         """Both trajectories by name, None if there is nothing to plot."""

@@ -124,7 +124,7 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
     causal = result.causal()
     final = result.final
     if causal is not None:
-        final = _since(final, float(causal.t[0]))
+        final = final.rows(final.t >= causal.t[0] - TOLERANCE)
     gap = result.max_gap
     scores: dict[str, Any] = {"scoring.max_gap": gap, WARNINGS: list(result.warnings)}
     trajectories = (("causal", causal), ("final", final))
@@ -230,13 +230,6 @@ def free_map_figures(
         if (good := _positive_definite(covariances)).any():
             figures["landmarks.anees"] = float(np.mean(_squared(error[good], covariances[good])))
     return figures
-
-
-def _since(trajectory: Trajectory, t: float) -> Trajectory:
-    """The poses of a trajectory from the time ``t`` on."""
-    keep = trajectory.t >= t - TOLERANCE
-    covariances = None if trajectory.covariances is None else trajectory.covariances[keep]
-    return Trajectory(trajectory.t[keep], trajectory.poses[keep], covariances, trajectory.has_heading)
 
 
 def _positive_definite(covariances: Array) -> NDArray[np.bool_]:

@@ -29,7 +29,7 @@ from factorgraph_loc.files.models import file_name, parse_model
 from factorgraph_loc.files.temporary import of_system, require_free, temporary_folder
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, load_all
-from factorgraph_loc.io.results import FILES, INDEX
+from factorgraph_loc.io.results import FILES, INDEX, ResultFiles
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
 from factorgraph_loc.text import listed, plain
@@ -206,7 +206,7 @@ def _plot(logs: Sequence[Log], prepared: Prepared, folder: Path) -> None:
         tracks: dict[str, Track] = {}
         for run in prepared.runs:
             if run.log == log.name and run.label not in tracks and store.state(run.key) == "ok":
-                tracks[run.label] = Track.read(partial(store.read, run.key), log.t0_ns, run.max_gap)
+                tracks[run.label] = Track.read(ResultFiles(partial(store.read, run.key), log.t0_ns), run.max_gap)
         if tracks:
             plot_log(log, tracks, folder, file_name(log.name))
 

@@ -17,13 +17,11 @@ from factorgraph_loc.io import results
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.text import told
 from factors.se2 import Array
 
 STORE = "store"  # of several runs
 COMPLETE = results.FILES[-1]  # written last, so that its presence marks a complete run
 OUTSIDE = 60.0  # s that an estimate may lie outside of its log
-SERIES = ("error_position", "error_heading", "nees")
 
 
 class _Landmark(FileModel, extra="ignore"):
@@ -127,22 +125,20 @@ def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
 def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
     if folder.log != log.name:
         raise InputError(f"{folder.path}: is a run of the log {folder.log}, expected one of {log.name}")
-    path = folder.path / results.ESTIMATES
-    table = results.parse_estimates(read_bytes(path, DATA), path)
-    table = table.filter(pl.all_horizontal(pl.col(key).is_finite() for key in ("x", "y", "heading")))
-    causal, final = results.by_kind(table).values()
-    try:
-        of_causal, of_final = results.trajectory_of(causal, log.t0_ns), results.trajectory_of(final, log.t0_ns)
-    except ValueError as error:
-        raise InputError(f"{path}: holds no trajectory: {told(error)}") from error
+    files = results.ResultFiles(lambda file: read_bytes(folder.path / file, DATA), log.t0_ns, folder.path)
+    causal, final = (
+        found.rows(np.isfinite(found.trajectory.poses).all(axis=1)) for found in files.estimates().values()
+    )
+    played = causal if len(causal.trajectory) else final
+    known = {key: np.isfinite(values) for key, values in played.errors.items()}
     run = StoredRun(
         name,
         folder,
-        of_causal,
-        of_final,
-        {key: _series(causal if len(causal) else final, key, log.t0_ns) for key in SERIES},
+        causal.trajectory,
+        final.trajectory,
+        {key: (played.trajectory.t[known[key]], values[known[key]]) for key, values in played.errors.items()},
         _landmarks(folder.path / "learnt.json"),
-        results.parse_events(read_bytes(folder.path / results.EVENTS, DATA), folder.path / results.EVENTS, log.t0_ns),
+        files.events(),
     )
     _check_times(run, log)
     return run
@@ -162,11 +158,6 @@ def _check_times(run: StoredRun, log: Log) -> None:
 def _config(folder: Path) -> StoredConfig:
     path = folder / "config.toml"
     return parse_model(StoredConfig, read_toml(path), path)
-
-
-def _series(table: pl.DataFrame, key: str, t0_ns: int) -> tuple[Array, Array]:
-    known = table.filter(pl.col(key).is_not_null())
-    return (known["t_ns"].to_numpy() - t0_ns) / 1e9, known[key].to_numpy()
 
 
 def _landmarks(path: Path) -> dict[str, LearntPoint]:

@@ -1,25 +1,27 @@
-"""Files of a result folder: their names, and the table of a run's estimates; see
-:func:`~factorgraph_loc.experiments.output.write_run`."""
+"""The files of a stored run, see :func:`~factorgraph_loc.experiments.output.write_run`: their names, and their one reader."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import foreign
 from factorgraph_loc.files.columns import LATEST
 from factorgraph_loc.files.tables import parse_parquet
 from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory
+from factorgraph_loc.text import told
+from factors.se2 import Array
 
 INDEX = "results.parquet"  # of several runs
 ESTIMATES, INNOVATIONS, EVENTS = "estimates.parquet", "innovations.parquet", "events.csv"
 KINDS = ("causal", "final")
 TEXTS, STAMP = ("kind", "status"), "t_ns"
-NUMBERS = (
-    *("x", "y", "heading", *COVARIANCES),
-    *("error_position", "error_heading", "nees"),
-)
+ERRORS = ("error_position", "error_heading", "nees")
+NUMBERS = ("x", "y", "heading", *COVARIANCES, *ERRORS)
 COLUMNS = (STAMP, *TEXTS, *NUMBERS)
 FILES = (
     "final.tum",
@@ -33,44 +35,83 @@ FILES = (
 )  # the last one is written last
 
 
-def trajectory_of(table: pl.DataFrame, t0_ns: int) -> Trajectory:
-    """The poses in rows of an ``estimates.parquet``, in seconds after ``t0_ns``."""
-    covariances = np.empty((len(table), 3, 3))
-    for name, (i, j) in COVARIANCES.items():
-        covariances[:, i, j] = covariances[:, j, i] = table[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
-    t = (table["t_ns"].to_numpy() - t0_ns) / 1e9
-    return Trajectory(t, table.select("x", "y", "heading").fill_null(np.nan).to_numpy(), covariances)
+@dataclass(frozen=True)
+class Estimates:
+    """Estimates of one kind: their ``trajectory`` (N poses), and by the names in :data:`ERRORS` the errors (N,) [m], [rad] and the
+    NEES, NaN where unknown."""
+
+    trajectory: Trajectory
+    errors: dict[str, Array]
+
+    @classmethod
+    def of(cls, table: pl.DataFrame, t0_ns: int) -> "Estimates":
+        """The rows of an ``estimates.parquet``, in seconds after ``t0_ns``."""
+        numbers = {name: table[name].fill_null(np.nan).to_numpy() for name in NUMBERS}
+        covariances = np.empty((len(table), 3, 3))
+        for name, (i, j) in COVARIANCES.items():
+            covariances[:, i, j] = covariances[:, j, i] = numbers[name]
+        t = (table[STAMP].to_numpy() - t0_ns) / 1e9
+        poses = np.column_stack([numbers[name] for name in ("x", "y", "heading")])
+        return cls(Trajectory(t, poses, covariances), {name: numbers[name] for name in ERRORS})
+
+    def rows(self, which: NDArray[np.bool_]) -> "Estimates":
+        """The estimates at ``which`` (N,)."""
+        return Estimates(self.trajectory.rows(which), {name: values[which] for name, values in self.errors.items()})
 
 
-def parse_events(content: bytes, source: object, t0_ns: int) -> tuple[tuple[float, str], ...]:
-    """Time [s after ``t0_ns``] and text of the events in the bytes of ``events.csv``. Raises InputError with ``source``."""
-    with foreign(source, "is no table of events"):
-        table = pl.read_csv(content, schema_overrides={"t_ns": pl.Int64, "event": pl.String}).select("t_ns", "event")
-    if table.null_count().sum_horizontal().item() or not table["t_ns"].is_between(-LATEST, LATEST).all():
-        raise InputError(f"{source}: has a row without a stamp and an event, expected both")
-    return tuple(((t_ns - t0_ns) / 1e9, text) for t_ns, text in table.iter_rows())
+@dataclass(frozen=True)
+class ResultFiles:
+    """The files of a run. ``read`` returns the content of a file by its name; ``folder``: named in errors. Times are in seconds
+    after ``t0_ns``, by default after the first estimate. InputError names a damaged file."""
+
+    read: Callable[[str], bytes]
+    t0_ns: int | None = None
+    folder: Path = Path()
+
+    def estimates(self) -> dict[str, Estimates]:
+        """The estimates of each of :data:`KINDS`: the causal ones from the first localized one on, and the final ones."""
+        source = self.folder / ESTIMATES
+        table = parse_estimates(self.read(ESTIMATES), source)
+        t0_ns = table[STAMP].min() if self.t0_ns is None else self.t0_ns
+        by_kind = {kind: table.filter(pl.col("kind") == kind) for kind in KINDS}
+        localized = (by_kind["causal"]["status"] == "localized").arg_true()
+        first = int(localized[0]) if len(localized) else len(by_kind["causal"])
+        by_kind["causal"] = by_kind["causal"][first:]
+        try:
+            return {kind: Estimates.of(rows, t0_ns) for kind, rows in by_kind.items()}  # type: ignore[arg-type] # an integer
+        except ValueError as error:
+            raise InputError(f"{source}: holds no trajectory: {told(error)}") from error
+
+    def innovations(self) -> dict[str, Array]:
+        """By sensor: rows (K, 3) of time, normalised innovation squared and degrees of freedom."""
+        table = parse_parquet(self.read(INNOVATIONS), self.folder / INNOVATIONS)
+        table = table.select("sensor", (pl.col(STAMP) - (self.t0_ns or 0)) / 1e9, "nis", "dof")
+        groups = table.group_by("sensor", maintain_order=True)
+        return {str(sensor): rows.drop("sensor").to_numpy() for (sensor,), rows in groups}
+
+    def events(self) -> tuple[tuple[float, str], ...]:
+        """Time and text of the events."""
+        source = self.folder / EVENTS
+        with foreign(source, "is no table of events"):
+            table = pl.read_csv(self.read(EVENTS), schema_overrides={STAMP: pl.Int64, "event": pl.String})
+            table = table.select(STAMP, "event")
+        if table.null_count().sum_horizontal().item() or not table[STAMP].is_between(-LATEST, LATEST).all():
+            raise InputError(f"{source}: has a row without a stamp and an event, expected both")
+        return tuple(((t_ns - (self.t0_ns or 0)) / 1e9, text) for t_ns, text in table.iter_rows())
 
 
-def by_kind(table: pl.DataFrame) -> dict[str, pl.DataFrame]:
-    """The rows of each of :data:`KINDS`: the causal ones from the first localized estimate on, and the final ones."""
-    found = {kind: table.filter(pl.col("kind") == kind) for kind in KINDS}
-    localized = (found["causal"]["status"] == "localized").arg_true()
-    found["causal"] = found["causal"][int(localized[0]) :] if len(localized) else found["causal"].clear()
-    return found
-
-
-def parse_estimates(content: bytes, source: object, columns: Sequence[str] = COLUMNS) -> pl.DataFrame:
-    """Some ``columns`` of the table in the bytes of the file, numbers as floats, null where unknown.
+def parse_estimates(content: bytes, source: object) -> pl.DataFrame:
+    """The table in the bytes of ``estimates.parquet``, numbers as floats, null where unknown.
 
     Raises InputError with ``source`` if the file is damaged."""
-    table = parse_parquet(content, source, columns)
-    for name in columns:
+    table = parse_parquet(content, source, COLUMNS)
+    for name in COLUMNS:
         kind = table.schema[name]
         is_right = (kind == pl.String) if name in TEXTS else kind.is_integer() if name == STAMP else kind.is_numeric()
         if not is_right and kind != pl.Null:
             raise InputError(f"{source}: {name} is of type {kind}, expected {'texts' if name in TEXTS else 'numbers'}")
-    table = table.select(pl.col(name).cast(_kind(name), strict=False) for name in columns)
-    if STAMP in columns and not table[STAMP].is_between(-LATEST, LATEST).fill_null(value=False).all():
+    table = table.select(pl.col(name).cast(_kind(name), strict=False) for name in COLUMNS)
+    if not table[STAMP].is_between(-LATEST, LATEST).fill_null(value=False).all():
         raise InputError(f"{source}: {STAMP} has a row without a stamp, or with one beyond {LATEST:.1e} ns")
     return table
 

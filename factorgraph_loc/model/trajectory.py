@@ -137,6 +137,11 @@ class Trajectory(Exchange):
     def __len__(self) -> int:
         return len(self.t)
 
+    def rows(self, which: Integers | NDArray[np.bool_]) -> Self:
+        """The poses at indices ``which``, or where ``which`` (N,) is true."""
+        covariances = None if self.covariances is None else self.covariances[which]
+        return replace(self, t=self.t[which], poses=self.poses[which], covariances=covariances)
+
     def at(self, t: Array, *, max_gap: float = np.inf) -> Array:
         """Poses (M, 3) at times ``t`` (M,), interpolated on SE(2); NaN outside and in gaps longer than ``max_gap``."""
         out = np.full((len(t), 3), np.nan)

@@ -18,6 +18,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import plots, tracks, write_report
 from factorgraph_loc.evaluation.report.metrics import metric_of
 from factorgraph_loc.evaluation.report.results import Results
+from factorgraph_loc.io.results import ResultFiles
 from factorgraph_loc.text import significant
 
 BAD = "<script>window.hacked = 1</script>\"'&</script><img src=x onerror=alert(1)> ../../etc"
@@ -210,17 +211,22 @@ def test_wrong_asks_are_told(made, tmp_path):
     assert not (tmp_path / "none.html").exists()
 
 
+def _estimates(content):
+    return ResultFiles(lambda _: content).estimates()
+
+
 def test_thinned_errors_keep_their_extremes(made):
     some = made({"ekf": 0.1}, ["one"], count=5000)
-    series = tracks.read_series(some.tables["0000"], None)["causal"]
+    series = _estimates(some.tables["0000"])["causal"]
     thinned = tracks.thinned(series, 100)
     t, x, errors = (np.array(thinned[name]) for name in "txe")
     assert 50 <= len(errors) <= 102
-    assert errors.max() == pytest.approx(series.error.max(), abs=1e-3)
-    assert errors.min() == pytest.approx(series.error.min(), abs=1e-3)
+    all_errors = series.errors["error_position"]
+    assert errors.max() == pytest.approx(all_errors.max(), abs=1e-3)
+    assert errors.min() == pytest.approx(all_errors.min(), abs=1e-3)
     assert (t[0], t[-1]) == pytest.approx((0.0, 499.9))
-    found = np.searchsorted(series.t, t - 1e-6)
-    assert x == pytest.approx(series.x[found], abs=1e-3)
+    rows = np.searchsorted(series.trajectory.t, t - 1e-6)
+    assert x == pytest.approx(series.trajectory.poses[rows, 0], abs=1e-3)
 
 
 def test_series_begin_with_the_first_localized_pose(made):
@@ -228,18 +234,18 @@ def test_series_begin_with_the_first_localized_pose(made):
     table = pl.read_parquet(some.tables["0000"])
     early = (pl.col("t_ns") < 1_000_000_000) & (pl.col("kind") == "causal")
     changed = table.with_columns(status=pl.when(early).then(pl.lit("unlocalized")).otherwise("status"))
-    series = tracks.read_series(_bytes(changed), None)
-    assert series["causal"].t[0] == pytest.approx(1.0)
-    assert series["final"].t[0] == 0.0
-    assert len(series["causal"].error) == 20
+    series = _estimates(_bytes(changed))
+    assert series["causal"].trajectory.t[0] == pytest.approx(1.0)
+    assert series["final"].trajectory.t[0] == 0.0
+    assert len(series["causal"].errors["error_position"]) == 20
     never = table.with_columns(status=pl.lit("unlocalized"), error_heading=pl.lit(None, dtype=pl.Float64))
-    found = tracks.read_series(_bytes(never), None)
-    assert list(found) == ["final"]
-    assert found["final"].dof == 2
+    series = _estimates(_bytes(never))
+    assert not len(series["causal"].trajectory)
+    assert tracks.consistency(series["final"])[2] == 2
 
 
 def test_consistent_runs_are_told_to_be_so(made):
-    series = tracks.read_series(made({"ekf": 0.1}, ["one"], count=20000).tables["0000"], None)["causal"]
+    series = _estimates(made({"ekf": 0.1}, ["one"], count=20000).tables["0000"])["causal"]
     mean, independent, dof = tracks.consistency(series)
     assert dof == 3
     assert mean == pytest.approx(1.0, abs=0.15)  # sigma of the mean: sqrt(2 / 3 / independent), 0.03

@@ -19,6 +19,7 @@ from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.plan import plan
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.experiments.store import FAILURE, MANIFEST, TIMINGS, Store, StoreError
+from factorgraph_loc.io.results import ResultFiles
 
 # a name that would leave the store as a path, and be code in a page
 NASTY = "../../a 'b' \"c\" <script>alert(1)</script>/.."
@@ -53,7 +54,7 @@ def test_a_run_gives_what_fgloc_run_gives_but_for_times(planned, out, tmp_path):
     store = Store(out)
     (log,) = load(str(tmp_path / "log"))
     result = run(log, RunConfig("ekf"))
-    track = Track.read(partial(store.read, one.key), log.t0_ns)
+    track = Track.read(ResultFiles(partial(store.read, one.key), log.t0_ns))
     np.testing.assert_allclose(track.final.t, result.final.t, atol=1e-9)
     np.testing.assert_array_equal(track.final.poses, result.final.poses)
     np.testing.assert_array_equal(track.causal.covariances, result.causal().covariances)

@@ -24,15 +24,14 @@ from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
 from factorgraph_loc.evaluation.report import tracks
 from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.report.scene import Scene
-from factorgraph_loc.evaluation.report.tracks import Series
 from factorgraph_loc.evaluation.warned import SWEEP, label_of
-from factorgraph_loc.io.results import KINDS
+from factorgraph_loc.io.results import KINDS, Estimates, ResultFiles
 from factors.se2 import Array
 
 POSES = 120_000  # on the page, shared by all trajectories
 FEWEST, MOST = 60, 1000  # bounds for one trajectory
 TRACKS = 1000  # maximum number of runs with trajectories; further logs appear in tables only
-_ESTIMATES, _CONFIG = "estimates.parquet", "config.toml"
+_CONFIG = "config.toml"
 SIMULATION = "simulation"  # first word of swept settings that change the log
 
 Row = Mapping[str, Any]
@@ -99,7 +98,9 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
             every = [(one, series if one is row else _series(runs(str(one["key"])))) for one in well]
             for kind in KINDS:
                 scored = [
-                    s[kind].error for one, s in every if kind in s and score(one, f"{kind}.position_rmse") is not None
+                    s[kind].errors["error_position"]
+                    for one, s in every
+                    if kind in s and score(one, f"{kind}.position_rmse") is not None
                 ]
                 if len(quantiles := tracks.quantiles(scored)):
                     found.errors[kind][variant, log] = quantiles
@@ -113,8 +114,10 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
     return found
 
 
-def _series(files: RunFiles) -> dict[str, Series]:
-    return tracks.read_series(files.read(_ESTIMATES), files.scene.t0_ns if files.scene else None)
+def _series(files: RunFiles) -> dict[str, Estimates]:
+    """The estimates of a run by kind, without kinds that it lacks."""
+    found = ResultFiles(files.read, files.scene.t0_ns if files.scene else None).estimates()
+    return {kind: estimates for kind, estimates in found.items() if len(estimates.trajectory)}
 
 
 def _add_config(found: RunData, run: str, text: str) -> None:

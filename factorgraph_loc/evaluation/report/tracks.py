@@ -1,73 +1,36 @@
 """Trajectories and errors of runs, decimated and rounded to limit the size of the page."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
-import polars as pl
 from numpy.typing import NDArray
 
 from factorgraph_loc.evaluation.inference import independent_count
-from factorgraph_loc.io.results import ESTIMATES, by_kind, parse_estimates
+from factorgraph_loc.io.results import Estimates
 from factors.se2 import Array
 
 LEVELS = np.linspace(0.0, 1.0, 51)  # of the plotted distribution of errors
-_NUMBERS = ("x", "y", "cov_xx", "cov_xy", "cov_yy", "error_position", "error_heading", "nees")
 
 
-@dataclass(frozen=True)
-class Series:
-    """One kind of trajectory of a run, N poses; NaN where unknown.
-
-    ``t`` (N,) [s from the log's start]; ``x``, ``y`` [m]; ``error`` [m] and ``sigma`` [m]: twice the standard deviation in the
-    least certain direction; ``nees`` and its ``dof``.
-    """
-
-    t: Array
-    x: Array
-    y: Array
-    error: Array
-    sigma: Array
-    nees: Array
-    dof: int
-
-
-def read_series(estimates: bytes, t0_ns: int | None) -> dict[str, Series]:
-    """The trajectories of ``estimates.parquet`` by kind: the causal one from the first localized estimate on, if there is any.
-
-    Times are relative to ``t0_ns``, by default to the first tick.
-    """
-    table = parse_estimates(estimates, ESTIMATES, ("kind", "t_ns", "status", *_NUMBERS))
-    start_ns = table["t_ns"].min() if t0_ns is None else t0_ns
-    found = {}
-    for kind, rows in by_kind(table).items():
-        if len(rows):
-            t = ((rows["t_ns"] - start_ns) / 1e9).to_numpy()
-            found[kind] = _series(t, {name: _numbers(rows[name]) for name in _NUMBERS})
-    return found
-
-
-def _numbers(column: pl.Series) -> Array:
-    return np.asarray(column.cast(pl.Float64).fill_null(math.nan).to_numpy(), dtype=float)
-
-
-def _series(t: Array, columns: Mapping[str, Array]) -> Series:
-    xx, xy, yy = (columns[f"cov_{name}"] for name in ("xx", "xy", "yy"))
+def sigma(estimates: Estimates) -> Array:
+    """Twice the standard deviation (N,) [m] in the least certain direction."""
+    assert estimates.trajectory.covariances is not None
+    xx, xy, yy = (estimates.trajectory.covariances[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     with np.errstate(invalid="ignore"):
-        sigma = 2.0 * np.sqrt((xx + yy) / 2.0 + np.sqrt(np.square((xx - yy) / 2.0) + np.square(xy)))
-    dof = 3 if np.isfinite(columns["error_heading"]).any() else 2
-    return Series(t, columns["x"], columns["y"], columns["error_position"], sigma, columns["nees"], dof)
+        return np.asarray(2.0 * np.sqrt((xx + yy) / 2.0 + np.sqrt(np.square((xx - yy) / 2.0) + np.square(xy))))
 
 
-def thinned(series: Series, count: int) -> dict[str, list[float | None]]:
+def thinned(estimates: Estimates, count: int) -> dict[str, list[float | None]]:
     """About ``count`` poses as plain values, to a millimetre and a millisecond; None where unknown.
 
     ``t``, ``x``, ``y``, ``e`` (position error) and ``s`` (sigma). Of each interval of time there are the poses with the smallest
     and with the largest error.
     """
-    keep = _thin(series.error, count)
-    columns = {"t": series.t, "x": series.x, "y": series.y, "e": series.error, "s": series.sigma}
+    error, trajectory = estimates.errors["error_position"], estimates.trajectory
+    x, y, _ = trajectory.poses.T
+    keep = _thin(error, count)
+    columns = {"t": trajectory.t, "x": x, "y": y, "e": error, "s": sigma(estimates)}
     return {
         name: [round(v, 3) if math.isfinite(v) else None for v in values[keep].tolist()]
         for name, values in columns.items()
@@ -80,10 +43,11 @@ def quantiles(errors: Sequence[Array]) -> Array:
     return np.quantile(known, LEVELS) if len(known) else known
 
 
-def consistency(series: Series) -> tuple[float, float, int] | None:
+def consistency(estimates: Estimates) -> tuple[float, float, int] | None:
     """Mean NEES per degree of freedom, its effective number of independent values, and the degrees of freedom; None without any."""
-    nees = _known(series.nees)
-    return (float(np.mean(nees)) / series.dof, independent_count(nees), series.dof) if len(nees) > 1 else None
+    nees = _known(estimates.errors["nees"])
+    dof = 3 if len(_known(estimates.errors["error_heading"])) else 2
+    return (float(np.mean(nees)) / dof, independent_count(nees), dof) if len(nees) > 1 else None
 
 
 def _known(values: Array) -> Array:
