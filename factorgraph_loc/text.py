@@ -1,8 +1,11 @@
 """Safe display of names and values of foreign origin: bounded length, one line, no control characters."""
 
+import json
 import math
 from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import is_dataclass
 from itertools import islice
+from typing import Any
 
 MESSAGE = 300  # characters of a message at most
 NAME = 120  # characters of a name, a path or a foreign message
@@ -56,6 +59,24 @@ def told(error: BaseException) -> str:
     """The message of a foreign exception on one line, or its class name if it has none."""
     says = " ".join(str(getattr(error, "strerror", None) or error).split())
     return plain(says or type(error).__name__)
+
+
+def plain_values(value: Any) -> Any:
+    """A value as in JSON: dictionaries for data classes and mappings, lists for arrays and tuples, null for NaN and infinity."""
+    if is_dataclass(value):
+        return {name: plain_values(getattr(value, name)) for name in value.__dataclass_fields__}
+    if hasattr(value, "tolist"):  # an array
+        return plain_values(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): plain_values(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain_values(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def json_text(content: Any) -> str:
+    """The text of a JSON file; see :func:`plain_values`."""
+    return json.dumps(plain_values(content), indent=2, allow_nan=False) + "\n"
 
 
 def well_formed(text: str) -> str:

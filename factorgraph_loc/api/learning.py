@@ -12,7 +12,7 @@ from factorgraph_loc.evaluation.features.feature_evaluation import feature
 from factorgraph_loc.evaluation.features.sequences import find_sequences
 from factorgraph_loc.experiments import maps, output
 from factorgraph_loc.files.models import replacing
-from factorgraph_loc.files.temporary import of_system, temporary_folder, writing
+from factorgraph_loc.files.temporary import of_system, require_free, temporary_folder, writing
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, load_all, read_log
 from factorgraph_loc.plugins import FEATURES, MAP_ESTIMATORS
@@ -88,7 +88,7 @@ def features(
     progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> feature_scores.FeatureScores:
     """Evaluate point features on images of planar scenes: folders of sequences, or photographs, which are warped."""
-    feature_scores.check_free(Path(out), overwrite=overwrite)
+    require_free(Path(out), feature_scores.FILES, overwrite=overwrite)
     chosen = [feature(name, count) for name in features]
     scores = feature_scores.evaluate_all(find_sequences([Path(path) for path in images]), chosen, progress)
     feature_scores.write_scores(scores, Path(out))

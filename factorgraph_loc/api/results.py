@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import TypeVar
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.trajectories.page import check_free, write_score
+from factorgraph_loc.evaluation.trajectories.page import FILES, write_score
 from factorgraph_loc.evaluation.trajectories.score import TrajectoryScore, score_paths
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 from factorgraph_loc.exports.ros import write_mcap
 from factorgraph_loc.exports.runs import StoredRun, find_runs, is_results, read_runs
 from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, pose_graph, write_g2o, write_trajectory
 from factorgraph_loc.files.shipped import manifests
+from factorgraph_loc.files.temporary import require_free
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, read_log
 from factorgraph_loc.io.trajectories import read_trajectory
 from factorgraph_loc.maps.points import write_ply
@@ -171,7 +172,7 @@ def score(
     score`` writes. InputError if a trajectory cannot be read, or the two have nothing in common.
     """
     if out is not None:
-        check_free(Path(out), overwrite=overwrite)
+        require_free(Path(out), FILES, overwrite=overwrite)
     paths = _path(estimate, "estimate"), _path(reference, "reference")
     found = score_paths(*paths, align, associate, max_diff=max_diff, max_gap=max_gap, all_pairs=all_pairs)
     if out is not None:

@@ -11,9 +11,11 @@ from factorgraph_loc.experiments import output
 from factorgraph_loc.experiments import run as running
 from factorgraph_loc.experiments.compare import told
 from factorgraph_loc.experiments.learning import run_and_learn
+from factorgraph_loc.files.temporary import require_free
 from factorgraph_loc.fitting.posterior import FittedConstant
 from factorgraph_loc.fusion.registry import for_final_only
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, read_log
+from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment, RunConfig
 
@@ -58,7 +60,7 @@ def run(
     reference. ``out``: folder for the files that ``fgloc run`` writes.
     """
     if out is not None:
-        output.check_free(Path(out), overwrite=overwrite)
+        require_free(Path(out), FILES, overwrite=overwrite)
     given = {estimator: settings or {}}
     chosen = (for_final_only(given) if final_only else given)[estimator]
     loaded = read_log(log, rig=rig, world=world)

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.calibration.learn import calibrators
 from factorgraph_loc.errors import InputError, RunFailedError
-from factorgraph_loc.io.results import KINDS
 from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.scoring import KINDS
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.odometry.calibration import odometry_of
 

@@ -10,7 +10,7 @@ from factorgraph_loc.calibration.learn import calibrators
 from factorgraph_loc.drawing.pages import Part, Rows, sectioned
 from factorgraph_loc.files.settings import settings_in
 from factorgraph_loc.fitting.posterior import FittedConstant
-from factorgraph_loc.io.results import KINDS
+from factorgraph_loc.model.scoring import KINDS
 from factorgraph_loc.model.sections import sections
 from factorgraph_loc.plugins import load
 from factorgraph_loc.text import listed, number

@@ -24,7 +24,9 @@ from factorgraph_loc.cli.options import (
     parse_settings,
     takes_options,
 )
+from factorgraph_loc.evaluation.scores import ACCURACY, metric_of
 from factorgraph_loc.experiments.seeds import parse_seeds
+from factorgraph_loc.model.scoring import KINDS
 from factorgraph_loc.text import number
 
 if TYPE_CHECKING:
@@ -32,14 +34,13 @@ if TYPE_CHECKING:
 
 SHOWN_CONSTANTS, SHOWN_EVENTS = 10, 5  # the others are in the files
 
-# table of a run; column: key of the scores, digits
-COLUMNS = {
-    "position RMSE [m]": ("position_rmse", 3),
-    "95 % [m]": ("position_p95", 3),
-    "max [m]": ("position_max", 3),
-    "heading RMSE [rad]": ("heading_rmse", 4),
-    "ANEES": ("anees", 2),
-    "poses scored": ("scored", 0),
+COLUMNS = {  # of the table of a run, by score
+    "position_rmse": "position RMSE [m]",
+    "position_p95": "95 % [m]",
+    "position_max": "max [m]",
+    "heading_rmse": "heading RMSE [rad]",
+    "anees": "ANEES",
+    "scored": "poses scored",
 }
 
 
@@ -62,11 +63,13 @@ def run(
 ) -> None:
     """Run one estimator on one log; write trajectories, estimates, scores and plots."""
     from factorgraph_loc.api import running
-    from factorgraph_loc.experiments.output import MAP, check_free
+    from factorgraph_loc.experiments.output import MAP
+    from factorgraph_loc.files.temporary import require_free
     from factorgraph_loc.fusion.registry import check_names
+    from factorgraph_loc.io.results import FILES
 
     check_names([estimator])
-    check_free(out, overwrite=options.overwrite)  # before the log is read
+    require_free(out, FILES, overwrite=options.overwrite)  # before the log is read
     settings = parse_settings(options.set_ or (), [estimator])
     loaded = source.load_one(log)
     show.first_use()
@@ -117,13 +120,14 @@ def compare(
 ) -> None:
     """Run several estimators on several logs; write a table and plots."""
     from factorgraph_loc.evaluation.tables import comparison_table, further_tables, unscored, verdict
-    from factorgraph_loc.experiments.compare import check_free
+    from factorgraph_loc.experiments.compare import FINISHED
     from factorgraph_loc.experiments.compare import compare as compare_estimators
+    from factorgraph_loc.files.temporary import require_free
     from factorgraph_loc.fusion.registry import check_names
 
     names = parse_list(estimators)
     check_names(names)
-    check_free(out, overwrite=options.overwrite)  # before the logs are read
+    require_free(out, FINISHED, overwrite=options.overwrite)  # before the logs are read
     settings = parse_settings(options.set_ or (), names)
     chosen = parse_seeds(seeds)
     loaded = source.load(logs)
@@ -163,10 +167,9 @@ def compare(
 def _print_accuracy(scores: Mapping[str, Any]) -> None:
     if scores["causal.position_rmse"] is not None or scores["final.position_rmse"] is not None:
         rows = [
-            (kind, *(number(scores[f"{kind}.{figure}"], digits) for figure, digits in COLUMNS.values()))
-            for kind in ("causal", "final")
+            (kind, *(number(scores[f"{kind}.{name}"], ACCURACY[name].digits) for name in COLUMNS)) for kind in KINDS
         ]
-        show.table(("", *COLUMNS), rows)
+        show.table(("", *COLUMNS.values()), rows)
     else:
         hardly = f", or too little: {scored} poses scored" if (scored := scores["final.scored"]) is not None else ""
         show.line(f"there is no reference to score against{hardly}")
@@ -183,15 +186,12 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
 def _print_further(scores: Mapping[str, Any], *, rpe: bool) -> None:
     """The tables that are asked for; nothing without a reference."""
     from factorgraph_loc.evaluation.tables import further_tables
-    from factorgraph_loc.io.results import KINDS
 
-    for title, columns in further_tables([scores], rpe=rpe).items():
-        rows = [
-            (kind, *(number(scores[key], n) for key, n, _ in columns.values() if key.startswith(kind)))
-            for kind in KINDS
-        ]
+    for title, keys in further_tables([scores], rpe=rpe).items():
+        metrics = {kind: [metric_of(key) for key in keys if key.startswith(kind)] for kind in KINDS}
+        rows = [(kind, *(number(scores[one.key], one.digits) for one in some)) for kind, some in metrics.items()]
         if any(cell != "-" for row in rows for cell in row[1:]):
-            names = [name.removeprefix(f"{KINDS[0]} ") for name in columns if name.startswith(KINDS[0])]
+            names = [one.column.removeprefix(f"{KINDS[0]} ") for one in metrics[KINDS[0]]]
             show.line(f"{title}:")
             show.table(("", *names), rows)
 

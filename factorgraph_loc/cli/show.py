@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from factorgraph_loc.text import MESSAGE, one_line, plain
+from factorgraph_loc.text import MESSAGE, one_line, plain, plain_values
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -49,7 +47,7 @@ def warnings(texts: Sequence[str]) -> None:
 def document(content: Any) -> None:
     """Print a JSON document on stdout; NaN and infinity become null, non-printable characters are escaped."""
     unicode = sys.stdout.encoding.lower().startswith("utf")
-    text = json.dumps(_plain(content), indent=2, ensure_ascii=not unicode)
+    text = json.dumps(plain_values(content), indent=2, ensure_ascii=not unicode)
     print("".join(c if c == "\n" or c.isprintable() else json.dumps(c)[1:-1] for c in text), flush=True)
 
 
@@ -137,17 +135,3 @@ def fields(content: Mapping[str, str]) -> None:
 
 def _is_number(text: str) -> bool:
     return text == "-" or text.replace(".", "", 1).lstrip("-").isdigit()
-
-
-def _plain(value: Any) -> Any:
-    if is_dataclass(value):
-        return {name: _plain(getattr(value, name)) for name in value.__dataclass_fields__}
-    if hasattr(value, "tolist"):  # an array
-        return _plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -9,6 +9,7 @@ __all__ = [
     "pairing",
     "plots",
     "report",
+    "scores",
     "statistics",
     "tables",
     "trajectories",

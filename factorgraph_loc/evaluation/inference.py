@@ -22,15 +22,15 @@ import numpy as np
 from scipy.special import ndtr
 
 from factorgraph_loc.evaluation.pairing import CONFIDENCE
+from factorgraph_loc.evaluation.scores import COMPARED
 from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS, average, bounds, draw_pooled, pair_seeds
-from factorgraph_loc.io.results import KINDS
+from factorgraph_loc.evaluation.warned import Row
 from factors import chi_squared
 from factors.se2 import Array
 
 SIGNIFICANT = 1.0 - CONFIDENCE
 _EXACT = 60  # pairs up to which the distribution is computed exactly
 
-COMPARED = tuple(f"{kind}.{what}_rmse" for kind in KINDS for what in ("position", "heading"))
 # columns of a difference, with their types, as there may be no rows
 DIFFERENCES: dict[str, type] = {
     **dict.fromkeys(("metric", "a", "b", "log"), str),
@@ -38,7 +38,6 @@ DIFFERENCES: dict[str, type] = {
     **dict.fromkeys(("pairs", "left_out"), int),
 }
 
-Row = Mapping[str, Any]
 Seeds = Mapping[int, float | None]  # the score of each seed, None where a run has none
 ByLog = Mapping[str, Seeds]
 Units = Literal["logs", "seeds"]

@@ -6,19 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.files.checks import ROUNDING
+from factorgraph_loc.io.checks import gap_warnings, long_gaps
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.interfaces import Summary
 from factorgraph_loc.sensors.registry import functions
 from factorgraph_loc.text import one_line
 from factors.se2 import Array
 
-LONG_GAP = 5.0  # s
-
 
 @dataclass(frozen=True)
 class StreamSummary:
-    """One stream: rows, median rate [Hz], first and last stamp [s], and gaps (start, length) [s] above ``LONG_GAP``."""
+    """One stream: rows, median rate [Hz], first and last stamp [s], and long gaps (start, length) [s]."""
 
     rows: int
     rate: float
@@ -62,12 +60,11 @@ def inspect(log: Log) -> Inspection:
     problems = list(log.warnings)
     problems += [f"the log has no {sensor}, which the rig lists" for sensor in log.rig.sensors if sensor not in streams]
     problems += [f"{name} is empty" for name, summary in streams.items() if summary.rows == 0]
-    problems += [_gaps(name, summary.gaps) for name, summary in streams.items() if summary.gaps]
-    if reference is not None and reference.gaps:
-        problems.append(_gaps("reference", reference.gaps))
+    for name, summary in (*streams.items(), *([("reference", reference)] if reference else [])):
+        problems += gap_warnings(name, summary.gaps)
     sensors = {name: summarize(log) for name, summarize in functions("summarize")}
     problems += [line for summary in sensors.values() for line in summary.problems]
-    return Inspection(streams, reference, tuple(map(one_line, problems)), sensors)
+    return Inspection(streams, reference, tuple(dict.fromkeys(map(one_line, problems))), sensors)
 
 
 def _summary(t: Array) -> StreamSummary:
@@ -76,14 +73,5 @@ def _summary(t: Array) -> StreamSummary:
         return StreamSummary(0, 0.0, 0.0, 0.0, ())
     stamps = np.unique(t)
     steps = np.diff(stamps)
-    gaps = tuple((float(stamps[i]), float(steps[i])) for i in np.flatnonzero(steps > LONG_GAP + ROUNDING))
     rate = 1.0 / float(np.median(steps)) if len(steps) else 0.0
-    return StreamSummary(len(t), rate, float(stamps[0]), float(stamps[-1]), gaps)
-
-
-def _gaps(name: str, gaps: tuple[tuple[float, float], ...]) -> str:
-    """One line on the gaps of a stream."""
-    start, length = max(gaps, key=lambda gap: gap[1])
-    if len(gaps) == 1:
-        return f"{name} has a gap of {length:.1f} s at {start:.1f} s"
-    return f"{name} has {len(gaps)} gaps above {LONG_GAP:g} s, the longest {length:.1f} s at {start:.1f} s"
+    return StreamSummary(len(t), rate, float(stamps[0]), float(stamps[-1]), long_gaps(stamps))

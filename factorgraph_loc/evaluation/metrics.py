@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.pairing import CONFIDENCE, TOLERANCE, Pairs, align_points, pairs, rms, spread
+from factorgraph_loc.evaluation.scores import ACCURACY, ALIGNED, OF_FREE_MAP
 from factorgraph_loc.evaluation.trajectories.association import in_plane
 from factorgraph_loc.evaluation.trajectories.score import pose_errors, score_paths
 from factorgraph_loc.evaluation.warned import WARNINGS
@@ -29,24 +30,7 @@ from factors import chi_squared, positive, se2
 from factors.se2 import Array
 
 FEWEST_SCORED = 10  # least number of poses for meaningful figures
-OF_FREE_MAP = ("aligned.position_rmse", "aligned.heading_rmse", "landmarks.count", "landmarks.rmse", "landmarks.anees")
-ALIGNED = ("aligned_position_rmse", "aligned_rotation_rmse")
 FREE_MAP = "unknown"  # value of an estimator's setting ``landmarks`` with which it estimates the map
-
-_HOW = ("rmse", "median", "p95", "max")
-_ACCURACY = (
-    *(f"{what}_{how}" for what in ("position", "heading") for how in _HOW),
-    "rpe_position_per_m",
-    "rpe_heading_per_m",
-    "rpe_pieces",
-    "rpe_position_per_s",
-    "rpe_heading_per_s",
-    "anees",
-    "nees_bounds",
-    "coverage_95",
-    "invalid_covariances",
-    "scored",
-)
 
 
 @dataclass(frozen=True)
@@ -129,9 +113,9 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
     scores: dict[str, Any] = {"scoring.max_gap": gap, WARNINGS: list(result.warnings)}
     trajectories = (("causal", causal), ("final", final))
     for kind, trajectory in trajectories:
-        figures = dict.fromkeys(_ACCURACY) if trajectory is None else accuracy(trajectory, log.reference, gap)
+        figures = dict.fromkeys(ACCURACY) if trajectory is None else accuracy(trajectory, log.reference, gap)
         if (figures["scored"] or 0) < FEWEST_SCORED:
-            figures = dict.fromkeys(_ACCURACY) | {"scored": figures["scored"]}
+            figures = dict.fromkeys(ACCURACY) | {"scored": figures["scored"]}
         scores |= {f"{kind}.{name}": value for name, value in figures.items()}
     scores["time_to_localized"] = None if causal is None else float(causal.t[0] - result.t[0])
     if result.config.get("settings", {}).get("landmarks") == FREE_MAP:
@@ -171,13 +155,13 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
     ellipse. ``invalid_covariances``: number of scored poses whose covariance is not positive definite, excluded from these three.
     ``scored``: number of poses of the reference with an estimate.
     """
-    figures: dict[str, Any] = dict.fromkeys(_ACCURACY)
+    figures: dict[str, Any] = dict.fromkeys(ACCURACY)
     if reference is None:
         return figures
     e = errors(trajectory, reference, max_gap)
     for name, values in (("position", e.position), ("heading", e.heading)):
         statistics = spread(values)
-        figures |= {f"{name}_{how}": statistics[how] for how in _HOW}
+        figures |= {key: value for how, value in statistics.items() if (key := f"{name}_{how}") in ACCURACY}
     _, per_m, per_s = pose_errors(in_plane(Pairs(e.t, e.poses, None, e.reference), trajectory, reference))
     for unit, relative in (("m", per_m), ("s", per_s)):
         if relative is not None and relative.rotation is not None:

@@ -2,65 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from factorgraph_loc.evaluation.scores import ACCURACY, ALIGNED, TABLE, Metric, metric_of
 from factorgraph_loc.evaluation.statistics import average, pooled_rms
-from factorgraph_loc.io.results import KINDS
-from factorgraph_loc.text import MESSAGE, plain
+from factorgraph_loc.evaluation.warned import Row
+from factorgraph_loc.model.scoring import KINDS
+from factorgraph_loc.text import MESSAGE, number, plain
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-# column: key of the score, digits, whether it is pooled as a root mean square (else averaged)
-COLUMNS = {
-    "causal pos [m]": ("causal.position_rmse", 3, True),
-    "causal head [rad]": ("causal.heading_rmse", 4, True),
-    "causal ANEES": ("causal.anees", 2, False),
-    "final pos [m]": ("final.position_rmse", 3, True),
-    "final head [rad]": ("final.heading_rmse", 4, True),
-    "final ANEES": ("final.anees", 2, False),
-    "update [ms]": ("timing.update_ms_median", 2, False),
-    "x real time": ("timing.real_time_factor", 0, False),
-}
-# after an unknown start
-SINCE_THE_START = {"localized after [s]": ("time_to_localized", 1, False)}
 ALL = "(all logs)"
-ALIGNED = {
-    f"{kind} {what}": (f"{kind}.aligned_{key}_rmse", digits, True)
-    for kind in KINDS
-    for what, key, digits in (("pos [m]", "position", 3), ("rot [rad]", "rotation", 4))
-}
-RELATIVE = {
-    f"{kind} {what} [{unit}/{per}]": (f"{kind}.rpe_{key}_per_{per}", 4, True)
-    for kind in KINDS
-    for per in ("m", "s")
-    for what, unit, key in (("pos", "m", "position"), ("head", "rad", "heading"))
-}
 SCORED = "poses scored"
 BASELINE = "dead_reckoning"
 ALIKE = 0.01  # relative difference of errors within which estimators are equally good
 
-Row = Mapping[str, Any]
-Columns = Mapping[str, tuple[str, int, bool]]
 
-
-def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, Columns]:
-    """The columns of each table that not all comparisons have, by its title: errors after an alignment, if the runs have one, and
+def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ...]]:
+    """The scores in each table that not all comparisons have, by its title: errors after an alignment, if the runs have one, and
     relative errors, if they are asked for."""
-    found: dict[str, Columns] = {}
+    found: dict[str, tuple[str, ...]] = {}
     aligned = dict.fromkeys(row["scoring.align"] for row in rows if row.get("scoring.align"))
     if aligned:
-        found[f"errors after alignment by {', '.join(aligned)}"] = ALIGNED
+        found[f"errors after alignment by {', '.join(aligned)}"] = tuple(
+            f"{kind}.{name}" for kind in KINDS for name in ALIGNED
+        )
     if rpe:
-        found["relative errors over a metre of path, and over a second"] = RELATIVE
+        found["relative errors over a metre of path, and over a second"] = tuple(
+            f"{kind}.{name}" for kind in KINDS for name in ACCURACY if name.startswith("rpe_") and name != "rpe_pieces"
+        )
     return found
 
 
-def comparison_cells(rows: Sequence[Row], shown: Columns | None = None) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of the table, from the rows of a comparison. ``shown``: other columns than :data:`COLUMNS`.
+def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of the table, from the rows of a comparison. ``shown``: other scores than :data:`TABLE`.
 
     RMSEs are pooled over seeds (root mean square), the rest is averaged; with several seeds the standard deviation follows after
     ±. The last rows pool each estimator over the logs with equal weights; ``runs`` is the number of successful runs of all, and a
@@ -69,26 +48,26 @@ def comparison_cells(rows: Sequence[Row], shown: Columns | None = None) -> tuple
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
-    columns: Columns = shown or COLUMNS
-    if shown is None and any(row.get("time_to_localized") for row in rows):
-        columns = {**SINCE_THE_START, **COLUMNS}
+    metrics = [metric_of(key) for key in shown or TABLE]
+    if not shown and any(row.get("time_to_localized") for row in rows):
+        metrics.insert(0, metric_of("time_to_localized"))
     lines = []
     for log in logs:
         for name in names:
             runs = [r for r in rows if r["log"] == log and r["estimator"] == name]
             if runs:
-                cells = [_cell([_figure(r, key) for r in runs], digits, rms) for key, digits, rms in columns.values()]
+                cells = [_cell(metric, [_figure(r, metric.key) for r in runs]) for metric in metrics]
                 lines.append([log, name, *cells, counted(runs) or "-", _went_well(runs)])
     if len(logs) > 1:
         for name in names:
             runs = [r for r in rows if r["estimator"] == name]
             by_log = [[r for r in runs if r["log"] == log] for log in logs]
-            cells = [_pooled(key, digits, rms, by_log) for key, digits, rms in columns.values()]
+            cells = [_pooled(metric, by_log) for metric in metrics]
             lines.append([ALL, name, *cells, counted(*by_log) or "-", _went_well(runs)])
-    return ["log", "estimator", *columns, SCORED, "runs"], lines
+    return ["log", "estimator", *(metric.column for metric in metrics), SCORED, "runs"], lines
 
 
-def comparison_table(rows: Sequence[Row], shown: Columns | None = None) -> Table:
+def comparison_table(rows: Sequence[Row], shown: Sequence[str] = ()) -> Table:
     """The same as a table for the terminal."""
     from rich import box  # noqa: PLC0415 - only a terminal needs it
     from rich.table import Table  # noqa: PLC0415
@@ -175,18 +154,18 @@ def _figure(row: Row, key: str) -> float | None:
     return None if offline and key.startswith("timing.") else row.get(key)
 
 
-def _cell(values: Sequence[float | None], digits: int, rms: bool) -> str:
+def _cell(metric: Metric, values: Sequence[float | None]) -> str:
     known = [v for v in values if v is not None]
     if not known:
         return "-"
-    text = f"{average(known, rms=rms):.{digits}f}"
-    return text if len(known) == 1 else f"{text} ±{np.std(known, ddof=1):.{digits}f}"
+    text = number(float(average(known, rms=metric.rms)), metric.digits)
+    return text if len(known) == 1 else f"{text} ±{np.std(known, ddof=1):.{metric.digits}f}"
 
 
-def _pooled(key: str, digits: int, rms: bool, by_log: Sequence[Sequence[Row]]) -> str:
-    known = [[v for v in (_figure(r, key) for r in runs) if v is not None] for runs in by_log]
-    averages = [average(values, rms=rms) for values in known if values]
-    return f"{average(averages, rms=rms):.{digits}f}" if averages else "-"
+def _pooled(metric: Metric, by_log: Sequence[Sequence[Row]]) -> str:
+    known = [[v for v in (_figure(r, metric.key) for r in runs) if v is not None] for runs in by_log]
+    averages = [average(values, rms=metric.rms) for values in known if values]
+    return number(float(average(averages, rms=metric.rms)) if averages else None, metric.digits)
 
 
 def counted(*by_log: Sequence[Row]) -> str:

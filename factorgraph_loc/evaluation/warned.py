@@ -5,6 +5,7 @@ from typing import Any
 
 WARNINGS = "warnings"  # key of the scores (a list), and of a row (one text, one line each; None without any)
 SWEEP = "sweep."  # columns of rows: the swept settings of a run
+SIMULATION = "simulation"  # first word of swept settings of simulated logs
 
 Row = Mapping[str, Any]
 

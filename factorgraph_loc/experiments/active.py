@@ -36,7 +36,7 @@ from factorgraph_loc.planning.closed_loop import ActiveRun, run_active
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.plugins import ACTIVE_ESTIMATORS, POLICIES
 from factorgraph_loc.simulation import SimulationSettings, named_settings
-from factorgraph_loc.text import quoted
+from factorgraph_loc.text import json_text, quoted
 from factorgraph_loc.version import __version__
 
 CHUNK = 10  # seeds that run with all policies before the next ones do
@@ -83,7 +83,7 @@ class ActiveJob:
             run = run_active(self.simulation, self.policy, self.estimator, self.seed, self.settings)
         except InputError as error:
             return failure("refused", str(error))
-        files = {METRICS: output.json_text(figures_of(run)).encode()}
+        files = {METRICS: json_text(figures_of(run)).encode()}
         return files | ({PICTURE: png_bytes(run_picture(run))} if self.pictured else {})
 
     def row(self, found: Mapping[str, Any]) -> Row:
@@ -133,7 +133,7 @@ def active(
     seeds, out = list(seeds), Path(out)
     _check_names("policy", policies, tuple(POLICIES))
     _check_names("estimator", estimators, ACTIVE_ESTIMATORS)
-    require_free(out, FILES, overwrite=overwrite, folders=(out / PLOTS,))
+    require_free(out, FILES, overwrite=overwrite)
     with writing(out):
         (out / PLOTS).mkdir(parents=True, exist_ok=True)
     for path in (*(out / name for name in FILES), *(out / PLOTS).glob("*.png")):

@@ -6,13 +6,14 @@ A run that failed or did not end localized counts with an infinite distance."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from factorgraph_loc.drawing.figures import COLOURS, dress, empty, grid, legend, styles
 from factorgraph_loc.evaluation.statistics import Interval, mcnemar, median_difference, median_ratio, quantile
+from factorgraph_loc.evaluation.warned import Row
 from factorgraph_loc.fitting.shares import wilson
 from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
 from factors.se2 import Array
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Row = Mapping[str, Any]
 Case = tuple[str, str]  # world, estimator
 
 # columns of a difference, with their types, as there may be no rows

@@ -15,7 +15,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.inference import DIFFERENCES, differences
 from factorgraph_loc.evaluation.plots import plot_log, remove_plots
-from factorgraph_loc.evaluation.report import DEFAULT
+from factorgraph_loc.evaluation.scores import REPORT
 from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, further_tables, markdown, unscored, verdict
 from factorgraph_loc.experiments.experiment import Prepared, run_experiment
 from factorgraph_loc.experiments.experiment_file import ENDLESS, Experiment
@@ -34,8 +34,11 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
 from factorgraph_loc.text import listed, plain
 
-# without results.parquet, which an unfinished comparison has
 _WRITTEN = (*(name for name in TABLES if name != INDEX), PAGE)
+FINISHED = (
+    *_WRITTEN,
+    *FILES,
+)  # results that are not replaced; an unfinished comparison, which is continued, has none of them
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,7 @@ def compare(
     Raises InputError, before anything runs, for invalid or missing input, and for results in ``out`` without ``overwrite``.
     """
     out = Path(out)
-    check_free(out, overwrite=overwrite)
+    require_free(out, FINISHED, overwrite=overwrite)
     named = _named(estimators, settings or {}, final_only=final_only)
     logs = load_all(logs, rig, world)
     if not logs or not named:
@@ -142,24 +145,18 @@ def _find_features(logs: Sequence[Log], prepared: Prepared) -> None:
         )
 
 
-def check_free(out: Path, *, overwrite: bool) -> None:
-    """Raise InputError if ``out`` is not a folder, or contains results that must not be replaced. Those of an unfinished
-    comparison are continued."""
-    require_free(out, (*_WRITTEN, *FILES), overwrite=overwrite, folders=(out.parent, out, out / "plots"))
-
-
 def _experiment(
     logs: Sequence[Log], estimators: Mapping[str, Mapping[str, Any]], keys: Mapping[str, Any], *, rpe: bool
 ) -> Experiment:
     """The experiment of a comparison."""
     align = keys.get("align", "none")
     tables = further_tables([{"scoring.align": None if align == "none" else align}], rpe=rpe)
-    further = [key for columns in tables.values() for key, *_ in columns.values()]
+    further = [key for keys in tables.values() for key in keys]
     content: dict[str, Any] = {
         "name": "Comparison",
         "logs": [plain(log.name) for log in logs],
         "estimators": [{"name": name, "settings": dict(settings)} for name, settings in estimators.items()],
-        "report": {"metrics": [*DEFAULT, *further]} | ({"baseline": BASELINE} if BASELINE in estimators else {}),
+        "report": {"metrics": [*REPORT, *further]} | ({"baseline": BASELINE} if BASELINE in estimators else {}),
         "limits": {"time": ENDLESS},
         **keys,
     }

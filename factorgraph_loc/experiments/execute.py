@@ -7,7 +7,6 @@ use the same store."""
 from __future__ import annotations
 
 import errno
-import json
 import tempfile
 import time
 import traceback
@@ -20,7 +19,7 @@ from typing import Any, Literal, Protocol
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments.keys import VanishedError
 from factorgraph_loc.experiments.store import FAILURE, Store, StoreError
-from factorgraph_loc.text import told
+from factorgraph_loc.text import json_text, told
 
 Files = dict[str, bytes]
 Kind = Literal["error", "timeout", "memory", "killed", "vanished", "refused"]
@@ -161,7 +160,7 @@ def compute(run: Planned) -> Files:
 def failure(kind: Kind, reason: str, details: str = "") -> Files:
     """The files of a failed run; ``details``: a traceback."""
     content = {"kind": kind, "reason": reason} | ({"traceback": details} if details else {})
-    return {FAILURE: (json.dumps(content, indent=2) + "\n").encode()}
+    return {FAILURE: json_text(content).encode()}
 
 
 def stored_outcome(key: str, store: Store) -> Outcome:

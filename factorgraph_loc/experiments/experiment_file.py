@@ -7,20 +7,20 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.scores import SUMMARY
+from factorgraph_loc.evaluation.warned import SIMULATION
 from factorgraph_loc.experiments.seeds import LARGEST_SEED, MOST_SEEDS, parse_seeds
-from factorgraph_loc.files.models import FileModel, check_content, nearest, parse_model, read_toml, set_key
+from factorgraph_loc.files.models import FileModel, check_content, flattened, nearest, parse_model, read_toml, set_key
 from factorgraph_loc.model.scoring import LONGEST, MAX_GAP, SHORTEST, TICK_GAP, Alignment
 from factorgraph_loc.text import listed, plain, quoted
 
-SIMULATION = "simulation"  # first word of settings of simulated logs
-METRICS = ("causal.position_rmse", "causal.heading_rmse", "causal.anees", "final.position_rmse", "final.heading_rmse")
 PATH, PART = 1000, 255  # maximum bytes of a path, and of a name within it
 LONGEST_NAME = 200  # maximum characters of the experiment's name, which is a folder name
 MOST = 1000  # maximum number of logs, estimators, sets of sensors and metrics in a file; globs and seeds may expand to more
@@ -57,15 +57,6 @@ def _seeds(value: Any) -> Any:
         except InputError as error:
             raise ValueError(str(error)) from error
     return value
-
-
-def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in content.items():
-        name = f"{before}{key}"
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{name}.")
-        else:
-            yield name, value
 
 
 class LogEntry(FileModel):
@@ -121,7 +112,7 @@ class Sweep(FileModel):
             return content
         rest = {key: value for key, value in content.items() if key != "mode"}
         mode = {"mode": content["mode"]} if "mode" in content else {}
-        over = dict(_flat(rest))
+        over = dict(flattened(rest))
         if len(over) > MOST_SWEPT:
             raise ValueError(f"{len(over):,} settings are swept over, expected at most {MOST_SWEPT}")
         for key, values in over.items():
@@ -163,7 +154,7 @@ class Sweep(FileModel):
 class ReportSettings(FileModel):
     """``metrics``: the scores in the report; ``baseline``: the label that the others are compared with."""
 
-    metrics: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST, fail_fast=True)] = METRICS
+    metrics: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST, fail_fast=True)] = SUMMARY
     baseline: str | None = None
 
 

@@ -36,6 +36,7 @@ COUNTED = (
     "errors.py",
     "evaluation/metrics.py",
     "evaluation/pairing.py",
+    "evaluation/scores.py",
     "evaluation/trajectories/association.py",
     "evaluation/trajectories/score.py",
     "evaluation/warned.py",

@@ -4,8 +4,6 @@ keeps; and the tables of several runs.
 Times aside, all files of a run are reproducible to the byte.
 """
 
-import json
-import math
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -24,14 +22,25 @@ from factorgraph_loc.files.models import write_text, write_toml
 from factorgraph_loc.files.tables import write_parquet
 from factorgraph_loc.files.temporary import of_system, require_free, sweep, temporary_folder, writing
 from factorgraph_loc.io.native.world_file import write_world
-from factorgraph_loc.io.results import EVENTS, FILES, INDEX, INNOVATIONS
+from factorgraph_loc.io.results import (
+    CAUSAL,
+    CONFIG,
+    ESTIMATES,
+    EVENTS,
+    FILES,
+    FINAL,
+    INDEX,
+    INNOVATIONS,
+    LEARNT,
+    METRICS,
+)
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import Alignment
 from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory, write_tum
 from factorgraph_loc.model.world import World
-from factorgraph_loc.text import plain_lines, quoted
+from factorgraph_loc.text import json_text, plain_lines, quoted
 from factors.se2 import Array
 
 MAP = "map.world.toml"
@@ -59,7 +68,7 @@ def write_run(
     Everything is written to a temporary folder first; other files in ``out`` are not changed. Raises InputError if ``out``
     contains results and ``overwrite`` is off.
     """
-    check_free(out, overwrite=overwrite)
+    require_free(out, FILES, overwrite=overwrite)
     scores = score(result, log, align)
     with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -108,14 +117,14 @@ def _keep(result: RunResult, log: Log, align: Alignment) -> Path | None:
 def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: Path) -> None:
     """Write the files of a run with these scores into an empty folder; see :func:`write_run`."""
     causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
-    write_tum(result.final, folder / "final.tum", log.t0_ns)
-    write_tum(causal, folder / "causal.tum", log.t0_ns)
-    write_parquet(estimates(result, log), folder / "estimates.parquet")
-    write_toml(folder / "config.toml", result.config)
-    write_text(folder / "learnt.json", json_text(learnt_tables(result.learnt)))
+    write_tum(result.final, folder / FINAL, log.t0_ns)
+    write_tum(causal, folder / CAUSAL, log.t0_ns)
+    write_parquet(estimates(result, log), folder / ESTIMATES)
+    write_toml(folder / CONFIG, result.config)
+    write_text(folder / LEARNT, json_text(learnt_tables(result.learnt)))
     write_parquet(innovations(result, log), folder / INNOVATIONS)
     write_text(folder / EVENTS, events(result, log).write_csv())
-    write_text(folder / "metrics.json", json_text(scores))
+    write_text(folder / METRICS, json_text(scores))
 
 
 def map_of(result: RunResult, log: Log) -> World | None:
@@ -144,11 +153,6 @@ def beside(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
         if path.exists() and not overwrite:
             raise InputError(f"{path}: exists already; choose another name or give --overwrite")
     return other
-
-
-def check_free(out: Path, *, overwrite: bool) -> None:
-    """Raise InputError if ``out`` is not a folder, or contains the results of a run that must not be replaced."""
-    require_free(out, FILES, overwrite=overwrite, folders=(out.parent, out / "plots"))
 
 
 def remove_run(out: Path) -> None:
@@ -236,20 +240,6 @@ def _slowest_update(result: RunResult) -> Array:
     inside = tick < len(result.t)  # updates after the last tick belong to none
     np.fmax.at(slowest, tick[inside], result.timings.update_ms[inside])
     return slowest
-
-
-def json_text(content: Mapping[str, Any]) -> str:
-    """Plain values as JSON; numbers that are not finite are null."""
-    return json.dumps(_plain(content), indent=2, allow_nan=False) + "\n"
-
-
-def _plain(content: Any) -> Any:
-    """Replace NaN and infinity, which JSON lacks, by null."""
-    if isinstance(content, Mapping):
-        return {key: _plain(value) for key, value in content.items()}
-    if isinstance(content, list):
-        return [_plain(value) for value in content]
-    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def run_files(result: RunResult, log: Log, started: float, align: Alignment = "none") -> dict[str, bytes]:

@@ -11,8 +11,8 @@ from time import perf_counter
 from typing import Any
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.warned import SIMULATION
 from factorgraph_loc.experiments.experiment_file import (
-    SIMULATION,
     EstimatorEntry,
     Experiment,
     LogEntry,

@@ -127,7 +127,7 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
         raise InputError(f"{folder.path}: is a run of the log {folder.log}, expected one of {log.name}")
     files = results.ResultFiles(lambda file: read_bytes(folder.path / file, DATA), log.t0_ns, folder.path)
     causal, final = (
-        found.rows(np.isfinite(found.trajectory.poses).all(axis=1)) for found in files.estimates().values()
+        found.rows(np.asarray(np.isfinite(found.trajectory.poses).all(axis=1))) for found in files.estimates().values()
     )
     played = causal if len(causal.trajectory) else final
     known = {key: np.isfinite(values) for key, values in played.errors.items()}
@@ -137,7 +137,7 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
         causal.trajectory,
         final.trajectory,
         {key: (played.trajectory.t[known[key]], values[known[key]]) for key, values in played.errors.items()},
-        _landmarks(folder.path / "learnt.json"),
+        _landmarks(folder.path / results.LEARNT),
         files.events(),
     )
     _check_times(run, log)
@@ -156,7 +156,7 @@ def _check_times(run: StoredRun, log: Log) -> None:
 
 
 def _config(folder: Path) -> StoredConfig:
-    path = folder / "config.toml"
+    path = folder / results.CONFIG
     return parse_model(StoredConfig, read_toml(path), path)
 
 

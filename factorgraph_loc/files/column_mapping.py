@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.models import FileModel, InUnit, inside, nearest, parse_json, read_text
+from factorgraph_loc.files.models import FileModel, InUnit, flattened, inside, nearest, parse_json, read_text
 from factorgraph_loc.files.tables import Cells, csv_rows, rows_of_length
 from factorgraph_loc.text import listed, quoted, well_formed
 from factors.se2 import Integers
@@ -290,12 +290,4 @@ def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
         entries = content if isinstance(content, list) else [content]
         if not all(isinstance(entry, dict) for entry in entries):
             raise bad_field(path, "line", line.strip()[:80], "an object, or a list of objects", row=row)
-        yield from ((row, dict(_values(entry))) for entry in entries)
-
-
-def _values(entry: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in entry.items():
-        if isinstance(value, Mapping):
-            yield from _values(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value
+        yield from ((row, dict(flattened(entry))) for entry in entries)

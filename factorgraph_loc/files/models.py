@@ -239,6 +239,15 @@ def set_key(content: dict[str, Any], key: str, value: Any, source: object) -> No
     content[last] = value
 
 
+def flattened(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of nested tables, with the keys on the path to each joined by dots."""
+    for key, value in content.items():
+        if isinstance(value, Mapping):
+            yield from flattened(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
 def inside(root: Path, name: str, source: object, *others: Path, expected: str = "one below it") -> Path:
     """The path ``name`` below ``root``, or below one of the folders ``others``, with links resolved; it need not exist.
 

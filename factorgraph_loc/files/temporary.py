@@ -139,12 +139,12 @@ def writing(path: object) -> Iterator[None]:
         raise InputError(f"{path}: cannot be written: {unencodable(error)}") from error
 
 
-def require_free(out: Path, names: Iterable[str], *, overwrite: bool, folders: Iterable[Path] = ()) -> None:
+def require_free(out: Path, names: Iterable[str], *, overwrite: bool) -> None:
     """Raise InputError if ``out`` is not a folder, or contains one of the files ``names`` that must not be replaced.
 
-    Temporary files of previous calls are removed from ``out`` and ``folders``.
+    Temporary files of previous calls are removed from ``out``, its ``plots`` and its parent.
     """
-    for folder in (out, *folders):
+    for folder in (out.parent, out, out / "plots"):
         sweep(folder)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected a folder for the results")

@@ -3,6 +3,7 @@
 Readers check what they can attribute to a file and row; values computed from several rows or foreign formats are checked here.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from factorgraph_loc.sensors.tables import columns_of
 from factorgraph_loc.text import listed
 from factors.se2 import Array
 
-MAX_ODOMETRY_GAP = 5.0  # s
+LONG_GAP = 5.0  # s
 TOLERANCE = 1e-9  # relative tolerance for converted values
 
 
@@ -66,6 +67,21 @@ def require_one_span(log: Log) -> None:
         )
 
 
+def long_gaps(t: Array) -> tuple[tuple[float, float], ...]:
+    """Start and length [s] of the gaps above :data:`LONG_GAP` between ascending timestamps ``t`` (N,)."""
+    steps = np.diff(t)
+    return tuple((float(t[i]), float(steps[i])) for i in np.flatnonzero(steps > LONG_GAP + ROUNDING))
+
+
+def gap_warnings(name: str, gaps: Sequence[tuple[float, float]]) -> list[str]:
+    """A warning about the gaps (start, length) of a stream, if there are any."""
+    if not gaps:
+        return []
+    start, length = max(gaps, key=lambda gap: gap[1])
+    count = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+    return [f"{name}: {count} above {LONG_GAP:g} s, the longest {length:.1f} s at t = {start:.3f} s"]
+
+
 def look_over(log: Log) -> list[str]:
     """Warnings about a whole log; InputError if it has measurements but no odometry."""
     odometry = log.streams.get("odometry")
@@ -74,14 +90,7 @@ def look_over(log: Log) -> list[str]:
     if odometry is None or len(odometry.t) == 0:
         raise InputError(f"{log.name}: has no odometry, which every estimator needs")
     warnings = []
-    gaps = np.diff(odometry.t)
-    wide = np.flatnonzero(gaps > MAX_ODOMETRY_GAP + ROUNDING)
-    if len(wide):
-        i = int(np.argmax(gaps))
-        count = "a gap" if len(wide) == 1 else f"{len(wide)} gaps"
-        warnings.append(
-            f"odometry: {count} above {MAX_ODOMETRY_GAP:g} s, the longest {gaps[i]:.1f} s at t = {odometry.t[i]:.3f} s"
-        )
+    warnings += gap_warnings("odometry", long_gaps(odometry.t))
     for name, stream in log.streams.items():
         if name != "odometry" and (early := int(np.count_nonzero(stream.t < odometry.t[0]))):
             warnings.append(f"{name}: {early} rows come before the first odometry")

@@ -12,27 +12,19 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import foreign
 from factorgraph_loc.files.columns import LATEST
 from factorgraph_loc.files.tables import parse_parquet
+from factorgraph_loc.model.scoring import KINDS
 from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory
 from factorgraph_loc.text import told
 from factors.se2 import Array
 
 INDEX = "results.parquet"  # of several runs
 ESTIMATES, INNOVATIONS, EVENTS = "estimates.parquet", "innovations.parquet", "events.csv"
-KINDS = ("causal", "final")
 TEXTS, STAMP = ("kind", "status"), "t_ns"
 ERRORS = ("error_position", "error_heading", "nees")
 NUMBERS = ("x", "y", "heading", *COVARIANCES, *ERRORS)
 COLUMNS = (STAMP, *TEXTS, *NUMBERS)
-FILES = (
-    "final.tum",
-    "causal.tum",
-    ESTIMATES,
-    INNOVATIONS,
-    "learnt.json",
-    EVENTS,
-    "config.toml",
-    "metrics.json",
-)  # the last one is written last
+FINAL, CAUSAL, LEARNT, CONFIG, METRICS = "final.tum", "causal.tum", "learnt.json", "config.toml", "metrics.json"
+FILES = (FINAL, CAUSAL, ESTIMATES, INNOVATIONS, LEARNT, EVENTS, CONFIG, METRICS)  # the last one is written last
 
 
 @dataclass(frozen=True)

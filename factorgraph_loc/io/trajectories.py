@@ -19,14 +19,13 @@ from factorgraph_loc.io.bags.file import is_bag, require_rosbags
 from factorgraph_loc.io.bags.poses import checked_rotations, seven
 from factorgraph_loc.io.readers import read_log
 from factorgraph_loc.io.readers.pose_file import read_pose_file
-from factorgraph_loc.io.results import FILES
+from factorgraph_loc.io.results import FINAL
 from factorgraph_loc.model.pose_path import PosePath, require_poses
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
 
-FINAL = FILES[0]
 TOPIC = ":"  # between a bag and a topic
 LOG = ".toml"
 MESSAGES = "PoseStamped, PoseWithCovarianceStamped, Odometry, TransformStamped or PointStamped"

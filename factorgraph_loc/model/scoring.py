@@ -11,6 +11,7 @@ from typing import Any, Literal
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import quoted
 
+KINDS = ("causal", "final")  # of the estimates of a run
 MAX_GAP = 0.5  # s between estimates across which scoring interpolates
 MAX_DIFF = 0.01  # s between stamps that are taken for one
 Alignment = Literal["none", "origin", "se2", "se3", "sim3"]

@@ -108,7 +108,7 @@ def test_gaps_unseen_and_unknown_landmarks_and_missing_streams_are_named() -> No
     for part in (
         "mended",
         "no odometry",
-        "gap of 30.5 s at 60.0 s",
+        "bearing_range: a gap above 5 s, the longest 30.5 s at t = 60.000 s",
         "landmark z of the map is never seen",
         "landmark a is not",
     ):

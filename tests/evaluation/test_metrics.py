@@ -9,8 +9,9 @@ from evo.core.trajectory import PosePath3D
 from scipy.stats import binom, chi2
 
 from factorgraph_loc import Log, Rig, Trajectory, World
-from factorgraph_loc.evaluation.metrics import OF_FREE_MAP, accuracy, errors, score
+from factorgraph_loc.evaluation.metrics import accuracy, errors, score
 from factorgraph_loc.evaluation.pairing import Pairs
+from factorgraph_loc.evaluation.scores import OF_FREE_MAP
 from factorgraph_loc.evaluation.trajectories.association import in_plane
 from factorgraph_loc.evaluation.trajectories.score import pose_errors
 from factorgraph_loc.model.belief import Learnt

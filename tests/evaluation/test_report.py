@@ -16,8 +16,8 @@ from in_short import blank_pictures  # noqa: F401 - a fixture
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import plots, tracks, write_report
-from factorgraph_loc.evaluation.report.metrics import metric_of
 from factorgraph_loc.evaluation.report.results import Results
+from factorgraph_loc.evaluation.scores import metric_of
 from factorgraph_loc.io.results import ResultFiles
 from factorgraph_loc.text import significant
 

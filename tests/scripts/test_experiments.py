@@ -10,7 +10,8 @@ from in_short import runs_here  # noqa: F401 - a fixture
 from recorded_logs import CONVERTED
 from scripts_here import run_script
 
-from factorgraph_loc.experiments.experiment_file import SIMULATION, read_experiment
+from factorgraph_loc.evaluation.warned import SIMULATION
+from factorgraph_loc.experiments.experiment_file import read_experiment
 from factorgraph_loc.files.models import set_key
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.fusion.registry import settings_of

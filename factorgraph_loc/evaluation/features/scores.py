@@ -19,7 +19,7 @@ from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.tables import markdown
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.tables import write_parquet
-from factorgraph_loc.files.temporary import require_free, writing
+from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.vision.matching import RATIO
 
 FILES = ("table.md", "pairs.parquet", "figure3.png")
@@ -73,11 +73,6 @@ def evaluate_all(
             for pair in evaluate(sequence, feature, lambda: progress(next(done), total))
         ]
     )
-
-
-def check_free(out: Path, *, overwrite: bool) -> None:
-    """Raise InputError if ``out`` is not a folder, or contains such results already."""
-    require_free(out, FILES, overwrite=overwrite)
 
 
 def write_scores(scores: FeatureScores, out: Path) -> None:

@@ -1,8 +1,7 @@
 """A report of results as one self-contained HTML file."""
 
-from factorgraph_loc.evaluation.report.metrics import DEFAULT
 from factorgraph_loc.evaluation.report.page import write_report
 from factorgraph_loc.evaluation.report.results import RunFiles
 from factorgraph_loc.evaluation.report.scene import Scene
 
-__all__ = ["DEFAULT", "RunFiles", "Scene", "write_report"]
+__all__ = ["RunFiles", "Scene", "write_report"]

@@ -13,9 +13,8 @@ import tomli_w
 from factorgraph_loc.drawing.pages import render
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import plots, tables
-from factorgraph_loc.evaluation.report.metrics import DEFAULT, TIMINGS, Metric, metric_of
 from factorgraph_loc.evaluation.report.results import Results, RunFiles, read_runs, score
-from factorgraph_loc.evaluation.report.tables import p_value
+from factorgraph_loc.evaluation.scores import REPORT, TIMINGS, Metric, metric_of
 from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.text import listed, quoted
@@ -29,7 +28,7 @@ def write_report(
     runs: Callable[[str], RunFiles],
     out: Path,
     *,
-    metrics: Sequence[str] = DEFAULT,
+    metrics: Sequence[str] = REPORT,
     baseline: str | None = None,
     title: str = "Results",
     experiment: Mapping[str, Any] | None = None,
@@ -79,7 +78,8 @@ def write_report(
         results=results,
         asked=asked,
         damaged=damaged,
-        p_value=p_value,
+        p_value=tables.p_value,
+        uncertainty=tables.uncertainty,
         **values,
     )
     write_text(out, page)
@@ -89,7 +89,7 @@ def _compared(results: Results, metrics: Sequence[Metric], baseline: str) -> dic
     """Values from the rows of the runs alone."""
     best = [results.compare(metric) for metric in metrics]
     against = [results.compare(metric, baseline) for metric in metrics]
-    times = _known(results, TIMINGS, whole=False)
+    times = _known(results, tuple(TIMINGS), whole=False)
     return {
         "metrics": metrics,
         "baseline": baseline,

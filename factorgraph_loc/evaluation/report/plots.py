@@ -15,10 +15,10 @@ from factorgraph_loc.drawing.figures import COLOURS, grid, legend, styles, svg
 from factorgraph_loc.drawing.pages import Picture
 from factorgraph_loc.evaluation.inference import pooled
 from factorgraph_loc.evaluation.plots import distribution, same_range
-from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.report.results import MetricComparison, Results, score, short_name
+from factorgraph_loc.evaluation.scores import Metric
 from factorgraph_loc.evaluation.warned import SWEEP
-from factorgraph_loc.io.results import KINDS
+from factorgraph_loc.model.scoring import KINDS
 from factorgraph_loc.text import plain
 from factors.se2 import Array
 

@@ -22,19 +22,16 @@ from factorgraph_loc.evaluation.inference import (
 )
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
 from factorgraph_loc.evaluation.report import tracks
-from factorgraph_loc.evaluation.report.metrics import Metric
 from factorgraph_loc.evaluation.report.scene import Scene
-from factorgraph_loc.evaluation.warned import SWEEP, label_of
-from factorgraph_loc.io.results import KINDS, Estimates, ResultFiles
+from factorgraph_loc.evaluation.scores import Metric
+from factorgraph_loc.evaluation.warned import SIMULATION, SWEEP, Row, label_of
+from factorgraph_loc.io.results import CONFIG, Estimates, ResultFiles
+from factorgraph_loc.model.scoring import KINDS
 from factors.se2 import Array
 
 POSES = 120_000  # on the page, shared by all trajectories
 FEWEST, MOST = 60, 1000  # bounds for one trajectory
 TRACKS = 1000  # maximum number of runs with trajectories; further logs appear in tables only
-_CONFIG = "config.toml"
-SIMULATION = "simulation"  # first word of swept settings that change the log
-
-Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -89,7 +86,7 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
             if left > 0:
                 plain = {kind: tracks.thinned(s, poses) for kind, s in series.items()}
                 drawn.append({"v": place, "seed": row["seed"], **plain})
-                _add_config(found, f"{variant}, {log}, seed {row['seed']}", files.read(_CONFIG).decode())
+                _add_config(found, f"{variant}, {log}, seed {row['seed']}", files.read(CONFIG).decode())
             trust = tracks.consistency(series["causal"]) if "causal" in series else None
             if trust is not None and score(row, "causal.position_rmse") is not None:
                 counts.setdefault(variant, []).append(trust)

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from statistics import median
 
 from factorgraph_loc.drawing.pages import Cell, Table
+from factorgraph_loc.evaluation.inference import Pooled
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
-from factorgraph_loc.evaluation.report.metrics import Metric
-from factorgraph_loc.evaluation.report.results import MetricComparison, Results, Row, score
+from factorgraph_loc.evaluation.report.results import MetricComparison, Results, score
+from factorgraph_loc.evaluation.scores import Metric
 from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS, average
 from factorgraph_loc.evaluation.tables import counted
-from factorgraph_loc.evaluation.warned import by_text, label_of
+from factorgraph_loc.evaluation.warned import Row, by_text, label_of
 from factorgraph_loc.fitting.shares import wilson
 from factorgraph_loc.text import listed, significant
 
@@ -123,6 +124,13 @@ def p_value(p: float | None) -> str:
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
+def uncertainty(metric: Metric, figure: Pooled) -> str:
+    """The interval, or else the range: ``[0.1, 0.2]`` or ``0.1 … 0.2``; empty for a single value."""
+    if figure.low is not None and figure.high is not None:
+        return f"[{metric.text(figure.low)}, {metric.text(figure.high)}]"
+    return metric.range(figure.least, figure.most) if figure.count > 1 else ""
+
+
 def _pooled_cell(c: MetricComparison, variant: str) -> Cell:
     figure = c.pooled.get(variant)
     if figure is None:
@@ -132,7 +140,7 @@ def _pooled_cell(c: MetricComparison, variant: str) -> Cell:
         mark, kind = "● ", "best"
     elif c.reference == c.best and variant in c.tied:
         mark = "○ "
-    lines = [c.metric.uncertainty(figure)]
+    lines = [uncertainty(c.metric, figure)]
     if figure.logs < max(of.logs for of in c.pooled.values()) or figure.logs == 1:
         lines.append(f"{figure.logs} log{'' if figure.logs == 1 else 's'}")
     return Cell(mark + c.metric.text(figure.value), lines, kind)

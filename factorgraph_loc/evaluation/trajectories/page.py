@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,8 +16,8 @@ from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.pairing import HOW, pauses
 from factorgraph_loc.evaluation.trajectories.score import TrajectoryScore
 from factorgraph_loc.files.models import write_text
-from factorgraph_loc.files.temporary import require_free, writing
-from factorgraph_loc.text import number
+from factorgraph_loc.files.temporary import writing
+from factorgraph_loc.text import json_text, number
 from factors.se2 import Array
 
 if TYPE_CHECKING:
@@ -159,11 +158,6 @@ def _alignment(score: TrajectoryScore) -> str:
     return f"{told}, scale {transform.scale:.5f}" if how == "sim3" else told
 
 
-def check_free(out: Path, *, overwrite: bool) -> None:
-    """Raise InputError if ``out`` is not a folder, or contains a score that must not be replaced."""
-    require_free(out, FILES, overwrite=overwrite, folders=(out.parent, out / "plots"))
-
-
 def write_score(score: TrajectoryScore, out: Path) -> None:
     """Write a score into the folder ``out``, replacing a previous one.
 
@@ -178,7 +172,7 @@ def write_score(score: TrajectoryScore, out: Path) -> None:
         write_picture(_errors(score), out / "plots" / "errors.png")
         write_text(out / FILES[0], errors_of(score).write_csv())
         write_text(out / FILES[1], page(score))
-        write_text(out / FILES[2], json.dumps(score.document(), indent=2, allow_nan=False) + "\n")
+        write_text(out / FILES[2], json_text(score.document()))
 
 
 def errors_of(score: TrajectoryScore) -> pl.DataFrame:
