@@ -7,15 +7,10 @@ import numpy as np
 import pytest
 from landmark_world import simulate
 
-from factorgraph_loc import BearingRangeStream, PoseEstimate, RfidScan
-from factorgraph_loc.experiments.preparation import resolve_prior
+from factorgraph_loc import BearingRangeStream, PoseEstimate
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.belief import gaussian_belief
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.simulation import named_settings
-from factorgraph_loc.simulation import simulate as simulated
 
 SETTINGS = {"particle_filter": {"particles": 300}, "smoother": {"lag": 5.0}}
 ESTIMATORS = ("ekf", "particle_filter", "smoother", "batch")
@@ -60,22 +55,6 @@ def test_a_look_counts_once_when_a_graph_goes_back(name):
     result = run(kidnapped, RunConfig(name))
     assert [what.partition(":")[0] for _, what in result.diagnostics.events] == ["lost"]
     assert told(result).tolist() == looks(kidnapped).tolist()
-
-
-@pytest.mark.parametrize("name", ["smoother", "particle_filter"])
-def test_late_scans_count_once(name):
-    changes = {"drive": {"duration": 12.0}, "world": {"tags": 12}}
-    log = simulated(named_settings("office", changes), 3)
-    setup = Setup(log.rig, log.world, ("odometry", "rfid"), np.random.default_rng(1))
-    estimator = create(name, setup, settings_of(name, {"max_delay": 1.0} | SETTINGS[name]))
-    estimator.initialize(resolve_prior(log, None)[0])
-    rows = list(log.measurements(("odometry", "rfid")))
-    scans = [m for m in rows if isinstance(m, RfidScan)]
-    held = {m.t for m in scans[::4]}
-    for m in sorted(rows, key=lambda m: m.t + 0.7 * (m.t in held and isinstance(m, RfidScan))):
-        estimator.process(m)
-    assert sorted(t for t, _, _ in estimator.diagnostics.nis["rfid"]) == [m.t for m in scans]
-    assert estimator.diagnostics.late == {}
 
 
 def test_what_is_taken_back_leaves_no_trace():

@@ -9,7 +9,6 @@ from landmark_world import simulate, with_sightings
 from factorgraph_loc import StartPose, VelocityStream
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.graph.solver import FullHistory, Window
 from factors import se2
 
 CONFIGS = {
@@ -214,29 +213,3 @@ def test_neither_range_nor_bearing_is_ignored(name, log):
     expected = run(with_sightings(log, **rows_of(stream, np.flatnonzero(~empty))), CONFIGS[name])
     assert sum(result.diagnostics.ignored.values()) == empty.sum()
     assert distance(result.final, expected.final) == 0.0
-
-
-@pytest.mark.parametrize(
-    ("name", "solver", "tolerance"),
-    [("smoother_all", FullHistory, 1e-3), ("smoother", Window, 0.02), ("smoother_lag", Window, 0.02)],
-)
-def test_solver_fails_in_mid_run(name, solver, tolerance, log, clean, monkeypatch):
-    """The failing update has been applied when it raises."""
-    update, calls = solver.update, []
-
-    def failing(self, *arguments):
-        update(self, *arguments)
-        calls.append(None)
-        if len(calls) == 60:
-            raise RuntimeError("made to fail\nwith a second line")
-
-    monkeypatch.setattr(solver, "update", failing)
-    result = run(log, CONFIGS[name])
-    ((t, event),) = result.diagnostics.events
-    assert 10.0 < t < 20.0
-    assert "rebuilt" in event
-    assert "made to fail" in event
-    assert clean(name).diagnostics.events == []
-    assert result.diagnostics.rejected == {}
-    assert distance(result.final, clean(name).final) < tolerance
-    assert distance(result, clean(name)) < tolerance

@@ -83,22 +83,6 @@ def test_clouds_are_kept_as_far_as_smoothing_needs_them(log, driven):
     assert np.all(np.isfinite(left.poses))
 
 
-def test_nothing_is_kept_of_points_seen_before(driven):
-    settings = {"lag": 3.0, "landmarks": "unknown"}
-    whole, _ = driven("smoother", ("odometry", "sightings"), settings, None)
-    short, _ = driven("smoother", ("odometry", "sightings"), settings, 0.0)
-    oldest, points = next(iter(short._graph.keyframes.values())), short._graph.mapper._unknown
-    assert oldest.index > 0
-    assert min(points._cameras.anchored) >= oldest.index
-    assert all(point.last >= oldest.t for point in points._gone)
-    assert short._graph.departed[0].keys() == short._graph.departed[1].keys() == {point.key for point in points._gone}
-    assert len(short._graph.departed[0]) < len(whole._graph.departed[0])
-    expected, left = whole.learnt().points, short.learnt().points
-    assert 0 < len(left) < len(expected)
-    rows = [expected.index[name] for name in left.names]
-    assert left.positions == pytest.approx(expected.positions[rows], abs=1e-9)
-
-
 def test_a_full_history_forgets_nothing(driven):
     whole, _ = driven("smoother", ("odometry", "bearing_range"), {}, None)
     short, _ = driven("smoother", ("odometry", "bearing_range"), {}, 1.0)

@@ -7,7 +7,6 @@ import pytest
 from landmark_world import simulate, with_sightings
 
 from factorgraph_loc import RunFailedError, Tick
-from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.cloud import Cloud, largest_share, pose_moments, systematic
@@ -15,7 +14,6 @@ from factorgraph_loc.fusion.particle_filter import ParticleFilter, ParticleFilte
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeUncertainty
 from factors import se2
 
 UNKNOWN = RunConfig("particle_filter", {"particles": 1000}, prior="unknown")
@@ -31,10 +29,6 @@ def only(log, landmarks):
     return with_sightings(log, np.isin(log.streams["bearing_range"].landmark, list(landmarks)))
 
 
-def events(result):
-    return [what.partition(":")[0] for _, what in result.diagnostics.events]
-
-
 def test_one_landmark_is_ambiguous(log, tmp_path):
     result = run(only(cut(log, 0.0, 3.0), "b"), UNKNOWN)
     assert set(result.status) == {"unlocalized", "ambiguous"}
@@ -42,15 +36,6 @@ def test_one_landmark_is_ambiguous(log, tmp_path):
     scores = write_run(result, log, tmp_path / "out")
     assert scores["causal.position_rmse"] is None
     assert scores["time_to_localized"] is None
-
-
-def test_nothing_seen(log, tmp_path):
-    result = run(only(log, ()), UNKNOWN)
-    assert set(result.status) == {"unlocalized"}
-    assert len(result.final) == 0
-    assert result.warnings == ("simulated: never localized: no landmarks of the map were detected",)
-    scores = write_run(result, log, tmp_path / "out")
-    assert scores["final.position_rmse"] is None
 
 
 def test_modes_of_a_cloud():
@@ -112,27 +97,6 @@ def test_trajectories_of_a_robot_that_stands_do_not_coalesce():
     ratio = np.sqrt(np.linalg.eigvalsh(found.covariances) / np.linalg.eigvalsh(smoothed.covariances))
     assert ratio.min() > 0.7
     assert ratio.max() < 2.5
-
-
-def test_constants_of_the_sensor_travel_with_the_particles():
-    """A rig whose sensor sits 0.3 m behind where it says, and whose ranges are 6 % short."""
-    log = simulate(seconds=45.0)
-    uncertainty = BearingRangeUncertainty(x=0.3, range_scale=0.06, time_offset=0.05)
-    sensor = log.rig.bearing_range.model_copy(update={"x": 0.3, "range_scale": 1.06, "uncertainty": uncertainty})
-    wrong = replace(log, rig=log.rig.model_copy(update={"bearing_range": sensor}))
-    with_constants = run(wrong, KNOWN)
-    without = run(wrong, replace(KNOWN, settings={**KNOWN.settings, "self_calibration": False}))
-    assert without.learnt.values == {}
-    values = with_constants.learnt.values
-    assert set(values) == {"bearing_range.x", "bearing_range.range_scale"}
-    truth = {"bearing_range.x": -0.3, "bearing_range.range_scale": 1.0 / 1.06 - 1.0}
-    for name, (value, sigma) in values.items():
-        assert abs(value - truth[name]) < 5.0 * sigma, name
-        assert sigma < 0.05
-    right, left = score(with_constants, wrong), score(without, wrong)
-    assert right["causal.position_rmse"] < 0.5 * left["causal.position_rmse"]
-    assert right["final.position_rmse"] < 0.06
-    assert right["final.anees"] < 6.0
 
 
 class Likely:

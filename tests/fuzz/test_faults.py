@@ -1,5 +1,7 @@
 """Each estimator on short logs with several faults: a sound result, or one line that refuses it."""
 
+from itertools import cycle
+
 import numpy as np
 import pytest
 from absurd_logs import FAULTS, verdict, whole
@@ -11,6 +13,18 @@ from test_calls import ESTIMATORS
 pytestmark = pytest.mark.filterwarnings("ignore")
 SENSORS = (None, ("odometry",), ("odometry", "bearing_range"), ("odometry", "rfid"))
 PRIORS = (None, "reference", "log", "unknown", "0,0,0", "10,6", "1e5,-1e5,3")
+
+BEYOND = ("glitch_beyond_bounds", "clocks_years_apart")  # the bounds of their columns, or of a log's length
+
+
+# each fault with one of the estimators; of landmarks in no map, some logs give no place
+@pytest.mark.parametrize(
+    ("fault", "estimator"),
+    list(zip(FAULTS, cycle(e for e in ESTIMATORS if "landmarks" not in e[1]), strict=False)),
+)
+def test_a_log_with_a_fault_is_survived(fault, estimator):
+    result = verdict(FAULTS[fault](whole(), np.random.default_rng(len(fault))), *estimator)
+    assert result == ("refused" if fault in BEYOND else "ok")
 
 
 @examples(cost=4)

@@ -32,12 +32,16 @@ def office():
     return with_signals(simulate_office(preset("office", changes), 3))
 
 
+# of the reader that the simulation draws
+SIGNALS = {
+    "rssi": RssiSettings(coefficients=(-50.0, 2.0, -8.0, 0.0, 2.0, 0.0), sigma=2.0, dof=4.0, tempering=0.3),
+    "phase": PhaseSettings(tempering=0.5, max_range=4.0),
+}
+
+
 def with_signals(log):
     """The log of a rig that knows how strength and phase were simulated."""
-    strength = RssiSettings(coefficients=(-50.0, 2.0, -8.0, 0.0, 2.0, 0.0), sigma=2.0, dof=4.0, tempering=0.3)
-    phase = PhaseSettings(tempering=0.5, max_range=4.0)
-    rfid = log.rig.rfid.model_copy(update={"phase": phase, "rssi": strength})
-    return replace(log, rig=log.rig.model_copy(update={"rfid": rfid}))
+    return with_reader(log, **SIGNALS)
 
 
 def mounted_exactly(log):
