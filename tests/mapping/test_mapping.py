@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, World, load
-from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, World
 from factorgraph_loc.mapping.mapping import TOLERANCE, align_robustly, make_map
 from factorgraph_loc.model.belief import LearntPoint
-from factorgraph_loc.model.log import cut
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factors import se2
 
@@ -181,16 +179,3 @@ def test_many_landmarks_are_aligned_by_a_sample_of_pairs():
     wrong[:60] = np.random.default_rng(5).permutation(wrong[:60])
     alignment = align_robustly([*learnt(points).values()], wrong, np.zeros((150, 2, 2)))
     np.testing.assert_allclose(alignment.pose, FRAME, atol=0.05)
-
-
-def test_swapped_landmarks_of_a_recorded_log_are_found(data_root):
-    recorded = cut(load("mrclam6-robot3", data_root=data_root)[0], 0.0, 300.0)
-    found = run(recorded, RunConfig("ekf", {"landmarks": "unknown"})).learnt.landmarks
-    for a, b in (("7", "17"), ("6", "19"), ("11", "15")):
-        given = dict(recorded.world.landmarks)
-        given[a], given[b] = given[b], given[a]
-        made = make_map(replace(recorded, world=World(landmarks=given)), found)
-        assert set(made.flagged) == {a, b}
-        assert verdicts(made)[a] == f"swapped with {b}"
-        errors = made.world.positions() - World(landmarks=given | recorded.world.landmarks).positions()
-        assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.15

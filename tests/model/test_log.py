@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.io.native.world_file import read_world
-from factorgraph_loc.io.readers import load
 from factorgraph_loc.model.log import Log, StartPose, cut, join
 from factorgraph_loc.model.measurement import Rows
 from factorgraph_loc.model.rig import Rig
@@ -154,21 +152,6 @@ def test_a_kidnapped_robot_keeps_its_velocity_and_feels_no_increment():
     log = drive("velocity")
     odometry = join(cut(log, 0.0, 5.0), cut(log, 2.0, 4.0)).streams["odometry"]
     assert (odometry.v == 1.0).all()
-
-
-@pytest.mark.parametrize("kind", ["velocity", "increments"])
-def test_a_joined_log_survives_the_native_format(kind, tmp_path):
-    log = drive(kind)
-    log = join(cut(log, 0.0, 5.0), replace(cut(log, 2.0, 4.0), name="again"))
-    write_native(log, tmp_path / "log")
-    (read,) = load(str(tmp_path / "log"))
-    assert (read.name, read.world, read.t0_ns) == ("drive+again", log.world, log.t0_ns)
-    assert "sigma = 0.1" in (world := (tmp_path / "log/drive_again.world.toml").read_text())
-    assert world.count("covariance") == 1
-    assert len(list(read.measurements(read.streams))) == len(list(log.measurements(log.streams)))
-    for name, stream in log.streams.items():
-        np.testing.assert_allclose(read.streams[name].t, stream.t, atol=1e-9)
-    np.testing.assert_allclose(read.reference.poses, log.reference.poses, atol=1e-9)
 
 
 def reads(*rows):

@@ -117,18 +117,6 @@ def test_the_scale_that_images_hardly_tell_is_not_believed(drive):
     assert np.mean(found) < 4.0
 
 
-def test_what_the_map_has_is_not_taken_in_again(drive):
-    log = drive(4, seconds=15.0)
-    names = log.world.points.names[::2]
-    half = PointMap.of(names, log.world.points.positions[::2])
-    log = replace(log, world=log.world.model_copy(update={"points": half}))
-    learnt = estimated(log, landmarks="extended").learnt.landmarks
-    assert learnt
-    assert not set(learnt) & set(names)
-    ignored = estimated(log).diagnostics.ignored
-    assert ignored["point not in the map"] > 100
-
-
 CAMERA = preset("office", {}).rig.camera
 EXACT_WHEELS = OdometrySettings(
     noise=OdometryNoise(
@@ -243,13 +231,6 @@ def test_features_become_points_and_are_found_again(drive):
     assert score(result, log)["aligned.position_rmse"] < 0.2
 
 
-def test_there_is_no_trajectory_before_the_start(drive):
-    log = drive(1, 2.0)
-    setup = Setup(log.rig, log.world, SENSORS, np.random.default_rng(0))
-    found = create("monoslam", setup, settings_of("monoslam", {})).trajectory()
-    assert (found.poses.shape, found.covariances.shape) == ((0, 3), (0, 3, 3))
-
-
 def test_an_innovation_that_rounding_made_singular_still_has_a_gain():
     """As of a robot that is known to a million kilometres, by pixels with no noise to speak of."""
     direction = np.arange(1.0, 5.0)
@@ -284,7 +265,7 @@ def test_wheels_that_rest_while_it_turns_are_told_by_the_points(turning):
 
 
 def test_wheels_that_hold_do_not_slip(turning, monkeypatch):
-    """Of some 300 images at most 0.6 count as slips on average, as a slip must be the likelier at one in a hundred seconds."""
+    """Of some 150 images at most 0.3 count as slips on average, as a slip must be the likelier at one in a hundred seconds."""
     slipped, judged = [], FeatureMatcher.unless_slipped
 
     def counted(self, m, state, *slip):
@@ -293,7 +274,6 @@ def test_wheels_that_hold_do_not_slip(turning, monkeypatch):
         return found
 
     monkeypatch.setattr(FeatureMatcher, "unless_slipped", counted)
-    for seed in (4, 5):
-        estimated(turning(seed)[0], landmarks="unknown")
-    assert len(slipped) > 270
+    estimated(turning(5)[0], landmarks="unknown")
+    assert len(slipped) > 135
     assert sum(slipped) <= 1

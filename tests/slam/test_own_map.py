@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-import factorgraph_loc as fgloc
 from factorgraph_loc import FeatureStream, World
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.output import map_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.mapping.point_maps import chosen
-from factorgraph_loc.maps.common_error import CommonError
 from factorgraph_loc.model.log import cut
 
 SECONDS, EVERY = 24.0, 0.4  # s
@@ -62,21 +60,6 @@ def test_what_the_map_may_be_wrong_by_is_told_once(days):
     assert len(told) == 1
     others = (RunConfig("dead_reckoning", sensors=("odometry",)), UNKNOWN)
     assert not any("without a reference" in w for config in others for w in run(log, config).warnings)
-
-
-def test_a_localizer_knows_it_too(days):
-    log = days[SEEDS[0]]
-    localizer = fgloc.Localizer(log.rig, log.world, "ekf")
-    localizer.initialize(log.reference.poses[0], np.diag((0.01, 0.01, 0.01)) ** 2, t=0.0)
-    for m in log.measurements(log.rig.sensors):
-        localizer.push(m)
-    found, error = localizer.estimate(), CommonError.of(log.world.points)
-    own = found.covariance - error.at(found.pose[None])[0]
-    assert np.linalg.eigvalsh(own)[0] > 0.0
-    assert np.linalg.eigvalsh(own)[-1] < 0.1**2
-    path = localizer.trajectory()
-    assert np.all(np.linalg.eigvalsh(path.covariances - error.at(path.poses))[:, 0] > -1e-12)
-    np.testing.assert_allclose(localizer.belief().modes[0].covariance, found.covariance)
 
 
 def test_points_are_known_from_several_sides(days):

@@ -7,7 +7,6 @@ import pytest
 from landmark_world import simulate
 from scipy.stats import chi2
 
-from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 
@@ -73,11 +72,6 @@ def seen_from(log, t, point):
     return np.hypot(dx, dy), np.arctan2(dy, dx) - poses[:, 2]
 
 
-def without_map_of(log, names):
-    landmarks = {name: m for name, m in log.world.landmarks.items() if name not in names}
-    return replace(log, world=log.world.model_copy(update={"landmarks": landmarks}))
-
-
 @pytest.mark.parametrize(("name", "overconfident"), [("smoother", 1.0), ("ekf", 1.8)])
 def test_errors_of_landmarks_are_as_large_as_stated(name, overconfident, logs, mapped):
     """Over four seeds, bounds of 0.1 % of false alarms on each side if all landmarks of a run are off together, as they nearly are.
@@ -88,22 +82,6 @@ def test_errors_of_landmarks_are_as_large_as_stated(name, overconfident, logs, m
     means = [squared(mapped(name, seed), logs[seed].world.position).mean() for seed in SEEDS]
     low, high = chi2.ppf((0.001, 0.999), 2 * len(SEEDS)) / len(SEEDS)
     assert low < np.mean(means) < overconfident * high
-
-
-@pytest.mark.parametrize("name", ["ekf", "smoother"])
-def test_what_the_map_lacks_is_added_and_the_rest_taken_as_it_is(name, log):
-    """Normalised squared errors of two points are above 18.4 in one of 10,000 each."""
-    extended = replace(CONFIGS[name], settings={**CONFIGS[name].settings, "landmarks": "extended"})
-    result = run(without_map_of(log, "bh"), extended)
-    assert set(result.learnt.landmarks) == {"b", "h"}
-    assert squared(result, log.world.position).max() < 18.4
-    assert score(result, log)["final.position_rmse"] < 0.04
-    # with the whole map there is nothing to add
-    whole = run(log, extended)
-    assert whole.learnt.landmarks == {}
-    known = run(log, replace(extended, settings={**extended.settings, "landmarks": "known"}))
-    # with landmarks to be estimated keyframes lie farther apart
-    assert np.hypot(*(whole.final.poses - known.final.poses)[:, :2].T).max() < (0.0 if name == "ekf" else 0.05) + 1e-9
 
 
 @pytest.mark.parametrize("name", ["ekf", "smoother"])

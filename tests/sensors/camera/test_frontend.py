@@ -228,13 +228,6 @@ def test_a_hundred_black_images(log, tmp_path, computed):
     assert not np.intersect1d(found[4].tracks, found[105].tracks).size
 
 
-def test_nothing_but_bad_images(tmp_path):
-    (tmp_path / "bad.png").write_bytes(b"no image")
-    found, (warning,) = frames(log_of([tmp_path / "bad.png"] * 3))
-    assert [len(f.pixels) for f in found] == [0, 0, 0]
-    assert "3 of 3 images cannot be read" in warning
-
-
 @pytest.mark.parametrize("scale", [0.5, 2.0])
 def test_a_calibration_of_another_resolution_is_an_error(log, scale):
     for file in log.streams["camera"].file:

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from landmark_world import simulate, swapped, with_sightings
+from landmark_world import simulate
 
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.landmarks.finder import LandmarkFinder, TrackMonitor
@@ -44,16 +44,6 @@ class Seeker:
         self.relocalizer.search()
         return self.relocalizer
 
-    def until_clear(self, seconds=60.0):
-        for odometry, seen, t in self.sightings():
-            if t > self.start + seconds:
-                return None
-            self.relocalizer.add(odometry, seen)
-            self.relocalizer.search()
-            if self.relocalizer.best is not None:
-                return self.relocalizer.best
-        return None
-
 
 def error(log, found):
     """Position [m] and heading [rad], and the normalised squared error."""
@@ -61,19 +51,6 @@ def error(log, found):
     difference[2] = se2.wrap_scalar(difference[2])
     squared = difference @ np.linalg.solve(found.covariance, difference)
     return np.hypot(*difference[:2]), abs(difference[2]), squared
-
-
-def test_one_landmark_is_ambiguous(log):
-    s = log.streams["bearing_range"]
-    lone = with_sightings(log, np.array(s.landmark) == "b")
-    relocalizer = Seeker(lone).stamps(1)
-    assert relocalizer.hypotheses
-    assert relocalizer.best is None
-    drawn = relocalizer.sample(np.random.default_rng(0), 2000)
-    distance = np.hypot(*(drawn[:, :2] - log.world.position("b")).T)
-    truth = np.hypot(*(log.reference.at(s.t[:1])[0, :2] - log.world.position("b")))
-    assert distance.std() < 0.15
-    assert distance.mean() == pytest.approx(truth, abs=0.4)
 
 
 def test_late_and_repeated_sightings_change_nothing(log):
@@ -110,13 +87,3 @@ def test_a_wrong_track_is_suspected_and_refuted_and_a_right_one_is_not(log):
     seeker.relocalizer.search()
     assert seeker.relocalizer.refutes(elsewhere, covariance)
     assert not seeker.relocalizer.refutes(pose, covariance)
-
-
-def test_swapped_landmarks_do_not_refute_the_right_track(log):
-    wrong_map = swapped(log, "a", "e")
-    seeker, covariance = Seeker(wrong_map), np.diag((0.05, 0.05, 0.02)) ** 2
-    for odometry, seen, t in seeker.sightings():
-        seeker.relocalizer.add(odometry, seen)
-        if int(t * 4) % 8 == 0:
-            seeker.relocalizer.search()
-            assert not seeker.relocalizer.refutes(log.reference.at(np.array([t]))[0], covariance)

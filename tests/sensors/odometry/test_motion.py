@@ -12,13 +12,6 @@ from factors.motion import propagate
 RIG = Rig(imu=ImuSettings(bias=0.1))
 
 
-def test_a_gyro_replaces_the_rotation_of_velocities():
-    motion = Motion(RIG, ("odometry", "imu"), Diagnostics())
-    motion.add(VelocityOdometry(0.0, 1.0, 5.0))
-    motion.add(YawRate(0.0, 0.4))
-    assert motion.state(1.0).heading == pytest.approx(0.3)
-
-
 @pytest.mark.parametrize(("rig", "turned"), [(RIG, 0.06), (Rig(), 0.09)])
 def test_a_gyro_replaces_the_rotation_of_increments(rig, turned):
     """Of a rig without settings of a gyro too: then its bias is 0."""
