@@ -9,7 +9,6 @@ from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Trajectory, 
 from factorgraph_loc.evaluation.inspect import inspect
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factorgraph_loc.sensors.landmarks.summary import find_suspects
-from factorgraph_loc.text import MESSAGE
 from factors.landmarks import model as bearing_range
 
 PLACES = {"a": (0.0, 0.0), "b": (10.0, 0.0), "c": (10.0, 8.0), "d": (0.0, 8.0), "e": (5.0, -3.0)}
@@ -113,13 +112,3 @@ def test_gaps_unseen_and_unknown_landmarks_and_missing_streams_are_named() -> No
         "landmark a is not",
     ):
         assert part in text
-
-
-def test_a_long_name_makes_no_long_warning() -> None:
-    log = circling_log()
-    stream = log.streams["bearing_range"]
-    assert isinstance(stream, BearingRangeStream)
-    named = dataclasses.replace(stream, landmark=["x" * 10_000] * len(stream.t))
-    found = inspect(dataclasses.replace(log, streams=log.streams | {"bearing_range": named}))
-    assert any("xxx" in problem for problem in found.problems)
-    assert all(len(problem) <= MESSAGE for problem in found.problems)

@@ -7,13 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from in_short import blank_pictures  # noqa: F401 - a fixture
-from typer.testing import CliRunner
 
-from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Tag, Trajectory, VelocityStream, World, write_native
-from factorgraph_loc.cli.app import app
+from factorgraph_loc import Landmark, Log, Rig, Tag, Trajectory, World
 from factorgraph_loc.evaluation.figures import Track
 from factorgraph_loc.evaluation.plots import error_bands, plot_log, trajectories
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
 
 
@@ -78,23 +75,6 @@ def test_a_run_that_nothing_told_the_pose(track, tmp_path):
     assert [path.name for path in paths] == ["log-trajectories.png"]
     paths = plot_log(log_of(track), {"ekf": nowhere, "batch": track}, tmp_path, "log")
     assert {path.name for path in paths if "ekf" in path.name or "errors" in path.name} == {"log-errors-batch.png"}
-
-
-@pytest.mark.usefixtures("blank_pictures")
-@pytest.mark.parametrize(("estimator", "reference"), [("particle_filter", True), ("smoother", False), ("batch", True)])
-def test_a_log_that_never_tells_the_pose_is_run_and_plotted(track, estimator, reference, tmp_path):
-    t = track.final.t
-    streams = {
-        "odometry": VelocityStream(t, np.ones(30), np.zeros(30)),
-        "bearing_range": BearingRangeStream(t[::5], ["ghost"] * 6, np.ones(6), np.zeros(6)),
-    }
-    rig = Rig(bearing_range=BearingRangeSettings(range_sigma=0.1))
-    write_native(replace(log_of(track, reference=reference), rig=rig, streams=streams), tmp_path / "log")
-    arguments = ["run", tmp_path / "log", "-e", estimator, "-o", tmp_path / "out", "--prior", "unknown"]
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == 0, result.output
-    assert "warning: log: never localized: no landmarks of the map were detected" in result.stderr
-    assert [path.name for path in (tmp_path / "out/plots").iterdir()] == ["log-trajectories.png"]
 
 
 def test_no_line_is_drawn_across_a_gap(track):

@@ -140,16 +140,6 @@ def test_every_string_is_escaped(made, tmp_path):
 
 
 @pytest.mark.usefixtures("blank_pictures")
-def test_few_logs_are_not_tested(made, tmp_path):
-    page = page_of(made({"a": 0.1, "b": 0.5}, LOGS[:3], count=40), tmp_path)
-    words = words_of(page)
-    assert "With fewer than 6 logs, or 6 seeds of one log, nothing is tested" in words
-    assert "95 % interval [" not in words
-    assert "from log to log" in words
-    assert 'class="grey"' in page
-
-
-@pytest.mark.usefixtures("blank_pictures")
 def test_failures_and_warnings_stand_with_their_runs(made, tmp_path):
     words = words_of(page_of(troubled(made), tmp_path))
     assert "2 warnings , in 4 of 8 runs. 2 estimators on 2 logs" in words

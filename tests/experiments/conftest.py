@@ -1,6 +1,5 @@
 """A short log, and an estimator that notes what it is given."""
 
-import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -60,26 +59,6 @@ class Fake:
 
     def trajectory(self):
         return Trajectory(np.array(self.ticks), np.tile(self.pose, (len(self.ticks), 1)))
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """``small_disk(size)``: a folder on a disk of its own with ``size`` kB; skipped where none can be mounted."""
-    mounted = []
-
-    def mount(size):
-        disk = tmp_path / "disk"
-        disk.mkdir()
-        command = ["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", disk]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            pytest.skip(f"a small tmpfs cannot be mounted: {done.stderr.strip()}")
-        mounted.append(disk)
-        return disk
-
-    yield mount
-    for disk in mounted:
-        subprocess.run(["umount", disk], check=True)
 
 
 @pytest.fixture(autouse=True)

@@ -52,11 +52,8 @@ def with_points(log, views):
     ("name", "settings", "hint"),
     [
         ("ekf", {}, ""),
-        ("ekf", {"landmarks": "unknown"}, ""),
         ("particle_filter", {"particles": 50}, ""),
         ("smoother", {"landmarks": "known"}, ", or smoother.landmarks=unknown"),
-        ("batch", {"landmarks": "known"}, ", or batch.landmarks=unknown"),
-        ("monoslam", {"landmarks": "known"}, ", or monoslam.landmarks=unknown"),
     ],
 )
 def test_a_camera_in_a_map_without_points(blank, sensor, name, settings, hint):

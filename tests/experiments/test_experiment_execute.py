@@ -2,7 +2,6 @@
 
 import dataclasses
 import shutil
-import subprocess
 from collections import Counter
 from functools import partial
 
@@ -18,7 +17,7 @@ from factorgraph_loc.experiments.experiment import prepare, run_experiment
 from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.plan import plan
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.experiments.store import FAILURE, MANIFEST, TIMINGS, Store, StoreError
+from factorgraph_loc.experiments.store import FAILURE, MANIFEST, TIMINGS, Store
 from factorgraph_loc.io.results import ResultFiles
 
 # a name that would leave the store as a path, and be code in a page
@@ -201,15 +200,3 @@ def test_the_table_is_written_when_an_experiment_is_stopped(experiment, out, mon
         run_experiment(experiment())
     assert load_results(out)["label"].to_list() == ["fake"]
     assert [one.label for one in experiment().todo()] == ["ekf"]
-
-
-def test_an_experiment_ends_with_one_line_when_the_disk_is_full_and_goes_on_when_there_is_room(experiment, small_disk):
-    disk = small_disk(120)
-    text = "estimators = ['particle_filter']\nseeds = '0:20'"
-    with pytest.raises(StoreError, match="No space left on device"):
-        run_experiment(experiment(text, folder=disk))
-    counts = Counter(experiment(text, folder=disk, verify=True).states.values())
-    assert 0 < counts["ok"] < 20
-    assert set(counts) == {"ok", "missing"}
-    subprocess.run(["mount", "-o", "remount,size=10M", disk], check=True)
-    assert len(run_experiment(experiment(text, folder=disk)).rows) == 20

@@ -122,13 +122,10 @@ def test_toml_of_other_editors_is_read(tmp_path):
     ("content", "words"),
     [
         (b"x = " + b"9" * 5000, "is not TOML"),
-        (b"x = " + b"9" * 4000, "more than 64 bits"),
         (b"x = " + b"[" * 3000 + b"]" * 3000, "nested too deep"),
         (b"x = " + b"[" * 100 + b"]" * 100, "64 tables or lists deep"),
         (b"\n" + b"a." * 100_000 + b"a = 1", "a.toml:2: a key has more than 64 parts"),
         (b"x = 1979-05-27", "x is a date"),
-        (b"x = \xff", "is not text in UTF-8"),
-        (b"x = 1\0", "is not TOML"),
     ],
 )
 def test_what_is_no_toml_of_ours_is_one_line(tmp_path, content, words):
@@ -159,11 +156,9 @@ def test_json_has_so_many_values_at_most(monkeypatch):
     ("text", "words"),
     [
         ("[" * 5000 + "]" * 5000, "nested too deep"),
-        ("[" * 100 + "]" * 100, "64 tables or lists deep"),
         ("9" * 5000, "5000 digits"),
         ('{"a": NaN}', "NaN"),
         ('{"a": 1, "a": 2}', "'a' is duplicate"),
-        ('{"a": 1', "is not JSON"),
         ("\ufeff1", "is not JSON"),
     ],
 )

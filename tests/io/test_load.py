@@ -10,7 +10,7 @@ from factorgraph_loc import InputError, load, read_rig
 from factorgraph_loc.files import shipped
 from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.files.shipped import manifests, readers, rigs
-from factorgraph_loc.io.readers import READERS, describe, read_manifest, reader, verify
+from factorgraph_loc.io.readers import describe, read_manifest, reader, verify
 
 MANIFEST = 'title = "t"\nreader = "mrclam"\npath = "set"\nlicence = "none"\norigin = "here"\n'
 
@@ -26,11 +26,6 @@ def manifest(mrclam):
         return folder / "small.toml"
 
     return write
-
-
-@pytest.mark.parametrize("name", READERS)
-def test_readers_are_there(name):
-    assert callable(reader(name).read)
 
 
 @pytest.mark.parametrize("name", manifests())

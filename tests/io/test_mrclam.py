@@ -40,9 +40,6 @@ def test_what_is_read(mrclam, read):
 
 
 BAD = {
-    "word": ("Robot1_Odometry.dat", "1 0 0\n\n2 0 x\n", ":3: 3 is 'x'", "a number"),
-    "short row": ("Robot1_Odometry.dat", "# c\n1 0 0\n2 0\n", ":3: row is '2,0'", "3 values"),
-    "time going back": ("Robot1_Odometry.dat", "2 0 0\n1 0 0\n", ":2: time is '1000000000 ns'"),
     "too late": ("Robot1_Measurement.dat", "2.0 63 1 0\n1.4 63 1 0\n", ":2: time", "at most 0.5 s older"),
     "half a barcode": ("Robot1_Measurement.dat", "2.0 63.5 1 0\n", "no row has a landmark that Barcodes.dat names"),
     "barcode twice": ("Barcodes.dat", "6 63\n7 63\n", "Barcodes.dat:2: 2 is '63'", "once"),
@@ -54,16 +51,6 @@ BAD = {
 def test_bad_input(mrclam, refuse, name, text, fragments):
     (mrclam / name).write_text(text)
     refuse(mrclam, name, *fragments)
-
-
-@pytest.mark.parametrize("file", ["Robot1_Odometry", "Robot1_Measurement", "Landmark_Groundtruth", "Barcodes"])
-def test_missing_files(mrclam, refuse, file):
-    (mrclam / f"{file}.dat").unlink()
-    refuse(mrclam, f"{file}.dat: cannot be read: No such file")
-
-
-def test_a_file_is_no_folder(mrclam, refuse):
-    refuse(mrclam / "Barcodes.dat", "is not a folder")
 
 
 @pytest.mark.parametrize(("robot", "rows", "sightings"), [(1, 61785, 1534), (3, 61150, 4348), (5, 60563, 4239)])

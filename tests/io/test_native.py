@@ -91,8 +91,6 @@ HEADER = "t_ns,landmark,range,bearing\n"
 BAD_SIGHTINGS = {
     "neither range nor bearing": ("1,A,1,0\n2,A,,\n", ":3: row", "a range, a bearing or both"),
     "no name": ("1,,1,0\n", ":2: landmark is ''", "name of a landmark"),
-    "degrees": ("1,A,1,90\n", ":2: bearing is 90.0", "radians"),
-    "nan": ("1,A,NaN,0\n", ":2: range is 'NaN'", "finite"),
     "too late": ("2000000000,A,1,0\n1400000000,A,1,0\n", ":3: time", "at most 0.5 s older"),
 }
 
@@ -117,19 +115,8 @@ def test_ranges_that_cannot_be_are_left_out_and_bearings_beside_them_kept(native
 BAD_FILES = {
     "imu going back": ("imu.csv", "t_ns,w\n5,0\n4,0\n", "imu.csv:3: time"),
     "reference going back": ("reference.tum", "2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "reference.tum:2: time"),
-    "reference short": ("reference.tum", "# c\n1 0 0\n", "reference.tum:2: row is '1 0 0'", "8 values"),
-    "reference not finite": ("reference.tum", "1 nan 0 0 0 0 0 1\n", "reference.tum:1:", "finite"),
-    "reference without rotation": ("reference.tum", "1 0 0 0 0 0 0 0\n", "reference.tum:1: length", "unit quaternion"),
-    "reference empty": ("reference.tum", "", "contains no poses"),
     "unknown key": ("run.toml", "[rig]\nsensor = ['odometry']\n", "unknown key sensor", "did you mean sensors?"),
-    "noise in degrees": (
-        "run.toml",
-        "[rig.bearing_range]\nrange_sigma = 0.1\nbearing_sigma = 5\n",
-        "bearing_range.bearing_sigma is 5",
-    ),
     "rig outside": ("run.toml", 'rig = "../other.rig.toml"\n', "run.toml: path '../other.rig.toml' leaves its folder"),
-    "world outside": ("run.toml", 'world = "/etc/passwd"\n', "leaves its folder"),
-    "not TOML": ("run.toml", "name = hall\n", "is not TOML"),
 }
 
 
@@ -229,7 +216,6 @@ BAD_PARQUET = {
     "stamps in seconds": ({"t_ns": [1.5], "v": [0.5], "w": [0.0]}, "t_ns is of type Float64"),
     "stamp missing": ({"t_ns": [1, None], "v": [0.5, 0.5], "w": [0.0, 0.0]}, ":2: t_ns is None"),
     "text": ({"t_ns": [1], "v": ["fast"], "w": [0.0]}, "v is of type String"),
-    "infinity": ({"t_ns": [1, 2], "v": [0.5, float("inf")], "w": [0.0, 0.0]}, ":2: v is inf"),
 }
 
 

@@ -98,10 +98,6 @@ def test_inventories_of_antennas_that_read_nothing(hall, one):
 
 BAD = {
     "no tag": ("rfid.csv", READS + "1,left,,,,\n", "rfid.csv:2: epc is ''", "EPC of a tag"),
-    "degrees": ("rfid.csv", READS + "1,left,E1,,90,\n", "rfid.csv:2: phase is 90.0", "radians"),
-    "text": ("rfid.csv", READS + "1,left,E1,loud,,\n", "rfid.csv:2: rssi is 'loud'", "a number"),
-    "column missing": ("rfid.csv", "t_ns,antenna,epc,rssi,phase\n", "column frequency is missing"),
-    "time going back": ("rfid.csv", READS + "9000000000,left,E1,,,\n1,left,E1,,,\n", "rfid.csv:3: time"),
     "no duration": ("inventories.csv", INVENTORIES + "1,left,\n", "inventories.csv:2: duration is ''", "seconds"),
 }
 

@@ -19,14 +19,6 @@ def test_a_bag_of_ros_1_whose_recording_was_cut_off(tmp_path, bag_maker, refuse)
     refuse(path, "is not indexed", "`rosbag reindex`")
 
 
-def test_an_unknown_compression(tmp_path, bag_maker, refuse):
-    path = tmp_path / "drive.bag"
-    with bag_maker(path) as made:
-        fill(made)
-    path.write_bytes(path.read_bytes().replace(b"compression=none", b"compression=zpaq"))
-    refuse(path, "Compression 'zpaq' is not supported")
-
-
 def test_old_bags_hold_no_definitions(tmp_path, bag_maker, read, refuse):
     """Messages of ROS are known all the same, others cannot be read."""
     with bag_maker(tmp_path / "drive", "sqlite3") as made:
