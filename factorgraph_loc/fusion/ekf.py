@@ -17,8 +17,7 @@ from pydantic import Field
 
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
-from factorgraph_loc.fusion.search import Refuted, Search, Tracked, is_doubted, laplace_evidence
-from factorgraph_loc.fusion.slipping import SlipMonitor
+from factorgraph_loc.fusion.tracking import Refuted, Tracked, Tracking, is_doubted, laplace_evidence
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -142,11 +141,11 @@ class Ekf(Filter):
         finders = {name: sensor for name, sensor in self._sensors.items() if sensor.finder is not None}
         slow = {name for name, sensor in finders.items() if sensor.finder and not sensor.finder.at_once}
         # a start is known from one measurement; a lost pose is searched by the same sensors, and by those that weigh poses
-        self._search = Search({n: s for n, s in self._sensors.items() if n not in slow}, self._motion, setup.rng)
+        fast = {n: s for n, s in self._sensors.items() if n not in slow}
+        self._search = Tracking(fast, self._motion, setup.rng, self.diagnostics)
         if self._search.possible:
             self._search.remember()
-        self._slips = SlipMonitor(self._motion, self.diagnostics)
-        self._headings = Search(finders, self._motion, setup.rng)
+        self._headings = Tracking(finders, self._motion, setup.rng, self.diagnostics)
         self.supports_unknown_start = len(slow) < len(finders)
         self.supports_unknown_heading = self._headings.possible
         self._step: _Step | None = None
@@ -241,7 +240,7 @@ class Ekf(Filter):
             if seen.is_judged:
                 if not sensor.judge(seen, correction, view):
                     continue
-                self._slips.add(partial(_at_its_time, seen, s), self._odometry, view, correction)
+                self._search.slips.add(partial(_at_its_time, seen, s), self._odometry, view, correction)
             if self._search.serves(sensor):
                 here = _on_pose(seen, s)
                 self._search.expect(sensor, here, self._odometry, view)

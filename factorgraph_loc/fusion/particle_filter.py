@@ -38,9 +38,8 @@ from factorgraph_loc.fusion.cloud import (
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, twin
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
-from factorgraph_loc.fusion.search import Change, Search, Tracked, is_known
-from factorgraph_loc.fusion.slipping import SlipMonitor
 from factorgraph_loc.fusion.timeline import Taken
+from factorgraph_loc.fusion.tracking import Change, Tracked, Tracking, is_known
 from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -94,8 +93,7 @@ class ParticleFilter(Filter):
         columns = Layout.of((name, len(constants.names)) for name, constants in self._blocks).columns
         # where they lie in the constants of the particles
         self._parts = {name: slice(part.start - POSE, part.stop - POSE) for name, part in columns.items()}
-        self._search = Search(self._sensors, self._motion, setup.rng)
-        self._slips = SlipMonitor(self._motion, self.diagnostics)
+        self._search = Tracking(self._sensors, self._motion, setup.rng, self.diagnostics)
         self._search.remember()
         self._lost = False
         self._changes: list[tuple[float, Change]] = []  # of the robot's place, each with when it was found out
@@ -277,7 +275,7 @@ class ParticleFilter(Filter):
                 correction = here.correct(view.pose, view.covariance, {}, {}, 1)
                 if not sensor.judge(here, correction, view):
                     continue
-                self._slips.add(here.at_its_time, self._odometry, view, correction)
+                self._search.slips.add(here.at_its_time, self._odometry, view, correction)
                 self._search.expect(sensor, here, self._odometry, view)
             evidence = self._weigh(seen)
             self._search.keep(sensor, here, self._odometry, partial(float, evidence))

@@ -19,7 +19,7 @@ import numpy as np
 
 from factorgraph_loc.fusion.ancestors import draw_ancestors
 from factorgraph_loc.fusion.cloud import Cloud, pose_moments, systematic
-from factorgraph_loc.fusion.search import Change
+from factorgraph_loc.fusion.tracking import Change
 from factors import positive, se2
 from factors.motion import ChainState, Increment
 from factors.se2 import Array

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from factorgraph_loc.fusion.base import EVERY
-from factorgraph_loc.fusion.search import DURATION, Search
+from factorgraph_loc.fusion.search import DURATION
+from factorgraph_loc.fusion.tracking import Tracking
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior, gaussian_belief
 from factorgraph_loc.model.diagnostics import Addition, Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -48,7 +49,7 @@ class Timeline(ABC):
         self._t = -math.inf  # the newest time
         self._begun = math.inf  # when the estimator started; infinite before
         self._taken: deque[Taken] = deque()  # the last measurements, in the order in which they were processed
-        self._seeking: Search | None = None  # finds the start with the measurements that are kept
+        self._seeking: Tracking | None = None  # finds the start with the measurements that are kept
 
     def process(self, measurement: Measurement) -> None:
         """Take one measurement, in time or late by at most ``max_delay``."""
@@ -116,12 +117,12 @@ class Timeline(ABC):
         if self._seeking is not None:
             self._seek_start(m, self._seeking)
 
-    def _seek_heading(self, prior: PosePrior, search: Search) -> None:
+    def _seek_heading(self, prior: PosePrior, search: Tracking) -> None:
         """Search the heading at a known position."""
         self._t, self._seeking = prior.t, search
         search.begin(KnownPosition(prior, self._motion))
 
-    def _seek_start(self, m: Measurement, search: Search) -> None:
+    def _seek_start(self, m: Measurement, search: Tracking) -> None:
         """Search with a measurement; if that gives one pose, start there and process all measurements again."""
         start = search.start
         if start is not None:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.rfid import kernels, weighing
+from factors.rfid import kernels, tag_states, weighing
 from factors.rfid.index import MapTags, Seen, moved, tag_index
 from factors.rfid.model import Packed, RfidModel
 from factors.rfid.parameters import adjusted
@@ -159,19 +159,16 @@ class ExpectedReads(NamedTuple):
 class RfidLikelihood:
     """The likelihood of an antenna model with M detection models and A antennas, and a map of tags.
 
-    ``parameters`` (Q,), Q = 2 M + A + 2: of models, mounting and clock (:mod:`factors.rfid.parameters`); ``packed``: the models
-    with them, for compiled code.
+    ``parameters`` (Q,), Q = 2 M + A + 2: of models, mounting and clock (:mod:`factors.rfid.parameters`).
     """
 
     model: RfidModel
     tags: TagArray
-    packed: Packed = field(init=False, repr=False)
     parameters: Array = field(init=False, repr=False)
     _unadjusted: RfidLikelihood = field(init=False, repr=False)
     _of_parameters: dict[tuple[float, ...], Places] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "packed", self.model.packed())
         object.__setattr__(self, "parameters", np.zeros(2 * len(self.model.models) + len(self.model.antennas) + 2))
         object.__setattr__(self, "_unadjusted", self)
 
@@ -180,7 +177,7 @@ class RfidLikelihood:
         parameters, out = np.asarray(parameters, dtype=float), copy.copy(self)
         if parameters.shape != self.parameters.shape:
             raise ValueError(f"{parameters.shape} parameters of a likelihood, expected {self.parameters.shape}")
-        object.__setattr__(out, "packed", adjusted(self._unadjusted.packed, parameters))
+        out.__dict__.pop("packed", None)
         object.__setattr__(out, "parameters", parameters)
         return out
 
@@ -194,6 +191,13 @@ class RfidLikelihood:
         """Make the tables now, which is done once, and not when they are first needed."""
         for name in ("_tables", "_places"):
             getattr(self._unadjusted, name)
+
+    @cached_property
+    def packed(self) -> Packed:
+        """The models with the parameters, for compiled code."""
+        if self._unadjusted is self:
+            return self.model.packed()
+        return adjusted(self._unadjusted.packed, self.parameters)
 
     @cached_property
     def arrays(self) -> tuple[Packed, MapTags]:
@@ -226,7 +230,7 @@ class RfidLikelihood:
         it, relative to a silence out of reach: the mean of the likelihood over the poses; and which of them were read.
         ``parameters``: (Q,)."""
         alpha = float(self.model.tempering)
-        return weighing.displaced(*self._tabled, looks.seen, poses, margin, odds, shifts, alpha, parameters)
+        return tag_states.displaced(*self._tabled, looks.seen, poses, margin, odds, shifts, alpha, parameters)
 
     def log_likelihood(self, poses: Array, looks: TagReadCounts, parameters: Array | None = None) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.weighing`, :mod:`factors.rfid.places`):

@@ -25,6 +25,13 @@ from numpy.typing import NDArray
 
 from factors import se2
 from factors.compiled import compiled
+from factors.gaussian import cholesky
+from factors.rfid.index import MapTags, Seen, delayed, near_tags
+from factors.rfid.kernels import FAST, reach_of
+from factors.rfid.model import Packed
+from factors.rfid.parameters import adjusted
+from factors.rfid.tables import Tables
+from factors.rfid.weighing import FARTHEST_RATIO, fast_exp, mark_near, place_looks, tags_of_tables, weigh_tag
 from factors.se2 import Array, Integers
 
 KEPT = 200.0  # s of evidence that can be taken back
@@ -134,16 +141,77 @@ class TagStates:
 
 
 @compiled
-def sigma_poses(pose: Array, root: Array) -> Array:
-    """The poses (6, 3) that lie a column of ``root`` (3, 3) before and behind ``pose`` (3,)."""
+def sigma_poses(pose: Array, covariance: Array, width: float) -> Array:
+    """The poses (6, 3) that lie ``width`` times a column of the root of ``covariance`` (3, 3) before and behind ``pose`` (3,)."""
     out = np.empty((6, 3))
+    root, exists = cholesky(covariance)
+    if not exists:  # by rounding: correlations are ignored
+        root = np.diag(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(6):
-        sign = 1.0 if i < 3 else -1.0
+        sign = width if i < 3 else -width
         x, y, turned = se2.exp_scalars(sign * root[0, i % 3], sign * root[1, i % 3], sign * root[2, i % 3])
         out[i, 0], out[i, 1] = pose[0] + c * x - s * y, pose[1] + s * x + c * y
         out[i, 2] = se2.wrap_scalar(pose[2] + turned)
     return out
+
+
+@compiled(error_model="numpy", fastmath=FAST)
+def displaced(
+    packed: Packed,
+    tables: Tables,
+    of_map: MapTags,
+    seen: Seen,
+    poses: Array,
+    margin: float,
+    odds: Array,
+    shifts: Array,
+    tempering: float,
+    parameters: Array,
+) -> tuple[Integers, Array, NDArray[np.bool_]]:
+    """See :meth:`factors.rfid.detection.RfidLikelihood.displaced`."""
+    placed = adjusted(packed, parameters)
+    looks = delayed(seen[0], seen[8], placed.delay), seen[1], seen[2]
+    reach = margin + reach_of(placed, looks[0])
+    near = near_tags(of_map, seen, poses, reach)
+    tags, heard = tags_of_tables(tables, near), np.zeros(len(near.tags), np.bool_)
+    for u in range(len(heard)):
+        for k in range(len(looks[1])):
+            heard[u] |= near.hits[k, u] > 0
+    kept = np.empty(len(heard), np.bool_)
+    mark_near(poses, tags, reach, kept)
+    for u in range(len(heard)):
+        kept[u] = (kept[u] or heard[u]) and odds[near.tags[u]] > -np.inf
+    found = np.flatnonzero(kept)
+    out = np.empty((len(found), len(shifts)))
+    each = len(poses)
+    size = len(shifts) * each
+    # what is seen of a tag that was moved is what is seen of the map's from poses that were moved the other way
+    moved = np.empty((size, 3))
+    for i in range(size):
+        shift, pose = shifts[i // each], poses[i % each]
+        moved[i, 0], moved[i, 1], moved[i, 2] = pose[0] - shift[0], pose[1] - shift[1], pose[2]
+    at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
+    own, product, room = np.empty(size), np.empty(size), np.empty(size)
+    place_looks(placed, moved, looks, parameters.reshape(1, -1), parameters, at, models)
+    matters = np.ones(len(looks[1]), np.bool_)
+    for u in range(len(found)):
+        weigh_tag(packed, tables, at, models, size, looks, tags, found[u], matters, own, product, room)
+        for i in range(len(shifts)):
+            most = own[i * each]
+            for n in range(i * each + 1, (i + 1) * each):
+                most = max(most, own[n])
+            out[u, i] = tempering * most
+            for n in range(i * each, (i + 1) * each):
+                own[n] = max(tempering * (own[n] - most), -FARTHEST_RATIO)
+        for n in range(size):
+            own[n] = fast_exp(own[n])
+        for i in range(len(shifts)):
+            mean = 0.0
+            for n in range(i * each, (i + 1) * each):
+                mean += own[n] / each
+            out[u, i] += math.log(mean)
+    return near.tags[found], out, heard[found]
 
 
 @compiled

@@ -19,7 +19,7 @@ from factors.rfid.tables import CELL, NEGLIGIBLE, Measured, Tables, Tags, releva
 from factors.se2 import Array, Integers
 
 BLOCK = 512  # poses at a time, so that what is needed of them stays in the cache
-FARTHEST = 20.0  # log of the ratio of two likelihoods of which the smaller one does not count
+FARTHEST_RATIO = 20.0  # log of the ratio of two likelihoods of which the smaller one does not count
 LEAST = 1e-12  # probability of a read, and of a miss
 PRODUCT = 20  # factors of at least LEAST, of which a product is no underflow
 SHIFT = 0.05  # of the logit of a model's peak, to which it is rounded, as in tables of places
@@ -49,9 +49,9 @@ def log_likelihood(
     if len(parameters) > 1:
         poses = delayed(poses, seen[8], parameters[:, -1] - parameters[0, -1])
     near = near_tags(of_map, seen, poses, reach)
-    tags, odds, elsewhere = _tabled(tables, near), near.odds, near.elsewhere
+    tags, odds, elsewhere = tags_of_tables(tables, near), near.odds, near.elsewhere
     near_enough = np.empty(len(odds), np.bool_)
-    _near(poses, tags, reach, near_enough)
+    mark_near(poses, tags, reach, near_enough)
     matters = relevant(first_row, tables, poses, looks, parameters, tags, near_enough, tempering)
     base = tempering * len(of_map.points) * _silence(packed, looks[2])
     none = packed.false_read + packed.span / (1.0 + math.exp(-NEGLIGIBLE_LOGIT))
@@ -67,12 +67,12 @@ def log_likelihood(
         count = min(size, len(poses) - first)
         found = out[first : first + count]
         own_parameters = parameters[first : first + count] if len(parameters) > 1 else parameters
-        _place(first_row, poses[first : first + count], looks, own_parameters, parameters[0], at, models)
+        place_looks(first_row, poses[first : first + count], looks, own_parameters, parameters[0], at, models)
         factors = 0
         for t in range(len(odds)):
             if not near_enough[t]:
                 continue
-            _of_tag(packed, tables, at, models, count, looks, tags, t, matters[:, t], own, product, room)
+            weigh_tag(packed, tables, at, models, count, looks, tags, t, matters[:, t], own, product, room)
             if odds[t] == -np.inf or elsewhere[t] == -np.inf:
                 for n in range(count):
                     found[n] += tempering * own[n]
@@ -82,71 +82,13 @@ def log_likelihood(
             for n in range(count):
                 surveyed = tempering * own[n]
                 found[n] += max(surveyed, other) - both
-                ratios[n] *= 1.0 + _exp(-min(abs(surveyed - other), FARTHEST))
+                ratios[n] *= 1.0 + fast_exp(-min(abs(surveyed - other), FARTHEST_RATIO))
             factors += 1
             if factors == MIXED:
                 _add_logs(ratios, count, found)
                 factors = 0
         _add_logs(ratios, count, found)
     return out
-
-
-@compiled(error_model="numpy", fastmath=FAST)
-def displaced(
-    packed: Packed,
-    tables: Tables,
-    of_map: MapTags,
-    seen: Seen,
-    poses: Array,
-    margin: float,
-    odds: Array,
-    shifts: Array,
-    tempering: float,
-    parameters: Array,
-) -> tuple[Integers, Array, NDArray[np.bool_]]:
-    """See :meth:`factors.rfid.detection.RfidLikelihood.displaced`."""
-    placed = adjusted(packed, parameters)
-    looks = delayed(seen[0], seen[8], placed.delay), seen[1], seen[2]
-    reach = margin + reach_of(placed, looks[0])
-    near = near_tags(of_map, seen, poses, reach)
-    tags, heard = _tabled(tables, near), np.zeros(len(near.tags), np.bool_)
-    for u in range(len(heard)):
-        for k in range(len(looks[1])):
-            heard[u] |= near.hits[k, u] > 0
-    kept = np.empty(len(heard), np.bool_)
-    _near(poses, tags, reach, kept)
-    for u in range(len(heard)):
-        kept[u] = (kept[u] or heard[u]) and odds[near.tags[u]] > -np.inf
-    found = np.flatnonzero(kept)
-    out = np.empty((len(found), len(shifts)))
-    each = len(poses)
-    size = len(shifts) * each
-    # what is seen of a tag that was moved is what is seen of the map's from poses that were moved the other way
-    moved = np.empty((size, 3))
-    for i in range(size):
-        shift, pose = shifts[i // each], poses[i % each]
-        moved[i, 0], moved[i, 1], moved[i, 2] = pose[0] - shift[0], pose[1] - shift[1], pose[2]
-    at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
-    own, product, room = np.empty(size), np.empty(size), np.empty(size)
-    _place(placed, moved, looks, parameters.reshape(1, -1), parameters, at, models)
-    matters = np.ones(len(looks[1]), np.bool_)
-    for u in range(len(found)):
-        _of_tag(packed, tables, at, models, size, looks, tags, found[u], matters, own, product, room)
-        for i in range(len(shifts)):
-            most = own[i * each]
-            for n in range(i * each + 1, (i + 1) * each):
-                most = max(most, own[n])
-            out[u, i] = tempering * most
-            for n in range(i * each, (i + 1) * each):
-                own[n] = max(tempering * (own[n] - most), -FARTHEST)
-        for n in range(size):
-            own[n] = _exp(own[n])
-        for i in range(len(shifts)):
-            mean = 0.0
-            for n in range(i * each, (i + 1) * each):
-                mean += own[n] / each
-            out[u, i] += math.log(mean)
-    return near.tags[found], out, heard[found]
 
 
 @compiled
@@ -162,7 +104,7 @@ def mixed(own: float, odds: float, elsewhere: float) -> float:
 
 
 @compiled
-def _tabled(tables: Tables, near: NearTags) -> Tags:
+def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
     """What tables are needed of tags."""
     levels = np.empty((len(tables.level), len(near.tags)), np.int64)
     for a in range(len(levels)):
@@ -172,7 +114,7 @@ def _tabled(tables: Tables, near: NearTags) -> Tags:
 
 
 @compiled
-def _near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) -> None:
+def mark_near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) -> None:
     """Which tags (T,) are within ``reach`` [m] of the box that holds the poses (N, 3)."""
     points = tags[0]
     low_x = high_x = poses[0, 0]
@@ -187,7 +129,7 @@ def _near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) -> Non
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def _place(
+def place_looks(
     packed: Packed, poses: Array, looks: Measured, parameters: Array, placed: Array, at: Array, models: Array
 ) -> None:
     """For each look ``at`` (K, 4, N): place of the antenna, cosine and sine of its heading; and for each of ``models`` (M, 2, N):
@@ -231,7 +173,7 @@ def _silence(packed: Packed, rounds: Integers) -> float:
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def _of_tag(
+def weigh_tag(
     packed: Packed,
     tables: Tables,
     at: Array,
@@ -337,7 +279,7 @@ def _add_logs(values: Array, count: int, out: Array) -> None:
 
 
 @compiled(inline="always")
-def _exp(x: float) -> float:
+def fast_exp(x: float) -> float:
     """The exponential of x from -20 to 0, to 1e-8."""
     y = x / 64.0
     e = 1.0 + y * (

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from factorgraph_loc.fusion.search import is_known
+from factorgraph_loc.fusion.tracking import is_known
 from factorgraph_loc.model.scoring import MAX_GAP
 
 T = 0.1 * np.arange(100)

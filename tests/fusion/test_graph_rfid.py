@@ -14,7 +14,7 @@ from factorgraph_loc.evaluation.metrics import errors as evaluated
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
-from factorgraph_loc.fusion.search import SURE, beyond
+from factorgraph_loc.fusion.tracking import SURE, beyond
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.model.result import RunResult

@@ -8,7 +8,7 @@ import pytest
 from factorgraph_loc import Rig, VelocityOdometry
 from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.population import CHUNK, PARTICLE, Population
-from factorgraph_loc.fusion.search import laplace_evidence
+from factorgraph_loc.fusion.tracking import laplace_evidence
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings

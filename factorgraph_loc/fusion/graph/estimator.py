@@ -25,8 +25,9 @@ from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.graph.keyframes import Backend, Builder
 from factorgraph_loc.fusion.graph.settings import BatchSettings, SmootherSettings
 from factorgraph_loc.fusion.layout import MOTION
-from factorgraph_loc.fusion.search import DURATION, FOUND, Refuted, Search, Tracked, is_known
+from factorgraph_loc.fusion.search import DURATION
 from factorgraph_loc.fusion.timeline import Taken, Timeline
+from factorgraph_loc.fusion.tracking import FOUND, Refuted, Tracked, Tracking, is_known
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -72,7 +73,7 @@ class Smoother(Timeline):
         self._sensors = sensors = bound_sensors(Binding(setup, motion, diagnostics, use, use, calibration))
         mapper: Mapper = MAPPERS["points"](sensors, self.diagnostics, settings)
         self._graph = Graph(self._motion, sensors, mapper, self.diagnostics)
-        self._search = self._seeking = Search(sensors, self._motion, setup.rng)
+        self._search = self._seeking = Tracking(sensors, self._motion, setup.rng, diagnostics)
         self._search.remember()
         # where landmarks are estimated too, they cannot tell the place
         self.supports_unknown_start = settings.landmarks == "known"

@@ -14,7 +14,7 @@ import numpy as np
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.fusion.graph.marginals import blamed, damped
 from factorgraph_loc.fusion.layout import MOTION
-from factorgraph_loc.fusion.search import Change
+from factorgraph_loc.fusion.tracking import Change
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics

@@ -196,7 +196,7 @@ class Incremental:
             covariance = self._solver.covariance(key) if spread is None else spread
         except GTSAM_ERRORS:
             covariance = np.full((1, 1), np.nan)
-        if positive.is_clear(covariance):
+        if _is_definite(covariance):
             return value, covariance
         if not (np.all(np.isfinite(covariance)) and np.all(np.diag(covariance) > 0.0)):
             found = covariances(*self._solver.linear(), (key,))
@@ -315,3 +315,11 @@ class Incremental:
         threshold = min(threshold, NEAR_POINTS) if self._maps else threshold
         # with points each pose leaves by itself: a window that is built anew soon linearises what it knew where it knew it
         return Window(parameters, threshold, self._failed.append, self._lag + self._margin if self._maps else math.inf)
+
+
+def _is_definite(covariance: Array) -> bool:
+    """Whether a covariance (D, D) is finite and has a Cholesky root."""
+    try:
+        return math.isfinite(np.linalg.cholesky(covariance).sum())
+    except np.linalg.LinAlgError:
+        return False

@@ -24,8 +24,7 @@ from factorgraph_loc.fusion.graph.graph import Addition, Graph, GraphView, Guess
 from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.graph.settings import GraphSettings
 from factorgraph_loc.fusion.layout import MOTION
-from factorgraph_loc.fusion.search import Search, laplace_evidence
-from factorgraph_loc.fusion.slipping import SlipMonitor
+from factorgraph_loc.fusion.tracking import Tracking, laplace_evidence
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation, Sensor
 from factors import se2
@@ -92,9 +91,8 @@ class _KeyframeView:
 class Builder:
     """Builds a graph as measurements come; see the module."""
 
-    def __init__(self, graph: Graph, backend: Backend, search: Search, settings: GraphSettings) -> None:
+    def __init__(self, graph: Graph, backend: Backend, search: Tracking, settings: GraphSettings) -> None:
         self._graph, self._backend, self._search, self._settings = graph, backend, search, settings
-        self._slips = SlipMonitor(graph.motion, graph.diagnostics)
         self._waiting: list[Observation] = []  # of a sensor that gathers, on the newest keyframe
         self._gatherer: Sensor | None = None  # that sensor
 
@@ -200,7 +198,7 @@ class Builder:
                     addition.hang(view.keyframe, self._graph.node(view.keyframe, term, sensor.name))
             if view.newest:
                 if seen.is_judged:
-                    self._slips.add(here.at_its_time, odometry, view, correction)
+                    self._search.slips.add(here.at_its_time, odometry, view, correction)
                 self._search.expect(sensor, here, odometry, view)
                 evidence = partial(laplace_evidence, here, view.pose, view.covariance, correction)
                 self._search.keep(sensor, here, odometry, evidence)

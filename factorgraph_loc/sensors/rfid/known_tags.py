@@ -17,7 +17,7 @@ from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidScan
-from factors import positive, se2
+from factors import se2
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
 from factors.rfid.signals import (
@@ -192,7 +192,7 @@ class KnownTags:
         """What looks tell of the tags in reach at a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3); ``parameters``
         (Q,): those of the likelihood, as they are estimated to be."""
         assert self.likelihood is not None
-        poses = sigma_poses(pose, WIDENED * math.sqrt(3.0) * positive.root(covariance))
+        poses = sigma_poses(pose, np.ascontiguousarray(covariance), WIDENED * math.sqrt(3.0))
         places = self.states.places, FARTHEST, parameters, self.states.odds
         return TagEvidence(*self.likelihood.displaced(poses, looks, *places))
 

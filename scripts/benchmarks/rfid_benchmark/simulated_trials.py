@@ -14,7 +14,7 @@ from benchmarking.trials import BEFORE, HOLD, JUMP, POSITION, is_right
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.base import Estimator
-from factorgraph_loc.fusion.search import beyond
+from factorgraph_loc.fusion.tracking import beyond
 from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.simulation import simulate
