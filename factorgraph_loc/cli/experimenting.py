@@ -116,11 +116,7 @@ def run(
 
 
 def _print_done(done: Done, prepared: Prepared, file: Path, json: bool) -> None:
-    show.warnings(done.warnings)
-    for failure in done.failures[:SHOWN]:
-        show.note(f"failed: {failure}")
-    if len(done.failures) > SHOWN:
-        show.note(f"failed: {len(done.failures) - SHOWN} more, see `fgloc experiment status {file}`")
+    show.outcome(done.warnings, done.failures, SHOWN, f", see `fgloc experiment status {file}`")
     if json:
         found = {"runs": done.rows.to_dicts(), "failures": done.failures, "warnings": done.warnings}
         show.document({"folder": str(prepared.folder), **found})
@@ -330,8 +326,7 @@ def active(
             overwrite=overwrite,
             progress=report,
         )
-    for failure in results.failures:
-        show.note(f"failed: {failure}")
+    show.outcome((), results.failures)
     if json:
         found = {"summaries": summaries(results.rows), "differences": differences(results.rows)}
         show.document({"runs": results.rows, **found, "failures": results.failures})

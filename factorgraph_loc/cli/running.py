@@ -144,9 +144,7 @@ def compare(
             progress=report,
             **options.given(),
         )
-    show.warnings(comparison.warnings)
-    for failure in comparison.failures:
-        show.note(f"failed: {failure}")
+    show.outcome(comparison.warnings, comparison.failures)
     if json:
         show.document({"runs": comparison.rows, "failures": comparison.failures, "warnings": comparison.warnings})
     else:

@@ -44,6 +44,15 @@ def warnings(texts: Sequence[str]) -> None:
         note(f"warning: {len(texts) - WARNINGS} more are listed with the results")
 
 
+def outcome(doubts: Sequence[str], failures: Sequence[str], most: int | None = None, more: str = "") -> None:
+    """Print warnings and failures of several runs on stderr; at ``most`` so many failures, then that there are ``more``."""
+    warnings(doubts)
+    for failure in failures[:most]:
+        note(f"failed: {failure}")
+    if most is not None and len(failures) > most:
+        note(f"failed: {len(failures) - most} more{more}")
+
+
 def document(content: Any) -> None:
     """Print a JSON document on stdout; NaN and infinity become null, non-printable characters are escaped."""
     unicode = sys.stdout.encoding.lower().startswith("utf")

@@ -16,6 +16,7 @@ import numpy as np
 
 from factorgraph_loc.drawing.pages import Picture
 from factorgraph_loc.text import plain
+from factors.se2 import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+CORNERS = 32  # of the polygon of an ellipse
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
+_CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
 _STYLES = ("-", "--", ":", "-.")  # a second cue beside colour
 _WIDTH, _DPI = 16.0, 100
 _TITLE, _LINES = 80, 3  # maximum length of a line of text, and number of lines
@@ -68,6 +72,14 @@ def styles() -> Iterator[dict[str, Any]]:
     while True:
         yield {"color": COLOURS[i % len(COLOURS)], "linestyle": _STYLES[i % len(_STYLES)]}
         i += 1
+
+
+def ellipses(centres: Array, covariances: Array, scale: float) -> Array:
+    """Closed outlines (K, CORNERS + 1, 2) of Gaussians with ``centres`` (K, 2) and ``covariances`` (K, 2, 2), ``scale`` standard
+    deviations from their centres."""
+    variances, axes = np.linalg.eigh(covariances)
+    lengths = scale * np.sqrt(np.maximum(variances, 0.0))
+    return np.asarray(centres[:, None] + np.einsum("kij,kj,cj->kci", axes, lengths, _CIRCLE))
 
 
 def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:

@@ -18,6 +18,7 @@ import polars as pl
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
+from factorgraph_loc.files.columns import COVARIANCES
 from factorgraph_loc.files.models import write_text, write_toml
 from factorgraph_loc.files.tables import write_parquet
 from factorgraph_loc.files.temporary import of_system, require_free, sweep, temporary_folder, writing
@@ -38,7 +39,7 @@ from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import Alignment
-from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory, write_tum
+from factorgraph_loc.model.trajectory import Trajectory, write_tum
 from factorgraph_loc.model.world import World
 from factorgraph_loc.text import json_text, plain_lines, quoted
 from factors.se2 import Array

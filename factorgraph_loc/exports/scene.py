@@ -15,12 +15,9 @@ from factors.se2 import Array
 
 LIT_FOR = 0.5  # s that a tag or landmark stays highlighted after an observation
 GAP = 1.0  # s between poses, above which the path is interrupted
-CORNERS = 32  # of the polygon of an ellipse
 SCALE_95 = math.sqrt(-2.0 * math.log(0.05))  # standard deviations that contain 95 % of a two-dimensional Gaussian
 Colour = tuple[int, int, int]  # red, green, blue of 255
 REFERENCE, DARK, LIT, SEEN = (128, 128, 128), (160, 160, 160), (230, 159, 0), (0, 158, 115)
-_ANGLES = np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
-_CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
 
 
 @dataclass(frozen=True)
@@ -49,21 +46,19 @@ def layers(log: Log) -> list[tuple[Marks, dict[str, Array], Lights]]:
 
 
 def ellipses(trajectory: Trajectory) -> tuple[Array, Array]:
-    """Stamps (K,) and closed outlines (K, CORNERS + 1, 2) of the 95 % ellipses of the positions, for poses with a covariance."""
+    """Stamps (K,) and closed outlines (K, L, 2) of the 95 % ellipses of the positions, for poses with a covariance."""
     if trajectory.covariances is None:
-        return np.empty(0), np.empty((0, CORNERS + 1, 2))
+        return np.empty(0), np.empty((0, drawing_figures.CORNERS + 1, 2))
     covariances = trajectory.covariances[:, :2, :2]
     known = np.isfinite(covariances).all(axis=(1, 2))
     return trajectory.t[known], outlines(trajectory.poses[known, :2], covariances[known])
 
 
 def outlines(centres: Array, covariances: Array) -> Array:
-    """Closed outlines (K, CORNERS + 1, 2) of the 95 % ellipses of Gaussians with ``centres`` (K, 2) and ``covariances`` (K, 2,
+    """Closed outlines (K, L, 2) of the 95 % ellipses of Gaussians with ``centres`` (K, 2) and ``covariances`` (K, 2,
     2).
     """
-    variances, axes = np.linalg.eigh(covariances)
-    lengths = SCALE_95 * np.sqrt(np.maximum(variances, 0.0))
-    return np.asarray(centres[:, None] + np.einsum("kij,kj,cj->kci", axes, lengths, _CIRCLE))
+    return drawing_figures.ellipses(centres, covariances, SCALE_95)
 
 
 def _lights(t: Iterable[float], names: Sequence[str]) -> Lights:

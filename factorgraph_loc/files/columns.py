@@ -46,6 +46,18 @@ NEAREST, LONGEST_RANGE = 1e-3, 1e5  # m
 FULL_TURN = 2.0 * math.pi
 LARGEST_PIXEL = 1e5  # px
 
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # entries on and above the diagonal
+# columns of tables: entries of a covariance of (x, y, heading)
+COVARIANCES = dict(zip(("cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh"), UPPER, strict=True))
+
+
+def symmetric(upper: Sequence[Array]) -> Array:
+    """The matrices (N, 3, 3) with these entries (N,) at :data:`UPPER`."""
+    full = np.empty((len(upper[0]), 3, 3))
+    for values, (i, j) in zip(upper, UPPER, strict=True):
+        full[:, i, j] = full[:, j, i] = values
+    return full
+
 
 @dataclass(frozen=True)
 class Column:

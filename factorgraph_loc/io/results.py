@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import foreign
-from factorgraph_loc.files.columns import LATEST
+from factorgraph_loc.files.columns import COVARIANCES, LATEST, symmetric
 from factorgraph_loc.files.tables import parse_parquet
 from factorgraph_loc.model.scoring import KINDS
-from factorgraph_loc.model.trajectory import COVARIANCES, Trajectory
+from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.text import told
 from factors.se2 import Array
 
@@ -39,9 +39,7 @@ class Estimates:
     def of(cls, table: pl.DataFrame, t0_ns: int) -> "Estimates":
         """The rows of an ``estimates.parquet``, in seconds after ``t0_ns``."""
         numbers = {name: table[name].fill_null(np.nan).to_numpy() for name in NUMBERS}
-        covariances = np.empty((len(table), 3, 3))
-        for name, (i, j) in COVARIANCES.items():
-            covariances[:, i, j] = covariances[:, j, i] = numbers[name]
+        covariances = symmetric([numbers[name] for name in COVARIANCES])
         t = (table[STAMP].to_numpy() - t0_ns) / 1e9
         poses = np.column_stack([numbers[name] for name in ("x", "y", "heading")])
         return cls(Trajectory(t, poses, covariances), {name: numbers[name] for name in ERRORS})

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from factorgraph_loc.drawing.figures import COLOURS, grid, legend
+from factorgraph_loc.drawing.figures import COLOURS, ellipses, grid, legend
 from factorgraph_loc.mapping.mapping import LandmarkMap
 from factorgraph_loc.mapping.tag_mapping import MadeTags
 from factorgraph_loc.maps.points import PointMap
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CORNERS = 60  # vertices of the polygon of an ellipse
 FAR = 10.0  # median absolute deviations beyond which points are not drawn
 LABEL = 4  # last characters of a tag's EPC that are shown
 
@@ -76,7 +75,8 @@ def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
         kind = "wrong in the given map" if entry.flagged else "learnt"
         x, y = entry.learnt.position
         axis.plot(x, y, "x" if entry.flagged else "+", color=colour, markersize=9, label=kind, zorder=4)
-        axis.plot(*_ellipse(entry.learnt.position, entry.learnt.covariance), color=colour, label="2 sigma", zorder=4)
+        (rim,) = ellipses(entry.learnt.position[None], entry.learnt.covariance[None], 2.0)
+        axis.plot(*rim.T, color=colour, label="2 sigma", zorder=4)
         axis.annotate(entry.landmark[-label:], (x, y), (7, 7), textcoords="offset points", fontsize=12, zorder=5)
         if entry.flagged and entry.given is not None:
             axis.plot(*np.stack((entry.given, entry.learnt.position)).T, ":", color=colour, zorder=2)
@@ -112,11 +112,3 @@ def _from_above(title: str, places: Sequence[Array], walls: Sequence[tuple[float
 def _is_in_frame(made: LandmarkMap, verdict: str) -> bool:
     """Whether a given landmark is in the new map's frame: a given map that could not be aligned is not."""
     return made.judged or verdict == "given"
-
-
-def _ellipse(centre: Array, covariance: Array) -> Array:
-    """Outline (2, CORNERS) at two standard deviations."""
-    values, vectors = np.linalg.eigh(covariance)
-    angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
-    circle = np.stack((np.cos(angle), np.sin(angle)))
-    return np.asarray(centre[:, None] + vectors @ (2.0 * np.sqrt(np.maximum(values, 0.0))[:, None] * circle))

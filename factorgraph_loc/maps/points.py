@@ -13,7 +13,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.files.columns import POINTS
+from factorgraph_loc.files.columns import COVARIANCES, POINTS, UPPER, symmetric
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.tables import read_parquet, text_column, write_parquet
 from factorgraph_loc.files.temporary import writing
@@ -23,9 +23,7 @@ from factors.se2 import Array
 
 POINTS_SUFFIX = ".points.parquet"
 COLUMNS = ("point", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz")
-UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 VIEW = ("from_x", "from_y", "from_z", "size")
-COMMON = ("cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh")
 Feature = Literal["colour", "sift", "orb"]
 KINDS: tuple[str, ...] = get_args(Feature)
 LARGEST_VALUE = 1e6  # largest absolute value of a descriptor
@@ -126,7 +124,7 @@ def write_points(points: PointMap, path: Path) -> None:
             columns[name] = np.where(shown, points.seen_from[views, axis], np.nan)
         columns["size"] = np.where(shown, points.sizes[views], np.nan)
         if points.common is not None:
-            entries = zip(COMMON, UPPER, strict=True)
+            entries = COVARIANCES.items()
             columns |= {name: np.where(shown, points.common[views, i, j], np.nan) for name, (i, j) in entries}
         columns["descriptor"] = [points.descriptors[v].tobytes() if v >= 0 else b"" for v in views.tolist()]
     write_parquet(pl.DataFrame(columns), path)
@@ -156,7 +154,7 @@ def read_points(path: Path) -> PointMap:
             stated = f"{float(expected[i])!r} as in row {first[owner[i]] + 1} of point {labels[i]}"
             raise bad_field(path, name, float(values[i]), stated, row=i + 1)
     positions = np.column_stack([numbers[axis] for axis in "xyz"])
-    covariances = _symmetric([numbers[name][first] for name in COLUMNS[4:]])
+    covariances = symmetric([numbers[name][first] for name in COLUMNS[4:]])
     _check_covariances(covariances, COLUMNS[4:], tuple(rows), first, path)
     features = text_column(table, "feature", path)
     kinds = sorted({name for name in features if name})
@@ -169,9 +167,9 @@ def read_points(path: Path) -> PointMap:
     shown = np.flatnonzero([bool(name) for name in features])
     columns = [_numbers(table, name, shown, path) for name in VIEW]
     common = None
-    if any(name in table.columns for name in COMMON):
-        common = _symmetric([_numbers(table, name, shown, path) for name in COMMON])
-        _check_covariances(common, COMMON, [labels[i] for i in shown.tolist()], shown, path)
+    if any(name in table.columns for name in COVARIANCES):
+        common = symmetric([_numbers(table, name, shown, path) for name in COVARIANCES])
+        _check_covariances(common, tuple(COVARIANCES), [labels[i] for i in shown.tolist()], shown, path)
     return PointMap(
         tuple(rows),
         positions[first],
@@ -183,14 +181,6 @@ def read_points(path: Path) -> PointMap:
         columns[3],
         common,
     )
-
-
-def _symmetric(upper: Sequence[Array]) -> Array:
-    """The matrices (N, 3, 3) with these entries (N,) on and above their diagonals."""
-    full = np.empty((len(upper[0]), 3, 3))
-    for values, (i, j) in zip(upper, UPPER, strict=True):
-        full[:, i, j] = full[:, j, i] = values
-    return full
 
 
 def _numbers(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path) -> Array:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.columns import COVARIANCES, symmetric
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.model.pose_path import PosePath
 from factors import se2
@@ -19,16 +20,6 @@ from factors.se2 import Array, Integers
 
 if TYPE_CHECKING:
     import polars as pl
-
-
-COVARIANCES = {  # columns of tables: entries of a covariance of (x, y, heading)
-    "cov_xx": (0, 0),
-    "cov_xy": (0, 1),
-    "cov_xh": (0, 2),
-    "cov_yy": (1, 1),
-    "cov_yh": (1, 2),
-    "cov_hh": (2, 2),
-}
 
 
 class Exchange:
@@ -181,10 +172,7 @@ class Trajectory(Exchange):
             return found
         if missing := [name for name in COVARIANCES if name not in table.columns]:
             raise InputError(f"the table has no column {missing[0]}, expected all or none of {', '.join(COVARIANCES)}")
-        covariances = np.empty((len(table), 3, 3))
-        for column, (i, j) in zip(numbers(table, COVARIANCES).T, COVARIANCES.values(), strict=True):
-            covariances[:, i, j] = covariances[:, j, i] = column
-        return replace(found, covariances=covariances)
+        return replace(found, covariances=symmetric(list(numbers(table, COVARIANCES).T)))
 
     def to_polars(self) -> pl.DataFrame:
         """The poses as a table with the columns of :meth:`from_polars`, those of covariances if there are any."""

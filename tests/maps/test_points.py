@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.maps.points import COMMON, PointMap, read_points, write_points
+from factorgraph_loc.files.columns import COVARIANCES
+from factorgraph_loc.maps.points import PointMap, read_points, write_points
 
 
 def a_map(count, views, feature="sift", seed=0, *, common=False):
@@ -62,8 +63,8 @@ def test_what_is_written_comes_back(tmp_path_factory, counts, feature, common):
 def test_a_map_without_what_its_points_have_in_common_is_read(tmp_path):
     path = tmp_path / "a.points.parquet"
     write_points(a_map(3, [0, 1, 1], common=True), path)
-    assert [name for name in pl.read_parquet(path).columns if name.startswith("cov_")] == list(COMMON)
-    pl.read_parquet(path).drop(COMMON).write_parquet(path)
+    assert [name for name in pl.read_parquet(path).columns if name.startswith("cov_")] == list(COVARIANCES)
+    pl.read_parquet(path).drop(COVARIANCES).write_parquet(path)
     assert read_points(path).common is None
 
 
