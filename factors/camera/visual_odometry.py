@@ -82,20 +82,30 @@ def translation(position: Array, motion: Array) -> Array:
 def nearness(pairs: RayPairs, motion: Array) -> tuple[Array, Array]:
     """The inverse depth (K,) [1/m] at which the rays of each match are nearest to each other for a robot's ``motion`` (3,),
     negative behind the camera, and its standard deviation (K,)."""
-    c, s = math.cos(motion[2]), math.sin(motion[2])
-    x, y = translation(pairs.position, motion)
-    a, b = pairs.first, pairs.second
-    turned = np.column_stack((c * b[:, 0] - s * b[:, 1], s * b[:, 0] + c * b[:, 1], b[:, 2]))
-    # a / rho = tau + mu R b, crossed with R b
-    far = np.column_stack((y * turned[:, 2], -x * turned[:, 2], x * turned[:, 1] - y * turned[:, 0]))
-    squared = np.maximum(np.einsum("ki,ki->k", far, far), 1e-18)
-    # a x R b, which numpy takes long for
-    u, v = a.T, turned.T
-    across = np.column_stack((u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]))
-    rho = np.einsum("ki,ki->k", across, far) / squared
-    noise = np.einsum("kij,kij->k", pairs.first_noise, pairs.first_noise) / 2.0
-    noise += np.einsum("kij,kij->k", pairs.second_noise, pairs.second_noise) / 2.0
-    return rho, np.sqrt(noise * np.einsum("ki,ki->k", turned, turned) / squared)
+    way = translation(pairs.position, motion)
+    return _nearness(pairs.first, pairs.second, pairs.first_noise, pairs.second_noise, way, float(motion[2]))
+
+
+@compiled(error_model="numpy")
+def _nearness(
+    first: Array, second: Array, first_noise: Array, second_noise: Array, way: Array, turn: float
+) -> tuple[Array, Array]:
+    inverse_depth, sigma = np.empty(len(first)), np.empty(len(first))
+    c, s, x, y = math.cos(turn), math.sin(turn), way[0], way[1]
+    for k in range(len(first)):
+        a, b = first[k], second[k]
+        u, v, w = c * b[0] - s * b[1], s * b[0] + c * b[1], b[2]  # the second ray in the first frame
+        # a / rho = way + mu R b, crossed with R b
+        far_x, far_y, far_z = y * w, -x * w, x * v - y * u
+        squared = max(far_x * far_x + far_y * far_y + far_z * far_z, 1e-18)
+        across = (a[1] * w - a[2] * v) * far_x + (a[2] * u - a[0] * w) * far_y + (a[0] * v - a[1] * u) * far_z
+        noise = 0.0
+        for i in range(3):
+            for j in range(2):
+                noise += (first_noise[k, i, j] ** 2 + second_noise[k, i, j] ** 2) / 2.0
+        inverse_depth[k] = across / squared
+        sigma[k] = math.sqrt(noise * (u * u + v * v + w * w) / squared)
+    return inverse_depth, sigma
 
 
 def from_epipole(pairs: RayPairs, motion: Array) -> Array:
