@@ -11,7 +11,7 @@ from factorgraph_loc.maps.free_space import distance_to_walls
 from factorgraph_loc.model.belief import Belief, Mode
 from factorgraph_loc.planning import closed_loop
 from factorgraph_loc.planning.closed_loop import ActiveRun, run_active
-from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
+from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation import preset
 from factors import se2
 
@@ -24,7 +24,7 @@ def office(policy: str = "information", seed: int = 1, estimator: str = "active_
 @cache
 def symmetric() -> list[ActiveRun]:
     settings = ActiveSettings(start=(12.0, 12.0, 0.1))
-    return [run_active(preset("symmetric"), "information", "active_mcl", seed, settings) for seed in range(1, 6)]
+    return [run_active(preset("symmetric"), "information", "active_mcl", seed, settings) for seed in range(1, 4)]
 
 
 def test_a_run_ends_where_the_place_is_known() -> None:
@@ -39,18 +39,10 @@ def test_a_run_ends_where_the_place_is_known() -> None:
     assert run.seconds == run.truth.t[-1]
 
 
-@pytest.mark.parametrize("estimator", ["particle_filter", "smoother"])
-def test_policies_stand_on_any_estimator(estimator: str) -> None:
-    run = office(estimator=estimator)
+def test_policies_stand_on_other_estimators_too() -> None:
+    run = office(estimator="particle_filter")
     assert run.localized
     assert run.error_position < 0.3
-
-
-def test_information_in_closed_form_localizes_too() -> None:
-    settings = ActiveSettings(policy=PolicySettings(expectation="fisher"))
-    run = run_active(preset("office"), "information", "smoother", 1, settings)
-    assert run.localized
-    assert run.metres < 30.0
 
 
 def test_a_corner_between_two_poses_of_a_way_is_seen() -> None:
@@ -130,7 +122,7 @@ def test_wrong_names(policy: str, estimator: str, message: str) -> None:
 def test_two_places_that_look_alike_are_told_apart() -> None:
     """Beside the tag in the middle of the corridors the robot may be at two places, turned by half. It has to go where the arms
     differ to find out, and to say nothing before. Four runs in a hundred claim a wrong place (8 of seeds 1 to 200), so two of
-    these five would by chance in 1.5 % of all choices of seeds."""
+    these three would by chance in 0.5 % of all choices of seeds."""
     runs = symmetric()
     assert all(run.localized for run in runs)
     assert sum(run.claimed_wrong for run in runs) <= 1

@@ -10,7 +10,6 @@ from scipy import stats
 from factorgraph_loc.maps.free_space import free_space
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.information import (
-    CELL,
     expected_gain,
     gaussian_entropy,
     has_several_modes,
@@ -75,28 +74,6 @@ def test_entropy_of_particles_is_that_of_the_density():
     assert particle_entropy(area, even, ALL, coarse) == pytest.approx(math.log(40.0 * 2.0 * math.pi), abs=0.01)
 
 
-def test_weights_count_as_particles_do():
-    poses, _ = drawn(5000)
-    weights = np.random.default_rng(1).random((3, 5000))
-    found = particle_entropy(poses, weights, ("x", "y"))
-    assert found.shape == (3,)
-    twice = particle_entropy(np.concatenate((poses, poses)), np.concatenate((weights[0], weights[0])), ("x", "y"))
-    assert found[0] == pytest.approx(twice, abs=1e-5)
-    half = np.where(poses[:, 0] < 1.0, 1.0, 0.0)
-    assert particle_entropy(poses, half, ("x", "y")) == pytest.approx(
-        particle_entropy(poses[poses[:, 0] < 1.0], np.ones(int(half.sum())), ("x", "y")), abs=1e-5
-    )
-
-
-def test_particles_in_one_cell_have_its_size():
-    poses = np.tile((0.1, 0.1, 0.1), (50, 1))
-    for dims in (1, 2, 3):
-        assert particle_entropy(poses, np.ones(50), ALL[:dims]) == pytest.approx(np.log(CELL[:dims]).sum())
-    turned = poses.copy()
-    turned[::2, 2] += 2.0 * math.pi
-    assert particle_entropy(turned, np.ones(50), ALL) == pytest.approx(np.log(CELL).sum())
-
-
 @pytest.mark.parametrize("sigma", [0.05, 0.3, 1.0, 4.0])
 def test_one_mode(sigma):
     poses, weights = drawn(2000, np.diag((sigma**2, 0.5 * sigma**2, 0.1)))
@@ -150,26 +127,6 @@ def test_two_places_are_told_apart_as_often_as_enumeration_says(tempering):
     )
     assert gain == pytest.approx(math.log(2.0) - after, abs=0.08)
     assert 0.2 < gain < 0.6
-
-
-def test_nothing_is_learnt_without_tags_and_something_lost_on_the_way():
-    poses, weights = drawn(2000, np.diag((0.3, 0.3, 0.01)))
-    none = beam()
-    (still,) = expected_gain(none, poses, weights, [straight(2.0)], np.random.default_rng(0), dims=ALL)
-    assert still == pytest.approx(0.0, abs=0.05)
-    noise = OdometryModel(along=Growth(0.2), lateral=Growth(0.1), heading=Growth(0.1))
-    (lost,) = expected_gain(none, poses, weights, [straight(2.0)], np.random.default_rng(0), dims=ALL, noise=noise)
-    assert lost < still - 0.3
-
-
-def test_towards_a_tag_more_is_learnt_than_away():
-    """The belief does not tell how far along x the robot is, and the tag is ahead, beyond its reach at first."""
-    poses, weights = drawn(2000, np.diag((1.5**2, 0.2**2, 0.05**2)), mean=(0.0, 0.0, 0.0))
-    paths = primitives(6.0)
-    gains = expected_gain(beam((9.0, 1.0)), poses, weights, paths, np.random.default_rng(0))
-    ends = np.array([p.poses[-1, 0] for p in paths])
-    assert ends[np.argmax(gains)] > 4.0
-    assert gains[np.argmax(ends)] > gains[np.argmin(ends)] + 0.5
 
 
 def test_what_lies_behind_a_wall_is_not_scanned():

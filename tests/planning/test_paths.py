@@ -107,17 +107,6 @@ def free_length(space, poses, path):
     return path.way[free_steps(space, poses, [path])[0]]
 
 
-def test_free_length_is_that_to_the_wall():
-    space = free_space(ROOM, CLEARANCE)
-    path = straight(20.0)
-    poses = np.array(((2.0, 3.0, 0.0), (2.0, 3.0, math.pi), (5.0, 3.0, math.pi / 2.0), (5.0, 3.0, -math.pi / 2.0)))
-    expected = np.array((8.0, 2.0, 3.0, 3.0)) - CLEARANCE
-    found = free_length(space, poses, path)
-    assert (found <= expected + CELL / 2.0).all()
-    assert (found >= expected - CELL / 2.0 - STEP).all()
-    assert free_length(space, poses, straight(1.0)) == pytest.approx(1.0)
-
-
 def test_free_length_agrees_with_distances_to_walls(office):
     world, space = office
     rng = np.random.default_rng(1)

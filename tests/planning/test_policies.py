@@ -93,45 +93,41 @@ def test_ways_end_where_the_sensor_sees_a_wall():
     assert kept[1].length == paths[2].length
 
 
+def two_modes(tag, middles, sigmas, targets):
+    """A belief of two equal modes in an empty hall with one tag, and the ways from the first of them to places far away."""
+    middles, sigmas = np.array(middles), np.array(sigmas)
+    particles = middles[np.arange(500) % 2] + np.random.default_rng(0).standard_normal((500, 3)) * sigmas
+    modes = tuple(Mode(0.5, m, np.diag(sigmas**2)) for m in middles)
+    ways = waypoint_paths(SPACE, middles[0], np.array(targets))
+    base = situation((*primitives(3.0), *ways), tags=np.array((tag,)))
+    return replace(base, particles=particles, modes=modes), ways
+
+
+SURE = (0.1, 0.1, 0.02)
+
+
 def test_of_two_places_a_far_one_that_tells_them_apart_is_chosen():
-    """Two equal places in an empty hall; a tag stands 15 m away from where one of them says."""
-    tags = np.array(((20.0, 35.0, 1.2),))
-    rng = np.random.default_rng(0)
-    middles = np.array(((20.0, 20.0, 0.0), (20.0, 5.0, 0.0)))
-    particles = middles[np.arange(500) % 2] + rng.standard_normal((500, 3)) * (0.1, 0.1, 0.02)
-    modes = tuple(Mode(0.5, m, np.diag((0.01, 0.01, 4e-4))) for m in middles)
-    ways = waypoint_paths(SPACE, middles[0], np.array(((20.0, 34.0), (20.0, 6.0), (34.0, 20.0))))
-    paths = (*primitives(3.0), *ways)
-    base = situation(paths, np.full(len(paths), 3.0), tags)
-    s = replace(base, particles=particles, modes=modes)
+    """A tag stands 15 m away from where one of them says."""
+    middles, targets = ((20.0, 20.0, 0.0), (20.0, 5.0, 0.0)), ((20.0, 34.0), (20.0, 6.0), (34.0, 20.0))
+    s, ways = two_modes((20.0, 35.0, 1.2), middles, SURE, targets)
     choice = make_policy("information").choose(s)
     assert choice.path is ways[0]
     assert choice.metres > 3.0
     # of one place nothing is gained by going far
-    assert make_policy("information").choose(replace(s, modes=modes[:1])).path is not ways[0]
+    assert make_policy("information").choose(replace(s, modes=s.modes[:1])).path is not ways[0]
 
 
 def test_of_two_headings_at_one_place_a_far_tag_tells():
     """In the middle of a hall, looking one way or the other; a tag stands 15 m ahead of one."""
-    tags = np.array(((20.0, 35.0, 1.2),))
-    middles = np.array(((20.0, 20.0, math.pi / 2.0), (20.0, 20.0, -math.pi / 2.0)))
-    particles = middles[np.arange(500) % 2] + np.random.default_rng(0).standard_normal((500, 3)) * (0.1, 0.1, 0.02)
-    modes = tuple(Mode(0.5, m, np.diag((0.01, 0.01, 4e-4))) for m in middles)
-    ways = waypoint_paths(SPACE, middles[0], np.array(((20.0, 34.0), (34.0, 20.0))))
-    paths = (*primitives(3.0), *ways)
-    s = replace(situation(paths, np.full(len(paths), 3.0), tags), particles=particles, modes=modes)
+    middles = ((20.0, 20.0, math.pi / 2.0), (20.0, 20.0, -math.pi / 2.0))
+    s, ways = two_modes((20.0, 35.0, 1.2), middles, SURE, ((20.0, 34.0), (34.0, 20.0)))
     assert make_policy("information").choose(s).path is ways[0]
 
 
 def test_a_far_tag_that_both_places_would_read_alike_tells_nothing():
     """The modes are known to 0.2 m only: that the way ends 0.1 m beside the one of them and not the other is no difference."""
-    tags = np.array(((20.0, 20.0, 1.2),))
-    middles = np.array(((8.0, 20.0, 0.0), (32.0, 20.1, math.pi)))
-    particles = middles[np.arange(500) % 2] + np.random.default_rng(0).standard_normal((500, 3)) * (0.2, 0.2, 0.05)
-    modes = tuple(Mode(0.5, m, np.diag((0.04, 0.04, 0.0025))) for m in middles)
-    ways = waypoint_paths(SPACE, middles[0], np.array(((19.0, 20.0),)))
-    paths = (*primitives(3.0), *ways)
-    s = replace(situation(paths, np.full(len(paths), 3.0), tags), particles=particles, modes=modes)
+    middles = ((8.0, 20.0, 0.0), (32.0, 20.1, math.pi))
+    s, _ = two_modes((20.0, 20.0, 1.2), middles, (0.2, 0.2, 0.05), ((19.0, 20.0),))
     assert make_policy("information").choose(s).path.kind == "patrol"
 
 

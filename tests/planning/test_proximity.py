@@ -29,12 +29,6 @@ def test_lengths_are_those_to_the_walls_less_the_clearance(sensor: ProximitySens
     assert lengths.max() <= SIGHT
 
 
-def test_it_turns_with_the_robot(sensor: ProximitySensor) -> None:
-    poses = np.array(((2.1, 14.0, 0.0), (2.1, 14.0, math.pi / 6.0)))
-    here, turned = sensor.expected(poses)
-    assert np.allclose(np.roll(here, -1), turned)
-
-
 def test_readings_scatter_as_they_are_weighed(sensor: ProximitySensor) -> None:
     """Of 4,000 readings where no length is near either end: mean and standard deviation miss by a twentieth of sigma in less than
     one of 500 cases each."""
@@ -67,9 +61,3 @@ def test_an_h_looks_the_same_when_it_is_turned_by_half(sensor: ProximitySensor) 
     poses = np.column_stack((places, rng.uniform(-math.pi, math.pi, 2000)))
     turned = np.column_stack((30.0 - poses[:, 0], 24.0 - poses[:, 1], poses[:, 2] + math.pi))
     assert np.array_equal(sensor.expected(poses), sensor.expected(turned))
-
-
-def test_a_crossing_is_no_corridor(sensor: ProximitySensor) -> None:
-    crossing, corridor = np.array(((1.7, 13.0, 0.4), (1.7, 19.0, 0.4)))
-    lengths = sensor.expected(crossing[None])[0]
-    assert sensor.log_likelihood(corridor[None], lengths)[0] < -1.0

@@ -34,10 +34,6 @@ def test_tags_hang_on_a_surface_and_face_free_space(name, seed):
     assert inside.all()
 
 
-def test_a_density_gives_a_number_of_tags():
-    assert len(world(tags=None, density=0.04, plan="warehouse", width=30.0, depth=20.0).tags) == 24
-
-
 def test_tags_on_the_floor_lie_low_and_face_nowhere():
     made = world(surfaces=("floor",))
     assert len(made.tags) == 20

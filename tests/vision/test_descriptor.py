@@ -27,12 +27,6 @@ def described(picture: np.ndarray) -> tuple[Keypoints, np.ndarray]:
     return features.record(picture, features.detect(picture))
 
 
-def test_a_record_has_the_papers_values() -> None:
-    counts = {name: int(np.prod(RECORD[name].shape, dtype=int)) for name in RECORD.names or ()}
-    assert counts == {"position": 2, "scale_responses": 20, "scale": 1, "orientation": 5, "texture": 9}
-    assert sum(counts.values()) - counts["position"] == VALUES
-
-
 def test_position_and_scale_are_those_of_the_point(described: tuple[Keypoints, np.ndarray]) -> None:
     keypoints, found = described
     assert np.allclose(found["position"], keypoints.points, atol=1e-4)

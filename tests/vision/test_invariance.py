@@ -87,12 +87,6 @@ def found_again(points: np.ndarray, sizes: np.ndarray, keypoints: Keypoints) -> 
 
 
 @settings(max_examples=15)
-@given(zoom=st.floats(0.5, 2.0))
-def test_zoom(zoom: float) -> None:
-    check(*warped(0.0, zoom))
-
-
-@settings(max_examples=15)
 @given(angle=st.floats(-np.pi, np.pi), zoom=st.floats(0.6, 1.6))
 def test_rotation_and_zoom(angle: float, zoom: float) -> None:
     check(*warped(angle, zoom))

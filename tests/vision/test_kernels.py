@@ -42,14 +42,6 @@ def test_corner_strength_is_determinant_over_trace() -> None:
     assert np.allclose(strength, expected, rtol=1e-3, atol=1e-4)
 
 
-def test_an_edge_and_a_flat_place_are_no_corners() -> None:
-    products = np.zeros((3, 4, 5), dtype=np.float32)
-    products[:, 2:] = np.array([4.0, 2.0, 1.0])[:, None, None]  # all gradients along (2, 1)
-    strength = np.full((4, 5), np.nan, dtype=np.float32)
-    corner_strength(products, np.float32(1.0), strength)
-    assert np.array_equal(strength, np.zeros((4, 5)))
-
-
 def peaks_of(strength: np.ndarray, planes: np.ndarray, threshold: float = 0.0) -> np.ndarray:
     peaks = np.empty((1, 5))
     pixels = np.array([[6, 5]], dtype=np.int32)
