@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from numerical import by_each
 
 from factors import positive, se2
 from factors.graph import jacobian_factors
@@ -73,23 +74,9 @@ def test_jacobians_are_the_numerical_ones(model, pose, point):
     sigma = sigmas(model, seen[1])[0]
     by_pose, by_point, by_sensor = np.split(sigma[:, None] * jacobian[0], (POINT, CONSTANTS), axis=1)
     np.testing.assert_allclose(error, 0.0, atol=1e-8)
-    step = 1e-6
-
-    def derivative(function, size):
-        columns = []
-        for d in step * np.eye(size):
-            after, before = np.array(function(d)), np.array(function(-d))
-            columns.append(np.array((after[0] - before[0], se2.wrap(after[1] - before[1]))) / (2 * step))
-        return np.column_stack(columns)
-
-    def with_sensor(d):
-        return predict(recalibrated(model, d), pose, point)
-
-    np.testing.assert_allclose(
-        by_pose, derivative(lambda d: predict(model, se2.compose(pose, se2.exp(d)), point), 3), atol=1e-5
-    )
-    np.testing.assert_allclose(by_point, derivative(lambda d: predict(model, pose, point + d), 2), atol=1e-5)
-    np.testing.assert_allclose(by_sensor, derivative(with_sensor, 6), atol=1e-5)
+    expected = by_each(lambda v: np.array(predict(recalibrated(model, v[2]), *v[:2])), [pose, point, np.zeros(6)])
+    for found, numerical in zip((by_pose, by_point, by_sensor), expected, strict=True):
+        np.testing.assert_allclose(found, numerical, atol=1e-5)
 
 
 @given(models, poses, st.integers(0, 10_000))
@@ -145,15 +132,8 @@ def test_jacobians_of_the_factor_by_constants_and_point_are_the_numerical_ones(m
     )
     values = [pose, np.zeros(5), point]
     _, blocks = factor.whitened(values)
-    step = 1e-6
-    for which, size in ((0, 3), (1, 5), (2, 2)):
-        for j, d in enumerate(step * np.eye(size)):
-            found = []
-            for sign in (1.0, -1.0):
-                moved = list(values)
-                moved[which] = se2.compose(pose, se2.exp(sign * d)) if which == 0 else values[which] + sign * d
-                found.append(factor.whitened(moved)[0])
-            np.testing.assert_allclose(blocks[which][:, :, j], (found[0] - found[1]) / (2 * step), rtol=1e-3, atol=2e-3)
+    for block, numerical in zip(blocks, by_each(lambda v: factor.whitened(v)[0], values), strict=True):
+        np.testing.assert_allclose(block, numerical, rtol=1e-3, atol=2e-3)
 
 
 @given(models, poses, st.integers(0, 10_000))
@@ -169,32 +149,9 @@ def test_a_located_landmark_has_the_spread_of_its_pose_and_noise(model, pose, se
     located_at, blocks, noise = factor.locate([pose, np.zeros(1)])
     np.testing.assert_allclose(located_at, point, atol=1e-9)
     assert np.all(np.linalg.eigvalsh(noise) > 0.0)
-    step = 1e-6
-    for j, d in enumerate(step * np.eye(3)):
-        after = factor.locate([se2.compose(pose, se2.exp(d)), np.zeros(1)])[0]
-        np.testing.assert_allclose(blocks[0][:, j], (after - point) / step, atol=1e-3)
-    after = factor.locate([pose, np.array([step])])[0]
-    np.testing.assert_allclose(blocks[1][:, 0], (after - point) / step, atol=1e-3)
-
-
-@given(models, poses, st.integers(0, 10_000), st.booleans())
-def test_jacobian_of_the_factor_is_the_numerical_one(model, pose, seed, displaced):
-    rng = np.random.default_rng(seed)
-    seen = rng.uniform(-8.0, 8.0, (3, 2))
-    offset = np.array((0.1, 0.02, 0.1)) if displaced else None
-    at = pose if offset is None else se2.compose(pose, offset)
-    assume(all(apart(model, at, p) for p in seen))
-    ranges, bearings = predict(model, at, seen)
-    noise = 1e-3 * np.eye(3) if displaced else None
-    # no residual: there the robust weights stand still
-    factor = BearingRangeFactor(model, seen, ranges, bearings, offset, noise)
-    residual, (block,) = factor.linearize([pose])
-    np.testing.assert_allclose(residual, 0.0, atol=1e-9)
-    step = 1e-7
-    for j, d in enumerate(step * np.eye(3)):
-        after = factor.linearize([se2.compose(pose, se2.exp(d))])[0]
-        before = factor.linearize([se2.compose(pose, se2.exp(-d))])[0]
-        np.testing.assert_allclose(block[:, j], (after - before) / (2 * step), rtol=1e-3, atol=1e-3)
+    numerical = by_each(lambda v: factor.locate(v)[0], [pose, np.zeros(1)])
+    for block, expected in zip(blocks, numerical, strict=True):
+        np.testing.assert_allclose(block, expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("split", [False, True])
@@ -237,20 +194,6 @@ def test_residuals_are_those_of_gtsams_factors(pose, point):
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array((0.05, 0.3)))
     theirs = gtsam.BearingRangeFactor2D(0, 1, gtsam.Rot2(0.4), 3.0, noise).error(values)
     error = residuals(model, pose, point[None], np.array([3.0]), np.array([0.4]))
-    assert 0.5 * np.sum(error**2) == pytest.approx(theirs, rel=1e-6, abs=1e-9)
-
-
-@given(poses, points)
-def test_ranges_with_a_mounting_are_those_of_gtsams_factor(pose, point):
-    mounting = (0.3, -0.2, 0.7)
-    model = BearingRangeModel(mounting=mounting, range_sigma=0.3)
-    assume(apart(model, pose, point))
-    values = gtsam.Values()
-    values.insert(0, gtsam.Pose2(*pose))
-    values.insert(1, point)
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.3)
-    theirs = gtsam.RangeFactorWithTransform2D(0, 1, 3.0, noise, gtsam.Pose2(*mounting)).error(values)
-    error = residuals(model, pose, point[None], np.array([3.0]), np.array([np.nan]))
     assert 0.5 * np.sum(error**2) == pytest.approx(theirs, rel=1e-6, abs=1e-9)
 
 
@@ -327,22 +270,6 @@ def test_a_landmark_where_the_sensor_is_has_a_place_and_a_spread(distance):
     assert np.hypot(*point) == pytest.approx(distance)
     assert np.all(np.isfinite(blocks[0]))
     assert np.all(np.linalg.eigvalsh(spread) > 0.0)
-
-
-@pytest.mark.parametrize("estimated", [(), (0, 2, 3)])
-def test_plain_looks_are_linearised_as_those_that_carry_more(estimated):
-    """One call for a look at exact landmarks from its own pose: the same as with a displacement of nothing."""
-    model = BearingRangeModel(mounting=(0.2, -0.1, 0.3), range_sigma_relative=0.1)
-    seen = np.array([[3.0, 1.0], [0.5, -4.0], [-2.0, 2.0]]), np.array((3.2, np.nan, 7.0)), np.array((0.1, -1.7, np.nan))
-    factor = BearingRangeFactor(model, *seen, estimated=estimated)
-    general = BearingRangeFactor(model, *seen, offset=np.zeros(3), estimated=estimated)
-    values = [np.array((0.1, -0.2, 0.4)), *([np.array((0.01, 0.02, -0.03))] if estimated else [])]
-    residual, blocks = factor.linearize(values)
-    expected, others = general.linearize(values)
-    np.testing.assert_allclose(residual, expected, atol=1e-12)
-    assert len(blocks) == len(others) == len(values)
-    for block, other in zip(blocks, others, strict=True):
-        np.testing.assert_allclose(block, other, atol=1e-12)
 
 
 def test_landmarks_beyond_a_gate_are_counted_by_their_own_innovations():

@@ -3,12 +3,12 @@
 import gtsam
 import numpy as np
 import pytest
+from numerical import by_each
 
 from factors import se2
 from factors.graph import PriorFactor, VectorPriorFactor, jacobian_factor
 
 MEAN, SIGMAS = np.array((0.5, -2.0, 0.1)), np.array((0.1, 0.5, 2.0))
-STEP = 1e-6
 
 
 @pytest.mark.parametrize("value", [MEAN, np.array((0.7, -2.0, 5.0)), np.zeros(3)])
@@ -36,16 +36,11 @@ def test_a_prior_on_a_pose_is_gtsams():
 
 def test_costs_are_half_the_squared_residuals_and_jacobians_the_numerical_ones():
     pose = np.array((1.0, -2.0, 3.0))
-    for factor, value, retract in (
-        (VectorPriorFactor(MEAN, SIGMAS), np.array((0.7, -1.0, 5.0)), np.add),
-        (
-            PriorFactor(pose, np.diag((0.1, 0.2, 0.05)) ** 2),
-            np.array((1.2, -2.1, -3.1)),
-            lambda p, d: se2.compose(p, se2.exp(d)),
-        ),
+    for factor, value, poses in (
+        (VectorPriorFactor(MEAN, SIGMAS), np.array((0.7, -1.0, 5.0)), ()),
+        (PriorFactor(pose, np.diag((0.1, 0.2, 0.05)) ** 2), np.array((1.2, -2.1, -3.1)), (0,)),
     ):
         residual, (jacobian,) = factor.linearize([value])
         assert factor.cost([value]) == pytest.approx(0.5 * residual @ residual)
-        for i, step in enumerate(STEP * np.eye(3)):
-            ahead, behind = (factor.linearize([retract(value, s)])[0] for s in (step, -step))
-            np.testing.assert_allclose(jacobian[:, i], (ahead - behind) / (2.0 * STEP), atol=1e-5)
+        (numerical,) = by_each(lambda v, factor=factor: factor.linearize(v)[0], [value], poses)
+        np.testing.assert_allclose(jacobian, numerical, atol=1e-5)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numerical import derivative as numerical
 from scipy.spatial.transform import Rotation
 
 from factors.camera import inverse_depth
@@ -19,16 +20,10 @@ RAYS = np.array(
         (-0.2, 0.0, 0.9, 0.1, 0.3, 0.0),  # infinitely far
     )
 )
-STEP = 1e-6
 
 
 def moved(delta):
     return POSITION + ROTATION @ delta[3:], ROTATION @ Rotation.from_rotvec(delta[:3]).as_matrix()
-
-
-def numerical(f, size):
-    columns = [(f(STEP * e) - f(-STEP * e)) / (2.0 * STEP) for e in np.eye(size)]
-    return np.stack(columns, axis=-1)
 
 
 def test_pixels_depend_on_the_camera_and_on_the_ray_as_stated():

@@ -92,15 +92,3 @@ def test_pixels_of_uncertain_points_scatter_with_both(rng):
     _, _, by_point = reprojection.linearize_in_space(MODEL, *camera_pose(MODEL, pose), factor.points)
     expected = MODEL.sigma**2 * np.eye(2) + by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
     np.testing.assert_allclose(pixel_kernels.spread(by_point, factor.point_covariances, MODEL.sigma), expected)
-
-
-def test_a_point_depends_on_a_camera_in_space_as_on_the_robot_that_carries_it(rng):
-    factor, pose = seen(rng)
-    pixels, by_pose, by_point, _ = reprojection.linearize(MODEL, pose, factor.points)
-    in_space = reprojection.linearize_in_space(MODEL, *camera_pose(MODEL, pose), factor.points)
-    lift = np.zeros((6, 3))
-    lift[:3, 2], lift[3:, 0], lift[3:, 1] = MODEL.rotation[2], MODEL.rotation[0], MODEL.rotation[1]
-    lift[3:, 2] = MODEL.position[0] * MODEL.rotation[1] - MODEL.position[1] * MODEL.rotation[0]
-    np.testing.assert_allclose(in_space[0], pixels)
-    np.testing.assert_allclose(in_space[1] @ lift, by_pose, atol=1e-9)
-    np.testing.assert_allclose(in_space[2], by_point, atol=1e-9)

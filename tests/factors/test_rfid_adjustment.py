@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numerical import by_each
 
 from factors import se2
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
@@ -38,12 +39,8 @@ def scene(seed: int, half: float = 4.0) -> tuple[RfidLikelihood, TagReadCounts, 
 @settings(max_examples=25, deadline=None)
 def test_the_gradient_is_that_of_the_likelihood(seed):
     likelihood, looks, parameters = scene(seed, 2.5)
-
-    def nll(step):
-        pose = se2.compose(POSE, se2.exp(step[:3]))
-        return likelihood.joint_score(pose, parameters + step[3:], looks).nll[0]
-
-    numeric = [(nll(1e-5 * e) - nll(-1e-5 * e)) / 2e-5 for e in np.eye(3 + PARAMETERS)]
+    values = [POSE, parameters]
+    numeric = np.concatenate(by_each(lambda v: likelihood.joint_score(*v, looks).nll[0], values, step=1e-5))
     found = likelihood.joint_score(POSE, parameters, looks)
     # a tag may lie at an edge of the grid's knots, or of the reach
     assert np.median(np.abs(found.gradient[0] - numeric)) < 1e-5

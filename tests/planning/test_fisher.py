@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numerical import by_pose as numerical
 
 from factorgraph_loc import Landmark, PointMap, Rig, Tag, World
 from factorgraph_loc.planning.information import (
@@ -33,14 +34,6 @@ MEAN = np.array((1.0, 2.0, 0.7))
 COVARIANCE = np.array(((0.04, 0.01, 0.002), (0.01, 0.03, -0.001), (0.002, -0.001, 0.01)))
 STRAIGHT = next(p for p in primitives(4.0) if p.length > 3.9 and not p.poses[:, 1:].any())
 STEP = Path(STRAIGHT.poses[:2], "arc")
-
-
-def numerical(function, pose):
-    """Derivative by the body-frame perturbation."""
-    h = 1e-6
-    moves = h * np.eye(3)
-    ends = [(function(se2.compose(pose, se2.exp(m))) - function(se2.compose(pose, se2.exp(-m)))) for m in moves]
-    return np.stack(ends, axis=-1) / (2.0 * h)
 
 
 def test_without_sensors_it_is_the_motion_model_alone():
