@@ -2,7 +2,7 @@
 
 from pydantic import BaseModel
 
-from factorgraph_loc.files.columns import POINTS, POSES, Table
+from factorgraph_loc.files.columns import POINTS, POSES, STAMP, Table
 from factorgraph_loc.files.settings import Setting, bound_text, settings_in
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.readers.manifests import StartSettings
@@ -15,13 +15,16 @@ from factorgraph_loc.simulation.settings import SimulationSettings
 FILES: dict[str, type[BaseModel]] = {
     "`NAME.world.toml`": World,
     "`[start]`": StartSettings,
-    "settings of simulations": SimulationSettings,
-    "settings of active robots": ActiveSettings,
 }
 ESTIMATORS: dict[str, type[BaseModel]] = {
     f"settings of {name}": registry.settings_type(name) for name in registry.ESTIMATORS
 }
-RIG: dict[str, type[BaseModel]] = {"`NAME.rig.toml`": Rig}  # as the former on the page of settings
+# the page of settings has the bounds of these, and of the estimators
+OTHERS: dict[str, type[BaseModel]] = {
+    "`NAME.rig.toml`": Rig,
+    "settings of simulations": SimulationSettings,
+    "settings of active robots": ActiveSettings,
+}
 
 
 def numbers_of(model: type[BaseModel]) -> list[Setting]:
@@ -31,25 +34,30 @@ def numbers_of(model: type[BaseModel]) -> list[Setting]:
 
 def tables() -> list[str]:
     """The lines of all tables, with their headings."""
-    lines = ["### Columns", ""]
+    lines = [
+        "### Columns",
+        "",
+        f"`t_ns` of every table is the {STAMP.doc}, from {bound_text(STAMP.low)} to {bound_text(STAMP.high)} ns.",
+        "",
+    ]
     for table in (*all_tables(), POSES, POINTS):
         lines += [*_of_columns(table), ""]
     lines += ["### Settings", ""]
     for name, model in FILES.items():
         lines += [f"**{name[0].upper()}{name[1:]}**", "", "| key | least | most |", "|---|---|---|"]
-        told = [
-            number for number in numbers_of(model) if not number.key.startswith("rig.")
-        ]  # those of the rig's own file
-        lines += [f"| `{s.key}` | {bound_text(s.low)} | {bound_text(s.high)} |" for s in told]
+        lines += [f"| `{s.key}` | {bound_text(s.low)} | {bound_text(s.high)} |" for s in numbers_of(model)]
         lines.append("")
     return lines[:-1]
 
 
 def _of_columns(table: Table) -> list[str]:
-    names = ", ".join(f"`{column.name}`" for column in table.columns if column.kind not in ("stamp", "name", "file"))
-    lines = [f"**`{table.name}`**" + (f" with {names}" if names else ""), ""]
-    lines += ["| column | unit | least | most | may be empty | what it is |", "|---|---|---|---|---|---|"]
-    for column in table.columns:
+    lines = [
+        f"**`{table.name}`**",
+        "",
+        "| column | unit | least | most | may be empty | what it is |",
+        "|---|---|---|---|---|---|",
+    ]
+    for column in (c for c in table.columns if c.name != STAMP.name):
         unit = next(iter(column.units), "")
         low, high = (bound_text(column.low), bound_text(column.high)) if column.units else ("", "")
         lack = "yes" if column.may_lack else ""

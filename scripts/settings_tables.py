@@ -1,6 +1,6 @@
 """The tables of docs/settings.md: what can be set, from the models of the settings."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from factorgraph_loc.api.lookups import describe_preset, known_policies
 from factorgraph_loc.files.settings import Setting, default_text, settings_in, values_text
@@ -39,8 +39,23 @@ def _readers() -> list[str]:
     lines = ["## Options of readers", ""]
     for name in READERS.own:
         options = settings_in(reader(name).options)
-        lines += [f"### {name}", "", reader(name).about, "", *(_table(options) if options else ["No options.", ""])]
+        lines += [f"### {name}", "", reader(name).about, "", *(_by_table(options) if options else ["No options.", ""])]
     return lines
+
+
+def _by_table(settings: Sequence[Setting]) -> list[str]:
+    """A table of settings, in which those of several tables that differ in nothing but the table are one row."""
+    rows: dict[tuple[str, ...], list[str]] = {}
+    for s in settings:
+        table, _, key = s.key.removesuffix(".*").rpartition(".")
+        key += s.key[len(f"{table}.{key}" if table else key) :]
+        rows.setdefault((key, default_text(s), values_text(s), s.meaning), []).append(table)
+    lines = ["| setting | of | default | values | what it is |", "|---|---|---|---|---|"]
+    return [
+        *lines,
+        *(f"| `{k}` | {_names(filter(None, tables))} | {d} | {v} | {m} |" for (k, d, v, m), tables in rows.items()),
+        "",
+    ]
 
 
 def _simulations() -> list[str]:
@@ -61,5 +76,5 @@ def _table(settings: Sequence[Setting]) -> list[str]:
     return [*lines, ""]
 
 
-def _names(names: Sequence[str]) -> str:
+def _names(names: Iterable[str]) -> str:
     return ", ".join(f"`{name}`" for name in names)

@@ -1,4 +1,4 @@
-"""What docs/formats.md tells to do with the files of other programs, step by step."""
+"""The steps of docs/quickstart.md, from files of other programs to a comparison."""
 
 import json
 import re
@@ -11,7 +11,7 @@ from scripts_here import run_script
 from factorgraph_loc.io.readers import load
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "formats.md").read_text()
+PAGE = (ROOT / "docs" / "quickstart.md").read_text()
 
 
 @pytest.fixture(scope="module")

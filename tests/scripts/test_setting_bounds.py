@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 import pytest
-from limits_tables import ESTIMATORS, FILES, RIG, numbers_of, tables
+from limits_tables import ESTIMATORS, FILES, OTHERS, numbers_of, tables
 
 from factorgraph_loc import InputError, Rig, World
 from factorgraph_loc.files.models import parse_model
@@ -18,7 +18,7 @@ from factorgraph_loc.sensors.odometry.settings import (
     OdometryUncertainty,
 )
 
-ALL = FILES | ESTIMATORS | RIG
+ALL = FILES | ESTIMATORS | OTHERS
 
 
 @pytest.mark.parametrize("file", list(ALL))
