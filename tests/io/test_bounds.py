@@ -95,12 +95,6 @@ def test_a_stamp_that_is_far_from_all_others_is_told_with_its_row(native, refuse
     refused(native, f"odometry.csv:{22 if late else 2}: stamp is '{first} ns'", "at most 30 days from all others")
 
 
-def test_tables_by_different_clocks_are_told(native, refused):
-    rows = "".join(f"{UNIX + i * 10**8},0.1,0\n" for i in range(20))
-    (native / "odometry.csv").write_text("t_ns,v,w\n" + rows)
-    refused(native, "bearing_range.csv:2: stamp is '1200000000 ns'", "30 days")
-
-
 def test_bounds_are_told_in_the_unit_of_the_file(hall, refused):
     (hall.parent / "run" / "wheels.csv").write_text("time_ms;speed;turn\n1000;361;90\n1500;1,8;0\n")
     refused(hall, "wheels.csv:2: speed is 361.0, expected a finite number of km/h in -360 to 360")

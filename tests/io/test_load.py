@@ -135,19 +135,6 @@ def test_a_manifest_leads_to_its_own_folder_or_below_the_data_folder(
     refused(file.rename(file.with_name("run.toml")), "run.toml: path '", "; or `--rig FILE` in its place")
 
 
-def test_links_of_a_manifest_count_by_where_they_lead(manifest, away, one, refused, tmp_path):
-    file = manifest('rig = "linked.rig.toml"\n[options]\nrobot = 1\n')
-    link = file.parent / "linked.rig.toml"
-    (file.parent / "own.rig.toml").write_text('name = "own"\n')
-    link.symlink_to("own.rig.toml")
-    assert one(file, data_root=tmp_path).rig.name == "own"
-    link.unlink()
-    link.symlink_to(away / "cart.rig.toml")
-    assert one(file, data_root=tmp_path).rig.name == "away"
-    shutil.copytree(tmp_path / "set", file.parent / "set")
-    refused(file, "path 'linked.rig.toml' leaves its folder", "`--rig FILE`")
-
-
 def test_a_link_that_leaves_the_data_root(manifest, mrclam, tmp_path, refused):
     root = tmp_path / "root"
     root.mkdir()

@@ -25,24 +25,13 @@ def test_files_of_three_programs_are_one_log(hall, one):
     np.testing.assert_allclose(log.reference.poses, ((1.0, 0.0, 0.0), (2.0, 0.0, np.pi / 2)))
 
 
-@pytest.mark.parametrize(
-    ("rows", "columns"),
-    [
-        (
-            "1 0 0 0 0 0 1\n2 0 1 0 0 {h} {h}\n3 0 2 0 0 {h} {h}\n",
-            't="1", x="2", y="3", qx="4", qy="5", qz="6", qw="7"',
-        ),
-        ("1 0 0 0\n2 0 1 90\n3 0 2 90\n", 't="1", x="2", y="3", heading="4"'),
-    ],
-    ids=["quaternions", "headings"],
-)
-def test_poses_are_odometry_by_the_motion_between_them(hall, with_options, one, rows, columns):
-    (hall.parent / "run" / "odom.txt").write_text("# poses\n" + rows.format(h=np.sqrt(0.5)))
-    units = 't = "s", heading = "deg"' if "heading" in columns else 't = "s"'
+def test_poses_are_odometry_by_the_motion_between_them(hall, with_options, one):
+    rows = "# poses\n1 0 0 0 0 0 1\n2 0 1 0 0 {h} {h}\n3 0 2 0 0 {h} {h}\n"
+    (hall.parent / "run" / "odom.txt").write_text(rows.format(h=np.sqrt(0.5)))
     log = one(
         with_options(
-            '[options.odometry]\nfile = "odom.txt"\nseparator = " "\nheader = false\n'
-            f"columns = {{ {columns} }}\nunits = {{ {units} }}\n"
+            '[options.odometry]\nfile = "odom.txt"\nseparator = " "\nheader = false\nunits = { t = "s" }\n'
+            'columns = { t="1", x="2", y="3", qx="4", qy="5", qz="6", qw="7" }\n'
         )
     )
     odometry = log.streams["odometry"]
@@ -65,22 +54,6 @@ units = {{ t = "s", wx = "deg/s", wy = "deg/s", wz = "deg/s" }}
     np.testing.assert_allclose(np.degrees(down.streams["imu"].w), (20.0, 30.0))
     one_axis = options.replace('wx = "a", wy = "b", wz = "c"', 'w = "c"').replace('wx = "deg/s", wy = "deg/s", wz', "w")
     refused(with_options(one_axis + 'axes = "optical"\n'), "axes and mounting apply to rates about three axes")
-
-
-def test_a_reference_in_space_by_mapping(hall, with_options, one, refused):
-    rows = "1,0,-9,0,0,0,0,1\n2,1,-4,2,0,0,0,1\n3,2,-1,4,0,0,0,1\n"
-    (hall.parent / "run" / "space.csv").write_text("t,x,y,z,qx,qy,qz,qw\n" + rows)
-    names = ", ".join(f'{name} = "{name}"' for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw"))
-    options = f"""{WHEELS}
-[options.reference]
-file = "space.csv"
-columns = {{ {names} }}
-units = {{ t = "s" }}
-"""
-    refused(with_options(options), "space.csv: the height of poses varies by 4.0 m, expected a robot on a floor")
-    log = one(with_options(options + 'axes = "optical"\n'))
-    np.testing.assert_allclose(log.reference.poses, [(0, 0, 0), (2, -1, 0), (4, -2, 0)], atol=1e-12)
-    assert any("poses vary in height by 8.00 m" in warning for warning in log.warnings)
 
 
 def test_other_sensors_by_mapping(hall, with_options, one):

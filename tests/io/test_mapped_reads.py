@@ -162,19 +162,6 @@ def test_rows_of_sllurp_log_and_rounds_that_another_file_tells(hall, with_option
     np.testing.assert_allclose(rfid.age[:2], (0.07, 0.04), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("content", "fragments"),
-    [
-        ('{"timestamp": "1970', ("events.jsonl:1: is not JSON",)),
-        ('{"time": 1, "tag": {"epc": "A"}}\n', ("no object has 'timestamp', the first has tag.epc, time",)),
-    ],
-)
-def test_wrong_json_lines(hall, with_options, refused, content, fragments):
-    (hall.parent / "run" / "events.jsonl").write_text(content)
-    manifest = with_options(f'{WHEELS}\n[options.rfid]\nfile = "events.jsonl"\npreset = "sllurp_log"\n')
-    refused(manifest, *fragments)
-
-
 def test_reads_in_several_files(hall, one, refused):
     folder = hall.parent / "run"
     expected = one(hall).streams["rfid"]

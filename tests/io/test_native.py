@@ -54,14 +54,6 @@ def test_increments_imu_start_and_files_beside(native, one):
     assert not log.reference.has_heading
 
 
-def test_streams_and_reference_may_be_missing(native, one):
-    (native / "bearing_range.csv").unlink()
-    (native / "reference.tum").unlink()
-    log = one(native)
-    assert list(log.streams) == ["odometry"]
-    assert (log.reference, log.warnings) == (None, ())
-
-
 BAD_ODOMETRY = {
     "nan": ("t_ns,v,w\n1,0.5,0\n2,nan,0\n", ":3: v is 'nan'", "finite"),
     "infinity": ("t_ns,v,w\n1,0.5,-inf\n", ":2: w is '-inf'", "finite"),

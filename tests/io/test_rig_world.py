@@ -5,29 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from factorgraph_loc import InputError, Landmark, Rig, Tag, World, read_rig, read_world, write_rig, write_world
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
-from factorgraph_loc.sensors.odometry.settings import ImuSettings, OdometrySettings
-
-GOOD = "[bearing_range]\nrange_sigma = 0.1\n"
-
-
-def test_a_rig_comes_back(tmp_path):
-    rig = Rig(
-        name="cart",
-        sensors=("odometry", "imu"),
-        odometry=OdometrySettings(lag=0.15, direction=-0.08),
-        imu=ImuSettings(bias=0.01),
-        bearing_range=BearingRangeSettings(range_sigma=0.1, x=0.2),
-    )
-    write_rig(rig, tmp_path / "a.rig.toml")
-    assert read_rig(tmp_path / "a.rig.toml") == rig
-
-
-def test_a_world_comes_back(tmp_path):
-    world = World(name="hall", landmarks={"A 1": Landmark(x=1.0, y=-2.5, sigma=0.01), "ü": Landmark(x=0.1, y=0.2)})
-    write_world(world, tmp_path / "a.world.toml")
-    assert read_world(tmp_path / "a.world.toml") == world
+from factorgraph_loc import InputError, Rig, Tag, World, read_rig, read_world, write_world
 
 
 def test_a_rig_needs_nothing_but_what_it_has(tmp_path):

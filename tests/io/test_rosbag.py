@@ -3,11 +3,8 @@
 import sys
 
 import numpy as np
-from rosbag_reads import FIELDS, MS, OPTIONS, POSES, T0
-from rosbags.typesys import get_types_from_msg
+from rosbag_reads import FIELDS, MS, POSES, T0
 
-from factorgraph_loc.io.bags import file as bag_file
-from factorgraph_loc.io.readers import load
 from factors import se2
 
 
@@ -99,22 +96,6 @@ def test_names_and_units_of_the_messages_become_those_of_the_map(mcap, read, ref
     refuse(
         mcap, "the unit of phase is 'degrees', expected one of rad, deg", rfid=rfid | {"units": {"phase": "degrees"}}
     )
-
-
-def test_types_are_compiled_once_however_often_a_bag_is_read(mcap, monkeypatch):
-    """For the list of an option a bag is read once for each value."""
-    compiled = []
-
-    def counted(text, kind):
-        compiled.append(kind)
-        return get_types_from_msg(text, kind)
-
-    monkeypatch.setattr("rosbags.typesys.get_types_from_msg", counted)
-    bag_file._store.cache_clear()
-    logs = load(str(mcap), reader="rosbag", options=OPTIONS | {"base_frame": [f"base{i}" for i in range(5)]})
-    assert len(logs) == 5
-    assert sorted(compiled) == sorted(set(compiled))
-    assert "nav_msgs/msg/Odometry" in compiled
 
 
 def test_without_the_library(mcap, refuse, monkeypatch):

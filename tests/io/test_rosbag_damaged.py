@@ -2,11 +2,9 @@
 
 import sqlite3
 
+from rosbag_drive import proposed
 from rosbag_reads import MS, POSES, T0, fill
 from rosbags.typesys import get_types_from_idl
-
-from factorgraph_loc.io.bags.file import open_bag
-from factorgraph_loc.io.bags.manifest import propose
 
 
 def test_a_bag_of_ros_1_whose_recording_was_cut_off(tmp_path, bag_maker, refuse):
@@ -28,11 +26,6 @@ def test_old_bags_hold_no_definitions(tmp_path, bag_maker, read, refuse):
     database.close()
     assert len(read(tmp_path / "drive", rfid=None).streams["odometry"].t) == len(POSES)
     refuse(tmp_path / "drive", "topic /rfid is of type shop_msgs/msg/Reads, which the bag does not define")
-
-
-def proposed(path):
-    with open_bag(path) as opened:
-        return propose(opened)
 
 
 def test_a_topic_that_nobody_can_read_does_not_hide_the_others(tmp_path, bag_maker):

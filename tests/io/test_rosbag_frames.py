@@ -3,10 +3,8 @@
 import math
 
 import numpy as np
-from rosbag_drive import COUNT, MS, T0, add_frames, transform
+from rosbag_drive import COUNT, MS, T0, add_frames, proposed, transform
 
-from factorgraph_loc.io.bags.file import open_bag
-from factorgraph_loc.io.bags.manifest import propose
 from factors import se2
 
 ODOMETRY = np.array([(0.2 * i, 0.0, 0.1 * i) for i in range(COUNT)])
@@ -24,17 +22,11 @@ def add_tree(made, robot="base_link", world="map"):
 
 def test_a_reference_from_transforms(maker, read_drive):
     """The correction of a map is slow, odometry is fast, and the robot's middle is not where odometry counts from."""
-    odometry = np.array([(0.2 * i, 0.0, 0.1 * i) for i in range(COUNT)])
-    for i, (x, y, heading) in enumerate(odometry):
-        t = T0 + 100 * MS * i
-        add_frames(maker, "/tf", t, transform(maker, t, "odom", "footprint", (x, y, 0.0), heading))
-        if i in {0, COUNT - 1}:
-            add_frames(maker, "/tf", t, transform(maker, t, "map", "odom", (5.0, i, 0.0), heading=math.pi / 2))
-    add_frames(maker, "/tf_static", T0, transform(maker, T0, "footprint", "base_link", (0.3, 0.0, 0.0)))
+    add_tree(maker)
     reference = read_drive(maker, reference={"topic": "/tf", "parent": "map", "child": "base_link"}).reference
     np.testing.assert_allclose(reference.t, 0.1 * np.arange(COUNT), atol=1e-9)
     corrections = np.column_stack((np.full(COUNT, 5.0), np.arange(COUNT), np.full(COUNT, math.pi / 2)))
-    expected = se2.compose(se2.compose(corrections, odometry), np.array((0.3, 0.0, 0.0)))
+    expected = se2.compose(se2.compose(corrections, ODOMETRY), np.array((0.3, 0.0, 0.0)))
     np.testing.assert_allclose(reference.poses, expected, atol=1e-9)
 
 
@@ -62,11 +54,6 @@ def test_odometry_from_transforms(maker, read_drive, refused):
         ({"topic": "/odom"}, "/odom: odometry.parent and odometry.child are for tf, this is nav_msgs/msg/Odometry"),
     ):
         refused(maker.path, message, reader="rosbag", options={"odometry": options | changed})
-
-
-def proposed(path):
-    with open_bag(path) as opened:
-        return propose(opened)
 
 
 def test_frames_are_proposed_where_nothing_else_is_odometry_or_a_reference(tmp_path, bag_maker):

@@ -5,6 +5,7 @@ import tomllib
 import numpy as np
 import pytest
 import tomli_w
+from rosbag_drive import add_imu
 from rosbags.typesys import get_types_from_msg
 
 import factorgraph_loc as fgloc
@@ -62,16 +63,6 @@ def test_odometry_without_poses_is_read_by_its_velocities(proposal, tmp_path):
     np.testing.assert_array_equal(log.streams["odometry"].v, (0.5, 0.5, 0.5))
     # what the manifest leaves out is told
     assert log.metadata["not read"] == "/depth (sensor_msgs/msg/Range), /robot_pose (geometry_msgs/msg/PoseStamped)"
-
-
-def test_an_estimate_is_not_taken_for_the_truth_without_a_word(proposal):
-    def fill(made):
-        made.odometry("/odom", T0, (0.0, 0.0, 0.0))
-        pose_of(made, "/robot_pose")
-
-    found, _, text = proposal(fill)
-    assert found.options["reference"] == {"topic": "/robot_pose"}
-    assert "# /robot_pose is used as the reference: remove it if it is an estimate, not the truth" in text
 
 
 def range_of(made):
@@ -150,15 +141,10 @@ def test_what_is_proposed_of_odometry_and_a_gyro_is_used_by_a_run(proposal, tmp_
     """Odometry as poses that go straight on, and a gyro that says a circle: the heading of the run is the gyro's."""
 
     def fill(made):
-        zero = np.zeros(9)
         for i in range(31):
             t = T0 + 100_000_000 * i
             made.odometry("/odom", t, (0.05 * i, 0.0, 0.0))
-            turn = made.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
-            rate = made.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.3)
-            told = {"orientation": turn, "angular_velocity": rate, "linear_acceleration": rate}
-            told |= {f"{name}_covariance": zero for name in tuple(told)}
-            made.write("/imu/data", t + 20_000_000, "sensor_msgs/msg/Imu", header=made.header(t + 20_000_000), **told)
+            add_imu(made, [(0.0, 0.0, 0.3)], "/imu/data", t + 20_000_000)
 
     found, _, text = proposal(fill)
     assert found.uses == {"/odom": "odometry", "/imu/data": "imu"}

@@ -4,12 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from rosbag_drive import COUNT, MS, T0, add_frames, transform
+from rosbag_drive import COUNT, MS, T0, add_frames, add_imu, proposed, transform
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
-
-from factorgraph_loc.io.bags.file import open_bag
-from factorgraph_loc.io.bags.manifest import propose
 
 MARKERS = """\
 std_msgs/Header header
@@ -50,19 +47,6 @@ def test_velocities_with_and_without_a_header(maker, read_drive, one):
     assert bare.t0_ns == T0
     assert bare.streams["odometry"].v.tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
     assert "as received: /cmd" in bare.metadata["clock"]
-
-
-def add_imu(maker, rates):
-    """A message of an IMU for each of ``rates`` (N, 3)."""
-    for i, (x, y, z) in enumerate(rates):
-        t = T0 + 100 * MS * i
-        vectors = [maker.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z) for _ in range(2)]
-        turn = maker.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
-        spread = {
-            f"{name}_covariance": np.zeros(9) for name in ("orientation", "angular_velocity", "linear_acceleration")
-        }
-        told = {"orientation": turn, "angular_velocity": vectors[0], "linear_acceleration": vectors[1]}
-        maker.write("/imu", t, "sensor_msgs/msg/Imu", header=maker.header(t), **told, **spread)
 
 
 def test_the_gyro(maker, read_drive):
@@ -200,8 +184,7 @@ def test_a_start(maker, read_drive):
     assert start.t == pytest.approx(0.25)
     np.testing.assert_allclose(start.pose, (1.0, 2.0, 3.0), atol=1e-12)
     np.testing.assert_allclose(start.sigmas, (0.1, 0.2, 0.3), atol=1e-12)
-    with open_bag(maker.path) as bag:
-        assert propose(bag).options["start"] == {"topic": "/initialpose"}
+    assert proposed(maker.path).options["start"] == {"topic": "/initialpose"}
 
 
 def test_landmarks_and_pixels_by_a_mapping(maker, read_drive):

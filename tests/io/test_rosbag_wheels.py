@@ -4,11 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from rosbag_drive import COUNT, MS, T0
+from rosbag_drive import COUNT, MS, T0, proposed
 
 import factorgraph_loc as fgloc
-from factorgraph_loc.io.bags.file import open_bag
-from factorgraph_loc.io.bags.manifest import propose
 
 
 def add_wheels(made, left, right, names=("arm", "l", "r")):
@@ -110,8 +108,7 @@ def test_the_rig_tells_the_size_of_the_wheels(maker):
 def test_wheels_are_proposed_by_their_names(tmp_path, bag_maker):
     with bag_maker(tmp_path / "topics") as made:
         add_topics(made, [1.0], [1.0])
-    with open_bag(made.path) as bag:
-        found = propose(bag)
+    found = proposed(made.path)
     wheels = {"left": "data", "right": "data", "right_topic": "/right_wheel/speed", "radius": 0.1, "track": 0.5}
     assert found.options == {
         "odometry": {"topic": "/left_wheel/speed", "use": "twist", "wheels": wheels},
@@ -121,7 +118,6 @@ def test_wheels_are_proposed_by_their_names(tmp_path, bag_maker):
     assert "are taken for speeds of wheels [rad/s]; measure radius and track" in found.notes[0]
     with bag_maker(tmp_path / "joints") as made:
         add_wheels(made, [0.0], [0.0], names=("left_arm", "wheel_left_joint", "wheel_right_joint"))
-    with open_bag(made.path) as bag:
-        found = propose(bag)
+    found = proposed(made.path)
     wheels = {"left": "wheel_left_joint", "right": "wheel_right_joint", "radius": 0.1, "track": 0.5}
     assert found.options["odometry"] == {"topic": "/joints", "wheels": wheels}

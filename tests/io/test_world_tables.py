@@ -39,22 +39,6 @@ def test_tags_of_a_spreadsheet(world):
     assert tags["E2002"] == Tag(x=0.0, y=0.03)
 
 
-@pytest.mark.parametrize(
-    ("sheet", "text", "fragments"),
-    [
-        (SHEET, TAGS.replace('"X [cm]"', '"X"'), ("sheet.csv:1", "no column 'X'", "X [cm]")),
-        (SHEET + "E2001;;0;0;0;0\n", TAGS, ("sheet.csv:4", "another name than in row 2")),
-    ],
-)
-def test_wrong_tables_of_tags(world, tmp_path, sheet, text, fragments):
-    (tmp_path / "sheet.csv").write_text(sheet)
-    with pytest.raises(InputError) as caught:
-        world(text)
-    assert "\n" not in str(caught.value)
-    for fragment in fragments:
-        assert fragment in str(caught.value)
-
-
 def test_corners_as_they_are_seen_from_the_front():
     """A marker at the end of a corridor, seen by who walks along x: its left is at +y."""
     corners = Marker(x=4.0, y=1.0, z=1.5, size=0.2, facing=np.pi).corners()

@@ -2,7 +2,11 @@
 
 import math
 
+import numpy as np
 import pytest
+
+from factorgraph_loc.io.bags.file import open_bag
+from factorgraph_loc.io.bags.manifest import propose
 
 T0 = 1_700_000_000_000_000_000
 MS = 1_000_000
@@ -54,3 +58,20 @@ def transform(made, t_ns, parent, child, place, heading=0.0, quaternion=None):
 
 def add_frames(made, topic, t_ns, *transforms):
     made.write(topic, t_ns, "tf2_msgs/msg/TFMessage", transforms=list(transforms))
+
+
+def add_imu(made, rates, topic="/imu", t_ns=T0):
+    """A message of an IMU for each of ``rates`` (N, 3), ten a second."""
+    for i, (x, y, z) in enumerate(rates):
+        t = t_ns + 100 * MS * i
+        vectors = [made.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z) for _ in range(2)]
+        turn = made.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+        told = {"orientation": turn, "angular_velocity": vectors[0], "linear_acceleration": vectors[1]}
+        told |= {f"{name}_covariance": np.zeros(9) for name in tuple(told)}
+        made.write(topic, t, "sensor_msgs/msg/Imu", header=made.header(t), **told)
+
+
+def proposed(path):
+    """What a manifest of a bag would say."""
+    with open_bag(path) as bag:
+        return propose(bag)
