@@ -103,6 +103,8 @@ def test_nor_with_other_settings(name, kind, settings):
     make, more = LOGS[kind]
     log = make()
     first, last = log.span()
+    if kind == "camera":  # of which each second takes long
+        log = cut(log, first, last := first + 4.0)
     check(log, RunConfig(name, SETTINGS[name] | settings, **more), (first + last) / 2.0)
 
 

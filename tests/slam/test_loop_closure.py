@@ -105,7 +105,7 @@ def test_no_image_twice_a_second():
     assert closure.due(4.0)
 
 
-def laps(points, seconds=66.0):
+def laps(points, seconds=48.0):
     """Two rounds in a room; no track lasts for more than ten seconds."""
     return with_features(camera_world.simulate(3, seconds), 10.0, points=points, every=0.6)
 
