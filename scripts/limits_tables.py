@@ -2,7 +2,7 @@
 
 from pydantic import BaseModel
 
-from factorgraph_loc.files.columns import POINTS, POSES, STAMP, Table
+from factorgraph_loc.files.columns import POINTS, POSES, STAMP
 from factorgraph_loc.files.settings import Setting, bound_text, settings_in
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.readers.manifests import StartSettings
@@ -40,9 +40,7 @@ def tables() -> list[str]:
         f"`t_ns` of every table is the {STAMP.doc}, from {bound_text(STAMP.low)} to {bound_text(STAMP.high)} ns.",
         "",
     ]
-    for table in (*all_tables(), POSES, POINTS):
-        lines += [*_of_columns(table), ""]
-    lines += ["### Settings", ""]
+    lines += [*_columns(), "", "### Settings", ""]
     for name, model in FILES.items():
         lines += [f"**{name[0].upper()}{name[1:]}**", "", "| key | least | most |", "|---|---|---|"]
         lines += [f"| `{s.key}` | {bound_text(s.low)} | {bound_text(s.high)} |" for s in numbers_of(model)]
@@ -50,16 +48,18 @@ def tables() -> list[str]:
     return lines[:-1]
 
 
-def _of_columns(table: Table) -> list[str]:
-    lines = [
-        f"**`{table.name}`**",
-        "",
-        "| column | unit | least | most | may be empty | what it is |",
-        "|---|---|---|---|---|---|",
-    ]
-    for column in (c for c in table.columns if c.name != STAMP.name):
-        unit = next(iter(column.units), "")
-        low, high = (bound_text(column.low), bound_text(column.high)) if column.units else ("", "")
-        lack = "yes" if column.may_lack else ""
-        lines.append(f"| `{column.name}` | {'' if unit == '1' else unit} | {low} | {high} | {lack} | {column.doc} |")
-    return lines
+def _columns() -> list[str]:
+    """The table of all columns. Those that differ only in the name, or in the table, are one row."""
+    tables: dict[tuple[str, ...], dict[str, None]] = {}
+    for table in (*all_tables(), POSES, POINTS):
+        for column in (c for c in table.columns if c.name != STAMP.name):
+            unit = next(iter(column.units), "")
+            low, high = (bound_text(column.low), bound_text(column.high)) if column.units else ("", "")
+            row = (column.name, "" if unit == "1" else unit, low, high, "yes" if column.may_lack else "", column.doc)
+            tables.setdefault(row, {})[table.name] = None
+    names: dict[tuple[str, ...], list[str]] = {}
+    for (name, *row), of in tables.items():
+        names.setdefault((", ".join(of), *row), []).append(f"`{name}`")
+    heads = ["column", "of", "unit", "least", "most", "may be empty", "what it is"]
+    rows = [heads, ["---"] * len(heads), *([", ".join(these), *row] for row, these in names.items())]
+    return [f"| {' | '.join(cells)} |" for cells in rows]

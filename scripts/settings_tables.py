@@ -17,63 +17,62 @@ def tables() -> list[str]:
 
 
 def _estimators() -> list[str]:
-    lines = ["## Estimators", ""]
-    for name in ESTIMATORS.own:
-        found = registry.describe(name)
-        kinds = " and ".join(word for word, there in (("causal", found.causal), ("smoothed", found.smoothed)) if there)
-        lines += [f"### {name}", "", found.about, f"Its estimates are {kinds}; it takes {_names(found.sensors)}.", ""]
-        lines += _table(settings_in(registry.settings_type(name)))
-    return lines
+    found = [registry.describe(name) for name in ESTIMATORS.own]
+    lines = ["## Estimators", "", "| estimator | estimates | sensors |", "|---|---|---|"]
+    for one in found:
+        kinds = " and ".join(word for word, there in (("causal", one.causal), ("smoothed", one.smoothed)) if there)
+        lines.append(f"| `{one.name}` | {kinds} | {_names(one.sensors)} |")
+    settings = [(s.key, one.name, s) for one in found for s in settings_in(registry.settings_type(one.name))]
+    return [*lines, "", *_table(settings, owned=True)]
 
 
 def _rig() -> list[str]:
     top = [setting for setting in settings_in(Rig) if "." not in setting.key and setting.kind == "text"]
-    lines = ["## Rig", "", *_table(top)]
+    lines = ["## Rig", "", *_own(top)]
     for name in SENSORS.own:
         for section, settings in sections_of(sensor(name)).items():
-            lines += [f"### [{section}]", "", f"A section of the sensor `{name}`. {about(name)}", "", *_table(settings)]
+            lines += [f"### [{section}]", "", f"A section of the sensor `{name}`. {about(name)}", "", *_own(settings)]
     return lines
 
 
 def _readers() -> list[str]:
     lines = ["## Options of readers", ""]
     for name in READERS.own:
-        options = settings_in(reader(name).options)
-        lines += [f"### {name}", "", reader(name).about, "", *(_by_table(options) if options else ["No options.", ""])]
+        lines += [f"### {name}", "", reader(name).about, ""]
+        options = []
+        for s in settings_in(reader(name).options):
+            table, _, key = s.key.removesuffix(".*").rpartition(".")
+            options.append((key + ".*" * s.key.endswith(".*"), table, s))
+        lines += _table(options, owned=True) if options else ["No options.", ""]
     return lines
-
-
-def _by_table(settings: Sequence[Setting]) -> list[str]:
-    """A table of settings, in which those of several tables that differ in nothing but the table are one row."""
-    rows: dict[tuple[str, ...], list[str]] = {}
-    for s in settings:
-        table, _, key = s.key.removesuffix(".*").rpartition(".")
-        key += s.key[len(f"{table}.{key}" if table else key) :]
-        rows.setdefault((key, default_text(s), values_text(s), s.meaning), []).append(table)
-    lines = ["| setting | of | default | values | what it is |", "|---|---|---|---|---|"]
-    return [
-        *lines,
-        *(f"| `{k}` | {_names(filter(None, tables))} | {d} | {v} | {m} |" for (k, d, v, m), tables in rows.items()),
-        "",
-    ]
 
 
 def _simulations() -> list[str]:
     settings = [s for s in describe_preset("office").settings if s.key != "name"]
-    told = "The values are those of the preset `office`; `fgloc presets NAME` prints those of another one."
-    return ["## Simulated logs", "", told, "", *_table(settings)]
+    text = "The values are those of the preset `office`; `fgloc presets NAME` prints those of another one."
+    return ["## Simulated logs", "", text, "", *_own(settings)]
 
 
 def _active() -> list[str]:
-    return ["## Active robots", "", *_table(known_policies()[0].settings)]
+    return ["## Active robots", "", *_own(known_policies()[0].settings)]
 
 
-def _table(settings: Sequence[Setting]) -> list[str]:
-    """A table of settings."""
-    lines = ["| setting | default | values | what it is |", "|---|---|---|---|"]
-    for s in settings:
-        lines.append(f"| `{s.key}` | {default_text(s)} | {values_text(s)} | {s.meaning} |")
-    return [*lines, ""]
+def _own(settings: Sequence[Setting]) -> list[str]:
+    """A table of settings of one owner."""
+    return _table((s.key, "", s) for s in settings)
+
+
+def _table(settings: Iterable[tuple[str, str, Setting]], *, owned: bool = False) -> list[str]:
+    """A table of settings, each with its key and its owner. Those that differ only in the owner, or in the key, are one row."""
+    owners: dict[tuple[str, ...], list[str]] = {}
+    for key, owner, s in settings:
+        owners.setdefault((key, default_text(s), values_text(s), s.meaning), []).append(owner)
+    keys: dict[tuple[str, ...], list[str]] = {}
+    for (key, *rest), of in owners.items():
+        keys.setdefault((_names(filter(None, of)), *rest), []).append(key)
+    heads = ["setting", "of", "default", "values", "what it is"]
+    rows = [heads, ["---"] * len(heads), *([_names(key), *rest] for rest, key in keys.items())]
+    return [f"| {' | '.join(cells if owned else [cells[0], *cells[2:]])} |" for cells in rows] + [""]
 
 
 def _names(names: Iterable[str]) -> str:
