@@ -3,17 +3,16 @@
 from collections.abc import Iterable, Sequence
 
 from factorgraph_loc.api.lookups import describe_preset, known_policies
-from factorgraph_loc.files.settings import Setting, default_text, settings_in, values_text
+from factorgraph_loc.files.settings import TABLE, Setting, default_text, settings_in, values_text
 from factorgraph_loc.fusion import registry
-from factorgraph_loc.io.readers import reader
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS
+from factorgraph_loc.plugins import ESTIMATORS, SENSORS
 from factorgraph_loc.sensors.registry import about, sections_of, sensor
 
 
 def tables() -> list[str]:
     """The lines of all tables, with their headings."""
-    return [*_estimators(), *_rig(), *_readers(), *_simulations(), *_active()][:-1]
+    return [*_estimators(), *_rig(), *_simulations(), *_active()][:-1]
 
 
 def _estimators() -> list[str]:
@@ -35,18 +34,6 @@ def _rig() -> list[str]:
     return lines
 
 
-def _readers() -> list[str]:
-    lines = ["## Options of readers", ""]
-    for name in READERS.own:
-        lines += [f"### {name}", "", reader(name).about, ""]
-        options = []
-        for s in settings_in(reader(name).options):
-            table, _, key = s.key.removesuffix(".*").rpartition(".")
-            options.append((key + ".*" * s.key.endswith(".*"), table, s))
-        lines += _table(options, owned=True) if options else ["No options.", ""]
-    return lines
-
-
 def _simulations() -> list[str]:
     settings = [s for s in describe_preset("office").settings if s.key != "name"]
     text = "The values are those of the preset `office`; `fgloc presets NAME` prints those of another one."
@@ -58,8 +45,9 @@ def _active() -> list[str]:
 
 
 def _own(settings: Sequence[Setting]) -> list[str]:
-    """A table of settings of one owner."""
-    return _table((s.key, "", s) for s in settings)
+    """A table of settings of one owner, without the tables whose keys are listed."""
+    listed = {s.key.rpartition(".")[0] for s in settings}
+    return _table((s.key, "", s) for s in settings if s.kind != TABLE or s.key not in listed)
 
 
 def _table(settings: Iterable[tuple[str, str, Setting]], *, owned: bool = False) -> list[str]:

@@ -20,13 +20,18 @@ SETTINGS = ActiveSettings()
 
 
 def compared(
-    name: str, options: Options, estimators: Mapping[str, Sequence[str]], seeds: Sequence[int], text: str
+    name: str,
+    options: Options,
+    estimators: Mapping[str, Sequence[str]],
+    seeds: Sequence[int],
+    text: str,
+    worlds: Sequence[str] = WORLDS,
 ) -> Report:
-    """The section ``name``: all worlds and ``estimators``, each with its policies."""
+    """The section ``name``: ``worlds`` and ``estimators``, each with its policies."""
     report = Report(name, options)
     jobs = [
         job
-        for world in WORLDS
+        for world in worlds
         for estimator, policies in estimators.items()
         for job in jobs_of(preset(world), policies, (estimator,), seeds, SETTINGS)
     ]
@@ -34,8 +39,9 @@ def compared(
     print(file=sys.stderr)
     report.failed += results.failures
     report.say(text)
-    for cells in (summary_cells, difference_cells):
-        report.table(*cells(results.rows))
+    report.table(*summary_cells(results.rows))
+    if len(estimators) == 1:
+        report.table(*difference_cells(results.rows))
     folder = options.out / name
     folder.mkdir(parents=True, exist_ok=True)
     write_tables(results.rows, folder)
@@ -51,8 +57,8 @@ def goal(seeds: Sequence[int]) -> str:
     """The caption of every table of runs."""
     degrees = math.degrees(SETTINGS.heading_limit)
     return (
-        f"{len(seeds)} robots in each world, the same for all policies; one gives up after {SETTINGS.max_metres:.0f} m. "
-        f"*Failed*: was not localized by then, within {SETTINGS.position_limit:g} m and {degrees:.0f} degrees both by its own "
-        "word and in truth. *Claimed wrongly*: said so once and was off by more than three times that. Errors are medians, "
-        "at the end; planning is the time of a step"
+        f"{len(seeds)} robots in each world, the same for all policies. A robot gives up after {SETTINGS.max_metres:.0f} m. "
+        f"*Failed*: not localized by then, with standard deviations and errors below {SETTINGS.position_limit:g} m and "
+        f"{degrees:.0f} degrees. *Claimed wrongly*: localized with an error above three times that. Errors are medians at "
+        "the end. Planning is the time of a step."
     )

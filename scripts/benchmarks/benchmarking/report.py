@@ -18,6 +18,8 @@ from factorgraph_loc.evaluation.statistics import pooled_rms
 from factorgraph_loc.fitting.shares import wilson
 from factorgraph_loc.processes import run_each
 
+ENOUGH = 10  # trials for an interval of a share
+
 
 @dataclass(frozen=True)
 class Options:
@@ -106,6 +108,6 @@ def ratio_text(ratio: Ratio) -> tuple[str, str]:
 
 
 def share_text(successes: int, count: int) -> str:
-    """A count with its interval in per cent."""
+    """A count, with its interval in per cent if there are at least :data:`ENOUGH`."""
     low, high = wilson(successes, count)
-    return f"{successes} of {count} ({100 * low:.0f} % to {100 * high:.0f} %)"
+    return f"{successes} of {count}" + (f" ({100 * low:.0f} % to {100 * high:.0f} %)" if count >= ENOUGH else "")

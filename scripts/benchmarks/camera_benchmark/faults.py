@@ -37,6 +37,7 @@ CONFIGS = {
     "smoother, rfid, camera": RunConfig("smoother", sensors=BOTH),
     NO_MAP: RunConfig("smoother", sensors=CAMERA),
 }
+REPORTED = "smoother, camera"
 SHOWN = 110  # characters of a message
 
 
@@ -57,18 +58,28 @@ def section(options: CameraOptions) -> Report:
     jobs = [Job(fault, drives[i], options.drives) for fault in FAULTS for i in sorted(ready)]
     outcomes = report.collect(faulty, jobs, [f"{job.fault}, seed {job.drive.seed}" for job in jobs])
     report.say(
-        f"{len(ready)} rendered offices of {options.seconds(DURATION):.0f} s with a map from another drive, pooled. *Afterwards*: "
-        f"causal position RMSE in the last {AFTERWARDS:.0f} s, of the worst run. *Said*: warnings, events, and what changed in the "
-        "diagnostics, of the first office; NIS is that of the camera per degree of freedom"
+        f"{len(ready)} rendered offices of {options.seconds(DURATION):.0f} s with a map from another drive, pooled. The cells are "
+        f"position RMSE [m] of causal and final estimates, and the causal one of the last {AFTERWARDS:.0f} s of the worst run."
     )
-    rows = []
-    for label in CONFIGS:
-        right = [outcomes[i][label] for i, job in enumerate(jobs) if job.fault == RIGHT and i in outcomes]
-        for fault in FAULTS:
-            runs = [outcomes[i][label] for i, job in enumerate(jobs) if job.fault == fault and i in outcomes]
-            if runs:
-                rows.append((fault, label, *cells(runs, right), said(runs[0], right[0] if right else runs[0])))
-    report.table(("fault", "run", "causal [m] / [deg]", "final [m] / [deg]", "afterwards [m]", "said"), rows)
+    runs = {
+        fault: [outcomes[i] for i, job in enumerate(jobs) if job.fault == fault and i in outcomes] for fault in FAULTS
+    }
+    runs = {fault: found for fault, found in runs.items() if found}
+    rows = [
+        (
+            fault,
+            *(cell([one[label] for one in found], [one[label] for one in runs.get(RIGHT, [])]) for label in CONFIGS),
+        )
+        for fault, found in runs.items()
+    ]
+    report.table(("fault", *CONFIGS), rows)
+    report.say(
+        f"Warnings, events and changes of the diagnostics of the run *{REPORTED}* in the first office. NIS is that of the camera "
+        "per degree of freedom."
+    )
+    right = runs.get(RIGHT, [{}])[0].get(REPORTED)
+    reports = [(fault, said(found[0][REPORTED], right or found[0][REPORTED])) for fault, found in runs.items()]
+    report.table(("fault", "reported"), [row for row in reports if row[1] != NOTHING])
     return report
 
 
@@ -95,15 +106,13 @@ def without_map(log: Log) -> Log:
     return replace(log, world=log.world.model_copy(update={"points": None}))
 
 
-def cells(runs: Sequence[Attempt], right: Sequence[Attempt]) -> tuple[str, str, str]:
+def cell(runs: Sequence[Attempt], right: Sequence[Attempt]) -> str:
     errors = [one.errors for one in runs if one.errors is not None]
     if len(errors) < len(runs):
-        return f"{len(runs) - len(errors)} of {len(runs)} refused", NOTHING, NOTHING
-    causal, final = (
-        "{:.3f} / {:.2f}".format(*pooled([getattr(one, kind) for one in errors])) for kind in ("causal", "final")
-    )
+        return f"{len(runs) - len(errors)} of {len(runs)} refused"
+    causal, final = (pooled([getattr(one, kind) for one in errors])[0] for kind in ("causal", "final"))
     last, usual = at_end(runs), at_end(right)
-    return causal, final, f"{last:.3f}" + ("" if last <= max(BACK, 2.0 * usual) else ", lost")
+    return f"{causal:.3f} / {final:.3f} / {last:.3f}" + ("" if last <= max(BACK, 2.0 * usual) else ", lost")
 
 
 def at_end(runs: Sequence[Attempt]) -> float:

@@ -55,7 +55,7 @@ def sentence(known: Sequence[FrameKnown]) -> str:
     low, high = (chi2.ppf(tail, 3 * count) / count for tail in tails)
     least = np.sqrt(np.mean([one.least**2 for one in known]))
     return (
-        f"The starts that were drawn have a NEES of {np.mean([one.nees for one in known]):.2f} on average (95 % of such draws: "
-        f"{low:.2f} to {high:.2f}), which without tags is part of that of all poses. With tags, who knew the form of the path "
-        f"exactly would still be {least:.4f} m off (Cramer-Rao bound)."
+        f"The starts have a mean NEES of {np.mean([one.nees for one in known]):.2f} (95 % of such draws: {low:.2f} to {high:.2f}), "
+        "which without tags is part of that of all poses. With tags and the exact shape of the path the error would still be "
+        f"{least:.4f} m (Cramer-Rao bound)."
     )

@@ -13,7 +13,6 @@ from benchmarking.report import Report, pooled, ratio_text, rmses, together
 from benchmarking.statistics import rmse_ratio, share_in_band
 
 from factorgraph_loc.errors import FglocError
-from factorgraph_loc.evaluation.inference import differences
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log
@@ -113,14 +112,3 @@ def ratio_cell(found: Attempts, label: str, to: str, kind: str) -> tuple[str, st
     if not both or not all(np.isfinite(one.position).any() for one in (*first, *second)):
         return NOTHING, NOTHING
     return ratio_text(rmse_ratio(rmses(first), rmses(second)))
-
-
-def paired(found: Attempts, label: str, to: str) -> list[dict[str, Any]]:
-    """The differences ``label`` less ``to`` over all logs, one for each metric; none with too few logs for an interval."""
-    rows = [
-        {"log": seed, "seed": 0, "estimator": name, **runs[name].figures}
-        for seed, runs in sorted(found.items())
-        for name in (label, to)
-        if name in runs and not runs[name].failure
-    ]
-    return [row for row in differences(rows) if row["log"] == "(all)"]

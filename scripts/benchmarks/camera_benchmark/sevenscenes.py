@@ -76,12 +76,11 @@ def section(options: CameraOptions) -> Report:
             rows = zip(numbers.tolist(), errors.position.tolist(), errors.angle.tolist(), strict=True)
             single += [(feature, query, *row) for row in rows]
     report.say(
-        f"{COUNT} features an image; medians, and the 90th percentiles; located: within {NEAR} m and {TURNED:.0f} degrees. "
-        "A: images 1, 3, ... 199; B: 200 to 299."
+        f"{COUNT} features an image. Medians and 90th percentiles. *Located*: within {NEAR} m and {TURNED:.0f} degrees."
     )
     heads = ("located", "position [m]", "angle [degrees]", "p90 [m]", "p90 [degrees]")
     report.table(("feature", "images", *heads), located_rows)
-    report.say("The maps, of images 0, 2, ... 198:")
+    report.say("The maps of images 0, 2, ... 198.")
     heads = ("points", "observations", "residual RMS [px]", "median [px]", "parallax [rad]", "sigma [m]")
     report.table(("feature", *heads), map_rows)
     report.figures("images", ("feature", "images", "image", "position", "angle"), single)

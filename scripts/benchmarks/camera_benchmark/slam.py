@@ -59,8 +59,8 @@ class Job:
 def section(options: CameraOptions) -> Report:
     report = Report("slam", options)
     report.say(
-        "The start is known to 0.1 m and 0.05 rad, and but for tags nothing tells of it later. *Aligned*: with the final "
-        f"trajectory laid on the reference, which takes the error of the start away. Target: {TARGET} m"
+        "The start is known to 0.1 m and 0.05 rad. Only tags reduce its error later. *Aligned*: the final trajectory is aligned "
+        f"with the reference, which removes the error of the start. Target: {TARGET} m."
     )
     for name, runs, usual, first, folder in (
         ("identified", RUNS, DURATION, FIRST, None),
@@ -76,7 +76,7 @@ def section(options: CameraOptions) -> Report:
         found = {jobs[i].drive.seed: outcome for i, outcome in outcomes.items()}
         failures(report, found)
         what = f"at most 20 of {POINTS} identified points in each" if folder is None else "rendered"
-        report.say(f"{len(found)} offices of {duration:.0f} s, {RATE:.0f} images/s, {what}:")
+        report.say(f"{len(found)} offices of {duration:.0f} s, {RATE:.0f} images/s, {what}.")
         report.say(sentence(list(known.values())))
         table(report, name, found)
     return report

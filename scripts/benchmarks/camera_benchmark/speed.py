@@ -106,8 +106,8 @@ def chain(report: Report, options: CameraOptions) -> None:
             links: Links = found[0]
             report.say(
                 f"{links.images} files of 640 x 480 px, at most {COUNT} features (`{links.feature}`) in each, in a map of "
-                f"{links.points} points; {os.cpu_count()} processes find features, the rest has one. *Smooth*: what the smoother "
-                "does but for finding the points of the map among the features. Targets: 15 images/s, 10 % of it to smooth"
+                f"{links.points} points. {os.cpu_count()} processes find features, the rest has one. *Smooth*: the smoother "
+                "without the association of features with points of the map. Targets: 15 images/s, 10 % of the time to smooth."
             )
             whole = links.find + links.follow + links.associate + links.smooth
             parts = {name: getattr(links, name) for name in ("find", "follow", "associate", "smooth")}
@@ -122,8 +122,8 @@ def estimators(report: Report, duration: float) -> None:
     jobs = [Job(steps, duration) for steps in STEPS]
     found = report.collect(timed, jobs, [f"{job.steps.what}, {job.steps.config.estimator}" for job in jobs], workers=1)
     report.say(
-        f"Steps of {duration:.0f} s in `office` with identified points. A step is what comes at one time, an image with about 20 "
-        "points and, where said, a round of all eight antennas, with the estimate after it. *Second half*: of the run"
+        f"Steps of {duration:.0f} s in `office` with identified points. A step is an image with about 20 points, or also a round "
+        "of all eight antennas, and the estimate after it. *Second half*: of the run."
     )
     rows = []
     for i, (ms, points, learnt) in sorted(found.items()):

@@ -15,6 +15,7 @@ from recordings_benchmark.listed import RECORDINGS, Recording
 from recordings_benchmark.prepare import prepare
 
 ESTIMATORS = ("dead_reckoning", "ekf", "particle_filter", "switching", "smoother", "batch")
+ALONE = ("dead_reckoning", "particle_filter")  # all others are equal to dead reckoning if there is nothing but odometry
 
 
 @dataclass(frozen=True)
@@ -26,10 +27,9 @@ class Job:
 
 @dataclass(frozen=True)
 class Found:
-    """``scores`` by estimator, or a line with the reason for their absence; ``seconds`` of log."""
+    """``scores`` by estimator, or a line with the reason for their absence."""
 
     scores: dict[str, dict[str, Any] | str]
-    seconds: float
 
 
 def section(options: Options) -> Report:
@@ -44,22 +44,21 @@ def section(options: Options) -> Report:
 
 
 def tell(report: Report, results: Sequence[tuple[Recording, Found]]) -> None:
-    """Write the table of results, and the reasons below it."""
-    rows, notes = [], []
+    """Write the tables of results, with other sensors than odometry and without, and the reasons below them."""
+    notes: list[str] = []
+    rows: dict[tuple[str, ...], list[tuple[str, ...]]] = {ESTIMATORS: [], ALONE: []}
     for recording, result in results:
         told = {name: one for name, one in result.scores.items() if isinstance(one, dict)}
         refused = {name: one for name, one in result.scores.items() if isinstance(one, str)}
         counts = {one.get("causal.scored") or one.get("final.scored") or 0 for one in told.values()}
         sensors = recording.odometry + (f"; {recording.others}" if recording.others else "")
         scored = str(max(counts, default=0))
-        rows.append((recording.name, recording.title, sensors, scored, *(_cell(result.scores[e]) for e in ESTIMATORS)))
-        lines = sorted(set(refused.values()))
-        notes += [f"- {recording.name}: {line}" for line in lines]
-        if told and not any(counts):
-            notes.append(
-                f"- {recording.name}: runs, but has no reference to be scored by; {result.seconds:.0f} s of log"
-            )
-    report.table(("log", "what it is", "odometry; other sensors", "poses", *ESTIMATORS), rows)
+        shown = ESTIMATORS if recording.others else ALONE
+        cells = (_cell(result.scores[name]) for name in shown)
+        rows[shown].append((recording.name, recording.title, sensors, scored, *cells))
+        notes += [f"- {recording.name}: {line}." for line in sorted(set(refused.values()))]
+    for shown, lines in rows.items():
+        report.table(("log", "what it is", "odometry; other sensors", "poses", *shown), lines)
     report.lines += [*notes, ""]
 
 
@@ -69,15 +68,14 @@ def measured(job: Job) -> Found:
     try:
         log = prepare(recording, job.folder, job.out)
     except FglocError as error:
-        return Found({name: str(error).replace(f"{job.folder}/", "") for name in ESTIMATORS}, 0.0)
+        return Found({name: str(error).replace(f"{job.folder}/", "") for name in ESTIMATORS})
     scores: dict[str, dict[str, Any] | str] = {}
     for name in ESTIMATORS:
         try:
             scores[name] = run(log, name, prior=recording.prior).scores
         except FglocError as error:
             scores[name] = str(error)
-    t = log.streams["odometry"].t
-    return Found(scores, float(t[-1] - t[0]))
+    return Found(scores)
 
 
 def _cell(scores: dict[str, Any] | str) -> str:

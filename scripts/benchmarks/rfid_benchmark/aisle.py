@@ -76,17 +76,14 @@ def section(options: Options) -> Report:
 
 def accuracy(report: Report, outcomes: list[tuple[Test, Tested]]) -> None:
     report.say(
-        f"Each run with what the other one taught, {len(outcomes) // len(RUNS)} odometry seeds each; *shipped rig*: "
-        "`datasets/rfid-aisle.rig.toml`, learnt on both. RMSE / median / p95 [m] / heading RMSE [degrees] / ANEES"
+        f"Both runs, each with the rig learnt on the other one, {len(outcomes) // len(RUNS)} odometry seeds each. *Shipped rig*: "
+        "`datasets/rfid-aisle.rig.toml`, learnt on both. The cells are RMSE / median / p95 [m] / heading RMSE [degrees] / ANEES."
     )
     rows = []
     for key in dict.fromkeys(key for _, outcome in outcomes for key in outcome.runs):
-        for label, runs in (*((f"run {n}", (n,)) for n in RUNS), ("**both**", RUNS)):
-            members = [outcome.runs[key] for test, outcome in outcomes if test.run in runs]
-            if members:
-                cells = [spread_cell([getattr(one, kind) for one in members]) for kind in ("causal", "final")]
-                rows.append((label, *key, *cells))
-    report.table(("run", "estimator", "sensors", "causal", "final"), rows)
+        members = [outcome.runs[key] for _, outcome in outcomes]
+        rows.append((*key, *(spread_cell([getattr(one, kind) for one in members]) for kind in ("causal", "final"))))
+    report.table(("estimator", "sensors", "causal", "final"), rows)
     single = [
         (*key, test.run, test.odometry_seed, *pooled([one.causal]), *pooled([one.final]))
         for test, outcome in outcomes
@@ -98,8 +95,8 @@ def accuracy(report: Report, outcomes: list[tuple[Test, Tested]]) -> None:
 
 def unknown_starts(report: Report, outcomes: list[tuple[Test, Tested]]) -> None:
     report.say(
-        "Unknown start, detections: seconds from the first scan until the estimate is nearer than "
-        f"{POSITION} m for {HOLD:.0f} s, for each odometry seed"
+        "Unknown start with detections: seconds from the first scan until the error is below "
+        f"{POSITION} m for {HOLD:.0f} s, for each odometry seed."
     )
     rows = []
     for estimator in ESTIMATORS:

@@ -63,7 +63,7 @@ def section(options: Options) -> Report:
     report.say(
         f"`office`, {count} worlds of {DURATION:.0f} s, pooled. "
         "*Status*: share of the time at which it is localized / ambiguous / unlocalized. "
-        "Causal errors count from the first `localized`"
+        "Causal errors count from the first `localized`."
     )
     rows = []
     for estimator in CONFIGS:

@@ -69,7 +69,7 @@ def section(options: Options) -> Report:
     report.say(
         f"{len(seeds)} runs of each kind in a hall of 100 x 60 m, each in a new world. *Right in time*: within {START:.0f} s of an "
         f"unknown start, within {RETURN:.0f} s of each of two kidnappings, and for 10 s from then on. *Busy*: processor time of a "
-        "tenth of a second of the log, which holds at most one scan with its estimate: 99.9 % of them, and the largest"
+        "tenth of a second of the log with at most one scan, 99.9th percentile and largest."
     )
     rows: list[tuple[str, ...]] = []
     groups: dict[tuple[str, int, str], list[Any]] = {}
@@ -82,7 +82,7 @@ def section(options: Options) -> Report:
     heads = ("", "tags", "estimator", "right in time", "median [s]", "false claims")
     report.table((*heads, "busy [ms]", "largest final error [m]"), rows)
     times = {(name, tags): found[0] for (what, tags, name), found in groups.items() if what == "scan"}
-    report.say(f"Processor time of a scan with its estimate, median [ms], at {DENSITY:.3f} tags per m^2")
+    report.say(f"Processor time of a scan with its estimate, median [ms], at {DENSITY:.3f} tags per m^2.")
     cells = [
         (name, *(f"{times[name, tags]:.2f}" if (name, tags) in times else "–" for tags in SIZES)) for name in ESTIMATORS
     ]

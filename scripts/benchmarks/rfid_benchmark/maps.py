@@ -26,7 +26,7 @@ def section(options: Options) -> Report:
     report = Report("maps", options)
     jobs = [Job(run, phases, options) for run in RUNS for phases in (True, False)]
     found = report.collect(made, jobs, [f"run {job.run}{'' if job.phases else ' without phases'}" for job in jobs])
-    report.say("Distances of the tags mapped along the reference from their survey [m]")
+    report.say("Distances [m] of the tags mapped along the reference from their survey.")
     rows = []
     for i, (distances, count) in sorted(found.items()):
         job = jobs[i]

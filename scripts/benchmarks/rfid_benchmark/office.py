@@ -43,10 +43,12 @@ def section(options: Options) -> Report:
             report.figures(name, heads, single)
     worlds = ", ".join(f"{len(runs['smoother'])} worlds of {name}" for name, runs in found.items())
     report.say(
-        f"{worlds}, 10 min each, pooled. *Inside*: share of times at which ANEES over worlds is in its 95 % band"
+        f"{worlds}, 10 min each, pooled. *Inside*: share of times at which ANEES over worlds is in its 95 % band."
     )
     accuracy(report, found)
-    report.say("Ratios of position RMSE, pooled, with 95 % interval over worlds, and the largest of a single world")
+    report.say(
+        "Ratios of pooled position RMSE, with constants as states, a 95 % interval over worlds, and the largest of a single world."
+    )
     ratios(report, found)
     return report
 
@@ -70,15 +72,12 @@ def accuracy(report: Report, found: dict[str, Found]) -> None:
 def ratios(report: Report, found: dict[str, Found]) -> None:
     rows = []
     for name, runs in found.items():
-        for suffix in ("", NOISE) if f"smoother{NOISE}" in runs else ("",):
-            smoother, particles = runs[f"smoother{suffix}"], runs[f"particle filter{suffix}"]
-            causal = [[one.causal for one in members] for members in (smoother, particles)]
-            final = [[one.final for one in members] for members in (smoother, particles)]
-            what = "as noise" if suffix else "as states"
-            rows += [
-                (name, what, "smoother / particle filter, causal", *ratio_cells(*causal)),
-                (name, what, "smoother / particle filter, final", *ratio_cells(*final)),
-                (name, what, "final / causal, smoother", *ratio_cells(final[0], causal[0])),
-                (name, what, "final / causal, particle filter", *ratio_cells(final[1], causal[1])),
-            ]
-    report.table(("preset", "constants", "ratio", "pooled (95 %)", "largest"), rows)
+        both = runs["smoother"], runs["particle filter"]
+        causal, final = ([[getattr(one, kind) for one in members] for members in both] for kind in ("causal", "final"))
+        rows += [
+            (name, "smoother / particle filter, causal", *ratio_cells(*causal)),
+            (name, "smoother / particle filter, final", *ratio_cells(*final)),
+            (name, "final / causal, smoother", *ratio_cells(final[0], causal[0])),
+            (name, "final / causal, particle filter", *ratio_cells(final[1], causal[1])),
+        ]
+    report.table(("preset", "ratio", "pooled (95 %)", "largest"), rows)

@@ -35,15 +35,15 @@ def section(options: Options) -> Report:
     rooms, offices = options.count(ROOMS), options.count(OFFICES)
     outcomes = report.collect(in_room, [Room(seed) for seed in range(rooms)], [f"room {i}" for i in range(rooms)])
     report.say(
-        f"A room of 6 x 4 m with 8 tags, 60 s, odometry without constant errors; {len(outcomes)} worlds. "
-        "Causal estimates at the scans, against the grid filter (5 cm, 3 degrees), which is optimal"
+        f"A room of 6 x 4 m with 8 tags, 60 s, odometry without constant errors, {len(outcomes)} worlds. "
+        "Causal estimates at the scans, against the grid filter (5 cm, 3 degrees), which is optimal."
     )
     table(report, {label: [outcomes[i][label] for i in sorted(outcomes)] for label in FILTERS}, "grid filter")
     jobs = [EnsembleJob(preset("office"), seed, SMOOTHERS) for seed in range(offices)]
     outcomes = report.collect(run_ensemble, jobs, [f"office {i}" for i in range(offices)])
     report.say(
         f"`office`, {len(outcomes)} worlds, final estimates, against a particle smoother of 5,000 particles "
-        "and 200 trajectories drawn backwards, with the same states"
+        "and 200 trajectories drawn backwards, with the same states."
     )
     finals = {label: [outcomes[i][label].final for i in sorted(outcomes)] for label in SMOOTHERS}
     table(report, finals, "particle smoother")

@@ -54,7 +54,7 @@ def section(options: Options) -> Report:
     found = report.collect(timed, jobs, labels, workers=1)
     report.say(
         f"{SCANS} scans at {RATE:.0f} Hz, each of 8 antennas that listen for 20 tags. "
-        "A step is a scan with the estimate after it"
+        "A step is a scan with the estimate after it."
     )
     rows = []
     for i, label in enumerate(RUNS):
@@ -70,7 +70,7 @@ def section(options: Options) -> Report:
     report.table((*heads, "final [s]", "peak memory [MB]"), rows)
     if len(RUNS) in found:
         report.say(
-            f"Calibration of one simulated log of {CALIBRATED:.0f} s (2 scans/s, 40 tags): {found[len(RUNS)]:.0f} s"
+            f"Calibration of one simulated log of {CALIBRATED:.0f} s (2 scans/s, 40 tags): {found[len(RUNS)]:.0f} s."
         )
     return report
 

@@ -38,9 +38,9 @@ def section(options: Options) -> Report:
         found.setdefault((job.kind, job.simulation.name, job.estimator, job.deadline), []).extend(outcomes[i])
     report.say(
         f"{len(seeds)} trials of each kind, with 95 % intervals. *Right in time*: from then on below 0.5 m and 15 degrees "
-        "for 10 s. *Called so in time*: by then it says `localized`, rightly (in brackets: the median of when). "
-        "*False claims*: the first `localized` is wrong, and in brackets the share of claims more than 0.5 m off that their own "
-        "covariances state; after a kidnapping: it says so at the deadline without being right"
+        "for 10 s. *Called so in time*: the status is rightly `localized` by then (in brackets: the median time). "
+        "*False claims*: the first `localized` is wrong (in brackets: the share of errors above 0.5 m that the covariances state). "
+        "After a kidnapping: it is `localized` at the deadline, but wrong."
     )
     report.table(
         ("", "preset", "estimator", "within", "right in time", "median [s]", "called so in time", "false claims"),
@@ -51,7 +51,7 @@ def section(options: Options) -> Report:
         for (kind, name, estimator, deadline), trials in found.items()
         if any(not t.seconds <= deadline for t in trials)
     ]
-    report.say("Seeds of those that were late: " + ("; ".join(late) or "none"))
+    report.say("Seeds of late runs: " + ("; ".join(late) or "none") + ".")
     heads = ("kind", "preset", "estimator", "seed", "seconds", "claimed", "false", "doubt")
     single = [
         (*key[:3], t.seed, t.seconds, t.claimed, t.false, t.doubt) for key, trials in found.items() for t in trials

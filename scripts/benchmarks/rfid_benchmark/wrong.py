@@ -70,9 +70,9 @@ def section(options: Options) -> Report:
                 unsure = np.mean([1.0 - run.share("localized") for run in mine])
                 rows.append((case.what, name, *causal, *anees, f"{100 * unsure:.0f} %"))
     report.say(
-        f"`office`, {len(seeds)} worlds of {DURATION:.0f} s. *Ratio*: of the causal error to that of an estimator that knows "
-        "range, read probability, the true places of the tags, and for bursts a tempering, with its 95 % interval over worlds, "
-        "and the largest of a single world"
+        f"`office`, {len(seeds)} worlds of {DURATION:.0f} s. *Ratio*: causal error over that of an estimator with the right "
+        "range, read probability and tags, and a tempering for bursts, with a 95 % interval over worlds. *Worst*: the largest of "
+        "a single world. *ANEES, knowing*: of that estimator."
     )
     heads = ("wrong", "estimator", "ratio", "worst", "ANEES", "ANEES, knowing", "not localized")
     report.table(heads, rows)
