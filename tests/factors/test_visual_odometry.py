@@ -21,6 +21,12 @@ def seen(rng: np.random.Generator, motion: Array, count: int = 40) -> tuple[Arra
     return predict(MODEL, np.zeros(3), points)[0], predict(MODEL, motion, points)[0]
 
 
+def test_matches_without_noise_have_no_error() -> None:
+    pairs = RayPairs.of(MODEL, *seen(np.random.default_rng(1), MOTION))
+    assert np.abs(sampson(pairs, MOTION)[0]).max() < 1e-6
+    assert np.abs(sampson(pairs, MOTION + np.array((0.0, 0.1, 0.0)))[0]).max() > 1.0
+
+
 def test_the_jacobian_is_the_numerical_one() -> None:
     rng = np.random.default_rng(2)
     first, second = seen(rng, MOTION)

@@ -6,20 +6,16 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import pytest
-from short_logs import mounted_exactly
 
 from factorgraph_loc import IncrementOdometry, IncrementStream, Log, RfidScan, Tick
 from factorgraph_loc.evaluation.metrics import errors as evaluated
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
-from factorgraph_loc.fusion.tracking import SURE, beyond
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.simulation import preset, simulate
-from factors import se2
 
 DURATION = 80.0
 
@@ -55,19 +51,6 @@ def test_a_silence_of_all_tags_is_no_place() -> None:
     assert errors(log, result)[result.t > 72.0].max() < 0.5
 
 
-@pytest.mark.parametrize(("estimator", "seed"), [("smoother", 2376), ("particle_filter", 2008)])
-def test_a_place_that_was_found_is_claimed_when_its_covariance_says_so(estimator: str, seed: int) -> None:
-    """Among few tags one place is clear seconds before it is known to half a metre."""
-    result = run(
-        mounted_exactly(simulate(preset("sparse", {"drive": {"duration": 17.0}}), seed)),
-        RunConfig(estimator, prior="unknown", seed=seed),
-    )
-    found = next(t for t, what in result.diagnostics.events if what == "localized")
-    first = result.status.index("localized")
-    assert result.t[first] > found + 0.4
-    assert beyond(result.covariances[first], 0.5) <= 1.0 - SURE
-
-
 def test_landmarks_of_a_track_that_was_lost_are_forgotten() -> None:
     """The odometry jumps by 8 m; tags tell it once, and landmarks that were put to where they seemed to be do not lead back."""
     seen = {"max_range": 6.0, "rate": 5.0}
@@ -84,21 +67,6 @@ def test_landmarks_of_a_track_that_was_lost_are_forgotten() -> None:
     assert score(result, log)["final.position_rmse"] < 0.15
 
 
-def test_kidnapping() -> None:
-    """Tags that the robot does not read, or reads, while it is thought to be elsewhere have neither died nor moved."""
-    log, _ = plain()
-    carried = join(cut(log, 0.0, 30.0), cut(log, 50.0, 80.0))
-    result = run(carried, RunConfig("smoother"))
-    assert any(what.startswith("lost") for _, what in result.diagnostics.events)
-    assert len(result.diagnostics.doubted["dead_tags"]) <= 1
-    assert len(result.diagnostics.doubted["moved_tags"]) <= 1
-    assert errors(carried, result)[result.t > 45.0].max() < 0.7
-    # nothing is told of what lies between the two places
-    final = evaluated(result.final, carried.reference)
-    assert np.nanmax(final.position) < 0.5
-    assert 0.5 < np.diff(result.final.t).max() < 2.0
-
-
 def test_a_robot_that_is_carried_far() -> None:
     """The way that it is carried tells nothing of the odometry's constants, and these nothing of that way."""
     hall = {"world": {"width": 60.0, "depth": 36.0, "tags": 180}, "drive": {"duration": 20.0}}
@@ -109,15 +77,6 @@ def test_a_robot_that_is_carried_far() -> None:
     assert what.startswith("lost")
     assert errors(carried, result)[result.t > found].max() < 0.6
     assert np.nanmax(evaluated(result.final, carried.reference).position) < 0.5
-
-
-def test_a_wrong_start_is_left() -> None:
-    log, _ = plain()
-    assert log.reference is not None
-    x, y, heading = log.reference.poses[0]
-    prior = f"{x + 3.0:.3f},{y:.3f},{se2.wrap_scalar(heading + 1.05):.3f}"
-    result = run(log, RunConfig("smoother", prior=prior))
-    assert errors(log, result)[result.t > 20.0].max() < 0.6
 
 
 def test_nothing_known_is_read() -> None:

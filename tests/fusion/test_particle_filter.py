@@ -17,7 +17,6 @@ from factorgraph_loc.model.setup import Setup
 from factors import se2
 
 UNKNOWN = RunConfig("particle_filter", {"particles": 1000}, prior="unknown")
-KNOWN = replace(UNKNOWN, prior=None)
 
 
 @pytest.fixture(scope="module")
@@ -87,16 +86,6 @@ def test_a_density_of_several_modes_stays_at_its_poses():
     drawn = shrunk.drawn(np.arange(100), kernel, rng)
     np.testing.assert_allclose(drawn.poses, cloud.poses, atol=1e-12)
     assert drawn.constants.std() == pytest.approx(cloud.constants.std(), rel=0.4)  # 5 sigma: 6e-7 of false alarms
-
-
-def test_trajectories_of_a_robot_that_stands_do_not_coalesce():
-    """Against the smoothed EKF; standard deviations of 100 trajectories are themselves off by a fourteenth."""
-    log = simulate(seconds=30.0, speeds=lambda t: (np.where(t < 5.0, 0.3, 0.0), np.zeros(len(t))))
-    found = run(log, KNOWN).final
-    smoothed = run(log, RunConfig("ekf")).final
-    ratio = np.sqrt(np.linalg.eigvalsh(found.covariances) / np.linalg.eigvalsh(smoothed.covariances))
-    assert ratio.min() > 0.7
-    assert ratio.max() < 2.5
 
 
 class Likely:

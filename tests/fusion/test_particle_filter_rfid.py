@@ -7,8 +7,6 @@ import pytest
 from short_logs import SIGNALS, with_signals
 
 from factorgraph_loc import RfidScan, Rig, Tag, VelocityOdometry, World
-from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.setup import Setup
@@ -98,27 +96,6 @@ def test_scans_that_come_again_make_no_silence():
         particles.process(scan(t))
     ((_, event),) = particles.diagnostics.events
     assert event.startswith("no tag is read")
-
-
-def test_phase_leads_from_decimetres_to_centimetres():
-    """Over three seeds the causal error is two thirds, the final one a third of that of the detections alone."""
-    found = []
-    for signals in ((), ("phase",)):
-        config = RunConfig("particle_filter", {"particles": 800}, ("odometry", "rfid", *signals))
-        scores = [score(run(log, config), log) for log in map(office, range(2))]
-        found.append([np.sqrt(np.mean([s[f"{k}.position_rmse"] ** 2 for s in scores])) for k in ("causal", "final")])
-    (causal_of_reads, final_of_reads), (causal, final) = found
-    assert causal < 0.85 * causal_of_reads
-    assert final < 0.6 * final_of_reads
-    assert final < 0.06
-
-
-def test_phases_leave_particles_enough():
-    """A filter that depletes believes in what is far from the truth: 3 is expected of the squared normalised error."""
-    sensors = ("odometry", "rfid", "rssi", "phase")
-    log = office(1)
-    result = run(log, RunConfig("particle_filter", {"particles": 800, "smooth": False}, sensors))
-    assert score(result, log)["causal.anees"] < 10.0
 
 
 @pytest.mark.parametrize("x", [2.0, 200.0])

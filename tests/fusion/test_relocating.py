@@ -1,11 +1,10 @@
-"""Smoother and batch where their place is not known (unknown start, wrong start, kidnapping), and where it always was."""
+"""Smoother and batch where their place is not known."""
 
 from dataclasses import replace
 
-import landmark_world
 import numpy as np
 import pytest
-from landmark_world import dirty, simulate, swapped, with_sightings
+from landmark_world import simulate, with_sightings
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -13,7 +12,6 @@ from factorgraph_loc.model.log import cut, join
 
 CONFIGS = {
     "smoother": RunConfig("smoother"),
-    "smoother_lag": RunConfig("smoother", {"lag": 10.0}),
     "batch": RunConfig("batch"),
 }
 
@@ -23,35 +21,9 @@ def log():
     return simulate(seconds=20.0)
 
 
-@pytest.fixture(scope="module")
-def kidnapped():
-    return landmark_world.kidnapped()
-
-
-def silent(log, start, end):
-    t = log.streams["bearing_range"].t
-    return with_sightings(log, (t < start) | (t >= end))
-
-
-def without(log, column):
-    return with_sightings(log, **{column: np.full(len(log.streams["bearing_range"].t), np.nan)})
-
-
 def off(trajectory, log):
     """Position errors at the estimates [m], NaN in gaps of the reference."""
     return np.hypot(*(trajectory.poses - log.reference.at(trajectory.t, max_gap=0.1))[:, :2].T)
-
-
-def changes(result):
-    """Each status in its turn, and when it began."""
-    first = [i for i in range(len(result.t)) if i == 0 or result.status[i] != result.status[i - 1]]
-    return [(result.status[i], float(result.t[i])) for i in first]
-
-
-def distance(a, b):
-    """Largest distance [m] between two trajectories at the stamps that both have."""
-    _, i, k = np.intersect1d(a.t, b.t, return_indices=True)
-    return np.hypot(*(a.poses[i] - b.poses[k])[:, :2].T).max()
 
 
 def test_a_lost_track_is_ambiguous_until_its_place_is_found(log):
@@ -69,50 +41,6 @@ def test_a_lost_track_is_ambiguous_until_its_place_is_found(log):
     assert np.nanmax(off(result.final, carried)[result.final.t > t]) < 0.2
 
 
-@pytest.mark.parametrize(
-    "disturbed",
-    [lambda log: log, dirty, lambda log: swapped(log, "a", "e"), lambda log: swapped(log, "b", "h")],
-    ids=["clean", "dirty", "swapped ae", "swapped bh"],
-)
-def test_a_right_track_is_never_left(disturbed, log):
-    log = disturbed(log)
-    result = run(log, CONFIGS["smoother"])
-    assert result.diagnostics.events == []
-    assert off(result.final, log).max() < 0.2
-    assert set(result.status) == {"localized"}
-
-
-@pytest.mark.parametrize("name", ["smoother_lag", "batch"])
-def test_a_blackout_is_no_kidnapping(name, log):
-    dark = silent(log, 5.0, 14.0)
-    for prior in (None, "unknown"):
-        result = run(dark, replace(CONFIGS[name], prior=prior))
-        assert [what for _, what in result.diagnostics.events] == ([] if prior is None else ["localized"])
-        assert off(result.final, log)[result.final.t > 15.0].max() < 0.15
-
-
-def test_kidnapped_in_a_blackout(kidnapped):
-    result = run(silent(kidnapped, 7.0, 14.0), CONFIGS["smoother"])
-    ((t, event),) = result.diagnostics.events
-    assert event.startswith("lost: ")
-    assert 14.0 < t < 20.0
-    final = off(result.final, kidnapped)
-    assert np.nanmax(final[result.final.t < 7.0]) < 0.15
-    assert np.nanmax(final[result.final.t > 14.5]) < 0.2
-
-
-@pytest.mark.parametrize("missing", ["range", "bearing"])
-def test_range_alone_and_bearing_alone(missing, log):
-    """Here they tell the place, too."""
-    log = without(log, missing)
-    result = run(log, replace(CONFIGS["smoother"], prior="unknown"))
-    ((t, event),) = result.diagnostics.events
-    assert event == "localized"
-    assert t < 15.0
-    assert off(result.final, log).max() < 0.3
-    assert off(result.causal(), log)[0] < 0.3
-
-
 @pytest.mark.parametrize("name", ["smoother", "batch"])
 def test_one_landmark_does_not_tell_the_place(name, log):
     """The start stays open, and everything is still there when the others come."""
@@ -126,8 +54,8 @@ def test_one_landmark_does_not_tell_the_place(name, log):
     (warning,) = result.warnings
     assert warning.startswith("simulated: never localized: ")
     if name != "batch":
-        assert [status for status, _ in changes(result)] == ["unlocalized", "ambiguous"]
         ambiguous = np.array(result.status) == "ambiguous"
+        assert result.status == ("unlocalized",) * int(np.argmax(ambiguous)) + ("ambiguous",) * int(ambiguous.sum())
         assert np.all(np.isfinite(result.poses[ambiguous]))
         distance_of_b = np.hypot(*(result.poses[ambiguous, :2] - log.world.position("b")).T)
         truth = np.hypot(*(log.reference.at(result.t[ambiguous])[:, :2] - log.world.position("b")).T)

@@ -1,14 +1,9 @@
-"""Constants of odometry and sensor that are estimated on the way, on simulated runs whose constants are not the rig's."""
-
-from dataclasses import replace
+"""Constants of odometry and sensor that are estimated on the way, against least squares."""
 
 import numpy as np
 import pytest
-from landmark_world import DEPTH, TRUTH, miscalibrated, simulate
 
 from factorgraph_loc import BearingRange, IncrementOdometry, Landmark, Rig, Tick, World
-from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.setup import Setup
@@ -19,53 +14,6 @@ from factorgraph_loc.sensors.odometry.settings import (
     OdometrySettings,
     OdometryUncertainty,
 )
-
-CONFIGS = {
-    "ekf": RunConfig("ekf"),
-    "smoother": RunConfig("smoother"),
-    "smoother_lag": RunConfig("smoother", {"lag": 5.0}),
-    "batch": RunConfig("batch"),
-}
-
-
-@pytest.fixture(scope="module")
-def logs():
-    """By whether ranges are depths: a log, and the truth."""
-    log = simulate(seconds=40.0)
-    return {depth: (miscalibrated(log, t, depth=depth), t) for depth, t in ((False, TRUTH), (True, DEPTH))}
-
-
-@pytest.mark.parametrize(("name", "depth"), [("ekf", True), ("smoother", False), ("batch", True)])
-def test_constants_are_found(name, depth, logs):
-    """One of the nine constants lies beyond 3.5 sigma in one of 240 simulations; the estimators err together."""
-    log, truth = logs[depth]
-    result = run(log, CONFIGS[name])
-    assert set(result.learnt.values) == set(truth)
-    for constant, expected in truth.items():
-        value, sigma = result.learnt.values[constant]
-        assert abs(value - expected) < 3.5 * sigma, constant
-        assert sigma < 0.25 * 2.0 * abs(expected), constant
-    off = run(log, replace(CONFIGS[name], settings={**CONFIGS[name].settings, "self_calibration": False}))
-    assert off.learnt.values == {}
-    for kind in ("final",) if name == "batch" else ("causal", "final"):
-        with_constants, without = (score(r, log)[f"{kind}.position_rmse"] for r in (result, off))
-        assert with_constants < 0.1
-        assert without > 3.0 * with_constants
-
-
-@pytest.mark.parametrize("name", ["ekf", "smoother_lag"])
-def test_right_constants_stay(name):
-    """As above, with a rig that is right and does not know it: 3.5 sigma of seven constants, one of 300 simulations."""
-    log = miscalibrated(simulate(seconds=40.0, seed=2), TRUTH, seed=2)
-    right = miscalibrated(simulate(seconds=40.0, seed=2), dict.fromkeys(TRUTH, 0.0), seed=2)
-    log = replace(right, rig=log.rig)
-    result = run(log, CONFIGS[name])
-    for constant, (value, sigma) in result.learnt.values.items():
-        assert abs(value) < 3.5 * sigma, constant
-    known = run(right, CONFIGS[name])
-    assert known.learnt.values == {}
-    assert score(result, log)["final.position_rmse"] < 1.5 * score(known, log)["final.position_rmse"] + 0.01
-
 
 # A landmark so far ahead that its range measures x: with the wheels' scale and the sensor's place ahead of the robot's centre a
 # linear and Gaussian problem.

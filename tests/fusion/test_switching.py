@@ -13,7 +13,6 @@ from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation import simulate as simulate_office
-from factors import se2
 
 BOTH = ("odometry", "rfid", "bearing_range")
 SIGHT, TAGS = ("odometry", "bearing_range"), ("odometry", "rfid")
@@ -30,11 +29,6 @@ def office():
 def switched(office):
     """The run that several tests look at."""
     return run(office, RunConfig("switching", {"particles": 500}, sensors=BOTH))
-
-
-def position_rmse(log, t, poses):
-    error = poses[:, :2] - log.reference.at(t)[:, :2]
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
 
 def scan(t, *tags):
@@ -99,16 +93,6 @@ def test_rows_that_neither_filter_uses_are_counted_once(office):
     estimator.initialize(PosePrior(0.0, office.reference.poses[0], np.eye(3)))
     estimator.process(YawRate(0.1, 0.2))
     assert estimator.diagnostics.ignored == {"yaw rate": 1}
-
-
-def test_vision_and_smoothing_help(office, switched):
-    odometry = run(office, RunConfig("dead_reckoning"))
-    causal, final = (position_rmse(office, x.t, x.poses) for x in (switched, switched.final))
-    assert final < causal < position_rmse(office, odometry.t, odometry.poses)
-    np.testing.assert_array_equal(switched.t, switched.final.t)
-    off = run(office, RunConfig("switching", {"particles": 500, "smooth": False}, sensors=BOTH))
-    np.testing.assert_allclose(off.final.poses[:, :2], off.poses[:, :2], atol=1e-9)
-    np.testing.assert_allclose(se2.wrap(off.final.poses[:, 2] - off.poses[:, 2]), 0.0, atol=1e-9)
 
 
 def test_an_unknown_start_needs_tags(office):

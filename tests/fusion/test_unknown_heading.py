@@ -106,16 +106,6 @@ def test_sightings_that_fit_no_heading_leave_the_start_as_it_was_told(name):
     assert np.all(np.isfinite(result.poses))
 
 
-@pytest.mark.parametrize("name", ["ekf", "smoother", "particle_filter"])
-def test_one_landmark_is_enough_where_the_position_is_known(name, log):
-    stream = log.streams["bearing_range"]
-    rows = [i for i, landmark in enumerate(stream.landmark) if landmark == "b"]
-    one = BearingRangeStream(stream.t[rows], ["b"] * len(rows), stream.range[rows], stream.bearing[rows])
-    one = cut(replace(log, streams={**log.streams, "bearing_range": one}), 0.0, 8.0)
-    result = run(one, replace(CONFIGS[name], prior=position(log)))
-    check(one, result, within=6.0)
-
-
 def test_a_camera_that_sees_the_robot_elsewhere_is_not_believed():
     log = camera_world.simulate(seconds=3.0)
     x, y, _ = log.reference.poses[0]
