@@ -16,13 +16,8 @@ def tables() -> list[str]:
 
 
 def _estimators() -> list[str]:
-    found = [registry.describe(name) for name in ESTIMATORS.own]
-    lines = ["## Estimators", "", "| estimator | estimates | sensors |", "|---|---|---|"]
-    for one in found:
-        kinds = " and ".join(word for word, there in (("causal", one.causal), ("smoothed", one.smoothed)) if there)
-        lines.append(f"| `{one.name}` | {kinds} | {_names(one.sensors)} |")
-    settings = [(s.key, one.name, s) for one in found for s in settings_in(registry.settings_type(one.name))]
-    return [*lines, "", *_table(settings, owned=True)]
+    settings = [(s.key, name, s) for name in ESTIMATORS.own for s in settings_in(registry.settings_type(name))]
+    return ["## Estimators", "", *_table(settings, owned=True)]
 
 
 def _rig() -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,7 @@ class Found:
 
 
 def section(options: Options) -> Report:
-    """The table, and the reasons for missing scores."""
+    """The tables."""
     assert options.data_root is not None
     report = Report("recordings", options)
     logs = options.out / "logs"
@@ -44,22 +45,20 @@ def section(options: Options) -> Report:
 
 
 def tell(report: Report, results: Sequence[tuple[Recording, Found]]) -> None:
-    """Write the tables of results, with other sensors than odometry and without, and the reasons below them."""
-    notes: list[str] = []
+    """Write the tables of results: of scored logs with other sensors than odometry, and of the others; print the reasons for
+    missing scores."""
     rows: dict[tuple[str, ...], list[tuple[str, ...]]] = {ESTIMATORS: [], ALONE: []}
     for recording, result in results:
-        told = {name: one for name, one in result.scores.items() if isinstance(one, dict)}
-        refused = {name: one for name, one in result.scores.items() if isinstance(one, str)}
-        counts = {one.get("causal.scored") or one.get("final.scored") or 0 for one in told.values()}
+        scores = [one for one in result.scores.values() if isinstance(one, dict)]
+        scored = max((one.get("causal.scored") or one.get("final.scored") or 0 for one in scores), default=0)
         sensors = recording.odometry + (f"; {recording.others}" if recording.others else "")
-        scored = str(max(counts, default=0))
-        shown = ESTIMATORS if recording.others else ALONE
+        shown = ESTIMATORS if recording.others and scored else ALONE
         cells = (_cell(result.scores[name]) for name in shown)
-        rows[shown].append((recording.name, recording.title, sensors, scored, *cells))
-        notes += [f"- {recording.name}: {line}." for line in sorted(set(refused.values()))]
+        rows[shown].append((recording.name, recording.title, sensors, str(scored), *cells))
+        for line in sorted({one for one in result.scores.values() if isinstance(one, str)}):
+            print(f"{recording.name}: {line}", file=sys.stderr)
     for shown, lines in rows.items():
         report.table(("log", "what it is", "odometry; other sensors", "poses", *shown), lines)
-    report.lines += [*notes, ""]
 
 
 def measured(job: Job) -> Found:

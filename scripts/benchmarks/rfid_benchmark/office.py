@@ -16,12 +16,6 @@ BOTH = STATES | {
     label + NOISE: RunConfig(config.estimator, {"self_calibration": False}) for label, config in STATES.items()
 }
 PRESETS = {"office": (5, BOTH), "sparse": (5, BOTH), "bursty": (3, STATES)}  # number of worlds, runs in each
-# causal RMSE m, heading degrees, final RMSE m, heading degrees, final p95 m of a reference implementation
-ANCHORS = {
-    ("office", "with the constants as states"): ("0.089", "2.2", "0.052", "1.3", "0.092"),
-    ("office", "without them"): ("0.103", "–", "0.066", "–", "0.119"),
-    ("sparse", "with the constants as states"): ("0.133", "–", "0.082", "–", "0.150"),
-}
 Found = dict[str, list[RunErrors]]  # of each configuration, one a seed
 
 
@@ -64,7 +58,6 @@ def accuracy(report: Report, found: dict[str, Found]) -> None:
             p95 = np.percentile(together(final), 95)
             cells = (f"{position:.3f}", f"{heading:.2f}", f"{final_position:.3f}", f"{final_heading:.2f}", f"{p95:.3f}")
             rows.append((name, label, *cells, nees, inside))
-        rows += [(name, f"*anchor, {what}*", *cells, "–", "–") for (of, what), cells in ANCHORS.items() if of == name]
     heads = ("preset", "estimator", "causal [m]", "[deg]", "final [m]", "[deg]", "final p95 [m]")
     report.table((*heads, "ANEES causal / final", "inside causal / final"), rows)
 
@@ -77,7 +70,5 @@ def ratios(report: Report, found: dict[str, Found]) -> None:
         rows += [
             (name, "smoother / particle filter, causal", *ratio_cells(*causal)),
             (name, "smoother / particle filter, final", *ratio_cells(*final)),
-            (name, "final / causal, smoother", *ratio_cells(final[0], causal[0])),
-            (name, "final / causal, particle filter", *ratio_cells(final[1], causal[1])),
         ]
     report.table(("preset", "ratio", "pooled (95 %)", "largest"), rows)

@@ -61,16 +61,6 @@ def ratios(cases: Sequence[Case]) -> Lines:
     yield from table(["", "ratio of errors", *(heads[kind] for kind in kinds)], rows)
 
 
-def hindsight(cases: Sequence[Case]) -> Lines:
-    """The final error of each estimator over its causal one."""
-    rows = [
-        [case.name, shown(label), ratio_cell(case.ratio((label, "final"), (label, "causal")), len(case.logs))]
-        for case in cases
-        for label in case.labels
-    ]
-    yield from table(["", "estimator", "final / causal (95 %)"], rows)
-
-
 def times(seconds: Mapping[tuple[str, str], float]) -> Lines:
     """Processor time [s per minute of drive] by name of the case and estimator."""
     names = list(dict.fromkeys(name for name, _ in seconds))
