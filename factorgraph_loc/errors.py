@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from factorgraph_loc.text import one_line, plain, quoted, told
+from factorgraph_loc.text import error_text, one_line, plain, quoted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,7 +55,7 @@ def require(
 
 def unusable(error: OSError) -> InputError:
     """The error for a file or folder that cannot be read or written."""
-    return InputError(told(error) if error.filename is None else f"{plain(error.filename)}: {told(error)}")
+    return InputError(error_text(error) if error.filename is None else f"{plain(error.filename)}: {error_text(error)}")
 
 
 def unencodable(error: UnicodeEncodeError) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.text import plain, told
+from factorgraph_loc.text import error_text, plain
 
 Place = str  # "package.module:name", or "package.module"
 
@@ -20,8 +20,8 @@ Place = str  # "package.module:name", or "package.module"
 def load(place: Place) -> Any:
     """Import the object at ``place``. ImportError or AttributeError if it does not exist."""
     module, _, name = place.partition(":")
-    found = importlib.import_module(module)
-    return getattr(found, name) if name else found
+    loaded = importlib.import_module(module)
+    return getattr(loaded, name) if name else loaded
 
 
 class Group(Mapping[str, Any]):
@@ -48,16 +48,16 @@ class Group(Mapping[str, Any]):
         if self._others is None:
             from importlib.metadata import entry_points  # noqa: PLC0415 - most commands need built-in ones only
 
-            found: dict[str, tuple[Place, str]] = {}
+            installed: dict[str, tuple[Place, str]] = {}
             for entry in entry_points(group=f"factorgraph_loc.{self.kind}"):
                 package = entry.dist.name if entry.dist else "another package"
-                if entry.name in self.own or entry.name in found:
-                    owner = "this project" if entry.name in self.own else found[entry.name][1]
+                if entry.name in self.own or entry.name in installed:
+                    owner = "this project" if entry.name in self.own else installed[entry.name][1]
                     raise InputError(
                         f"{self.kind}: {package} registers {plain(entry.name)}, which {owner} already registers"
                     )
-                found[entry.name] = entry.value, package
-            self._others = found
+                installed[entry.name] = entry.value, package
+            self._others = installed
         return self._others
 
     def __getitem__(self, name: str) -> Any:
@@ -66,12 +66,12 @@ class Group(Mapping[str, Any]):
         place, package = self._installed()[name]
         what = f"{self.kind}: {plain(name)} of {package}"
         try:
-            found = load(place)
+            loaded = load(place)
         except Exception as error:  # code of another package may raise anything
-            raise InputError(f"{what} cannot be loaded from {place}: {told(error)}") from error
-        if missing := [needed for needed in self.needs if not hasattr(found, needed)]:
+            raise InputError(f"{what} cannot be loaded from {place}: {error_text(error)}") from error
+        if missing := [needed for needed in self.needs if not hasattr(loaded, needed)]:
             raise InputError(f"{what} has no {missing[0]}, which the interface requires")
-        return found
+        return loaded
 
     def __contains__(self, name: object) -> bool:
         """Whether a name is registered; nothing is loaded."""

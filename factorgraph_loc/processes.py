@@ -70,13 +70,13 @@ class Worker:
     def hear(self) -> Any:
         """Receive ``READY``, a value, or the exception of the job; a ProcessDiedError if the process has ended."""
         try:
-            heard, told = self.connection.recv()
+            answer, traceback_text = self.connection.recv()
         except (EOFError, OSError):
             return ProcessDiedError("the process died (killed, out of memory, or a crash in native code)")
         self.ready = True
-        if told:
-            heard.__cause__ = RemoteError(told)
-        return heard
+        if traceback_text:
+            answer.__cause__ = RemoteError(traceback_text)
+        return answer
 
     def end(self) -> None:
         """Kill the process."""
@@ -92,12 +92,12 @@ def start(function: Callable[..., None], *args: Any) -> tuple[Child, Connection]
     process is tied to this one only after loading it. The process ignores keyboard interrupts.
     """
     use_one_thread()
-    here, there = Pipe()
-    process = Child(target=function, args=(there, *args), daemon=True)
+    parent_end, child_end = Pipe()
+    process = Child(target=function, args=(child_end, *args), daemon=True)
     with _undisturbed(), _without_script():
         process.start()
-    there.close()
-    return process, here
+    child_end.close()
+    return process, parent_end
 
 
 def run_each(
@@ -124,18 +124,18 @@ def run_each(
                 worker.send(function)
             for connection in wait([worker.connection for worker in team], None if beat is None else BEAT):
                 worker = next(worker for worker in team if worker.connection is connection)
-                heard = worker.hear()
-                if isinstance(heard, ProcessDiedError) and worker.job is None and waiting:  # died before its first job
+                answer = worker.hear()
+                if isinstance(answer, ProcessDiedError) and worker.job is None and waiting:  # died before its first job
                     worker.job = waiting.popleft()
                 at, worker.job = worker.job, None
-                if isinstance(heard, ProcessDiedError) or (at is not None and not lasting):
+                if isinstance(answer, ProcessDiedError) or (at is not None and not lasting):
                     team.remove(worker)
                     worker.end()
                 elif waiting:
                     worker.job = waiting.popleft()
                     worker.send(jobs[worker.job])
                 if at is not None:
-                    yield at, heard
+                    yield at, answer
             if beat is not None:
                 beat()
     finally:
@@ -217,18 +217,18 @@ def _undisturbed() -> Iterator[None]:
     """Start processes that ignore keyboard interrupts; signals to this process are deferred until the block ends."""
     resource_tracker.ensure_running()  # otherwise it is started with the first process, and unblocks interrupts
     came: list[int] = []
-    before = {}
+    replaced = {}
     if threading.current_thread() is threading.main_thread():
-        handlers = {one: signal.getsignal(one) for one in STOPS}
-        before = {one: handler for one, handler in handlers.items() if callable(handler)}
-        for one in before:
-            signal.signal(one, lambda number, _: came.append(number))
+        handlers = {signum: signal.getsignal(signum) for signum in STOPS}
+        replaced = {signum: handler for signum, handler in handlers.items() if callable(handler)}
+        for signum in replaced:
+            signal.signal(signum, lambda number, _: came.append(number))
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        for signum, handler in replaced.items():
+            signal.signal(signum, handler)
         for number in came:
             signal.raise_signal(number)

@@ -55,7 +55,7 @@ def listed(names: Iterable[object], most: int = LISTED) -> str:
     return shown if len(every) <= most else f"{shown} and {len(every) - most} more"
 
 
-def told(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """The message of a foreign exception on one line, or its class name if it has none."""
     says = " ".join(str(getattr(error, "strerror", None) or error).split())
     return plain(says or type(error).__name__)

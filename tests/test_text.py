@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError, RunFailedError, bad_field
-from factorgraph_loc.text import MESSAGE, NAME, VALUE, listed, one_line, plain, quoted, told
+from factorgraph_loc.text import MESSAGE, NAME, VALUE, error_text, listed, one_line, plain, quoted
 
 ANY = st.text(st.characters(), max_size=400)  # lone surrogates and control characters too
 NESTED = st.recursive(
@@ -77,10 +77,10 @@ def test_of_many_names_the_first_are_listed() -> None:
 
 
 def test_what_an_exception_says_fits_on_a_line() -> None:
-    assert told(RuntimeError("one\n\n  two")) == "one two"
-    assert told(RuntimeError()) == "RuntimeError"
-    assert told(FileNotFoundError(2, "No such file or directory", "x")) == "No such file or directory"
-    assert told(OSError("3 requested and 0 written")) == "3 requested and 0 written"
+    assert error_text(RuntimeError("one\n\n  two")) == "one two"
+    assert error_text(RuntimeError()) == "RuntimeError"
+    assert error_text(FileNotFoundError(2, "No such file or directory", "x")) == "No such file or directory"
+    assert error_text(OSError("3 requested and 0 written")) == "3 requested and 0 written"
 
 
 @settings(max_examples=200)

@@ -36,11 +36,11 @@ def calibrate(
     # learnt grids are kept here until the rig is written, so that a failed calibration leaves nothing behind
     with temporary_folder(of_system("grids")) as folder:
         grids = folder / file.name.removesuffix(RIG)
-        found = calibration.calibrate(loaded, run, progress=progress, grids=grids)
+        result = calibration.calibrate(loaded, run, progress=progress, grids=grids)
         with writing(file), replacing(page) as temporary:  # write both files or none
-            temporary.write_text(rig_report.page(found), encoding="utf-8")
-            write_rig(found.rig, file)
-    return found
+            temporary.write_text(rig_report.page(result), encoding="utf-8")
+            write_rig(result.rig, file)
+    return result
 
 
 def report_beside(out: Path, *, overwrite: bool) -> Path:

@@ -77,11 +77,11 @@ def manifest(bag: str | Path, out: str | Path | None = None, *, overwrite: bool 
     file = Path(out)
     if file.exists() and not overwrite:
         raise InputError(f"{file}: exists already, expected a new file")
-    found = manifest_of_bag(Path(bag), file.parent)
-    if found.folder != file.parent.resolve():
-        raise InputError(f"{file}: the bag is in {found.folder}, expected a file there or in a folder above")
-    write_text(file, found.text)
-    return found
+    proposal = manifest_of_bag(Path(bag), file.parent)
+    if proposal.folder != file.parent.resolve():
+        raise InputError(f"{file}: the bag is in {proposal.folder}, expected a file there or in a folder above")
+    write_text(file, proposal.text)
+    return proposal
 
 
 def simulate(

@@ -61,8 +61,8 @@ def known_readers() -> list[NamedSettings]:
 
 def describe_reader(name: str) -> NamedSettings:
     """The description of a reader; InputError for an unknown one."""
-    found = reader(name)
-    return NamedSettings(name, found.about, tuple(settings_in(found.options)))
+    described = reader(name)
+    return NamedSettings(name, described.about, tuple(settings_in(described.options)))
 
 
 def known_sensors() -> list[SensorDescription]:
@@ -72,13 +72,13 @@ def known_sensors() -> list[SensorDescription]:
 
 def describe_sensor(name: str) -> SensorDescription:
     """The description of a sensor, by its name or that of a channel; InputError for an unknown one."""
-    found = sensor(name)
+    described = sensor(name)
     return SensorDescription(
-        found.name,
-        about(found.name),
-        tuple(channel.name for channel in found.channels),
-        {table.name: table.columns for table in tables_of_sensor(found)},
-        {section: tuple(settings) for section, settings in sections_of(found).items()},
+        described.name,
+        about(described.name),
+        tuple(channel.name for channel in described.channels),
+        {table.name: table.columns for table in tables_of_sensor(described)},
+        {section: tuple(settings) for section, settings in sections_of(described).items()},
     )
 
 

@@ -139,8 +139,8 @@ def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
 
 def _only(runs: list[StoredRun], out: Path) -> StoredRun:
     if len(runs) != 1:
-        found = f"there are {len(runs)} ({listed(run.name for run in runs)})" if runs else "there is none"
-        raise InputError(f"{out}: holds one run, and {found}, expected the folder of one run")
+        count = f"there are {len(runs)} ({listed(run.name for run in runs)})" if runs else "there is none"
+        raise InputError(f"{out}: holds one run, and {count}, expected the folder of one run")
     return runs[0]
 
 
@@ -174,10 +174,10 @@ def score(
     if out is not None:
         require_free(Path(out), FILES, overwrite=overwrite)
     paths = _path(estimate, "estimate"), _path(reference, "reference")
-    found = score_paths(*paths, align, associate, max_diff=max_diff, max_gap=max_gap, all_pairs=all_pairs)
+    result = score_paths(*paths, align, associate, max_diff=max_diff, max_gap=max_gap, all_pairs=all_pairs)
     if out is not None:
-        write_score(found, Path(out))
-    return found
+        write_score(result, Path(out))
+    return result
 
 
 def _path(trajectory: TrajectoryLike, name: str) -> PosePath:

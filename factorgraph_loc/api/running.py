@@ -9,7 +9,7 @@ from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.evaluation.plots import write_plots
 from factorgraph_loc.experiments import output
 from factorgraph_loc.experiments import run as running
-from factorgraph_loc.experiments.compare import told
+from factorgraph_loc.experiments.compare import summary_text
 from factorgraph_loc.experiments.learning import run_and_learn
 from factorgraph_loc.files.temporary import require_free
 from factorgraph_loc.fitting.posterior import FittedConstant
@@ -31,7 +31,7 @@ class Run:
 
     def __repr__(self) -> str:
         done = {"log": self.result.log, "estimator": self.result.config["estimator"], "status": "ok"}
-        return told([done | self.scores])
+        return summary_text([done | self.scores])
 
 
 def run(

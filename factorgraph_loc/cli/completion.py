@@ -48,7 +48,7 @@ def setting(incomplete: str) -> list[str]:
     """The name of a setting NAME.KEY=VALUE: that of the estimator first, then the key."""
     name, dot, _ = incomplete.partition(".")
     if not dot:
-        return [f"{one}." for one in estimator(name)]
+        return [f"{known}." for known in estimator(name)]
     if name not in ESTIMATORS:
         return []
     from factorgraph_loc.files.settings import settings_in

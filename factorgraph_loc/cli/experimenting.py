@@ -118,8 +118,8 @@ def run(
 def _print_done(done: Done, prepared: Prepared, file: Path, json: bool) -> None:
     show.outcome(done.warnings, done.failures, SHOWN, f", see `fgloc experiment status {file}`")
     if json:
-        found = {"runs": done.rows.to_dicts(), "failures": done.failures, "warnings": done.warnings}
-        show.document({"folder": str(prepared.folder), **found})
+        results = {"runs": done.rows.to_dicts(), "failures": done.failures, "warnings": done.warnings}
+        show.document({"folder": str(prepared.folder), **results})
         return
     header, lines = _summary(done.rows.to_dicts(), prepared.experiment.report.metrics)
     show.table(header, lines)
@@ -140,17 +140,19 @@ def status(
     from factorgraph_loc.experiments.experiment import STATES
     from factorgraph_loc.experiments.experiment import status as count_states
 
-    found = count_states(file, **options.given(), verify=verify)
+    counted = count_states(file, **options.given(), verify=verify)
     if json:
-        show.document(vars(found) | {"folder": str(found.folder)})
+        show.document(vars(counted) | {"folder": str(counted.folder)})
         return
-    by_label = {label: list(counts.values()) for label, counts in found.labels.items()}
+    by_label = {label: list(counts.values()) for label, counts in counted.labels.items()}
     total = [sum(numbers) for numbers in zip(*by_label.values(), strict=True)]
     rows = [[label, *map(str, numbers)] for label, numbers in (*by_label.items(), ("(all)", total))]
     show.table(["label", *STATES], rows)
-    _print_damaged(found.damaged, file)
-    for one in found.failures:
-        show.line(f"failed: {one['log']}, {one['label']}, seed {one['seed']}: {one['kind']}: {one['reason']}")
+    _print_damaged(counted.damaged, file)
+    for failure in counted.failures:
+        show.line(
+            f"failed: {failure['log']}, {failure['label']}, seed {failure['seed']}: {failure['kind']}: {failure['reason']}"
+        )
 
 
 @app.command()
@@ -328,8 +330,8 @@ def active(
         )
     show.outcome((), results.failures)
     if json:
-        found = {"summaries": summaries(results.rows), "differences": differences(results.rows)}
-        show.document({"runs": results.rows, **found, "failures": results.failures})
+        tables = {"summaries": summaries(results.rows), "differences": differences(results.rows)}
+        show.document({"runs": results.rows, **tables, "failures": results.failures})
     else:
         show.table(*summary_cells(results.rows))
         header, lines = difference_cells(results.rows)

@@ -60,13 +60,13 @@ def info(
         draw(logs, out)
     inspections = [inspect(loaded) for loaded in logs]
     if json:
-        documents = [_document(loaded, found) for loaded, found in zip(logs, inspections, strict=True)]
+        documents = [_document(loaded, inspection) for loaded, inspection in zip(logs, inspections, strict=True)]
         show.document(documents[0] if len(documents) == 1 else documents)
         return
-    for i, (loaded, found) in enumerate(zip(logs, inspections, strict=True)):
+    for i, (loaded, inspection) in enumerate(zip(logs, inspections, strict=True)):
         if i:
             show.line()
-        _print(loaded, found)
+        _print(loaded, inspection)
     if out is not None:
         show.line()
         show.line(f"wrote {out}")
@@ -95,13 +95,13 @@ def convert(
         show.line(f"wrote {out}")
 
 
-def _print(log: Log, found: Inspection) -> None:
+def _print(log: Log, inspection: Inspection) -> None:
     first, last = log.span()
     about = {
         "log": log.name,
         "span": f"{last - first:.1f} s",
         "rig": f"{log.rig.name}, sensors {', '.join(log.rig.sensors) or 'none'}",
-        "world": ", ".join([log.world.name, *(f"{count} {layer}" for layer, count in found.in_map.items())]),
+        "world": ", ".join([log.world.name, *(f"{count} {layer}" for layer, count in inspection.in_map.items())]),
         "start": "given by the log" if log.start is not None else "not given",
     }
     if log.reference is None:
@@ -110,20 +110,20 @@ def _print(log: Log, found: Inspection) -> None:
         about["reference"] = "positions only, headings are not scored"
     show.fields(about | dict(log.metadata))
     show.line()
-    streams = dict(found.streams)
-    if found.reference is not None:
-        streams["reference"] = found.reference
+    streams = dict(inspection.streams)
+    if inspection.reference is not None:
+        streams["reference"] = inspection.reference
     header = ("stream", "rows", "rate [Hz]", "first [s]", "last [s]", "gaps")
     show.table(header, [_row(name, stream) for name, stream in streams.items()])
     show.line()
-    for paragraph in (p for summary in found.sensors.values() for p in summary.text):
+    for paragraph in (p for summary in inspection.sensors.values() for p in summary.text):
         show.line(paragraph.line)
         if paragraph.header:
             show.table(paragraph.header, paragraph.rows)
         show.line()
-    if not found.problems:
+    if not inspection.problems:
         show.line("no warnings")
-    for problem in found.problems:
+    for problem in inspection.problems:
         show.line(f"! {problem}")
 
 
@@ -132,19 +132,19 @@ def _row(name: str, stream: StreamSummary) -> tuple[str, ...]:
     return (name, str(stream.rows), *numbers, str(len(stream.gaps)))
 
 
-def _document(log: Log, found: Inspection) -> dict[str, Any]:
+def _document(log: Log, inspection: Inspection) -> dict[str, Any]:
     first, last = log.span()
     return {
         "log": log.name,
         "metadata": dict(log.metadata),
         "span": last - first,
         "rig": log.rig.model_dump(mode="json", exclude_none=True),
-        "world": {"name": log.world.name, **found.in_map},
+        "world": {"name": log.world.name, **inspection.in_map},
         "start": None if log.start is None else {"t": log.start.t, "pose": log.start.pose.tolist()},
-        "streams": found.streams,
-        "reference": found.reference,
-        **found.found,
-        "problems": found.problems,
+        "streams": inspection.streams,
+        "reference": inspection.reference,
+        **inspection.found,
+        "problems": inspection.problems,
     }
 
 
@@ -155,28 +155,30 @@ def manifest(
     """Propose a manifest for a ROS bag: which topic is which sensor. Write it to a file and check it."""
     from factorgraph_loc.io.bags.manifest import manifest_of_bag
 
-    found = manifest_of_bag(bag, Path.cwd())
-    if found.folder != Path.cwd().resolve():
-        name = found.content["path"]
-        show.note(f"the manifest names {name} only: save it in {found.folder}, or give --data-root {found.folder}")
+    proposal = manifest_of_bag(bag, Path.cwd())
+    if proposal.folder != Path.cwd().resolve():
+        name = proposal.content["path"]
+        show.note(
+            f"the manifest names {name} only: save it in {proposal.folder}, or give --data-root {proposal.folder}"
+        )
     if json:
-        show.document({"manifest": found.content, "remarks": found.remarks})
+        show.document({"manifest": proposal.content, "remarks": proposal.remarks})
     else:
-        show.lines(found.text.rstrip("\n"))
+        show.lines(proposal.text.rstrip("\n"))
 
 
 def info_of_bag(bag: Path, json: Json) -> None:
     """Print the topics of a bag."""
     from factorgraph_loc.io.bags.manifest import manifest_of_bag
 
-    found = manifest_of_bag(bag, Path.cwd())
+    proposal = manifest_of_bag(bag, Path.cwd())
     if json:
-        show.document({"bag": str(bag), "duration": found.duration, "topics": found.topics})
+        show.document({"bag": str(bag), "duration": proposal.duration, "topics": proposal.topics})
         return
-    show.fields({"bag": str(bag), "duration": f"{found.duration:.1f} s"})
+    show.fields({"bag": str(bag), "duration": f"{proposal.duration:.1f} s"})
     show.line()
     header = ("topic", "type", "messages", "rate [Hz]", "looks like")
-    show.table(header, [_topic_row(topic) for topic in found.topics])
+    show.table(header, [_topic_row(topic) for topic in proposal.topics])
     show.line()
     show.line(f"`fgloc manifest {bag} > run.toml` proposes a manifest; then `fgloc info run.toml` shows the content")
 

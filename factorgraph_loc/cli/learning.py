@@ -49,12 +49,12 @@ def calibrate(
     loaded = source.load(logs)
     show.first_use()
     with show.progress("calibrating", counted=True) as progress:
-        found = learning.calibrate(loaded, out, overwrite=overwrite, progress=progress)
-    show.warnings(found.doubts)
+        result = learning.calibrate(loaded, out, overwrite=overwrite, progress=progress)
+    show.warnings(result.doubts)
     if json:
-        show.document(report.document(found) | {"files": {"rig": str(out), "report": str(page)}})
+        show.document(report.document(result) | {"files": {"rig": str(out), "report": str(page)}})
         return
-    for line in report.summary(found):
+    for line in report.summary(result):
         show.line(line)
     show.line(f"the rig is in {out}, the report in {page}")
 
@@ -149,55 +149,55 @@ if TYPE_CHECKING:
     Made = LandmarkMap | MadeTags | PointReport | DroppedTags
 
 
-def tell(found: Made) -> tuple[str, ...]:
+def tell(made: Made) -> tuple[str, ...]:
     """Print the table of map elements, if any, and return further lines."""
     from factorgraph_loc.experiments.maps import DroppedTags
     from factorgraph_loc.mapping.mapping import LandmarkMap
     from factorgraph_loc.mapping.tag_mapping import MadeTags
 
-    if isinstance(found, DroppedTags):
-        if found.dropped:
-            _table(("dropped tag", "P(dead)"), [(name, f"{dead:.4f}") for name, dead in found.dropped.items()])
-        count = len(found.dropped)
-        return (f"believed dead and not in the new map: {count} of {count + found.kept} tags",)
-    if isinstance(found, LandmarkMap):
-        _table(("landmark", *COLUMNS), _rows(found, {}))
-        return (found.summary(), *_notes(found))
-    if isinstance(found, MadeTags):
-        _table(("tag", *COLUMNS), _rows(found.made, _reasons(found)))
-        return (found.made.summary("tags"), *_notes_on_tags(found))
+    if isinstance(made, DroppedTags):
+        if made.dropped:
+            _table(("dropped tag", "P(dead)"), [(name, f"{dead:.4f}") for name, dead in made.dropped.items()])
+        count = len(made.dropped)
+        return (f"believed dead and not in the new map: {count} of {count + made.kept} tags",)
+    if isinstance(made, LandmarkMap):
+        _table(("landmark", *COLUMNS), _rows(made, {}))
+        return (made.summary(), *_notes(made))
+    if isinstance(made, MadeTags):
+        _table(("tag", *COLUMNS), _rows(made.made, _reasons(made)))
+        return (made.made.summary("tags"), *_notes_on_tags(made))
     return (
-        f"{found.points} points are in the new map, with {found.observations} observations in {found.keyframes} keyframes"
-        + (f", {found.fused} of them known before" if found.fused else ""),
-        f"reprojection residual: {found.rms:.2f} px root mean square, {found.mad:.2f} px median",
-        f"parallax {found.parallax:.3f} rad, standard deviation in the worst direction {found.sigma:.3f} m (medians)",
-        f"the cameras were moved by {found.shifted:.3f} m and {found.turned:.4f} rad (medians)",
+        f"{made.points} points are in the new map, with {made.observations} observations in {made.keyframes} keyframes"
+        + (f", {made.fused} of them known before" if made.fused else ""),
+        f"reprojection residual: {made.rms:.2f} px root mean square, {made.mad:.2f} px median",
+        f"parallax {made.parallax:.3f} rad, standard deviation in the worst direction {made.sigma:.3f} m (medians)",
+        f"the cameras were moved by {made.shifted:.3f} m and {made.turned:.4f} rad (medians)",
     )
 
 
-def document(found: Made) -> dict[str, Any]:
+def document(made: Made) -> dict[str, Any]:
     """All figures as plain values."""
     from factorgraph_loc.mapping.mapping import LandmarkMap
     from factorgraph_loc.mapping.tag_mapping import MadeTags
 
-    if isinstance(found, LandmarkMap):
-        landmarks = [{"landmark": name} | entry for name, entry in _entries(found, {}).items()]
-        return {"landmarks": landmarks, "summary": found.summary(), "notes": _notes(found)}
-    if not isinstance(found, MadeTags):
-        return asdict(found)
-    facing = {name: tag.facing for name, tag in found.world.tags.items()}
-    entries = _entries(found.made, _reasons(found))
+    if isinstance(made, LandmarkMap):
+        landmarks = [{"landmark": name} | entry for name, entry in _entries(made, {}).items()]
+        return {"landmarks": landmarks, "summary": made.summary(), "notes": _notes(made)}
+    if not isinstance(made, MadeTags):
+        return asdict(made)
+    facing = {name: tag.facing for name, tag in made.world.tags.items()}
+    entries = _entries(made.made, _reasons(made))
     modes = {
         name: [{"weight": m.weight, "position": m.position.tolist()} for m in modes]
-        for name, modes in found.modes.items()
+        for name, modes in made.modes.items()
     }
     return {
         "tags": [{"tag": name, "facing": facing.get(name)} | entry for name, entry in entries.items()],
-        "not_located": _reasons(found),
+        "not_located": _reasons(made),
         "modes": modes,
-        "rms": math.nan if found.rms is None else found.rms,
-        "summary": found.made.summary("tags"),
-        "notes": _notes_on_tags(found),
+        "rms": math.nan if made.rms is None else made.rms,
+        "summary": made.made.summary("tags"),
+        "notes": _notes_on_tags(made),
     }
 
 

@@ -121,7 +121,9 @@ def _summary(sensor: SensorDescription) -> dict[str, Any]:
 
 
 def _document(sensor: SensorDescription) -> dict[str, Any]:
-    tables = [{"name": name, "columns": [_column(one) for one in columns]} for name, columns in sensor.tables.items()]
+    tables = [
+        {"name": name, "columns": [_column(column) for column in columns]} for name, columns in sensor.tables.items()
+    ]
     return {**_summary(sensor), "tables": tables, "settings": sensor.rig}
 
 
@@ -164,5 +166,7 @@ def _print_settings(settings: Sequence[Setting], hint: str = "", word: str = "se
         show.line(hint)
 
 
-def _estimates(found: Description) -> str:
-    return ", ".join(name for name, there in (("causal", found.causal), ("smoothed", found.smoothed)) if there)
+def _estimates(estimator: Description) -> str:
+    return ", ".join(
+        name for name, is_given in (("causal", estimator.causal), ("smoothed", estimator.smoothed)) if is_given
+    )

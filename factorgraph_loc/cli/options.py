@@ -193,20 +193,20 @@ def parse_list(text: str) -> tuple[str, ...]:
 
 
 def parse_settings(
-    texts: Sequence[str], estimators: Sequence[str], others: Sequence[str] = ()
+    texts: Sequence[str], estimators: Sequence[str], sections: Sequence[str] = ()
 ) -> dict[str, dict[str, Any]]:
-    """``smoother.lag=10`` as {"smoother": {"lag": 10}}; InputError for an estimator that is not run. ``others``: names that are
+    """``smoother.lag=10`` as {"smoother": {"lag": 10}}; InputError for an estimator that is not run. ``sections``: names that are
     no estimators."""
     from factorgraph_loc.files.models import set_key
     from factorgraph_loc.fusion.registry import check_names
 
-    settings: dict[str, Any] = {name: {} for name in (*estimators, *others)}
+    settings: dict[str, Any] = {name: {} for name in (*estimators, *sections)}
     for text in texts:
         key, value = key_and_value(text, "--set")
         estimator, dot, _ = key.partition(".")
         if not dot or not all(key.split(".")):
             raise InputError(f"--set is {quoted(text)}, expected NAME.key=value, such as smoother.lag=10")
-        if estimator not in others:
+        if estimator not in sections:
             check_names([estimator])
         if estimator not in settings:
             raise InputError(f"--set is {quoted(text)}, but {estimator} is not run here; run: {listed(estimators)}")

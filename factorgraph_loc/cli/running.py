@@ -74,7 +74,7 @@ def run(
     loaded = source.load_one(log)
     show.first_use()
     with show.progress(estimator, counted=False) as report:
-        found = running.run(
+        outcome = running.run(
             loaded,
             estimator,
             settings=settings[estimator],
@@ -84,7 +84,7 @@ def run(
             progress=lambda share: report(share, 1.0),
             **options.given(),
         )
-    result, scores = found.result, found.scores
+    result, scores = outcome.result, outcome.scores
     show.warnings(scores["warnings"])
     if json:
         show.document(scores)
@@ -93,11 +93,11 @@ def run(
     _print_further(scores, rpe=options.rpe)
     _print_consistency(scores)
     _print_learnt(result)
-    if found.learnt:
+    if outcome.learnt:
         from factorgraph_loc.calibration.report import constants_table
 
         show.line("learnt from the log, for the final trajectory alone:")
-        show.table(*constants_table(found.learnt))
+        show.table(*constants_table(outcome.learnt))
     _print_events(result)
     _print_effort(scores)
     show.line()
@@ -187,9 +187,11 @@ def _print_further(scores: Mapping[str, Any], *, rpe: bool) -> None:
 
     for title, keys in further_tables([scores], rpe=rpe).items():
         metrics = {kind: [metric_of(key) for key in keys if key.startswith(kind)] for kind in KINDS}
-        rows = [(kind, *(number(scores[one.key], one.digits) for one in some)) for kind, some in metrics.items()]
+        rows = [
+            (kind, *(number(scores[metric.key], metric.digits) for metric in some)) for kind, some in metrics.items()
+        ]
         if any(cell != "-" for row in rows for cell in row[1:]):
-            names = [one.column.removeprefix(f"{KINDS[0]} ") for one in metrics[KINDS[0]]]
+            names = [metric.column.removeprefix(f"{KINDS[0]} ") for metric in metrics[KINDS[0]]]
             show.line(f"{title}:")
             show.table(("", *names), rows)
 

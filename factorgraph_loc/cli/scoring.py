@@ -67,14 +67,14 @@ def score(
     from factorgraph_loc.api import results
     from factorgraph_loc.evaluation.trajectories.page import errors_table, extents
 
-    found = results.score(estimate, reference, **vars(options))
-    show.warnings(found.warnings)
+    result = results.score(estimate, reference, **vars(options))
+    show.warnings(result.warnings)
     if json:
-        show.document(found.document())
+        show.document(result.document())
         return
-    show.fields(extents(found))
+    show.fields(extents(result))
     show.line()
-    show.table(*errors_table(found))
+    show.table(*errors_table(result))
     if options.out is not None:
         show.line()
         show.line(f"results are in {options.out}: report.html, score.json, errors.csv, plots/")

@@ -27,8 +27,8 @@ def line(text: str = "") -> None:
 
 def lines(text: str) -> None:
     """Print text of several lines on stdout, such as a file."""
-    for one in text.split("\n"):
-        line(one)
+    for row in text.split("\n"):
+        line(row)
 
 
 def note(text: str) -> None:
@@ -38,8 +38,8 @@ def note(text: str) -> None:
 
 def warnings(texts: Sequence[str]) -> None:
     """Print warnings on stderr, one per line; only the first :data:`WARNINGS` of them."""
-    for one in texts[:WARNINGS]:
-        note(f"warning: {one_line(one)}")
+    for text in texts[:WARNINGS]:
+        note(f"warning: {one_line(text)}")
     if len(texts) > WARNINGS:
         note(f"warning: {len(texts) - WARNINGS} more are listed with the results")
 

@@ -88,14 +88,14 @@ def simulate(
     if "images" in changes and not images:
         raise InputError("--image-rate and --set images.KEY configure images, expected --images with them")
     settings = named_settings(what, changes)
-    looks = None
+    observations = None
     if recorded is not None:
-        looks = recorded_looks(LogOptions(data_root=data_root).load([recorded]))
+        observations = recorded_looks(LogOptions(data_root=data_root).load([recorded]))
     written = []
     for number in chosen:
         folder = out if seeds is None else out / file_name(f"{settings.name}-{number}")
         with show.progress(folder.name, counted=True) as tell:
-            log = logs.simulate(settings, number, recorded=looks, images=images, out=folder, progress=tell)
+            log = logs.simulate(settings, number, recorded=observations, images=images, out=folder, progress=tell)
         for warning in log.warnings:
             show.note(f"warning: {log.name}: {warning}")
         if not json:

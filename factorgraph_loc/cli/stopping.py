@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.text import told
+from factorgraph_loc.text import error_text
 
 AGAIN = 0.05  # s
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
@@ -61,12 +61,12 @@ def stoppable() -> Iterator[None]:
     A second signal ends the process as usual. If Python cannot propagate the exception, in a destructor or callback, the signal
     is sent again.
     """
-    before: dict[signal.Signals, Any] = {}
+    handlers: dict[signal.Signals, Any] = {}
     hook = sys.unraisablehook
 
     def stop(number: int, _: FrameType | None) -> None:
-        for one in before:
-            signal.signal(one, signal.SIG_DFL)
+        for signum in handlers:
+            signal.signal(signum, signal.SIG_DFL)
         raise Stop(number)
 
     def lost(unraisable: Any) -> None:
@@ -77,16 +77,16 @@ def stoppable() -> Iterator[None]:
         else:
             hook(unraisable)
 
-    for one in WORDS:
-        if signal.getsignal(one) not in (signal.SIG_IGN, None):
-            before[one] = signal.signal(one, stop)
+    for signum in WORDS:
+        if signal.getsignal(signum) not in (signal.SIG_IGN, None):
+            handlers[signum] = signal.signal(signum, stop)
     sys.unraisablehook = lost
     try:
         yield
     finally:
         sys.unraisablehook = hook
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        for signum, handler in handlers.items():
+            signal.signal(signum, handler)
 
 
 class OutputError(InputError):
@@ -113,7 +113,7 @@ class _Output(io.TextIOWrapper):
         _discard(1)
         if isinstance(error, BrokenPipeError):
             raise SystemExit(PIPE_CLOSED) from error
-        raise OutputError(f"standard output: cannot be written: {told(error)}") from error
+        raise OutputError(f"standard output: cannot be written: {error_text(error)}") from error
 
 
 class _Messages(_Output):

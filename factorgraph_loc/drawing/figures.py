@@ -91,8 +91,8 @@ def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:
     if entries:
         labels = [plain(label, _LABEL) for label in entries]
         columns = min(len(labels), max(1, _LEGEND // (max(map(len, labels)) + _SIGN)))
-        look = {"ncols": columns, "fontsize": 13, "markerscale": markers}
-        figure.legend(entries.values(), labels, loc="lower center", **look)
+        style = {"ncols": columns, "fontsize": 13, "markerscale": markers}
+        figure.legend(entries.values(), labels, loc="lower center", **style)
 
 
 @contextmanager

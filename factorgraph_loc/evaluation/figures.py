@@ -68,7 +68,7 @@ class Track:
     @classmethod
     def read(cls, files: ResultFiles, max_gap: float = MAX_GAP) -> Track:
         """The data in the files of a run."""
-        causal, final = (found.trajectory for found in files.estimates().values())
+        causal, final = (estimates.trajectory for estimates in files.estimates().values())
         return cls(causal if len(causal) else None, final, files.innovations(), files.events(), max_gap)
 
     def kinds(self) -> tuple[tuple[str, Trajectory | None], tuple[str, Trajectory | None]]:
@@ -95,7 +95,7 @@ def with_pauses(t: Array, values: Array) -> tuple[Array, Array]:
     return np.insert(t, breaks, np.nan), np.insert(values, breaks, np.nan, axis=0)
 
 
-def way(trajectory: Trajectory) -> Array:
+def gapped_path(trajectory: Trajectory) -> Array:
     """The positions (N, 2) of a trajectory, with a row of NaN in each gap."""
     return with_pauses(trajectory.t, trajectory.poses[:, :2])[1]
 
@@ -106,8 +106,8 @@ def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
     None if there is neither.
     """
     # empty innovations have no degrees of freedom
-    told = {s: rows[(rows[:, 2] > 0.0) & np.isfinite(rows[:, 1])] for s, rows in track.nis.items()}
-    sensors = sorted(sensor for sensor, values in told.items() if len(values))
+    innovations = {s: rows[(rows[:, 2] > 0.0) & np.isfinite(rows[:, 1])] for s, rows in track.nis.items()}
+    sensors = sorted(sensor for sensor, values in innovations.items() if len(values))
     rows: list[Any] = [["causal", "final"]] if log.reference is not None else []
     rows += [[f"nis.{sensor}"] * 2 for sensor in sensors]
     if not rows:
@@ -122,7 +122,7 @@ def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
         for kind in ("causal", "final"):
             axes[kind].set_ylim(limits[:, 0].min(), limits[:, 1].max())
     for sensor in sensors:
-        _nis(axes[f"nis.{sensor}"], sensor, told[sensor])
+        _nis(axes[f"nis.{sensor}"], sensor, innovations[sensor])
     start, end = track.final.t[0], track.final.t[-1]
     for axis in axes.values():
         mark_events(axis, track.events)

@@ -91,9 +91,9 @@ def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) 
     per_log = np.array([average(cluster, rms=rms)[0] for cluster in clusters])
     units, enough = _units(clusters)
     low, high = bounds(draw_pooled(clusters, rms=rms)[:, 0]) if enough else (None, None)
-    spread = clusters[0] if units == "seeds" else per_log
+    values = clusters[0] if units == "seeds" else per_log
     value = float(average(per_log[:, None], rms=rms)[0])
-    return Pooled(value, low, high, float(spread.min()), float(spread.max()), units, len(spread), len(clusters))
+    return Pooled(value, low, high, float(values.min()), float(values.max()), units, len(values), len(clusters))
 
 
 def contrast(
@@ -104,10 +104,10 @@ def contrast(
     One that ran with one seed is paired with each seed of the other. ``interval``: whether to compute the interval, which takes
     time. ``alike``: see :func:`pooled`; ``by_log`` lists these logs separately.
     """
-    found = {log: pair_seeds(a[log], b[log]) for log in a if log in b}
-    left_out = sum(missing for _, missing in found.values()) + sum(len(b[log]) for log in b if log not in a)
+    matched = {log: pair_seeds(a[log], b[log]) for log in a if log in b}
+    left_out = sum(missing for _, missing in matched.values()) + sum(len(b[log]) for log in b if log not in a)
     left_out += sum(len(a[log]) for log in a if log not in b)
-    scores = {log: both for log, (both, _) in found.items() if len(both)}
+    scores = {log: both for log, (both, _) in matched.items() if len(both)}
     clusters = _clusters(scores, alike)
     if not clusters:
         return None
@@ -145,7 +145,7 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
-    found: list[dict[str, Any]] = []
+    compared: list[dict[str, Any]] = []
     for metric in COMPARED:
         scores: dict[str, dict[str, dict[int, float | None]]] = {name: {log: {} for log in logs} for name in names}
         for row in rows:
@@ -162,8 +162,8 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
                 lines.append(("(all)", *values, total.low, total.high, total.pairs, total.left_out))
             for log, x, y, *rest in lines:
                 cells = (metric, a, b, log, x, y, None if x is None else x - y, *rest)
-                found.append(dict(zip(DIFFERENCES, cells, strict=True)))
-    return found
+                compared.append(dict(zip(DIFFERENCES, cells, strict=True)))
+    return compared
 
 
 def signed_rank(differences: Array) -> float:
@@ -179,11 +179,11 @@ def signed_rank(differences: Array) -> float:
         # the continuity correction is half a step of the rank sum, which is doubled here
         z = (extreme + 1.0 - total / 2.0) / math.sqrt(float(np.sum(np.square(doubled.astype(float)))) / 4.0)
         return min(1.0, 2.0 * float(ndtr(z)))
-    ways = np.zeros(total + 1)
-    ways[0] = 1.0
+    counts = np.zeros(total + 1)
+    counts[0] = 1.0
     for rank in doubled.tolist():
-        ways[rank:] += ways[:-rank].copy()
-    return min(1.0, 2.0 * float(ways[: extreme + 1].sum() / ways.sum()))
+        counts[rank:] += counts[:-rank].copy()
+    return min(1.0, 2.0 * float(counts[: extreme + 1].sum() / counts.sum()))
 
 
 def rank_biserial(differences: Array) -> float:
@@ -198,8 +198,8 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     tested = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     largest = 0.0
-    for before, (p, i) in enumerate(tested):
-        largest = max(largest, min(1.0, (len(tested) - before) * p))
+    for rank, (p, i) in enumerate(tested):
+        largest = max(largest, min(1.0, (len(tested) - rank) * p))
         corrected[i] = largest
     return corrected
 
@@ -249,9 +249,9 @@ def _ranks(differences: Array) -> Array:
 def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> list[Array]:
     """The scores (K, C) of each log that has any, with those of ``alike`` logs merged."""
     merged: dict[str, list[Array]] = {}
-    for log, found in scores.items():
-        if len(found):
-            merged.setdefault((alike or {}).get(log, log), []).append(found)
+    for log, values in scores.items():
+        if len(values):
+            merged.setdefault((alike or {}).get(log, log), []).append(values)
     return [np.concatenate(parts) for parts in merged.values()]
 
 

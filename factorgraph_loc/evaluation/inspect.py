@@ -47,9 +47,9 @@ class Inspection:
         return {layer: count for summary in self.sensors.values() for layer, count in summary.in_map.items()}
 
     def __getattr__(self, name: str) -> Any:
-        found = self.found if "sensors" in self.__dict__ else {}  # missing while being unpickled
-        if name in found:
-            return found[name]
+        results = self.found if "sensors" in self.__dict__ else {}  # missing while being unpickled
+        if name in results:
+            return results[name]
         raise AttributeError(f"an inspection has no {name!r}")
 
 

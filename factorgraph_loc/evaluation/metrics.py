@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.pairing import CONFIDENCE, TOLERANCE, Pairs, align_points, pairs, rms, spread
+from factorgraph_loc.evaluation.pairing import CONFIDENCE, TOLERANCE, Pairs, align_points, pairs, rms, summarize
 from factorgraph_loc.evaluation.scores import ACCURACY, ALIGNED, OF_FREE_MAP
 from factorgraph_loc.evaluation.trajectories.association import in_plane
 from factorgraph_loc.evaluation.trajectories.score import pose_errors, score_paths
@@ -139,8 +139,8 @@ def _aligned(trajectory: Trajectory | None, log: Log, align: Alignment, max_gap:
     if trajectory is None or log.reference is None or not len(trajectory):
         return {}
     paths = path_of(trajectory, log.name), path_of(log.reference, "the reference")
-    found = score_paths(*paths, align, "interpolate", max_gap=max_gap).figures
-    return {name: found[f"ape.{name.removeprefix('aligned_')}"] for name in ALIGNED}
+    scored = score_paths(*paths, align, "interpolate", max_gap=max_gap).figures
+    return {name: scored[f"ape.{name.removeprefix('aligned_')}"] for name in ALIGNED}
 
 
 def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: float = MAX_GAP) -> dict[str, Any]:
@@ -160,7 +160,7 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
         return figures
     e = errors(trajectory, reference, max_gap)
     for name, values in (("position", e.position), ("heading", e.heading)):
-        statistics = spread(values)
+        statistics = summarize(values)
         figures |= {key: value for how, value in statistics.items() if (key := f"{name}_{how}") in ACCURACY}
     _, per_m, per_s = pose_errors(in_plane(Pairs(e.t, e.poses, None, e.reference), trajectory, reference))
     for unit, relative in (("m", per_m), ("s", per_s)):
@@ -241,8 +241,8 @@ def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
     for sensor, rows in sorted(diagnostics.nis.items()):
         if rows:
             _, nis, dof = np.array(rows, dtype=float).T
-            told = (dof > 0.0) & np.isfinite(nis)
-            nis, dof = nis[told], dof[told]
+            valid = (dof > 0.0) & np.isfinite(nis)
+            nis, dof = nis[valid], dof[valid]
             # not the mean, which a few outliers dominate
             figures[f"nis.{sensor}.median_ratio"] = (
                 float(np.median(nis / chi_squared.quantile(0.5, dof))) if len(nis) else None

@@ -69,13 +69,13 @@ def pairs(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GA
 
 
 def pairs_in_space(
-    found: Trajectory3, reference: Trajectory3, max_gap: float = MAX_GAP
+    estimate: Trajectory3, reference: Trajectory3, max_gap: float = MAX_GAP
 ) -> tuple[Trajectory3, Trajectory3]:
     """The same in space: estimates and true poses, only where both exist."""
     rows = thinned(reference.t)
-    at = _within(reference.t[rows], found.t)
-    valid = found.spans(at, max_gap=max_gap)
-    return found.at(at[valid]), reference.rows(rows[valid])
+    at = _within(reference.t[rows], estimate.t)
+    valid = estimate.spans(at, max_gap=max_gap)
+    return estimate.at(at[valid]), reference.rows(rows[valid])
 
 
 def pauses(t: Array) -> Integers:
@@ -115,7 +115,7 @@ def rms(values: Array) -> float | None:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
-def spread(values: Array) -> dict[str, float | None]:
+def summarize(values: Array) -> dict[str, float | None]:
     """Statistics of the finite values by the names of :data:`HOW`, None without any."""
     values = values[np.isfinite(values)]
     if not len(values):
@@ -134,29 +134,29 @@ def spread(values: Array) -> dict[str, float | None]:
 def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
     """Pieces, one after the other, as indices of first and last pose, for the ``steps`` (N - 1,) between N poses that are numbered
     from ``first``: each ends at the first pose at which the steps since its beginning sum up to ``length`` or more."""
-    found: list[tuple[int, int]] = []
+    pieces: list[tuple[int, int]] = []
     begin, covered = first, 0.0
     for i, step in enumerate(steps.tolist(), start=first + 1):
         covered += step
         if covered >= length:
-            found.append((begin, i))
+            pieces.append((begin, i))
             begin, covered = i, 0.0
-    return found
+    return pieces
 
 
 def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
     """The same for pieces that may overlap: from each pose to that later one whose distance is nearest to ``length``, the first of
     several, if it differs from that by at most :data:`PIECE_TOLERANCE` of it."""
     covered = np.concatenate(([0.0], np.cumsum(steps))).tolist()
-    found: list[tuple[int, int]] = []
-    for i, here in enumerate(covered[:-1]):
-        after = bisect.bisect_left(covered, here + length, i + 1)
-        near = [j for j in (after - 1, after) if i < j < len(covered)]
-        best = min(near, key=lambda j: abs(covered[j] - here - length))
+    pieces: list[tuple[int, int]] = []
+    for i, start in enumerate(covered[:-1]):
+        next_index = bisect.bisect_left(covered, start + length, i + 1)
+        near = [j for j in (next_index - 1, next_index) if i < j < len(covered)]
+        best = min(near, key=lambda j: abs(covered[j] - start - length))
         best = bisect.bisect_left(covered, covered[best], i + 1)  # the first of those that stand still
-        if abs(covered[best] - here - length) <= PIECE_TOLERANCE * length:
-            found.append((first + i, first + best))
-    return found
+        if abs(covered[best] - start - length) <= PIECE_TOLERANCE * length:
+            pieces.append((first + i, first + best))
+    return pieces
 
 
 def between(count: int, breaks: Iterable[int]) -> list[tuple[int, int]]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from factorgraph_loc.drawing.figures import COLOURS, grid, legend, styles
-from factorgraph_loc.evaluation.figures import Track, consistency, mark_events, way, with_pauses, write_picture
+from factorgraph_loc.evaluation.figures import Track, consistency, gapped_path, mark_events, with_pauses, write_picture
 from factorgraph_loc.evaluation.metrics import Errors, errors
 from factorgraph_loc.files.models import file_name
 from factorgraph_loc.model.log import Log
@@ -92,7 +92,7 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
         for (estimator, track), style in zip(tracks.items(), styles(), strict=False):
             kind, trajectory = track.kinds()[i]
             if trajectory is not None:
-                axis.plot(*way(trajectory).T, label=estimator, linewidth=1.2, zorder=3, **style)
+                axis.plot(*gapped_path(trajectory).T, label=estimator, linewidth=1.2, zorder=3, **style)
                 axis.plot(*trajectory.poses[0, :2], "o", color=style["color"], markersize=5, zorder=4)
             axis.set_title(f"{kind} (dot: start)")
     legend(figure, axes[0])
@@ -105,26 +105,37 @@ def overview(log: Log, odometry: Trajectory | None) -> Figure:
     figure, axes = grid(1, 1, height, log.name)
     _map(axes[0, 0], log, view)
     if odometry is not None and len(odometry):
-        axes[0, 0].plot(*way(odometry).T, label="odometry", linewidth=1.2, zorder=3, color=COLOURS[0])
+        axes[0, 0].plot(*gapped_path(odometry).T, label="odometry", linewidth=1.2, zorder=3, color=COLOURS[0])
         axes[0, 0].plot(*odometry.poses[0, :2], "o", label="start", color=COLOURS[0], markersize=5, zorder=4)
     legend(figure, axes[0])
     return figure
 
 
-def reliability_diagram(log: Log, estimator: str, found: Mapping[str, Reliability]) -> Figure:
+def reliability_diagram(log: Log, estimator: str, reliability: Mapping[str, Reliability]) -> Figure:
     """Detections that were observed over those that were predicted, by group, with two-sigma bars about what is predicted."""
-    figure, axes = grid(len(found), 1, 3.2 * len(found), f"{log.name}, {estimator}: observed over predicted detections")
-    for axis, one in zip(axes[:, 0], found.values(), strict=True):
-        place = np.arange(len(one.groups))
+    figure, axes = grid(
+        len(reliability), 1, 3.2 * len(reliability), f"{log.name}, {estimator}: observed over predicted detections"
+    )
+    for axis, sensor in zip(axes[:, 0], reliability.values(), strict=True):
+        place = np.arange(len(sensor.groups))
         label = "what a right model leaves to chance (2 sigma)"
         axis.errorbar(
-            place, np.ones(len(place)), 2.0 * one.spread / one.predicted, fmt="none", color=COLOURS[1], label=label
+            place,
+            np.ones(len(place)),
+            2.0 * sensor.spread / sensor.predicted,
+            fmt="none",
+            color=COLOURS[1],
+            label=label,
         )
         axis.plot(
-            place, one.observed / one.predicted, "o", color=COLOURS[0], label=f"{one.what}, observed over predicted"
+            place,
+            sensor.observed / sensor.predicted,
+            "o",
+            color=COLOURS[0],
+            label=f"{sensor.what}, observed over predicted",
         )
         axis.axhline(1.0, color="0.7", linewidth=0.8, zorder=1)
-        axis.set_xticks(place, one.groups, rotation=40, ha="right")
+        axis.set_xticks(place, sensor.groups, rotation=40, ha="right")
         axis.set_ylim(bottom=0.0)
     legend(figure, axes[:, 0])
     return figure
@@ -136,11 +147,13 @@ def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -
     figure, axes = grid(
         len(rows), 2, 3.0 * len(rows), f"{log.name}, {estimator}: errors, with 2-sigma bands", shared=True
     )
-    found = [None if one is None else errors(one, reference, track.max_gap) for _, one in track.kinds()]
+    all_errors = [
+        None if estimated is None else errors(estimated, reference, track.max_gap) for _, estimated in track.kinds()
+    ]
     for column, (kind, trajectory) in enumerate(track.kinds()):
         axes[0, column].set_title(kind)
         axes[-1, column].set_xlabel("time [s]")
-        e = found[column]
+        e = all_errors[column]
         if trajectory is None or e is None:
             for axis in axes[:, column]:
                 axis.text(0.5, 0.5, "no causal estimate", ha="center", transform=axis.transAxes, color="0.4")
@@ -150,7 +163,7 @@ def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -
             mark_events(axes[row, column], track.events)
     for row, (what, unit) in enumerate(rows):
         limit = max(
-            (_extent(e, t, row) for e, (_, t) in zip(found, track.kinds(), strict=True) if e and t), default=1.0
+            (_extent(e, t, row) for e, (_, t) in zip(all_errors, track.kinds(), strict=True) if e and t), default=1.0
         )
         axes[row, 0].set(ylim=(-limit, limit), ylabel=f"error in {what} [{unit}]")
     legend(figure, axes[0])
@@ -180,14 +193,14 @@ def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Tra
 def _map(axis: Axes, log: Log, view: Array | None) -> None:
     """Draw walls, map objects and reference; ``view`` (2, 2): lower and upper corner of the axes, None for all that is drawn."""
     if log.reference is not None:
-        axis.plot(*way(log.reference).T, color="0.75", linewidth=4.0, label="reference", zorder=1)
+        axis.plot(*gapped_path(log.reference).T, color="0.75", linewidth=4.0, label="reference", zorder=1)
     walls = np.array(log.world.walls).reshape(-1, 2, 2)
     if len(walls):
         axis.plot(*_joined(walls).T, color="0.45", linewidth=1.0, label="walls", zorder=1)
     for m in sorted(_layers(log), key=lambda m: m.order):
         if len(m.positions):
-            look: dict[str, Any] = {"markersize": m.size, "label": m.layer, "zorder": m.order}
-            axis.plot(*m.positions[:, :2].T, f"k{m.marker}", markerfacecolor="none", **look)
+            style: dict[str, Any] = {"markersize": m.size, "label": m.layer, "zorder": m.order}
+            axis.plot(*m.positions[:, :2].T, f"k{m.marker}", markerfacecolor="none", **style)
     axis.set_aspect("equal", adjustable="box")
     axis.set(xlabel="x [m]", ylabel="y [m]")
     if view is not None:

@@ -104,5 +104,5 @@ def metric_of(key: str) -> Metric:
         metric = of_trajectory[name]
         column = metric.column and f"{kind} {metric.column}"
         return replace(metric, key=key, title=f"{kind} {metric.title}", column=column)
-    others = OF_FREE_MAP | TIMINGS | LOCALIZED
-    return replace(others.get(key, Metric(key.replace("_", " "), better=None)), key=key)
+    further = OF_FREE_MAP | TIMINGS | LOCALIZED
+    return replace(further.get(key, Metric(key.replace("_", " "), better=None)), key=key)

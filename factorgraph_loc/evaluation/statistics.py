@@ -137,10 +137,10 @@ def _of_medians(
     # the original cases come first: their figure is the value
     cases = np.vstack((np.arange(len(first)), drawn))
     with np.errstate(invalid="ignore", divide="ignore"):
-        found = compare(np.median(first[cases], axis=1), np.median(second[cases], axis=1))
+        figures = compare(np.median(first[cases], axis=1), np.median(second[cases], axis=1))
     tail = (1.0 - CONFIDENCE) / 2.0
     # a draw in which both medians are infinite extends the interval to both sides
-    unknown = np.isnan(found[1:])
-    low = quantile(np.where(unknown, lowest, found[1:]), tail)
-    high = quantile(np.where(unknown, math.inf, found[1:]), 1.0 - tail)
-    return Interval(float(found[0]), low, high)
+    unknown = np.isnan(figures[1:])
+    low = quantile(np.where(unknown, lowest, figures[1:]), tail)
+    high = quantile(np.where(unknown, math.inf, figures[1:]), 1.0 - tail)
+    return Interval(float(figures[0]), low, high)

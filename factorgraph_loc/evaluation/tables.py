@@ -25,17 +25,17 @@ ALIKE = 0.01  # relative difference of errors within which estimators are equall
 def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ...]]:
     """The scores in each table that not all comparisons have, by its title: errors after an alignment, if the runs have one, and
     relative errors, if they are asked for."""
-    found: dict[str, tuple[str, ...]] = {}
+    tables: dict[str, tuple[str, ...]] = {}
     aligned = dict.fromkeys(row["scoring.align"] for row in rows if row.get("scoring.align"))
     if aligned:
-        found[f"errors after alignment by {', '.join(aligned)}"] = tuple(
+        tables[f"errors after alignment by {', '.join(aligned)}"] = tuple(
             f"{kind}.{name}" for kind in KINDS for name in ALIGNED
         )
     if rpe:
-        found["relative errors over a metre of path, and over a second"] = tuple(
+        tables["relative errors over a metre of path, and over a second"] = tuple(
             f"{kind}.{name}" for kind in KINDS for name in ACCURACY if name.startswith("rpe_") and name != "rpe_pieces"
         )
-    return found
+    return tables
 
 
 def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
@@ -78,8 +78,10 @@ def comparison_table(rows: Sequence[Row], shown: Sequence[str] = ()) -> Table:
     for i, name in enumerate(header):
         # wrap words to keep the table narrow; folded or truncated numbers would be worse
         table.add_column(Text(name.replace(" ", "\n")), justify="left" if i < 2 else "right", no_wrap=True)
-    for line, after in zip(lines, [*lines[1:], None], strict=True):
-        table.add_row(*(plain(cell, MESSAGE) for cell in line), end_section=after is None or after[0] != line[0])
+    for line, following in zip(lines, [*lines[1:], None], strict=True):
+        table.add_row(
+            *(plain(cell, MESSAGE) for cell in line), end_section=following is None or following[0] != line[0]
+        )
     return table
 
 
@@ -105,7 +107,7 @@ def verdict(rows: Sequence[Row]) -> list[str]:
     names = list(dict.fromkeys(row["estimator"] for row in rows))
     lines = []
     for kind in KINDS:
-        found: dict[str, float] = {}
+        errors: dict[str, float] = {}
         for name in names:
             scores = {
                 log: [r.get(f"{kind}.position_rmse") for r in rows if (r["log"], r["estimator"]) == (log, name)]
@@ -113,15 +115,15 @@ def verdict(rows: Sequence[Row]) -> list[str]:
             }
             known = [[v for v in values if v is not None] for values in scores.values()]
             if all(known) and sum(map(len, known)) == sum(map(len, scores.values())):
-                found[name] = pooled_rms([pooled_rms(values) for values in known])
-        if found:
-            best = min(found, key=found.__getitem__)
-            line = f"least {kind} position error: {best}, {found[best]:.3f} m"
-            near = [name for name in found if name != best and found[name] <= (1.0 + ALIKE) * found[best]]
+                errors[name] = pooled_rms([pooled_rms(values) for values in known])
+        if errors:
+            best = min(errors, key=errors.__getitem__)
+            line = f"least {kind} position error: {best}, {errors[best]:.3f} m"
+            near = [name for name in errors if name != best and errors[name] <= (1.0 + ALIKE) * errors[best]]
             if near:
                 line += f", within {ALIKE:.0%} of it {', '.join(near)}"
-            if BASELINE in found and best != BASELINE:
-                line += f" ({BASELINE}: {found[BASELINE]:.3f} m)"
+            if BASELINE in errors and best != BASELINE:
+                line += f" ({BASELINE}: {errors[BASELINE]:.3f} m)"
             lines.append(line)
     return lines
 
@@ -140,8 +142,8 @@ def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 def scored_of(row: Row) -> float | None:
     """Number of scored poses of a run's causal trajectory, else of the final one; None without a reference."""
-    found = (row.get(f"{kind}.scored") for kind in KINDS)
-    return next((count for count in found if count is not None), None)
+    counts = (row.get(f"{kind}.scored") for kind in KINDS)
+    return next((count for count in counts if count is not None), None)
 
 
 def _is_known(row: Row, figure: str) -> bool:

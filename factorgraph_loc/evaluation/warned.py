@@ -18,23 +18,23 @@ def row_of(scores: Mapping[str, Any]) -> dict[str, Any]:
 
 def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """The runs concerned by each warning, in order of appearance."""
-    found: dict[str, list[Row]] = {}
+    concerned: dict[str, list[Row]] = {}
     for row in rows:
         for text in (row.get(WARNINGS) or "").split("\n"):
             if text:
-                found.setdefault(text, []).append(row)
-    return found
+                concerned.setdefault(text, []).append(row)
+    return concerned
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
     """Each warning once, with the estimators concerned unless these are all that ran on the logs."""
-    told = []
+    texts = []
     for text, concerned in by_text(rows).items():
         logs = {row["log"] for row in concerned}
         all_of_them = dict.fromkeys(label_of(row) for row in rows if row["log"] in logs)
         some = dict.fromkeys(label_of(row) for row in concerned)
-        told.append(text if len(some) == len(all_of_them) else f"{text} ({', '.join(some)})")
-    return told
+        texts.append(text if len(some) == len(all_of_them) else f"{text} ({', '.join(some)})")
+    return texts
 
 
 def label_of(row: Row) -> str:

@@ -86,13 +86,13 @@ class ActiveJob:
         files = {METRICS: json_text(figures_of(run)).encode()}
         return files | ({PICTURE: png_bytes(run_picture(run))} if self.pictured else {})
 
-    def row(self, found: Mapping[str, Any]) -> Row:
-        """The row of the run, from its ``found`` row in the store."""
+    def row(self, stored: Mapping[str, Any]) -> Row:
+        """The row of the run, from its ``stored`` row in the store."""
         about = {"world": self.source, "policy": self.policy, "estimator": self.estimator, "seed": self.seed}
-        row = {name: found.get(name) for name in ROW} | about
+        row = {name: stored.get(name) for name in ROW} | about
         for name in ("localized", "claimed_wrong"):
             row[name] = None if row[name] is None else bool(row[name])
-        return row | ({"status": "refused"} if found["kind"] == "refused" else {})
+        return row | ({"status": "refused"} if stored["kind"] == "refused" else {})
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
     ``claimed_wrong``: runs that at some time claimed wrongly to be localized; median errors ``error_position`` [m] and
     ``error_heading`` [rad] and median ``seconds`` (simulated) of those that ended localized; ``planning_ms``: median over runs of
     the median time of a planning step."""
-    found = []
+    results = []
     for case in cases(rows):
         for policy in policies(rows):
             runs = runs_of(rows, case, policy)
@@ -75,7 +75,7 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
             ended = [row for row in runs if row["localized"]]
             failures = len(runs) - len(ended)
             low, high = wilson(failures, len(runs))
-            found.append(
+            results.append(
                 {
                     "world": case[0],
                     "estimator": case[1],
@@ -91,7 +91,7 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
                     "planning_ms": _median(runs, "planning_ms"),
                 }
             )
-    return found
+    return results
 
 
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -101,12 +101,12 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     interval; the numbers of seeds ``failed_only_a`` and ``failed_only_b``, and ``p`` of McNemar's exact test for equal failure
     rates.
     """
-    found = []
-    first, *others = policies(rows)
+    results = []
+    first, *further = policies(rows)
     for case in cases(rows):
         ours = {row["seed"]: row for row in runs_of(rows, case, first)}
-        for other in others:
-            theirs = {row["seed"]: row for row in runs_of(rows, case, other)}
+        for policy in further:
+            theirs = {row["seed"]: row for row in runs_of(rows, case, policy)}
             seeds = sorted(ours.keys() & theirs.keys())
             if not seeds:
                 continue
@@ -114,12 +114,12 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
             difference, ratio = median_difference(a, b), median_ratio(a, b)
             failed = mcnemar(np.isinf(a), np.isinf(b))
             values = (
-                *(*case, first, other, len(seeds)),
+                *(*case, first, policy, len(seeds)),
                 *(difference.value, difference.low, difference.high, ratio.value, ratio.low, ratio.high),
                 *(failed.only_a, failed.only_b, failed.p),
             )
-            found.append(dict(zip(DIFFERENCES, values, strict=True)))
-    return found
+            results.append(dict(zip(DIFFERENCES, values, strict=True)))
+    return results
 
 
 def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
@@ -127,16 +127,16 @@ def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     header = ["world", "policy", "estimator", "runs", "median [m]", "90 % [m]", "failed (95 %)", "claimed wrongly"]
     header += ["error [m]", "[deg]", "time [s]", "planning [ms]"]
     lines = []
-    for one in summaries(rows):
-        low, high = 100.0 * one["failures_low"], 100.0 * one["failures_high"]
+    for summary in summaries(rows):
+        low, high = 100.0 * summary["failures_low"], 100.0 * summary["failures_high"]
         lines.append(
             [
-                *(one["world"], one["policy"], one["estimator"], str(one["runs"])),
-                *(metres_text(one["median"]), metres_text(one["p90"])),
-                f"{one['failures']} ({low:.0f} % to {high:.0f} %)",
-                str(one["claimed_wrong"]),
-                *(_text(one["error_position"], 2), _text(np.degrees(one["error_heading"]), 1)),
-                *(_text(one["seconds"], 0), _text(one["planning_ms"], 1)),
+                *(summary["world"], summary["policy"], summary["estimator"], str(summary["runs"])),
+                *(metres_text(summary["median"]), metres_text(summary["p90"])),
+                f"{summary['failures']} ({low:.0f} % to {high:.0f} %)",
+                str(summary["claimed_wrong"]),
+                *(_text(summary["error_position"], 2), _text(np.degrees(summary["error_heading"]), 1)),
+                *(_text(summary["seconds"], 0), _text(summary["planning_ms"], 1)),
             ]
         )
     return header, lines
@@ -147,14 +147,19 @@ def difference_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     header = ["world", "policies", "estimator", "pairs", "difference [m] (95 %)", "ratio (95 %)"]
     header += ["failed only first / second", "p (McNemar)"]
     lines = []
-    for one in differences(rows):
-        difference = Interval(one["difference"], one["low"], one["high"])
-        ratio = Interval(one["ratio"], one["ratio_low"], one["ratio_high"])
+    for compared in differences(rows):
+        difference = Interval(compared["difference"], compared["low"], compared["high"])
+        ratio = Interval(compared["ratio"], compared["ratio_low"], compared["ratio_high"])
         lines.append(
             [
-                *(one["world"], f"{one['a']} / {one['b']}", one["estimator"], str(one["pairs"])),
+                *(
+                    compared["world"],
+                    f"{compared['a']} / {compared['b']}",
+                    compared["estimator"],
+                    str(compared["pairs"]),
+                ),
                 *(_interval_text(difference, 1), _interval_text(ratio, 2)),
-                *(f"{one['failed_only_a']} / {one['failed_only_b']}", f"{one['p']:.3f}"),
+                *(f"{compared['failed_only_a']} / {compared['failed_only_b']}", f"{compared['p']:.3f}"),
             ]
         )
     return header, lines
@@ -182,10 +187,10 @@ def _median(rows: Sequence[Row], key: str) -> float:
 
 def comparison(rows: Sequence[Row]) -> Figure:
     """For each world and estimator: a box plot per policy, and the fraction of runs localized over distance."""
-    found = cases(rows)
+    panels = cases(rows)
     seeds = len({row["seed"] for row in rows})
-    figure, axes = grid(len(found), 2, 4.2 * len(found) + 1.0, f"metres driven until localized, {seeds} runs of each")
-    for (world, estimator), (boxes, shares) in zip(found, axes, strict=True):
+    figure, axes = grid(len(panels), 2, 4.2 * len(panels) + 1.0, f"metres driven until localized, {seeds} runs of each")
+    for (world, estimator), (boxes, shares) in zip(panels, axes, strict=True):
         for axis in (boxes, shares):
             axis.set_title(f"{world}, {estimator}")
         _boxes(boxes, rows, (world, estimator))
@@ -212,8 +217,8 @@ def run_picture(run: ActiveRun) -> Figure:
             _step(axis, run, int(chosen[panel]))
         else:
             axis.set_axis_off()
-    driven, spread = [step.metres for step in run.steps], [_spread(step) for step in run.steps]
-    axes["belief"].semilogy(driven, np.maximum(spread, 1e-3), "o-", color=COLOURS[0], markersize=4)
+    driven, sigmas = [step.metres for step in run.steps], [_belief_sigma(step) for step in run.steps]
+    axes["belief"].semilogy(driven, np.maximum(sigmas, 1e-3), "o-", color=COLOURS[0], markersize=4)
     axes["belief"].axvline(run.metres, color="0.5", linestyle="--", label="end of the run")
     axes["belief"].set(xlabel="metres driven", ylabel="spread of the belief [m]")
     legend(figure, axes.values())
@@ -260,32 +265,32 @@ def _farthest(rows: Sequence[Row], case: tuple[str, str]) -> float:
 
 
 def _step(axis: Axes, run: ActiveRun, index: int) -> None:
-    one = run.steps[index]
+    step = run.steps[index]
     for i, (x1, y1, x2, y2) in enumerate(run.world.walls):
         axis.plot((x1, x2), (y1, y2), color="0.35", linewidth=1.0, label=None if i else "walls", zorder=1)
     tags = np.array([(tag.x, tag.y) for tag in run.world.tags.values()]).reshape(-1, 2)
     axis.plot(*tags.T, "s", color=COLOURS[-1], markersize=4, markerfacecolor="none", label="tags", zorder=2)
-    axis.plot(*one.particles[:, :2].T, ".", color=COLOURS[4], markersize=2, label="belief", zorder=3)
-    for i, path in enumerate(one.candidates):
+    axis.plot(*step.particles[:, :2].T, ".", color=COLOURS[4], markersize=2, label="belief", zorder=3)
+    for i, path in enumerate(step.candidates):
         axis.plot(*path[:, :2].T, color="0.7", linewidth=0.6, label=None if i else "candidates", zorder=2)
-    if one.chosen is not None:
-        axis.plot(*one.chosen[:, :2].T, color=COLOURS[1], linewidth=2.2, label="chosen", zorder=6)
-    x, y, heading = one.truth.tolist()
+    if step.chosen is not None:
+        axis.plot(*step.chosen[:, :2].T, color=COLOURS[1], linewidth=2.2, label="chosen", zorder=6)
+    x, y, heading = step.truth.tolist()
     along = (x, x + ARROW * math.cos(heading)), (y, y + ARROW * math.sin(heading))
     axis.plot(*along, color=COLOURS[0], linewidth=2.0, zorder=5)
     axis.plot(x, y, "o", color=COLOURS[0], markersize=6, label="robot (true)", zorder=5)
     truth = run.truth.poses
     driven = np.concatenate((np.zeros(1), np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))))
     last = index == len(run.steps) - 1
-    so_far = truth if last else truth[driven <= one.metres + 1e-6]
+    so_far = truth if last else truth[driven <= step.metres + 1e-6]
     axis.plot(*so_far[:, :2].T, color=COLOURS[0], linewidth=1.2, label="way (true)", zorder=4)
     low, high = _outline(run).min(axis=0), _outline(run).max(axis=0)
     axis.set(xlim=(low[0] - 0.5, high[0] + 0.5), ylim=(low[1] - 0.5, high[1] + 0.5))
     axis.set_aspect("equal", adjustable="box")
-    axis.set_title(f"after {one.metres:.1f} m" + (f", way to the end at {run.metres:.1f} m" if last else ""))
+    axis.set_title(f"after {step.metres:.1f} m" + (f", way to the end at {run.metres:.1f} m" if last else ""))
 
 
-def _spread(step: PlanningStep) -> float:
+def _belief_sigma(step: PlanningStep) -> float:
     """Root of the sum of the belief's variances in x and y [m]."""
     return float(np.sqrt(np.sum(np.var(step.particles[:, :2], axis=0))))
 

@@ -64,7 +64,7 @@ class CausalRun:
     progress: Callable[[float], None] = lambda _: None
     watch: Callable[[float, Estimator], None] | None = None
     end: float = math.inf
-    told: CausalEstimates = field(default_factory=CausalEstimates)
+    estimates: CausalEstimates = field(default_factory=CausalEstimates)
 
     def __post_init__(self) -> None:
         first, self._last = span_of(self.log, self.sensors)
@@ -154,7 +154,7 @@ class CausalRun:
         with self.guard.telling("the estimate", t):
             e = self.frame.estimate(sound(self.estimator.estimate(t)))
         self.guard.process(self.estimator, Tick(t))
-        self.told.add(t, e)
+        self.estimates.add(t, e)
         if self.watch is not None:
             self.watch(t, self.estimator)
         share = (t - self._start) / max(self._last - self._start, 1e-9)

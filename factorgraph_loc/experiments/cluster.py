@@ -23,7 +23,7 @@ from factorgraph_loc.experiments.execute import Executor, Files, Planned, Take, 
 from factorgraph_loc.experiments.keys import code_version, digest_of, library_versions
 from factorgraph_loc.experiments.log_source import GivenSource, LogSource, SimulatedSource
 from factorgraph_loc.experiments.plan import PlannedRun
-from factorgraph_loc.text import quoted, told
+from factorgraph_loc.text import error_text, quoted
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -64,7 +64,7 @@ class Cluster(Executor):
         try:
             self._client = self._distributed.Client(self._scheduler, timeout=CONNECT, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(f"{named}: no scheduler answers there: {told(error)}") from error
+            raise InputError(f"{named}: no scheduler answers there: {error_text(error)}") from error
         if not self._client.nthreads():
             self._client.close()
             raise InputError(f"{named}: it has no workers")
@@ -116,7 +116,7 @@ class Cluster(Executor):
             return _Made(failure("killed", "the workers that were given it died, one after the other"))
         if isinstance(error, FglocError):
             raise error
-        raise RunFailedError(f"a worker could not make a run: {type(error).__name__}: {told(error)}") from error
+        raise RunFailedError(f"a worker could not make a run: {type(error).__name__}: {error_text(error)}") from error
 
 
 def make(run: Planned, version: str, seconds: float) -> _Made:

@@ -51,10 +51,10 @@ class Comparison:
     warnings: list[str] = field(default_factory=list)
 
     def __repr__(self) -> str:
-        return told(self.rows)
+        return summary_text(self.rows)
 
 
-def told(rows: Sequence[Mapping[str, Any]]) -> str:
+def summary_text(rows: Sequence[Mapping[str, Any]]) -> str:
     """The table of runs, and what follows from it, as text."""
     best = verdict(rows) if len({row["estimator"] for row in rows}) > 1 else []
     failures = [f"failed: {row['log']}, {row['estimator']}: {row['reason']}" for row in rows if row["status"] != "ok"]
@@ -127,8 +127,8 @@ def _named(
     estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]], *, final_only: bool
 ) -> Mapping[str, Mapping[str, Any]]:
     """The settings of each estimator, by name; InputError for settings of another one."""
-    if others := [name for name in settings if name not in estimators]:
-        raise InputError(f"settings are given for {others[0]}, which is not run here; run: {listed(estimators)}")
+    if unknown := [name for name in settings if name not in estimators]:
+        raise InputError(f"settings are given for {unknown[0]}, which is not run here; run: {listed(estimators)}")
     named = {name: settings.get(name, {}) for name in estimators}
     return registry.for_final_only(named) if final_only else named
 

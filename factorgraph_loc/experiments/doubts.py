@@ -62,14 +62,14 @@ def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: floa
 def never_localized(log: Log, sensors: Sequence[str], status: Sequence[Status], final: Trajectory) -> tuple[str, ...]:
     """Warnings for an unknown start that was never resolved, in terms of what ``sensors`` observe in the map; ``status``: of
     each causal estimate."""
-    found = set(status)
-    if "localized" in found or (len(final) and status[-1] == "unlocalized"):  # or it has no causal estimates
+    kinds_of_status = set(status)
+    if "localized" in kinds_of_status or (len(final) and status[-1] == "unlocalized"):  # or it has no causal estimates
         return ()
     kinds = detecting(log.world, sensors)
     names = " and ".join(kind.detects for kind in kinds)
     if not kinds:
         why = "the map has nothing that its sensors could find"
-    elif "ambiguous" in found:
+    elif "ambiguous" in kinds_of_status:
         why = f"its {names} leave several places possible"
     elif len(kinds) > 1:  # an estimator may use only some of them
         why = f"its {names} did not determine the pose"

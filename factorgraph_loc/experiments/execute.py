@@ -19,7 +19,7 @@ from typing import Any, Literal, Protocol
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments.keys import VanishedError
 from factorgraph_loc.experiments.store import FAILURE, Store, StoreError
-from factorgraph_loc.text import json_text, told
+from factorgraph_loc.text import error_text, json_text
 
 Files = dict[str, bytes]
 Kind = Literal["error", "timeout", "memory", "killed", "vanished", "refused"]
@@ -52,8 +52,8 @@ class Planned(Protocol):
 class Take(Protocol):
     """A function that returns the next claimed run, or None if there is none now."""
 
-    def __call__(self, loaded: Hashable = None, others: Sequence[Hashable] = ()) -> Planned | None:
-        """The run has the source ``loaded`` if possible, else one that is not among ``others``."""
+    def __call__(self, loaded: Hashable = None, avoided: Sequence[Hashable] = ()) -> Planned | None:
+        """The run has the source ``loaded`` if possible, else one that is not among ``avoided``."""
 
 
 class Executor(AbstractContextManager[Any], Protocol):
@@ -78,14 +78,14 @@ class _Queue:
     def __len__(self) -> int:
         return sum(map(len, self._runs.values())) + len(self.later)
 
-    def next(self, loaded: Hashable, others: Sequence[Hashable]) -> Planned | None:
+    def next(self, loaded: Hashable, avoided: Sequence[Hashable]) -> Planned | None:
         """The next run; see :class:`Take`."""
         while self.later and self.later[0][0] <= time.monotonic():
             self._add(self.later.pop(0)[1])
         if not self._runs:
             return None
         most = max(self._runs, key=lambda source: len(self._runs[source]))
-        free = next((source for source in self._runs if source not in others), most)
+        free = next((source for source in self._runs if source not in avoided), most)
         chosen = loaded if loaded in self._runs else free
         run = self._runs[chosen].pop(0)
         if not self._runs[chosen]:
@@ -104,10 +104,10 @@ def execute(runs: Sequence[Planned], folder: Path, executor: Executor, *, again:
     """
     store, queue = Store(folder), _Queue(runs)
     claims: dict[str, ExitStack] = {}
-    found: list[Outcome] = []
+    outcomes: list[Outcome] = []
 
-    def take(loaded: Hashable = None, others: Sequence[Hashable] = ()) -> Planned | None:
-        while (run := queue.next(loaded, others)) is not None:
+    def take(loaded: Hashable = None, avoided: Sequence[Hashable] = ()) -> Planned | None:
+        while (run := queue.next(loaded, avoided)) is not None:
             with ExitStack() as claim:
                 if not claim.enter_context(store.claim(run.key)):
                     queue.later.append((time.monotonic() + AGAIN, run))
@@ -116,15 +116,15 @@ def execute(runs: Sequence[Planned], folder: Path, executor: Executor, *, again:
                 if state not in ("ok", "failed") or (state == "failed" and again):
                     claims[run.key] = claim.pop_all()
                     return run
-            found.append(stored_outcome(run.key, store))
+            outcomes.append(stored_outcome(run.key, store))
         return None
 
     try:
         with executor:
             while left := len(queue) + len(claims):
                 executor.submit(take, left)
-                yield from found
-                found.clear()
+                yield from outcomes
+                outcomes.clear()
                 for key, files in executor.finished():
                     with claims.pop(key):
                         store.put(key, files)
@@ -154,7 +154,7 @@ def compute(run: Planned) -> Files:
         if isinstance(error, OSError) and error.errno in _DISK:
             raise StoreError(f"{tempfile.gettempdir()}: cannot be written: {error.strerror}") from error
         details = "".join(traceback.format_exception(error))
-        return failure("error", f"{type(error).__name__}: {told(error)}", details)
+        return failure("error", f"{type(error).__name__}: {error_text(error)}", details)
 
 
 def failure(kind: Kind, reason: str, details: str = "") -> Files:

@@ -145,8 +145,8 @@ def prepare(
     file = Path(file)
     experiment = read_experiment(file, changes)
     folder = experiment.folder() if out is None else Path(out)
-    if (found := kind(folder)) not in ("", "a folder"):
-        raise InputError(f"{folder}: is {found}, expected a folder for the results")
+    if (kind_of_path := kind(folder)) not in ("", "a folder"):
+        raise InputError(f"{folder}: is {kind_of_path}, expected a folder for the results")
     store = Store(folder)
     store.create()
     try:
@@ -194,11 +194,11 @@ def run_experiment(
                 states[run.key] = prepared.store.state(run.key, thorough=True)
         finished = [run for run in prepared.runs if states[run.key] in ("ok", "failed")]
         rows = _write_rows(finished, prepared)
-    found = rows.to_dicts()
+    by_run = rows.to_dicts()
     failures = [
-        f"{run.shown}: {row['reason']}" for run, row in zip(finished, found, strict=True) if row["status"] == "failed"
+        f"{run.shown}: {row['reason']}" for run, row in zip(finished, by_run, strict=True) if row["status"] == "failed"
     ]
-    return Done(rows, failures, lines(found))
+    return Done(rows, failures, lines(by_run))
 
 
 def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:

@@ -79,8 +79,8 @@ class LogEntry(FileModel):
     def _is_one(self) -> LogEntry:
         if (self.log is None) == (self.simulate is None):
             raise ValueError("expected either log or simulate")
-        others = ("settings", "seeds") if self.log is not None else ("reader", "options", "rig", "world")
-        if wrong := [name for name in others if name in self.model_fields_set]:
+        unusable = ("settings", "seeds") if self.log is not None else ("reader", "options", "rig", "world")
+        if wrong := [name for name in unusable if name in self.model_fields_set]:
             raise ValueError(f"{wrong[0]} says nothing about {'log' if self.log is not None else 'simulate'}")
         return self
 
@@ -195,12 +195,14 @@ class Experiment(FileModel):
     def _named(cls, value: Any, info: Any) -> Any:
         """Allow a name in place of an entry."""
         key = "log" if info.field_name == "logs" else "name"
-        return [{key: one} if isinstance(one, str) else one for one in value] if isinstance(value, list) else value
+        return (
+            [{key: entry} if isinstance(entry, str) else entry for entry in value] if isinstance(value, list) else value
+        )
 
     @field_validator("sensors", mode="before")
     @classmethod
     def _several(cls, value: Any) -> Any:
-        return [value] if isinstance(value, list) and value and all(isinstance(one, str) for one in value) else value
+        return [value] if isinstance(value, list) and value and all(isinstance(name, str) for name in value) else value
 
     @model_validator(mode="after")
     def _fits(self) -> Experiment:
@@ -242,7 +244,7 @@ def _change(content: dict[str, Any], key: str, value: Any, source: object) -> No
     if first in Experiment.model_fields:
         set_key(content, key, value, source)
         return
-    logs = [one for one in _tables(content, "logs", "log", source) if "simulate" in one]
+    logs = [log for log in _tables(content, "logs", "log", source) if "simulate" in log]
     estimators = _tables(content, "estimators", "name", source)
     chosen = logs if first == SIMULATION else [e for e in estimators if first in (e.get("label"), e.get("name"))]
     if not chosen or not rest:
@@ -256,13 +258,13 @@ def _change(content: dict[str, Any], key: str, value: Any, source: object) -> No
 
 def _tables(content: dict[str, Any], key: str, named: str, source: object) -> list[dict[str, Any]]:
     """The entries of a list of the file, with names replaced by tables with the key ``named``."""
-    found = content.setdefault(key, [])
-    if not isinstance(found, list):
-        raise InputError(f"{source}: {key} is {quoted(found)}, expected a list")
-    found[:] = [{named: one} if isinstance(one, str) else one for one in found]
-    if wrong := [one for one in found if not isinstance(one, dict)]:
+    entries = content.setdefault(key, [])
+    if not isinstance(entries, list):
+        raise InputError(f"{source}: {key} is {quoted(entries)}, expected a list")
+    entries[:] = [{named: entry} if isinstance(entry, str) else entry for entry in entries]
+    if wrong := [entry for entry in entries if not isinstance(entry, dict)]:
         raise InputError(f"{source}: {key} has {quoted(wrong[0])}, expected names or tables")
-    return found
+    return entries
 
 
 def canonical(settings: Mapping[str, Any]) -> str:

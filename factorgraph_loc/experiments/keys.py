@@ -149,10 +149,10 @@ class FileDigests:
     def of_source(self, source: LogSource) -> str:
         """The digest of a log's source. Raises InputError if a file is missing."""
         try:
-            found = source.files()
+            paths = source.files()
         except OSError as error:  # a folder that must not be read
             raise InputError(f"{plain(error.filename)}: cannot be read: {error.strerror}") from error
-        files = {name: self.of_file(path) for name, path in found.items()}
+        files = {name: self.of_file(path) for name, path in paths.items()}
         return digest_of({"identity": source.identity(), "files": files})
 
     def of_file(self, path: Path) -> str:
@@ -163,13 +163,13 @@ class FileDigests:
             if known is not None and known[:2] == (stat.st_size, stat.st_mtime_ns):
                 return known[2]
             with path.open("rb") as file:
-                found = hashlib.file_digest(file, "sha256").hexdigest()
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from error
         if time.time() - stat.st_mtime > _UNSETTLED:
-            self._known[str(path)] = (stat.st_size, stat.st_mtime_ns, found)
+            self._known[str(path)] = (stat.st_size, stat.st_mtime_ns, digest)
             self._new = True
-        return found
+        return digest
 
     def save(self) -> None:
         """Save new digests."""

@@ -44,7 +44,7 @@ def run_and_learn(log: Log, config: RunConfig, progress: Callable[[float], None]
         turns = learn_by_turns(
             [log],
             start,
-            lambda one: run(replace(log, rig=one.rig), smoothing),
+            lambda learnt_log: run(replace(log, rig=learnt_log.rig), smoothing),
             folder / "learnt",
             lambda done, _all: report((1.0 + done) / runs),
         )

@@ -46,7 +46,7 @@ def matching(pattern: str, folder: Path, source: object) -> list[Path]:
         raise InputError(f"{source}: {quoted(pattern)} has {len(parts)} parts, expected at most {DEEPEST}")
     if wrong := [part for part in parts if ANY_DEPTH in part and part != ANY_DEPTH]:
         raise InputError(f"{source}: {quoted(pattern)} has {quoted(wrong[0])}, expected {ANY_DEPTH} to be a whole part")
-    found = [Path(path.anchor) if path.anchor else folder]
+    paths = [Path(path.anchor) if path.anchor else folder]
     visited = 0
 
     def entries(place: Path) -> list[os.DirEntry[str]]:
@@ -66,15 +66,15 @@ def matching(pattern: str, folder: Path, source: object) -> list[Path]:
 
     for part in parts:
         if part == ANY_DEPTH:
-            for here in found:  # which grows meanwhile
-                found += [Path(entry.path) for entry in entries(here) if entry.is_dir(follow_symlinks=False)]
+            for parent in paths:  # which grows meanwhile
+                paths += [Path(entry.path) for entry in entries(parent) if entry.is_dir(follow_symlinks=False)]
         elif is_pattern(part):
             fits = re.compile(fnmatch.translate(part)).match
-            found = [Path(entry.path) for place in found for entry in entries(place) if fits(entry.name)]
+            paths = [Path(entry.path) for place in paths for entry in entries(place) if fits(entry.name)]
         else:
-            found = [place / part for place in found]
-        found = list(dict.fromkeys(found))
-    return sorted(one for one in found if os.path.lexists(one))
+            paths = [place / part for place in paths]
+        paths = list(dict.fromkeys(paths))
+    return sorted(candidate for candidate in paths if os.path.lexists(candidate))
 
 
 def _fixed_part(pattern: str) -> str:
@@ -114,8 +114,8 @@ class RecordedSource:
     def files(self) -> dict[str, Path]:
         """The files that the log is read from, by names independent of their location."""
         given = {"rig": self.rig, "world": self.world}
-        found = [(f"{what}/{name}", file) for what, path in given.items() for name, file in _of_toml(path)]
-        return dict(found) | dict(self._data())
+        named = [(f"{what}/{name}", file) for what, path in given.items() for name, file in _of_toml(path)]
+        return dict(named) | dict(self._data())
 
     def identity(self) -> dict[str, Any]:
         """What determines the log besides the content of its files."""
@@ -142,7 +142,7 @@ class RecordedSource:
             if given is None and isinstance(content.get(what), str):
                 file = named_path(path.parent, content[what], path, self.data_root)
                 if not _is_below(file, path.parent):
-                    yield from ((f"{what}/{name}", one) for name, one in _of_toml(str(file)))
+                    yield from ((f"{what}/{name}", part) for name, part in _of_toml(str(file)))
         if content.get("path") is None:  # the data come with a library, whose version is part of the key
             return
         summed = content.get("checksums")
@@ -173,7 +173,7 @@ class SimulatedSource:
         from factorgraph_loc.simulation import named_settings  # noqa: PLC0415
 
         settings = named_settings(self.preset, json.loads(self.settings))
-        return settings.drive.duration, sum(settings.looks().values())
+        return settings.drive.duration, sum(settings.observation_counts().values())
 
     def load(self) -> Log:
         """The log."""
@@ -228,15 +228,15 @@ def recorded_sources(name: str, folder: Path, **others: Any) -> list[RecordedSou
         # for anything else the reader raises the error, with the nearest name
         path = named_path(folder, name, "logs", data_root)
         return [RecordedSource(str(path) if kind(path) or kind(Path(name)) else name, **others)]
-    found = [one for one in known if fnmatchcase(one, name)]
+    names = [candidate for candidate in known if fnmatchcase(candidate, name)]
     named_path(folder, _fixed_part(name), "logs", data_root)
     paths = [named_path(folder, str(path.absolute()), "logs", data_root) for path in matching(name, folder, "logs")]
-    found += [str(path) for path in paths if others.get("reader") or _is_log(path)]
-    if not found:
+    names += [str(path) for path in paths if others.get("reader") or _is_log(path)]
+    if not names:
         raise InputError(
             f"no log matches {quoted(name)}: neither a name that `fgloc datasets` lists, nor a path from {folder}"
         )
-    return [RecordedSource(one, **others) for one in found]
+    return [RecordedSource(candidate, **others) for candidate in names]
 
 
 def _is_log(path: Path) -> bool:
@@ -269,7 +269,11 @@ def _of_toml(path: str | None) -> Iterator[tuple[str, Path]]:
             named = (
                 file.parent / text for text in _texts(NAMING[file.suffix](file)) if text and len(text.encode()) < 200
             )
-            waiting += [one for one in named if one.is_relative_to(folder) and one.is_file() and _is_below(one, folder)]
+            waiting += [
+                candidate
+                for candidate in named
+                if candidate.is_relative_to(folder) and candidate.is_file() and _is_below(candidate, folder)
+            ]
 
 
 def _is_below(path: Path, folder: Path) -> bool:

@@ -136,19 +136,19 @@ def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points
     of_landmarks = bool(options.settings) or options.estimator != MAP_ESTIMATORS[0]
     of_tags = options.tag_height is not None
     of_others = of_landmarks or of_tags
-    of, there = options.of, _mappable(log)
+    of, available = options.of, _mappable(log)
     if of == POINTS and of_others:
         raise InputError(
             "--estimator, --set of an estimator and --tag-height are for other maps, but points are mapped here"
         )
     extends = not options.extend or log.world.points is not None
-    if of == POINTS or (of is None and not of_others and extends and POINTS in there):
+    if of == POINTS or (of is None and not of_others and extends and POINTS in available):
         return "points"
     if options.points:
         raise InputError("--set points... is for maps of points, but others are mapped here")
     if of not in (None, "landmarks", "tags"):
         raise InputError(f"--of is {quoted(of)}, expected landmarks, tags or points")
-    if of == "tags" or (of is None and "landmarks" not in there and "tags" in there):
+    if of == "tags" or (of is None and "landmarks" not in available and "tags" in available):
         if of_landmarks:
             raise InputError("--estimator and --set are for maps of landmarks, but tags are mapped here")
         return "tags"
@@ -159,10 +159,10 @@ def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points
 
 def _mappable(log: Log) -> dict[str, str]:
     """The layers of a world that can be mapped from a log, and the sensors that observe them."""
-    found = {sensor.detects: sensor for sensor in sensors().values() if sensor.detects}
+    by_layer = {sensor.detects: sensor for sensor in sensors().values() if sensor.detects}
     return {
         layer: sensor.name
-        for layer, sensor in found.items()
+        for layer, sensor in by_layer.items()
         if (first := sensor.channels[0].name) in log.streams and not lacking_section(log.rig, first)
     }
 
@@ -194,7 +194,7 @@ def _of_landmarks(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
 
 
 def _of_tags(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
-    along_reference = _along_reference(options, there=log.reference is not None)
+    along_reference = _along_reference(options, has_reference=log.reference is not None)
     height = options.tag_height
     if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
         raise InputError(f"--tag-height is {height:g}, expected metres, {HEIGHTS[0]:g} to {HEIGHTS[1]:g}")
@@ -246,9 +246,9 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference that says where its images were taken: {BY_RUN}")
     with stages("features") as report:
-        seen, doubts = with_features(log, camera.frontend, lambda share: report(share, 1.0))
+        observed, doubts = with_features(log, camera.frontend, lambda share: report(share, 1.0))
     with stages("points") as report:
-        posed = posed_frames(seen)
+        posed = posed_frames(observed)
         made = map_points(camera.model(), posed, settings, progress=lambda share: report(share, 1.0))
     points, fused = made.points, 0
     if options.extend and log.world.points is not None:
@@ -261,11 +261,11 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     return MadeMap(world, OF_REFERENCE, details, (*log.warnings, *doubts), draw)
 
 
-def _along_reference(options: MapOptions, *, there: bool) -> bool:
-    """Whether the robot's poses are those of the reference; ``there``: whether a usable one exists."""
+def _along_reference(options: MapOptions, *, has_reference: bool) -> bool:
+    """Whether the robot's poses are those of the reference; ``has_reference``: whether a usable one exists."""
     if options.poses not in (None, "reference", "odometry"):
         raise InputError(f"--poses is {quoted(options.poses)}, expected reference or odometry")
-    return there if options.poses is None else options.poses == "reference"
+    return has_reference if options.poses is None else options.poses == "reference"
 
 
 def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:

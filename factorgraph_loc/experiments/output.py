@@ -77,8 +77,8 @@ def write_run(
             content = temporary / "run"  # with the permissions of any new folder
             content.mkdir()
             write_files(result, log, scores, content)
-            if (found := map_of(result, log)) is not None:
-                write_world(found, content / MAP)
+            if (world := map_of(result, log)) is not None:
+                write_world(world, content / MAP)
             if out.exists():
                 remove_run(out)
                 for path in sorted(content.iterdir(), key=lambda path: path.name == FILES[-1]):
@@ -149,11 +149,11 @@ def beside(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
     if not out.parent.is_dir():
         raise InputError(f"--out is {quoted(str(out))}, but there is no folder {out.parent}")
     sweep(out.parent)
-    other = out.with_name(f"{name}{ending}")
-    for path in (out, other):
+    neighbour = out.with_name(f"{name}{ending}")
+    for path in (out, neighbour):
         if path.exists() and not overwrite:
             raise InputError(f"{path}: exists already; choose another name or give --overwrite")
-    return other
+    return neighbour
 
 
 def remove_run(out: Path) -> None:

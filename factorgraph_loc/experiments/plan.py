@@ -169,26 +169,26 @@ def _check_count(count: int, most: int) -> None:
 
 def _check_simulated(experiment: Experiment, digests: FileDigests, facts: Facts) -> None:
     """Raise InputError if the simulations exceed the limits."""
-    seconds, looks = 0.0, 0.0
+    seconds, observations = 0.0, 0.0
     for point in experiment.sweep.points(SIMULATION):
         for entry in experiment.logs:
             if entry.simulate is not None:
                 sources = _simulated(entry, point)
                 new = sum(not facts.knows(digests.of_source(source)) for source in sources)
                 size = sources[0].size() if new else (0.0, 0.0)
-                seconds, looks = seconds + new * size[0], looks + new * size[1]
-                if seconds > MOST_SECONDS or looks > MOST_LOOKS:
-                    what = f"{seconds:,.0f} s and {looks:,.0f} observations of tags, landmarks and points"
+                seconds, observations = seconds + new * size[0], observations + new * size[1]
+                if seconds > MOST_SECONDS or observations > MOST_LOOKS:
+                    what = f"{seconds:,.0f} s and {observations:,.0f} observations of tags, landmarks and points"
                     expected = f"{MOST_SECONDS:,} s and {MOST_LOOKS:,} observations"
                     raise InputError(f"has to simulate drives of {what} or more, expected at most {expected}")
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:
     """The points of a sweep that apply to an estimator or to simulated logs, by the values of the latter."""
-    found: dict[tuple[Any, ...], list[dict[str, Scalar]]] = {}
+    points: dict[tuple[Any, ...], list[dict[str, Scalar]]] = {}
     for swept in sweep.points(SIMULATION, entry.shown, entry.name):
-        found.setdefault(tuple(_part(swept, (SIMULATION,)).values()), []).append(swept)
-    return found
+        points.setdefault(tuple(_part(swept, (SIMULATION,)).values()), []).append(swept)
+    return points
 
 
 def _runs(
@@ -267,9 +267,9 @@ def _simulated(entry: LogEntry, point: Mapping[str, Any]) -> list[SimulatedSourc
 
 def _logs(sources: Sequence[LogSource], digests: FileDigests, facts: Facts) -> Iterator[_PlannedLog]:
     for first in sources:
-        for number, found in enumerate(facts.logs(first, digests.of_source(first))):
+        for number, log in enumerate(facts.logs(first, digests.of_source(first))):
             source = RecordedSource(**vars(first) | {"number": number}) if isinstance(first, RecordedSource) else first
-            yield _PlannedLog(source, digests.of_source(source), found.name, found.duration, found.sensors)
+            yield _PlannedLog(source, digests.of_source(source), log.name, log.duration, log.sensors)
 
 
 def _settings(entry: EstimatorEntry, point: Mapping[str, Any]) -> dict[str, Any]:
@@ -294,6 +294,6 @@ def _check(logs: Sequence[_PlannedLog], sensors: Sequence[tuple[str, ...] | None
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise InputError(f"two logs are called {twice[0]}, expected different names")
     known = list(dict.fromkeys(sensor for log in logs for sensor in log.sensors))
-    for sensor in (one for several in sensors for one in several or ()):
+    for sensor in (candidate for several in sensors for candidate in several or ()):
         if sensor not in known:
             raise InputError(f"no log has a sensor {quoted(sensor)}{nearest(sensor, known)}")

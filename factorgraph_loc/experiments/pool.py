@@ -57,18 +57,18 @@ class Processes(Executor):
             self._team[-1].send(compute)
         for worker in self._team:
             if worker.ready and worker.job is None:
-                others = [o.source for o in self._team if o.job is not None and o.source is not None]
-                run = self._repeated.pop() if self._repeated else take(worker.source, others)
+                busy = [o.source for o in self._team if o.job is not None and o.source is not None]
+                run = self._repeated.pop() if self._repeated else take(worker.source, busy)
                 if run is None:
                     return
                 worker.job, worker.source, worker.since = run, run.source, time.monotonic()
                 worker.send(run)
 
     def finished(self) -> Iterator[tuple[str, Files]]:
-        heard = wait([worker.connection for worker in self._team], LOOK)
+        readable = wait([worker.connection for worker in self._team], LOOK)
         for worker in list(self._team):
             run, failed = worker.job, self._too_much(worker)
-            if worker.connection in heard:
+            if worker.connection in readable:
                 was_ready, answer = worker.ready, worker.hear()
                 if not isinstance(answer, ProcessDiedError):
                     worker.job = None

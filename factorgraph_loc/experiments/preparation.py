@@ -67,12 +67,12 @@ def _from_reference(log: Log) -> PosePrior:
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference to start from, expected a prior {PRIORS}")
     start = first_odometry(log)
-    after = int(np.searchsorted(log.reference.t, start))
-    if after == len(log.reference):
+    first = int(np.searchsorted(log.reference.t, start))
+    if first == len(log.reference):
         raise InputError(
             f"{log.name}: its reference ends before the first odometry at {start:.3f} s, choose another prior"
         )
-    t, pose = float(log.reference.t[after]), np.array(log.reference.poses[after])
+    t, pose = float(log.reference.t[first]), np.array(log.reference.poses[first])
     covariance = _covariance(REFERENCE_POSITION_SIGMA, REFERENCE_HEADING_SIGMA)
     if not log.reference.has_heading:
         return PosePrior.at_position(t, pose[:2], covariance[:2, :2])
@@ -85,39 +85,41 @@ def _covariance(position_sigma: float, heading_sigma: float) -> np.typing.NDArra
 
 def columns_of(streams: Iterable[str]) -> tuple[str, ...]:
     """The channels that are columns of ``streams``."""
-    there = set(streams)
-    return tuple(name for name in channels() if parent_of(name) in there)
+    available = set(streams)
+    return tuple(name for name in channels() if parent_of(name) in available)
 
 
 def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
     """The sensors to use: those of the rig that the log has, or ``asked``, which must be available."""
-    there = (*log.streams, *_told_columns(log))
+    available = (*log.streams, *_filled_columns(log))
     for sensor in asked or ():
         parent = parent_of(sensor)
         if parent and parent not in (asked or ()):
             raise InputError(f"{log.name}: {sensor} is a column of {parent}, expected {parent} among the sensors too")
-        if parent and sensor not in there:
+        if parent and sensor not in available:
             raise InputError(f"{log.name}: has no sensor {quoted(sensor)}: no row of {parent} has a value of it")
-        if sensor not in there:
-            raise InputError(f"{log.name}: has no sensor {quoted(sensor)}{nearest(sensor, list(there))}")
+        if sensor not in available:
+            raise InputError(f"{log.name}: has no sensor {quoted(sensor)}{nearest(sensor, list(available))}")
         if section := lacking_section(log.rig, sensor):
             raise InputError(f"{log.name}: {sensor} needs [{section}] in the rig, and {log.rig.name} has none")
     sensors = tuple(
-        s for s in (log.rig.sensors if asked is None else asked) if s in there and not lacking_section(log.rig, s)
+        s for s in (log.rig.sensors if asked is None else asked) if s in available and not lacking_section(log.rig, s)
     )
     if not log.streams:
         raise InputError(f"{log.name}: has a reference but no measurements, expected odometry at least")
     if not sensors:
         raise InputError(
-            f"{log.name}: has none of the rig's sensors {listed(log.rig.sensors)}{nearest('', list(there))}"
+            f"{log.name}: has none of the rig's sensors {listed(log.rig.sensors)}{nearest('', list(available))}"
         )
     return sensors
 
 
 def unused(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
     """Warnings about unusable sensors of the rig, and about missing odometry."""
-    there = (*log.streams, *_told_columns(log))
-    doubts = [f"{log.name}: the rig lists the sensor {s}, the log has none" for s in log.rig.sensors if s not in there]
+    available = (*log.streams, *_filled_columns(log))
+    doubts = [
+        f"{log.name}: the rig lists the sensor {s}, the log has none" for s in log.rig.sensors if s not in available
+    ]
     lacking = {s: section for s in log.streams if s in log.rig.sensors and (section := lacking_section(log.rig, s))}
     for section in dict.fromkeys(lacking.values()):
         names = ", ".join(name for name, of in lacking.items() if of == section)
@@ -150,7 +152,7 @@ def fill_cache(uses: Iterable[Use]) -> None:
         any(prepare(use, lambda _: None).images for use in uses)
 
 
-def _told_columns(log: Log) -> tuple[str, ...]:
+def _filled_columns(log: Log) -> tuple[str, ...]:
     """The columns that have a value in any row of the log."""
     names = columns_of(log.streams)
     return tuple(n for n in names if np.any(np.isfinite(getattr(log.streams[parent_of(n)], n, np.nan))))

@@ -13,7 +13,7 @@ from factorgraph_loc.experiments.store import Store, StoreError
 from factorgraph_loc.files.bounded import kind
 from factorgraph_loc.files.tables import read_parquet, write_parquet
 from factorgraph_loc.io.results import INDEX
-from factorgraph_loc.text import told
+from factorgraph_loc.text import error_text
 
 TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "reason", "key", "scoring.align", WARNINGS}
 
@@ -34,7 +34,7 @@ def write_index(table: pl.DataFrame, folder: Path) -> None:
     try:
         write_parquet(table, folder / INDEX)
     except OSError as error:
-        raise StoreError(f"{folder / INDEX}: cannot be written: {told(error)}") from error
+        raise StoreError(f"{folder / INDEX}: cannot be written: {error_text(error)}") from error
 
 
 def load_results(path: str | Path) -> pl.DataFrame:
@@ -53,7 +53,7 @@ def load_results(path: str | Path) -> pl.DataFrame:
         raise InputError(f"{error}; `fgloc experiment run` writes it anew") from error
 
 
-def _row(run: PlannedRun, found: dict[str, Any]) -> dict[str, Any]:
+def _row(run: PlannedRun, stored: dict[str, Any]) -> dict[str, Any]:
     row = {
         "label": run.label,
         "log": run.log,
@@ -62,8 +62,8 @@ def _row(run: PlannedRun, found: dict[str, Any]) -> dict[str, Any]:
         "prior": run.prior,
         "seed": run.seed,
         **{f"{SWEEP}{key}": value for key, value in run.sweep.items()},
-        **{name: found.pop(name) for name in ("status", "kind", "reason")},
+        **{name: stored.pop(name) for name in ("status", "kind", "reason")},
         "key": run.key,
         "duration": run.duration,
     }
-    return row | {name: value for name, value in found.items() if name not in row}
+    return row | {name: value for name, value in stored.items() if name not in row}

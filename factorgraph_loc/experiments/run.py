@@ -74,7 +74,7 @@ def run(
 
     report = progress or (lambda _: None)
     prepared = prepare(use, lambda share: report(0.5 * share))
-    before = 0.5 if prepared.images else 0.0
+    prepared_share = 0.5 if prepared.images else 0.0
     frame = MapFrame.of(setup, use.modalities, getattr(use.settings, "landmarks", "known"))
     _rehearse(config, setup, use.settings, prepared.log, start.prior)
     ticks = Ticks(_begin(log, use.sensors, start.prior), config.tick_gap)
@@ -86,7 +86,7 @@ def run(
         start.prior,
         ticks,
         frame,
-        lambda share: report(before + (1.0 - before) * share),
+        lambda share: report(prepared_share + (1.0 - prepared_share) * share),
         watch,
     )
     with guard.quiet(), only_new_searched():
@@ -156,7 +156,7 @@ def _result(
 ) -> RunResult:
     log = use.log
     reviews = {name: review(use, end) for name, review in functions("review")}
-    reliability = {name: one.reliability for name, one in reviews.items() if one.reliability is not None}
+    reliability = {name: result.reliability for name, result in reviews.items() if result.reliability is not None}
     versions = _versions()
     effective = {
         "log": log.name,
@@ -176,9 +176,9 @@ def _result(
         *use.warnings,
         *unused(log, use.sensors),
         *prepared.warnings,
-        *(line for one in reviews.values() for line in one.warnings),
-        *(line for one in reliability.values() for line in one.doubts),
-        *never_localized(log, use.sensors, causal.told.status, end.final),
+        *(line for result in reviews.values() for line in result.warnings),
+        *(line for result in reliability.values() for line in result.doubts),
+        *never_localized(log, use.sensors, causal.estimates.status, end.final),
         *partly_scored(log, end.final, config.max_gap),
         *in_bent_map(log, causal.frame, end.final),
         *with_pauses(log, causal.ticks.skipped, config.tick_gap),
@@ -186,11 +186,11 @@ def _result(
     return RunResult(
         log=log.name,
         config=effective,
-        t=np.array(causal.told.t),
-        poses=np.array(causal.told.poses).reshape(-1, 3),
-        covariances=np.array(causal.told.covariances).reshape(-1, 3, 3),
-        status=tuple(causal.told.status),
-        doubts_model=tuple(causal.told.doubts_model),
+        t=np.array(causal.estimates.t),
+        poses=np.array(causal.estimates.poses).reshape(-1, 3),
+        covariances=np.array(causal.estimates.covariances).reshape(-1, 3, 3),
+        status=tuple(causal.estimates.status),
+        doubts_model=tuple(causal.estimates.doubts_model),
         final=end.final,
         diagnostics=end.final_diagnostics,
         learnt=end.learnt,
@@ -214,8 +214,8 @@ def _rehearse(
     begin = _begin(log, setup.sensors, prior)
     moves = moving(log.streams, TURN)
     observes = [s for s in log.streams if s in setup.sensors and s not in moves]
-    seen = [log.streams[s].t + log.rig.time_offset(s) for s in observes]
-    first = min((float(t[t >= begin].min(initial=math.inf)) for t in seen), default=begin)
+    stamps = [log.streams[s].t + log.rig.time_offset(s) for s in observes]
+    first = min((float(t[t >= begin].min(initial=math.inf)) for t in stamps), default=begin)
     guard = Guard(config.estimator)
     with suppress(FglocError), guard, guard.quiet():
         estimator = registry.create(config.estimator, replace(setup, rng=np.random.default_rng(config.seed)), settings)

@@ -47,13 +47,13 @@ def record_camera(recording: rr.RecordingStream, log: Log, runs: Sequence[Stored
             expected = [_expected(model, pose, log.world.points.positions) for pose in poses.at(t, max_gap=GAP)]
             _pixels_over_time(recording, f"{at}/image/map", t, expected)
             recording.log(f"{at}/image/map", rr.Points2D.from_fields(radii=2.0, colors=LIT), static=True)
-    seen = list(pictures_of.sightings(log))
-    if seen:
-        labels = [name for _, names, _ in seen for name in names]
-        t = np.array([t for t, _, _ in seen])
-        _pixels_over_time(recording, f"{at}/image/landmarks", t, [pixels for _, _, pixels in seen], labels)
-        look = rr.Points2D.from_fields(radii=3.0, colors=SEEN, show_labels=False)
-        recording.log(f"{at}/image/landmarks", look, static=True)
+    sightings = list(pictures_of.sightings(log))
+    if sightings:
+        labels = [name for _, names, _ in sightings for name in names]
+        t = np.array([t for t, _, _ in sightings])
+        _pixels_over_time(recording, f"{at}/image/landmarks", t, [pixels for _, _, pixels in sightings], labels)
+        style = rr.Points2D.from_fields(radii=3.0, colors=SEEN, show_labels=False)
+        recording.log(f"{at}/image/landmarks", style, static=True)
 
 
 def _batches(pictures: Iterator[tuple[float, bytes]]) -> Iterator[list[tuple[float, bytes]]]:
@@ -88,8 +88,8 @@ def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Ar
 
 def _carrier(log: Log, runs: Sequence[StoredRun]) -> Trajectory | None:
     """Trajectory of the robot that carries the drawn camera: of the first run that has one, else the reference."""
-    found = [run.played() for run in runs if len(run.played())]
-    return found[0] if found else log.reference
+    trajectories = [run.played() for run in runs if len(run.played())]
+    return trajectories[0] if trajectories else log.reference
 
 
 def camera_path(log: Log, runs: Sequence[StoredRun]) -> str:

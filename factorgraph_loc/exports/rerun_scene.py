@@ -102,8 +102,8 @@ def _lamps(recording: rr.RecordingStream, what: str, positions: Mapping[str, Arr
         columns = rr.Points3D.columns(positions=np.array([positions[name] for name in flat]), labels=flat)
         columns = columns.partition([len(names) for names in lit])
         recording.send_columns(f"{WORLD}/{what}/lit", times(lights.t), columns)
-        look = rr.Points3D.from_fields(radii=2.0 * POINT, colors=LIT, show_labels=True)
-        recording.log(f"{WORLD}/{what}/lit", look, static=True)
+        style = rr.Points3D.from_fields(radii=2.0 * POINT, colors=LIT, show_labels=True)
+        recording.log(f"{WORLD}/{what}/lit", style, static=True)
 
 
 def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:

@@ -127,7 +127,8 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
         raise InputError(f"{folder.path}: is a run of the log {folder.log}, expected one of {log.name}")
     files = results.ResultFiles(lambda file: read_bytes(folder.path / file, DATA), log.t0_ns, folder.path)
     causal, final = (
-        found.rows(np.asarray(np.isfinite(found.trajectory.poses).all(axis=1))) for found in files.estimates().values()
+        estimates.rows(np.asarray(np.isfinite(estimates.trajectory.poses).all(axis=1)))
+        for estimates in files.estimates().values()
     )
     played = causal if len(causal.trajectory) else final
     known = {key: np.isfinite(values) for key, values in played.errors.items()}
@@ -161,8 +162,8 @@ def _config(folder: Path) -> StoredConfig:
 
 
 def _landmarks(path: Path) -> dict[str, LearntPoint]:
-    found = {}
+    points = {}
     for name, entry in parse_model(_Learnt, read_json(path), path).landmarks.items():
         xx, xy, yy = (np.nan if value is None else value for value in entry.covariance)
-        found[name] = LearntPoint(np.array((entry.x, entry.y), dtype=float), np.array(((xx, xy), (xy, yy))))
-    return found
+        points[name] = LearntPoint(np.array((entry.x, entry.y), dtype=float), np.array(((xx, xy), (xy, yy))))
+    return points

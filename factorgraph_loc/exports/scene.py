@@ -41,8 +41,11 @@ def layers(log: Log) -> list[tuple[Marks, dict[str, Array], Lights]]:
     """The map objects of each sensor: their positions (3,) [m], and when each is highlighted, for :data:`LIT_FOR` seconds from
     an observation.
     """
-    found = sorted(marks(log), key=lambda one: one.order)
-    return [(one, dict(zip(one.names, one.positions, strict=True)), _lights(one.t.tolist(), one.seen)) for one in found]
+    drawn = sorted(marks(log), key=lambda layer: layer.order)
+    return [
+        (layer, dict(zip(layer.names, layer.positions, strict=True)), _lights(layer.t.tolist(), layer.seen))
+        for layer in drawn
+    ]
 
 
 def ellipses(trajectory: Trajectory) -> tuple[Array, Array]:

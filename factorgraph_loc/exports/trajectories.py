@@ -109,15 +109,15 @@ def pose_graph(
     landmarks = {name: np.array((mark.x, mark.y)) for name, mark in log.world.landmarks.items()}
     if not landmarks:
         landmarks = {name: point.position for name, point in (learnt or {}).items()}
-    seen = located_landmarks(log, sensors, landmarks) if len(trajectory) else []
-    seen = [s for s in seen if trajectory.t[0] <= s.t <= trajectory.t[-1]]
-    t = np.unique(np.concatenate((trajectory.t, [s.t for s in seen])))
+    observed = located_landmarks(log, sensors, landmarks) if len(trajectory) else []
+    observed = [s for s in observed if trajectory.t[0] <= s.t <= trajectory.t[-1]]
+    t = np.unique(np.concatenate((trajectory.t, [s.t for s in observed])))
     if len(t) < 2:
         raise InputError(f"{log.name}: the run has {len(t)} poses, expected two or more for a pose graph")
     index = {at: i for i, at in enumerate(t.tolist())}
-    sightings = tuple(LandmarkEdge(index[at], name, point, covariance) for at, name, point, covariance in seen)
-    found = {s.landmark for s in seen}
-    landmarks = {name: place for name, place in landmarks.items() if name in found}
+    sightings = tuple(LandmarkEdge(index[at], name, point, covariance) for at, name, point, covariance in observed)
+    sighted = {s.landmark for s in observed}
+    landmarks = {name: place for name, place in landmarks.items() if name in sighted}
     motion = whole_motion(log, moving(used, TURN))
     motions = tuple(motion.relative(a, b) for a, b in pairwise([motion.state(at) for at in t.tolist()]))
     return PoseGraph(t, trajectory.at(t), motions, landmarks, bool(log.world.landmarks), sightings)

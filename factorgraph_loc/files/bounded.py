@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from factorgraph_loc.errors import FglocError, InputError
-from factorgraph_loc.text import plain, quoted, told
+from factorgraph_loc.text import error_text, plain, quoted
 
 SETTINGS = 16 * 2**20  # bytes of a TOML or JSON file
 YAML = 2**16  # bytes of a YAML file, which is a hundred times slower to read
@@ -75,8 +75,8 @@ def require_size(source: object, what: str, size: int, limit: int) -> None:
 @contextmanager
 def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
     """Open a regular file of at most ``limit`` bytes for reading; InputError if that is impossible."""
-    if found := kind(path):
-        _require_file(path, found)
+    if kind_of_path := kind(path):
+        _require_file(path, kind_of_path)
     try:
         # non-blocking, in case a FIFO has replaced the file since
         file = os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb")
@@ -131,7 +131,7 @@ def foreign(source: object, what: str) -> Iterator[None]:
     except BaseException as error:
         if not isinstance(error, Exception) and type(error).__module__ != "pyo3_runtime":
             raise  # a signal
-        raise InputError(f"{plain(source)}: {what}: {told(error)}") from error
+        raise InputError(f"{plain(source)}: {what}: {error_text(error)}") from error
 
 
 def limit_memory() -> None:
@@ -178,8 +178,8 @@ def resident_memory(pid: int | None) -> float:
         return 0.0
 
 
-def _kind(found: os.stat_result) -> str:
-    return _KINDS.get(stat.S_IFMT(found.st_mode), "a device")
+def _kind(status: os.stat_result) -> str:
+    return _KINDS.get(stat.S_IFMT(status.st_mode), "a device")
 
 
 def _require_file(path: Path, kind: str) -> None:

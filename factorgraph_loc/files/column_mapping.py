@@ -96,10 +96,10 @@ def read_mapped(
     if either:
         needed.append(tuple(mapping.columns[field] for field in either if field in given))
     read = _read_json_lines if path.suffix.lower() in JSON_SUFFIXES else _read_csv
-    found = read(path, mapping, needed)
-    if not len(found.rows):
+    cells = read(path, mapping, needed)
+    if not len(cells.rows):
         raise InputError(f"{path}: contains no rows{' as chosen by where' if mapping.where else ''}")
-    return found
+    return cells
 
 
 def _mapped(

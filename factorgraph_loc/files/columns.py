@@ -169,8 +169,8 @@ def farthest(tables: Sequence[Array | Integers], most: float) -> tuple[int, int,
 def require_span(tables: Sequence[tuple[object, Sequence[int] | Integers, Integers]]) -> None:
     """InputError if timestamps of tables, (source, rows (N,), timestamps (N,) [ns]), are more than :data:`MAX_SPAN` apart; it names
     the one that is farthest from the median."""
-    if found := farthest([t_ns for _, _, t_ns in tables], MAX_SPAN * 1e9):
-        table, i, middle = found
+    if outlier := farthest([t_ns for _, _, t_ns in tables], MAX_SPAN * 1e9):
+        table, i, middle = outlier
         source, rows, t_ns = tables[table]
         expected = f"one at most {MAX_SPAN / 86_400.0:g} days from all others of the log, most are near {middle} ns"
         raise bad_field(source, "stamp", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))

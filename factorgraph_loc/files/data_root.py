@@ -30,5 +30,5 @@ def named_path(folder: Path, name: str, source: object, data_root: str | Path | 
     the same errors.
     """
     data = os.environ.get(DATA_ROOT) if data_root is None else data_root
-    others = [Path(data)] if data and Path(data).is_dir() else []
-    return inside(folder, name, source, *others, expected=expected)
+    folders = [Path(data)] if data and Path(data).is_dir() else []
+    return inside(folder, name, source, *folders, expected=expected)

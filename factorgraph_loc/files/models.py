@@ -23,7 +23,7 @@ from pydantic.fields import FieldInfo
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files.temporary import temporary_file
-from factorgraph_loc.text import LISTED, NAME, listed, plain, quoted, told
+from factorgraph_loc.text import LISTED, NAME, error_text, listed, plain, quoted
 
 LONGEST_FILE = 100  # bytes of a generated file name
 DEEPEST = 64  # nesting levels of tables or lists, and parts of a key
@@ -62,12 +62,12 @@ class InUnit:
 
 def add_fields(model: type[BaseModel], fields: Mapping[str, tuple[Any, Any]], *, after: str) -> None:
     """Add fields to a model after another one, each with its type and default."""
-    there = dict(model.model_fields)
-    behind = list(there)[list(there).index(after) + 1 :]
+    old = dict(model.model_fields)
+    later = list(old)[list(old).index(after) + 1 :]
     added = {name: FieldInfo.from_annotated_attribute(kind, default) for name, (kind, default) in fields.items()}
     model.model_fields.clear()
-    model.model_fields.update({name: there[name] for name in there if name not in behind} | added)
-    model.model_fields.update({name: there[name] for name in behind})
+    model.model_fields.update({name: old[name] for name in old if name not in later} | added)
+    model.model_fields.update({name: old[name] for name in later})
     model.model_rebuild(force=True)
 
 
@@ -159,7 +159,7 @@ def parse_json(text: str, source: object) -> Any:
     except RecursionError as error:
         raise InputError(f"{source}: is not JSON: it is nested too deeply") from error
     except ValueError as error:
-        raise InputError(f"{source}: is not JSON: {told(error)}") from error
+        raise InputError(f"{source}: is not JSON: {error_text(error)}") from error
     if text.count("[") + text.count("{") > DEEPEST or len(text) > MOST_ENTRIES:
         deque(_leaves(content, source), maxlen=0)
     return content
@@ -297,7 +297,7 @@ def replacing(path: Path) -> Iterator[Path]:
             temporary.chmod(0o666 & ~umask)
             temporary.replace(path)
     except OSError as error:
-        raise OSError(error.errno or 0, told(error), str(path)) from error
+        raise OSError(error.errno or 0, error_text(error), str(path)) from error
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -314,7 +314,7 @@ def write_text(path: Path, text: str) -> None:
 
 def write_toml(path: Path, content: Mapping[str, Any]) -> None:
     """Write a TOML file atomically."""
-    write_text(path, re.sub("[\ud800-\udfff]", lambda found: f"\\{found[0]}", tomli_w.dumps(content)))
+    write_text(path, re.sub("[\ud800-\udfff]", lambda match: f"\\{match[0]}", tomli_w.dumps(content)))
 
 
 def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
@@ -346,11 +346,11 @@ def _constant(name: str) -> float:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    table = dict(pairs)
+    if len(table) < len(pairs):
         twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
         raise ValueError(f"the key {quoted(twice)} is duplicate")
-    return found
+    return table
 
 
 _JSON = json.JSONDecoder(parse_int=_integer, parse_constant=_constant, object_pairs_hook=_object)

@@ -56,7 +56,7 @@ class _Part:
 def settings_in(model: type[BaseModel], prefix: str = "", default: BaseModel | None = None) -> list[Setting]:
     """All settings of a model, in its order; those of models in it have their keys after a dot. ``default``: a model whose values
     are the defaults."""
-    found: dict[str, Setting] = {}
+    settings: dict[str, Setting] = {}
     for name, field in model.model_fields.items():
         key = f"{prefix}{name}"
         value = field.get_default(call_default_factory=True) if default is None else getattr(default, name)
@@ -68,13 +68,13 @@ def settings_in(model: type[BaseModel], prefix: str = "", default: BaseModel | N
             *_own(key, parts, Setting(key, "", 1, value, required, -math.inf, math.inf, (), "", meaning)),
             *_nested(key, parts, value),
         ):
-            there = found.get(setting.key)
-            if there is None:
-                found[setting.key] = setting
-            elif there.choices and setting.choices:  # the kinds of alternative models
-                choices = dict.fromkeys((*there.choices, *setting.choices))
-                found[setting.key] = replace(there, choices=tuple(choices))
-    return list(found.values())
+            known = settings.get(setting.key)
+            if known is None:
+                settings[setting.key] = setting
+            elif known.choices and setting.choices:  # the kinds of alternative models
+                choices = dict.fromkeys((*known.choices, *setting.choices))
+                settings[setting.key] = replace(known, choices=tuple(choices))
+    return list(settings.values())
 
 
 def bound_text(value: float) -> str:

@@ -20,7 +20,7 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.bounded import CELLS, DATA, foreign, limited_memory, quiet, read_bytes, require_size
 from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table, require_span
 from factorgraph_loc.files.models import Model, nearest, parse_model, read_text, write_bytes, write_text
-from factorgraph_loc.text import quoted, told
+from factorgraph_loc.text import error_text, quoted
 from factors.se2 import Array, Integers
 
 SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten of a nanosecond
@@ -166,7 +166,7 @@ def csv_rows(path: Path, lines: Sequence[tuple[int, str]], **form: Any) -> Itera
         for parts in reader:
             yield lines[reader.line_num - 1][0], parts
     except csv.Error as error:
-        raise InputError(f"{path}:{lines[reader.line_num - 1][0]}: is not CSV: {told(error)}") from error
+        raise InputError(f"{path}:{lines[reader.line_num - 1][0]}: is not CSV: {error_text(error)}") from error
 
 
 def rows_of_length(
@@ -226,16 +226,16 @@ def rows_by_name(
     ``rows`` (N,): line numbers in ``path``; ``numbers``: values (N,) by field, NaN for the default of the field. InputError names
     file and row of an empty or repeated name, and of an invalid value.
     """
-    found: dict[str, Model] = {}
-    seen: dict[str, int] = {}
+    models: dict[str, Model] = {}
+    first_rows: dict[str, int] = {}
     for i, (row, name) in enumerate(zip(rows.tolist(), names, strict=True)):
-        if not name or name in seen:
-            expected = f"another name than in row {seen[name]}" if name else column.doc
+        if not name or name in first_rows:
+            expected = f"another name than in row {first_rows[name]}" if name else column.doc
             raise bad_field(path, column.name, name, expected, row=row)
         values = {field: float(cells[i]) for field, cells in numbers.items() if not math.isnan(cells[i])}
-        found[name] = parse_model(kind, values, f"{path}:{row}")
-        seen[name] = row
-    return found
+        models[name] = parse_model(kind, values, f"{path}:{row}")
+        first_rows[name] = row
+    return models
 
 
 def read_parquet(path: Path) -> pl.DataFrame:
@@ -259,11 +259,11 @@ def text_column(table: pl.DataFrame, name: str, source: object) -> list[str]:
     if not (kind in (pl.String, pl.Null, pl.Categorical) or kind.is_integer() or isinstance(kind, pl.Enum)):
         raise InputError(f"{source}: {name} is of type {kind}, expected texts")
     with foreign(source, f"{name} is no column of texts"):
-        found = column.cast(pl.String)
-        if len(found) * found.estimated_size() > DATA:  # one long text may be referenced many times
-            length = int(found.str.len_bytes().sum())
+        texts = column.cast(pl.String)
+        if len(texts) * texts.estimated_size() > DATA:  # one long text may be referenced many times
+            length = int(texts.str.len_bytes().sum())
             require_size(source, f"the length of all texts of {name}", length, DATA)
-        return [text or "" for text in found.to_list()]
+        return [text or "" for text in texts.to_list()]
 
 
 @dataclass(frozen=True)
@@ -318,21 +318,21 @@ def _cells_of_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequenc
     """The cells of a Parquet file, and the one of ``shapes`` whose columns it has."""
     frame = read_parquet(path)
     shape = shape_of(path, frame.columns, shapes)
-    found: dict[str, Any] = {}
+    cells: dict[str, Any] = {}
     for name in shape:
         kind = frame[name].dtype
         if columns[name].kind in NAMES:
-            found[name] = text_column(frame, name, path)
+            cells[name] = text_column(frame, name, path)
         elif columns[name].kind in NUMBERS:
             if not kind.is_numeric() and kind != pl.Null:
                 raise InputError(f"{path}: {name} is of type {kind}, expected numbers")
-            found[name] = frame[name].cast(pl.Float64).to_numpy().copy()
+            cells[name] = frame[name].cast(pl.Float64).to_numpy().copy()
         elif not kind.is_integer():
             raise InputError(f"{path}: {name} is of type {kind}, expected integers, nanoseconds")
         else:
-            found[name] = frame[name].to_list()
+            cells[name] = frame[name].to_list()
     rows = np.arange(1, frame.height + 1, dtype=np.int64)
-    return Cells(path, rows, found, left_out=tuple(name for name in frame.columns if name not in shape)), shape
+    return Cells(path, rows, cells, left_out=tuple(name for name in frame.columns if name not in shape)), shape
 
 
 def write_parquet(frame: pl.DataFrame, path: Path) -> None:

@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from factorgraph_loc.errors import InputError, unencodable
-from factorgraph_loc.text import told
+from factorgraph_loc.text import error_text
 
 MARK = ".fgloc-"
 _NAME = re.compile(rf"\..*{re.escape(MARK)}([0-9a-f]{{8}})-([1-9][0-9]*)-[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
@@ -33,14 +33,14 @@ _own: set[Path] = set()  # paths created by this process and not yet removed
 @contextmanager
 def temporary_file(path: Path) -> Iterator[Path]:
     """An empty file next to ``path``, with its suffix; removed at the end of the block unless it was renamed."""
-    with _held(path, path.stem, path.suffix, folder=False) as made:
+    with _created(path, path.stem, path.suffix, folder=False) as made:
         yield made
 
 
 @contextmanager
 def temporary_folder(path: Path) -> Iterator[Path]:
     """A new private folder next to ``path``; removed with its content at the end of the block."""
-    with _held(path, path.name, "", folder=True) as made:
+    with _created(path, path.name, "", folder=True) as made:
         yield made
 
 
@@ -85,7 +85,7 @@ def remove_own() -> None:
 
 
 @contextmanager
-def _held(path: Path, name: str, suffix: str, *, folder: bool) -> Iterator[Path]:
+def _created(path: Path, name: str, suffix: str, *, folder: bool) -> Iterator[Path]:
     if path.parent not in _swept:
         _swept.add(path.parent)
         sweep(path.parent)
@@ -134,7 +134,7 @@ def writing(path: object) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {told(error)}") from error
+        raise InputError(f"{path}: cannot be written: {error_text(error)}") from error
     except UnicodeEncodeError as error:
         raise InputError(f"{path}: cannot be written: {unencodable(error)}") from error
 
@@ -148,6 +148,6 @@ def require_free(out: Path, names: Iterable[str], *, overwrite: bool) -> None:
         sweep(folder)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected a folder for the results")
-    held = [name for name in names if (out / name).exists()]
-    if held and not overwrite:
-        raise InputError(f"{out}: holds results already ({held[0]}); choose another folder, or --overwrite")
+    existing = [name for name in names if (out / name).exists()]
+    if existing and not overwrite:
+        raise InputError(f"{out}: holds results already ({existing[0]}); choose another folder, or --overwrite")

@@ -22,43 +22,43 @@ def seconds_of(where: str, value: object, name: str = "t") -> float:
     """A time [s]; InputError if it is not a number or out of range."""
     if type(value) is float and SECONDS.low <= value <= SECONDS.high:
         return value
-    found = math.nan
+    seconds = math.nan
     if isinstance(value, NUMBER) and not isinstance(value, bool):
         with contextlib.suppress(OverflowError):
-            found = float(value)
-    if SECONDS.outside(np.array(found)):
+            seconds = float(value)
+    if SECONDS.outside(np.array(seconds)):
         raise bad_field(where, name, value, SECONDS.expected)
-    return found
+    return seconds
 
 
 def numbers(where: str, field: str, value: object) -> Array:
     """A new array of ``value``; InputError if it does not consist of real numbers."""
     try:
-        found = np.array(value)
-        if found.dtype.kind == "O" and all(
-            isinstance(item, NUMBER) and not isinstance(item, bool) for item in found.flat
+        array = np.array(value)
+        if array.dtype.kind == "O" and all(
+            isinstance(item, NUMBER) and not isinstance(item, bool) for item in array.flat
         ):
-            found = found.astype(float)
+            array = array.astype(float)
     except (TypeError, ValueError, OverflowError):  # rows of different lengths, huge integers
         raise bad_field(where, field, value, "numbers") from None
-    if found.dtype.kind not in "iuf" and found.size:
+    if array.dtype.kind not in "iuf" and array.size:
         raise bad_field(where, field, value, "numbers")
-    return np.asarray(found, dtype=float)
+    return np.asarray(array, dtype=float)
 
 
 def within(where: str, column: Column, value: object, shape: tuple[int, ...]) -> Any:
     """Numbers of a given shape within the bounds of their column; a float for the shape ()."""
     column, field = column.measured, column.field or column.name
-    found = numbers(where, field, value)
-    if found.shape != shape:
-        raise InputError(f"{where}: {field} has shape {found.shape}, expected {shape}")
+    array = numbers(where, field, value)
+    if array.shape != shape:
+        raise InputError(f"{where}: {field} has shape {array.shape}, expected {shape}")
     low, high = column.low, column.high
-    if column.kind != "whole" and found.size <= FEW and all(low <= one <= high for one in found.ravel().tolist()):
-        return found if shape else float(found)
-    if (bad := column.outside(found)).any():
+    if column.kind != "whole" and array.size <= FEW and all(low <= number <= high for number in array.ravel().tolist()):
+        return array if shape else float(array)
+    if (bad := column.outside(array)).any():
         lack = ", or NaN where not measured" if column.may_lack else ""
-        raise bad_field(where, field, float(found[bad].flat[0]), column.expected + lack)
-    return found if shape else float(found)
+        raise bad_field(where, field, float(array[bad].flat[0]), column.expected + lack)
+    return array if shape else float(array)
 
 
 def names(where: str, field: str, value: object) -> tuple[str, ...]:
@@ -70,20 +70,20 @@ def names(where: str, field: str, value: object) -> tuple[str, ...]:
 
 def items_of(where: str, field: str, values: object) -> tuple[Any, ...]:
     """The items of a list; InputError if ``values`` is not a list."""
-    found = None
+    items = None
     if isinstance(values, Iterable) and not isinstance(values, str):
         with contextlib.suppress(TypeError):  # a zero-dimensional array
-            found = tuple(values)
-    if found is None:
+            items = tuple(values)
+    if items is None:
         raise bad_field(where, field, values, "a list of them")
-    return found
+    return items
 
 
 def integers(where: str, column: Column, value: object, count: int) -> NDArray[np.int64]:
     """Integers (K,) within the bounds of their column; InputError if they are invalid."""
-    found = numbers(where, column.name, value)
-    if found.shape != (count,) or (count and np.asarray(value).dtype.kind not in "iu"):
+    array = numbers(where, column.name, value)
+    if array.shape != (count,) or (count and np.asarray(value).dtype.kind not in "iu"):
         raise bad_field(where, column.name, value, f"{count} whole numbers")
-    if (bad := column.outside(found)).any():
-        raise bad_field(where, column.name, float(found[bad][0]), column.expected)
-    return found.astype(np.int64)
+    if (bad := column.outside(array)).any():
+        raise bad_field(where, column.name, float(array[bad][0]), column.expected)
+    return array.astype(np.int64)

@@ -29,11 +29,11 @@ def read_yaml(path: Path) -> dict[str, Any]:
     what = "is not YAML that can be read"
     with foreign(path, what):
         try:
-            found = yaml.load(read_text(path, YAML), _Loader) or {}
+            content = yaml.load(read_text(path, YAML), _Loader) or {}
         except yaml.MarkedYAMLError as error:
             mark = error.context_mark or error.problem_mark
-            told = ", ".join(part for part in (error.context, error.problem) if part)
-            raise InputError(f"{path}:{mark.line + 1 if mark else 1}: {what}: {told}") from error
-    if not isinstance(found, dict):
+            problem = ", ".join(part for part in (error.context, error.problem) if part)
+            raise InputError(f"{path}:{mark.line + 1 if mark else 1}: {what}: {problem}") from error
+    if not isinstance(content, dict):
         raise InputError(f"{path}:1: {what}: expected key: value")
-    return {str(key): value for key, value in found.items() if value is not None}
+    return {str(key): value for key, value in content.items() if value is not None}

@@ -56,8 +56,8 @@ def require_one_span(log: Log) -> None:
             raise InputError(f"{log.name}: {name} has a timestamp that is not a finite number")
     first, last = log.span()
     expected = f"one at most {MAX_SPAN / 86_400.0:g} days from all others of the log"
-    if found := farthest(list(filled.values()), MAX_SPAN):
-        table, i, middle = found
+    if outlier := farthest(list(filled.values()), MAX_SPAN):
+        table, i, middle = outlier
         name, t = list(filled.items())[table]
         where = f"{log.name}: {name} has a timestamp {t[i] - middle:+.0f} s from most others in row {i + 1}"
         raise InputError(f"{where}, expected {expected}: do their clocks agree?")

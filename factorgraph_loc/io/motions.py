@@ -49,14 +49,14 @@ def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[s
     moves = se2.between(poses[:-1], poses[1:])
     durations = _durations(t_ns)
     speeds, turns = np.hypot(moves[:, 0], moves[:, 1]) / durations, np.abs(moves[:, 2]) / durations
-    fastest = _before(speeds, SPEED)
+    fastest = _largest_before(speeds, SPEED)
     home = np.hypot(poses[1:, 0], poses[1:, 1]) <= NEAR + fastest * durations
-    jumps = (speeds > FASTER * fastest) | (turns > FASTER * _before(turns, TURN))
+    jumps = (speeds > FASTER * fastest) | (turns > FASTER * _largest_before(turns, TURN))
     zeros = np.all(np.abs(poses[1:]) < ZERO, axis=1) & (speeds * durations > NEAR) & (durations > HELD)
     anew = np.flatnonzero((home & jumps) | zeros)
     for i in anew.tolist():
-        before = se2.log(moves[i - 1]) / durations[i - 1] if i else np.zeros(3)
-        moves[i] = se2.exp(before * min(float(durations[i]), HELD))
+        previous = se2.log(moves[i - 1]) / durations[i - 1] if i else np.zeros(3)
+        moves[i] = se2.exp(previous * min(float(durations[i]), HELD))
     _tell(source, t_ns, anew, warnings)
     return moves
 
@@ -66,27 +66,27 @@ def after_rest(moves: Array) -> Array:
     return np.vstack((np.zeros((1, 3)), moves))
 
 
-def between_ways(source: object, t_ns: Integers, ways: Array, scales: Array, warnings: list[str]) -> Array:
+def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array, warnings: list[str]) -> Array:
     """The motions (N - 1, 3) from the distances (N, 2) [m] of a pair of wheels at N timestamps [ns]; ``scales`` (2,): metres per
     encoder tick. Wrapping of encoders is handled; resets are treated as for poses."""
-    steps = np.stack([_unwound(ways[:, i], float(scales[i])) for i in range(2)], axis=-1)
+    steps = np.stack([_unwound(distances[:, i], float(scales[i])) for i in range(2)], axis=-1)
     durations = _durations(t_ns)
     speeds = np.abs(steps).max(axis=1, initial=0.0) / durations
-    fastest = _before(speeds, SPEED)
-    home = np.abs(ways[1:]).max(axis=1, initial=0.0) <= NEAR + fastest * durations
+    fastest = _largest_before(speeds, SPEED)
+    home = np.abs(distances[1:]).max(axis=1, initial=0.0) <= NEAR + fastest * durations
     anew = np.flatnonzero(home & (speeds > FASTER * fastest))
     for i in anew.tolist():
-        before = steps[i - 1] / durations[i - 1] if i else np.zeros(2)
-        steps[i] = before * min(float(durations[i]), HELD)
+        previous = steps[i - 1] / durations[i - 1] if i else np.zeros(2)
+        steps[i] = previous * min(float(durations[i]), HELD)
     _tell(source, t_ns, anew, warnings)
     return steps
 
 
 def between_wheels(
-    source: object, t_ns: Integers, ways: Array, scales: Array, track: float, warnings: list[str]
+    source: object, t_ns: Integers, distances: Array, scales: Array, track: float, warnings: list[str]
 ) -> Array:
     """The motions (N - 1, 3) of a differential drive with a ``track`` [m]; for the others see :func:`between_ways`."""
-    arc, turn = velocities_of_wheels(between_ways(source, t_ns, ways, scales, warnings), track).T
+    arc, turn = velocities_of_wheels(between_ways(source, t_ns, distances, scales, warnings), track).T
     return se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn)))
 
 
@@ -102,10 +102,10 @@ def odometry_stream(t_ns: Integers, values: Array, t0_ns: int) -> IncrementStrea
     return IncrementStream(t, *values.T) if values.shape[1] == 3 else VelocityStream(t, *np.ascontiguousarray(values.T))
 
 
-def _unwound(ways: Array, scale: float) -> Array:
+def _unwound(distances: Array, scale: float) -> Array:
     """Steps (N - 1,) of one wheel, assuming less than half a counter range between rows."""
-    steps: Array = np.diff(ways)
-    ticks = ways / scale
+    steps: Array = np.diff(distances)
+    ticks = distances / scale
     if not np.allclose(ticks, np.rint(ticks), atol=1e-3):
         return steps
     size = next((size for size in COUNTERS if ticks.min() >= -(size // 2) and ticks.max() < size), None)
@@ -121,7 +121,7 @@ def _durations(t_ns: Integers) -> Array:
     return np.asarray(np.maximum(np.diff(t_ns), 1_000_000) / 1e9)
 
 
-def _before(rates: Array, least: float) -> Array:
+def _largest_before(rates: Array, least: float) -> Array:
     """The largest (N,) of all rates (N,) before each without jumps, at least ``least``."""
     out, most = np.empty(len(rates)), least
     for i, rate in enumerate(rates.tolist()):
@@ -143,24 +143,24 @@ def _tell(source: object, t_ns: Integers, anew: Integers, warnings: list[str]) -
 def with_wheels_of(rig: Rig | None, options: Mapping[str, Any]) -> Mapping[str, Any]:
     """The options of a reader with radius and track of the rig, where they tell of wheels and the rig knows these."""
     drive = None if rig is None else rig.of(OdometrySettings).wheels
-    told = options.get("odometry")
-    if drive is None or not isinstance(told, Mapping):
+    odometry = options.get("odometry")
+    if drive is None or not isinstance(odometry, Mapping):
         return options
     known = drive.model_dump(exclude_none=True)
-    if isinstance(wheels := told.get("wheels"), Mapping):
-        return {**options, "odometry": {**told, "wheels": {**wheels, **known}}}
-    if isinstance(columns := told.get("columns"), Mapping) and columns.keys() & set(WHEELS):
-        return {**options, "odometry": {**told, **known}}
+    if isinstance(wheels := odometry.get("wheels"), Mapping):
+        return {**options, "odometry": {**odometry, "wheels": {**wheels, **known}}}
+    if isinstance(columns := odometry.get("columns"), Mapping) and columns.keys() & set(WHEELS):
+        return {**options, "odometry": {**odometry, **known}}
     return options
 
 
 def with_wheels_in(rig: Rig, options: Mapping[str, Any]) -> Rig:
     """The rig with the wheels that valid options tell of, if it has none."""
-    told = options.get("odometry")
+    odometry = options.get("odometry")
     settings = rig.of(OdometrySettings)
-    if settings.wheels is not None or not isinstance(told, Mapping):
+    if settings.wheels is not None or not isinstance(odometry, Mapping):
         return rig
-    sizes = told.get("wheels") or told
+    sizes = odometry.get("wheels") or odometry
     if sizes.get("track") is None:
         return rig
     drive = DifferentialDrive(radius=sizes.get("radius"), track=sizes["track"])

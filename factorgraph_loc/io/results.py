@@ -14,7 +14,7 @@ from factorgraph_loc.files.columns import COVARIANCES, LATEST, symmetric
 from factorgraph_loc.files.tables import parse_parquet
 from factorgraph_loc.model.scoring import KINDS
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.text import told
+from factorgraph_loc.text import error_text
 from factors.se2 import Array
 
 INDEX = "results.parquet"  # of several runs
@@ -70,7 +70,7 @@ class ResultFiles:
         try:
             return {kind: Estimates.of(rows, t0_ns) for kind, rows in by_kind.items()}  # type: ignore[arg-type] # an integer
         except ValueError as error:
-            raise InputError(f"{source}: holds no trajectory: {told(error)}") from error
+            raise InputError(f"{source}: holds no trajectory: {error_text(error)}") from error
 
     def innovations(self) -> dict[str, Array]:
         """By sensor: rows (K, 3) of time, normalised innovation squared and degrees of freedom."""

@@ -38,8 +38,8 @@ def read_trajectory(source: str | Path) -> PosePath:
     run, whose final trajectory it is; or a log, whose reference it is. InputError describes what is invalid in one line.
     """
     path, text = Path(source), str(source)
-    if (found := _in_bag(text)) is not None:
-        return replace(rosbag.read_trajectory(*found), name=text)
+    if (bag := _in_bag(text)) is not None:
+        return replace(rosbag.read_trajectory(*bag), name=text)
     if path.is_file() and path.suffix != LOG:
         return read_pose_file(path)
     if (path / FINAL).is_file():
@@ -60,10 +60,10 @@ def _in_bag(text: str) -> tuple[Path, str] | None:
 
 
 def _reference(log: str) -> PosePath:
-    found = read_log(log)
-    if found.reference is None:
+    loaded = read_log(log)
+    if loaded.reference is None:
         raise InputError(f"{log}: is a log without a reference, expected one with a reference, or a trajectory")
-    return path_of(found.reference, log, found.t0_ns)
+    return path_of(loaded.reference, log, loaded.t0_ns)
 
 
 def to_evo(trajectory: Trajectory | Trajectory3, t0_ns: int = 0) -> Any:
@@ -124,8 +124,8 @@ def from_ros(messages: Any) -> PosePath:
             stamps.append(stamp.sec * 10**9 + stamp.nanosec)
             rows.append(_seven(message))
         except AttributeError as error:
-            told = f"message {i} is of type {type(message).__name__}"
-            raise InputError(f"{told}, expected {MESSAGES} of ROS 2, or one nav_msgs/Path") from error
+            problem = f"message {i} is of type {type(message).__name__}"
+            raise InputError(f"{problem}, expected {MESSAGES} of ROS 2, or one nav_msgs/Path") from error
         points.add(hasattr(message, "point"))
     path = _path("the messages", np.array(rows, dtype=float).reshape(-1, 7), np.array(stamps, dtype=np.int64))
     return path if points != {True} else PosePath(path.name, path.positions, path.rotations, path.t_ns, False)
@@ -163,6 +163,6 @@ def _messages() -> Any:
 def _path(name: str, table: Array, t_ns: Any) -> PosePath:
     """The path of rows (N, 7) with position and quaternion. InputError if one is not finite, or no unit quaternion."""
     rows = np.arange(1, len(table) + 1)
-    found = PosePath(name, table[:, :3], checked_rotations(name, rows, table), t_ns)
-    require_poses(found)
-    return found
+    path = PosePath(name, table[:, :3], checked_rotations(name, rows, table), t_ns)
+    require_poses(path)
+    return path

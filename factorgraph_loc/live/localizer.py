@@ -253,10 +253,10 @@ class Localizer:
                 f"t is {at:.3f} s, {at - self._newest:.0f} s ahead of all measurements, expected the same clock"
             )
         with self._guard.telling("the estimate", at):
-            found = self._frame.estimate(sound(self._estimator.estimate(at)))
+            estimate = self._frame.estimate(sound(self._estimator.estimate(at)))
         # copied, because the estimator may reuse its arrays
-        self._last = _copied(found, at)
-        return _copied(found, at)
+        self._last = _copied(estimate, at)
+        return _copied(estimate, at)
 
     def _tidy(self, estimator: Estimator) -> None:
         """Forget the old past."""
@@ -320,21 +320,21 @@ def prior_of(pose: ArrayLike, covariance: ArrayLike | None, t: float | None) -> 
     size = len(known)
     if covariance is None:
         covariance = np.diag(np.square((POSITION_SIGMA, POSITION_SIGMA, HEADING_SIGMA))[:size])
-    spread = numbers("initialize()", "covariance", covariance)
-    if not _is_covariance(spread, size):
+    matrix = numbers("initialize()", "covariance", covariance)
+    if not _is_covariance(matrix, size):
         expected = (
             f"({size}, {size}), symmetric and positive definite, standard deviations of {NARROWEST:g} to {WIDEST:g} m"
         )
         turn = f" and up to {WIDEST_TURN:g} rad" if size == 3 else ""
-        raise InputError(f"covariance is {quoted(spread.tolist())}, expected {expected}{turn}")
+        raise InputError(f"covariance is {quoted(matrix.tolist())}, expected {expected}{turn}")
     at = math.nan if t is None else seconds_of("initialize()", t)
-    return PosePrior(at, mean, spread) if size == 3 else PosePrior.at_position(at, mean[:2], spread)
+    return PosePrior(at, mean, matrix) if size == 3 else PosePrior.at_position(at, mean[:2], matrix)
 
 
-def _is_covariance(spread: Any, size: int) -> bool:
-    if spread.shape != (size, size) or not np.all(np.isfinite(spread)) or not np.allclose(spread, spread.T):
+def _is_covariance(matrix: Any, size: int) -> bool:
+    if matrix.shape != (size, size) or not np.all(np.isfinite(matrix)) or not np.allclose(matrix, matrix.T):
         return False
-    if np.any(np.diag(spread) > np.square((WIDEST, WIDEST, WIDEST_TURN)[:size])):
+    if np.any(np.diag(matrix) > np.square((WIDEST, WIDEST, WIDEST_TURN)[:size])):
         return False
-    variances = np.linalg.eigvalsh(spread)
+    variances = np.linalg.eigvalsh(matrix)
     return bool(variances[0] >= max(NARROWEST**2, variances[-1] / RATIO))

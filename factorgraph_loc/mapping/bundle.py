@@ -96,8 +96,8 @@ def agreeing(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array
     """Observations (N,) with residuals of at most ``limit`` standard deviations, of points that retain two of them or more."""
     errors, _, _, depths = reproject(model, cameras, points, tracks)
     right = (np.sum(errors**2, axis=1) < (limit * model.sigma) ** 2) & (depths > NEAREST)
-    seen = np.bincount(tracks.track[right], minlength=tracks.count)
-    return np.asarray(right & (seen >= 2)[tracks.track])
+    count = np.bincount(tracks.track[right], minlength=tracks.count)
+    return np.asarray(right & (count >= 2)[tracks.track])
 
 
 def marginals(
@@ -142,13 +142,13 @@ def robust_noise(model: CameraModel) -> Any:
 
 def _unknown_constants(model: CameraModel, *, lens: bool) -> Array:
     """The covariance (9, 9) of (fx, fy, skew, cx, cy, k1, k2, p1, p2) if a data sheet is all that is known of them."""
-    spread = FIXED**2 * np.eye(9)
+    covariance = FIXED**2 * np.eye(9)
     focal = np.array((model.fx, model.fy))
-    spread[:2, :2] += FOCAL_SIGMA**2 * np.outer(focal, focal) + ASPECT_SIGMA**2 * np.diag(focal**2)
+    covariance[:2, :2] += FOCAL_SIGMA**2 * np.outer(focal, focal) + ASPECT_SIGMA**2 * np.diag(focal**2)
     if lens:
         centre = CENTRE_SIGMA * focal
-        spread[range(3, 9), range(3, 9)] = np.square((*centre, *LENS_SIGMA))
-    return spread
+        covariance[range(3, 9), range(3, 9)] = np.square((*centre, *LENS_SIGMA))
+    return covariance
 
 
 def _optimized(
@@ -180,13 +180,13 @@ def _optimized(
     parameters.setMaxIterations(ITERATIONS)
     parameters.setRelativeErrorTol(RELATIVE)
     parameters.setAbsoluteErrorTol(ABSOLUTE)
-    found = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    solution = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
     if constants:
-        fx, fy, _, cx, cy, *distortion = found.atCal3DS2(K(0)).vector().tolist()
+        fx, fy, _, cx, cy, *distortion = solution.atCal3DS2(K(0)).vector().tolist()
         model = replace(model, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
-    poses = [found.atPose3(X(i)) for i in range(len(cameras))]
+    poses = [solution.atPose3(X(i)) for i in range(len(cameras))]
     adjusted = Cameras(np.array([p.translation() for p in poses]), np.array([p.rotation().matrix() for p in poses]))
-    return model, adjusted, np.array([found.atPoint3(L(k)) for k in range(len(points))]).reshape(-1, 3)
+    return model, adjusted, np.array([solution.atPoint3(L(k)) for k in range(len(points))]).reshape(-1, 3)
 
 
 def _sparse(blocks: Array, rows: Integers, columns: Integers, shape: tuple[int, int]) -> Any:

@@ -89,9 +89,9 @@ def matched_pairs(
             continue
         allowed = near_epipolar_lines(model, cameras, i, j, a.pixels, b.pixels, gate)
         binary = a.descriptors.dtype == np.uint8
-        found = match(a.descriptors, b.descriptors, binary=binary, ratio=RATIO, allowed=allowed)
-        if len(found):
-            out.append((i, j, found.indices, found.distances / np.median(found.distances + 1e-9)))
+        matches = match(a.descriptors, b.descriptors, binary=binary, ratio=RATIO, allowed=allowed)
+        if len(matches):
+            out.append((i, j, matches.indices, matches.distances / np.median(matches.distances + 1e-9)))
     return out
 
 
@@ -125,7 +125,7 @@ def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Int
             root[rb] = ra
             of_a |= of_b
             del members[rb]
-    chains = [sorted(one.values()) for one in members.values() if len(one) > 1]
+    chains = [sorted(features.values()) for features in members.values() if len(features) > 1]
     chains.sort()
     nodes = np.array([k for chain in chains for k in chain], dtype=np.int64)
     track = np.repeat(np.arange(len(chains)), [len(chain) for chain in chains]).astype(np.int64)
@@ -135,7 +135,7 @@ def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Int
     return Tracks(track, frame, feature, pixels)
 
 
-def _angles(rotations: Array, other: Array) -> Array:
+def _angles(rotations: Array, rotation: Array) -> Array:
     """Angles (F,) [rad] between ``rotations`` (F, 3, 3) and one (3, 3)."""
-    trace = np.einsum("nij,ij->n", rotations, other)
+    trace = np.einsum("nij,ij->n", rotations, rotation)
     return np.asarray(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))

@@ -243,9 +243,11 @@ def _differ(point: LearntPoint, landmark: Landmark) -> bool:
 def _verdict(name: str, learnt: Mapping[str, LearntPoint], given: Mapping[str, Landmark], wrong: list[str]) -> str:
     if name not in wrong:
         return "agrees"
-    for other in wrong:
-        if other != name and not (_differ(learnt[name], given[other]) or _differ(learnt[other], given[name])):
-            return f"swapped with {other}"
+    for candidate in wrong:
+        if candidate != name and not (
+            _differ(learnt[name], given[candidate]) or _differ(learnt[candidate], given[name])
+        ):
+            return f"swapped with {candidate}"
     offset = learnt[name].position - np.array((given[name].x, given[name].y))
     return f"moved by {np.hypot(*offset):.2f} m"
 

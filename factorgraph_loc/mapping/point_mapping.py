@@ -25,7 +25,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.use import frames_of
-from factorgraph_loc.text import told
+from factorgraph_loc.text import error_text
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera.model import CameraModel, camera_pose
 from factors.positive import worst_sigma
@@ -128,25 +128,25 @@ def map_points(
         matches += matched_pairs(model, posed.cameras, posed.frames, pairs[begin : begin + 50], gate)
         progress(0.7 * min(1.0, (begin + 50) / len(pairs)))
     tracks = chained(posed.frames, matches)
-    found = triangulate(model, posed.cameras, tracks)
+    triangulated = triangulate(model, posed.cameras, tracks)
     # until all is adjusted, the rays contain the errors of the poses
-    good = found.good(tracks, replace(model, sigma=gate / GATE), settings.parallax)
+    good = triangulated.good(tracks, replace(model, sigma=gate / GATE), settings.parallax)
     if not good.any():
         raise RunFailedError("no feature was matched between images from several places, so no point was mapped")
-    total, (seen, old) = tracks.count, tracks.kept(good[tracks.track])
+    total, (chosen, old) = tracks.count, tracks.kept(good[tracks.track])
     try:
         adjusted = bundle.adjust(
             model,
             posed.cameras,
             posed.covariances,
-            seen,
-            found.positions[old],
+            chosen,
+            triangulated.positions[old],
             focal=settings.focal,
             lens=settings.lens,
             progress=lambda share: progress(0.7 + 0.3 * share),
         )
     except RuntimeError as error:  # raised by GTSAM for an underdetermined system
-        raise RunFailedError(f"points and cameras cannot be adjusted: {told(error)}") from error
+        raise RunFailedError(f"points and cameras cannot be adjusted: {error_text(error)}") from error
     return _made(posed, adjusted, settings, len(pairs), total, int(np.count_nonzero(good)))
 
 
@@ -173,16 +173,16 @@ def point_map(
 ) -> PointMap:
     """The map of ``points`` (T, 3), each with the descriptors of at most ``views`` observations."""
     shown = _different_views(cameras, tracks, points, views)
-    seen = list(zip(tracks.frame[shown].tolist(), tracks.feature[shown].tolist(), strict=True))
+    views_of = list(zip(tracks.frame[shown].tolist(), tracks.feature[shown].tolist(), strict=True))
     return PointMap(
         names=tuple(f"p{i}" for i in range(len(points))),
         positions=points,
         covariances=covariances,
         feature=posed.frames[0].feature,
         owners=tracks.track[shown],
-        descriptors=np.array([posed.frames[i].descriptors[k] for i, k in seen]),
+        descriptors=np.array([posed.frames[i].descriptors[k] for i, k in views_of]),
         seen_from=cameras.positions[tracks.frame[shown]],
-        sizes=np.array([posed.frames[i].sizes[k] for i, k in seen], dtype=float),
+        sizes=np.array([posed.frames[i].sizes[k] for i, k in views_of], dtype=float),
     )
 
 
@@ -251,10 +251,10 @@ def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int
     return np.array(chosen, dtype=np.int64)
 
 
-def _moved(before: Cameras, after: Cameras) -> tuple[Array, Array]:
+def _moved(old: Cameras, new: Cameras) -> tuple[Array, Array]:
     """Change of each camera's position (F,) [m] and orientation (F,) [rad]."""
-    trace = np.einsum("nij,nij->n", before.rotations, after.rotations)
-    shift = np.linalg.norm(after.positions - before.positions, axis=1)
+    trace = np.einsum("nij,nij->n", old.rotations, new.rotations)
+    shift = np.linalg.norm(new.positions - old.positions, axis=1)
     return shift, np.asarray(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
 
 
@@ -265,7 +265,7 @@ def posed_frames(log: Log, turn_sigma: float = 0.01, shift_sigma: float = 0.02) 
     covariances. Frames outside of the reference or in its gaps are omitted. Raises InputError if a camera, features or a
     reference are missing, or no frame remains.
     """
-    t, found = frames_of(log)
+    t, all_frames = frames_of(log)
     if log.rig.find(CameraSettings) is None:
         raise InputError(f"{log.name}: its rig has no [camera], expected focal length and mounting")
     model = log.rig.of(CameraSettings).model()
@@ -275,7 +275,7 @@ def posed_frames(log: Log, turn_sigma: float = 0.01, shift_sigma: float = 0.02) 
     poses = log.reference.at(t, max_gap=MAX_GAP)
     inside = np.asarray(np.isfinite(poses).all(axis=1))
     cameras, covariances = _on_robot(model, log.reference, t[inside], poses[inside], usual)
-    frames = [frame for frame, keep in zip(found, inside.tolist(), strict=True) if keep]
+    frames = [frame for frame, keep in zip(all_frames, inside.tolist(), strict=True) if keep]
     if not any(len(frame.pixels) for frame in frames):
         raise InputError(f"{log.name}: none of its {len(t)} images has features and a pose of the reference")
     return PosedFrames(frames, cameras, covariances)

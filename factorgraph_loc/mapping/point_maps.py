@@ -37,32 +37,36 @@ def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
     old, new = pairs[:, 0], pairs[:, 1]
     positions, covariances = first.positions.copy(), first.covariances.copy()
     if len(pairs):
-        informations = [positive.inverse(_spread(points, which)) for points, which in ((first, old), (second, new))]
+        informations = [
+            positive.inverse(_covariances(points, which)) for points, which in ((first, old), (second, new))
+        ]
         covariances[old] = positive.inverse((informations[0] + informations[1]) / 2.0)
-        told = [i @ p[..., None] for i, p in zip(informations, (positions[old], second.positions[new]), strict=True)]
-        positions[old] = (covariances[old] @ ((told[0] + told[1]) / 2.0))[..., 0]
+        weighted = [
+            i @ p[..., None] for i, p in zip(informations, (positions[old], second.positions[new]), strict=True)
+        ]
+        positions[old] = (covariances[old] @ ((weighted[0] + weighted[1]) / 2.0))[..., 0]
     fused = replace(first, positions=positions, covariances=covariances)
-    others = np.setdiff1d(np.arange(len(second)), new)
+    new_only = np.setdiff1d(np.arange(len(second)), new)
     owners = np.full(len(second), -1, dtype=np.int64)
-    owners[new], owners[others] = old, len(first) + np.arange(len(others))
-    return _joined(fused, second, others, owners), len(pairs)
+    owners[new], owners[new_only] = old, len(first) + np.arange(len(new_only))
+    return _joined(fused, second, new_only, owners), len(pairs)
 
 
 def thinned(points: PointMap, most: int) -> PointMap:
     """At most ``most`` of the points that have views, the best determined ones in as many places as possible, and all others."""
-    seen = np.unique(points.owners)
-    if len(seen) <= most:
+    viewed = np.unique(points.owners)
+    if len(viewed) <= most:
         return points
     sigma = positive.worst_sigma(points.covariances)
-    cells = np.floor(points.positions[seen] / CELL).astype(np.int64)
+    cells = np.floor(points.positions[viewed] / CELL).astype(np.int64)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
-    order = np.lexsort((sigma[seen], cell.ravel()))
+    order = np.lexsort((sigma[viewed], cell.ravel()))
     ordered = cell.ravel()[order]
     starts = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
-    rank = np.empty(len(seen), dtype=np.int64)
-    rank[order] = np.arange(len(seen)) - np.repeat(starts, np.diff(np.append(starts, len(seen))))
-    kept = seen[np.lexsort((sigma[seen], rank))[:most]]
-    return chosen(points, np.sort(np.concatenate((kept, np.setdiff1d(np.arange(len(points)), seen)))))
+    rank = np.empty(len(viewed), dtype=np.int64)
+    rank[order] = np.arange(len(viewed)) - np.repeat(starts, np.diff(np.append(starts, len(viewed))))
+    kept = viewed[np.lexsort((sigma[viewed], rank))[:most]]
+    return chosen(points, np.sort(np.concatenate((kept, np.setdiff1d(np.arange(len(points)), viewed)))))
 
 
 def chosen(points: PointMap, which: Integers) -> PointMap:
@@ -83,13 +87,13 @@ def chosen(points: PointMap, which: Integers) -> PointMap:
     )
 
 
-def _joined(first: PointMap, second: PointMap, others: Integers, owners: Integers) -> PointMap:
-    """The points of ``first`` and the ``others`` of ``second``, whose views have new ``owners`` (P,) by point."""
-    named = {second.names[i] for i in np.setdiff1d(others, second.owners).tolist()}
+def _joined(first: PointMap, second: PointMap, added: Integers, owners: Integers) -> PointMap:
+    """The points of ``first`` and the ``added`` of ``second``, whose views have new ``owners`` (P,) by point."""
+    named = {second.names[i] for i in np.setdiff1d(added, second.owners).tolist()}
     if double := sorted(named & set(first.names)):
         raise InputError(f"the point {double[0]} is in both maps without a view, expected different names")
     taken, number, names = {*first.names, *named}, 0, list(first.names)
-    for i in others.tolist():
+    for i in added.tolist():
         name = second.names[i]
         while name in taken and name not in named:
             name, number = f"p{len(first) + number}", number + 1
@@ -98,8 +102,8 @@ def _joined(first: PointMap, second: PointMap, others: Integers, owners: Integer
     parts = [points for points in (first, second) if len(points.owners)] or [first]
     return PointMap(
         tuple(names),
-        np.concatenate((first.positions, second.positions[others])),
-        np.concatenate((first.covariances, second.covariances[others])),
+        np.concatenate((first.positions, second.positions[added])),
+        np.concatenate((first.covariances, second.covariances[added])),
         first.feature or second.feature,
         np.concatenate((first.owners, owners[second.owners])),
         np.concatenate([points.descriptors for points in parts]),
@@ -127,19 +131,19 @@ def _same(first: PointMap, second: PointMap) -> Integers:
     none = np.empty((0, 2), dtype=np.int64)
     if not (len(first.owners) and len(second.owners)):
         return none
-    views, others = _views(first), _views(second)
+    views, second_views = _views(first), _views(second)
     limit = _limit(first, views)
     near = cKDTree(second.positions).query_ball_point(first.positions, FARTHEST)
     rows = []
     for i, candidates in enumerate(near):
-        which = np.array([j for j in candidates if len(others[j])], dtype=np.int64)
+        which = np.array([j for j in candidates if len(second_views[j])], dtype=np.int64)
         if not len(views[i]) or not len(which):
             continue
-        spread = _spread(second, which) + _spread(first, np.array([i]))
-        agree = positive.squared(second.positions[which] - first.positions[i], spread) < GATE
+        covariance = _covariances(second, which) + _covariances(first, np.array([i]))
+        agree = positive.squared(second.positions[which] - first.positions[i], covariance) < GATE
         for j in which[agree].tolist():
             apart = distance_matrix(
-                first.descriptors[views[i]], second.descriptors[others[j]], binary=first.feature == "orb"
+                first.descriptors[views[i]], second.descriptors[second_views[j]], binary=first.feature == "orb"
             )
             rows.append((float(apart.min()), i, j))
     pairs: list[tuple[int, int]] = []
@@ -168,5 +172,5 @@ def _limit(points: PointMap, views: list[Integers]) -> float:
     return float(np.percentile(least, ALIKE)) if least else 0.0
 
 
-def _spread(points: PointMap, which: Integers) -> Array:
+def _covariances(points: PointMap, which: Integers) -> Array:
     return points.covariances[which] + LEAST**2 * np.eye(3)

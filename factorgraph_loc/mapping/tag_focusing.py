@@ -36,7 +36,7 @@ INTERPOLATED, LONGEST = 0.05, 2.0  # s between interpolated poses, and at most b
 
 
 def focused(
-    log: Log, looks: TagLooks, learnt: Mapping[int, LearntPoint], keyframes: Trajectory | None = None
+    log: Log, observations: TagLooks, learnt: Mapping[int, LearntPoint], keyframes: Trajectory | None = None
 ) -> dict[int, LearntPoint]:
     """The ``learnt`` positions by tag, improved by the phases of the reads along the log's reference, or along the estimated
     ``keyframes``, which are interpolated.
@@ -50,35 +50,35 @@ def focused(
     if keyframes is not None:
         t = np.arange(keyframes.t[0], keyframes.t[-1], INTERPOLATED)
         poses = keyframes.at(t, max_gap=LONGEST)
-        there = np.isfinite(poses[:, 0])
-        log = replace(log, reference=Trajectory(t[there], poses[there]))
+        known = np.isfinite(poses[:, 0])
+        log = replace(log, reference=Trajectory(t[known], poses[known]))
     model = replace(rfid.phase.model(rfid.model().antennas), tempering=TEMPERING)
     antennas = {name: i for i, name in enumerate(rfid.all_antennas())}
-    wanted = {name: i for i, name in enumerate(looks.names) if i in learnt and looks.has_height[i]}
+    wanted = {name: i for i, name in enumerate(observations.names) if i in learnt and observations.has_height[i]}
     reads = phase_reads(log, wanted, antennas, rfid.phase.window)
     out = dict(learnt)
     for tag in wanted.values():
         mine = reads.chosen(reads.tags == tag)
         alone = replace(mine, tags=np.zeros_like(mine.tags))
-        out[tag] = _focused(model, alone, float(looks.heights[tag]), learnt[tag])
+        out[tag] = _focused(model, alone, float(observations.heights[tag]), learnt[tag])
     return out
 
 
 def _focused(model: PhaseModel, reads: PhaseReads, height: float, prior: LearntPoint) -> LearntPoint:
     """The position of the only tag of ``reads``, which are relative to the world's origin."""
     information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
-    found = prior
+    position = prior
     for _ in range(SELECTIONS):
-        tag = TagArray(np.array([(*found.position, height)]), np.full(1, np.nan))
+        tag = TagArray(np.array([(*position.position, height)]), np.full(1, np.nan))
         likelihood = PhaseLikelihood(model, tag)
         near = likelihood.near(np.zeros(3), reads)
         if len(near.tags) < FEWEST:
             break
-        start = found.position - prior.position
+        start = position.position - prior.position
         off = _best(likelihood, near, start, information, _lattice(prior.covariance) - start)
         off, curvature = _refined(likelihood, near, start, information, off)
-        found = LearntPoint(found.position + off, np.asarray(np.linalg.inv(curvature), dtype=np.float64))
-    return found
+        position = LearntPoint(position.position + off, np.asarray(np.linalg.inv(curvature), dtype=np.float64))
+    return position
 
 
 def _lattice(covariance: Array) -> Array:
@@ -109,5 +109,5 @@ def _refined(
         cost = float(score.nll[0] + 0.5 * moved @ information @ moved)
         return cost, gradient, score.information[0, :2, :2] + information
 
-    found, _, curvature = minimum(at, off, ITERATIONS, CONVERGED, largest=STEP)
-    return found, curvature
+    optimum, _, curvature = minimum(at, off, ITERATIONS, CONVERGED, largest=STEP)
+    return optimum, curvature

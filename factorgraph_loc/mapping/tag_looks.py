@@ -50,15 +50,15 @@ def tag_looks(log: Log, height: float | None = None) -> TagLooks:
     Raises InputError if the log has no reads, or none by an antenna of its rig.
     """
     scans = whole_scans(log)
-    found = {epc for scan in scans for epc in scan.tags}
-    if not found:
+    read_tags = {epc for scan in scans for epc in scan.tags}
+    if not read_tags:
         raise InputError(f"{log.name}: has no reads of tags (rfid), so that there is nothing to map")
     if log.rig.find(RfidSettings) is None:
         raise InputError(f"{log.name}: its rig has no [rfid], expected antennas and what they read")
     antennas = {name: i for i, name in enumerate(log.rig.of(RfidSettings).all_antennas())}
     model = log.rig.of(RfidSettings).model()
     given = tag_map(log.world, log.rig.of(SurveySettings))
-    names = (*given.names, *sorted(found - set(given.names)))
+    names = (*given.names, *sorted(read_tags - set(given.names)))
     index = {name: i for i, name in enumerate(names)}
     rows = [row for m in scans for row in _rows(m, antennas, index)]
     if not rows:
@@ -66,8 +66,8 @@ def tag_looks(log: Log, height: float | None = None) -> TagLooks:
         raise InputError(f"{log.name}: no antenna that read is in its rig, expected some of {known}")
     rows.sort(key=lambda row: row[0])
     t, antenna, rounds, hits = zip(*rows, strict=True)
-    others = len(names) - len(given.names)
-    has_height = np.append(np.ones(len(given.names), dtype=bool), np.full(others, height is not None))
+    unmapped = len(names) - len(given.names)
+    has_height = np.append(np.ones(len(given.names), dtype=bool), np.full(unmapped, height is not None))
     if height is None:
         height = float(np.mean([a.z for a in model.antennas]))
     return TagLooks(
@@ -77,9 +77,9 @@ def tag_looks(log: Log, height: float | None = None) -> TagLooks:
         np.array(antenna, dtype=np.int64),
         np.array(rounds, dtype=np.int64),
         np.array(hits, dtype=np.int64),
-        np.concatenate((given.tags.points[:, 2], np.full(others, height))),
-        np.concatenate((given.tags.facing, np.full(others, np.nan))),
-        np.concatenate((given.tags.points[:, :2], np.full((others, 2), np.nan))),
+        np.concatenate((given.tags.points[:, 2], np.full(unmapped, height))),
+        np.concatenate((given.tags.facing, np.full(unmapped, np.nan))),
+        np.concatenate((given.tags.points[:, :2], np.full((unmapped, 2), np.nan))),
         has_height,
     )
 

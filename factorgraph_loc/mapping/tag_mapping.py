@@ -77,79 +77,83 @@ def map_tags(
 
     Raises InputError if the log lacks what is needed, RunFailedError if no tag could be located.
     """
-    looks = tag_looks(log, height)
-    given = np.isfinite(looks.positions[:, 0])
+    observations = tag_looks(log, height)
+    given = np.isfinite(observations.positions[:, 0])
     known = given if extend else np.zeros_like(given)
     if poses == "reference":
-        learnt, facing, found, way = _along_reference(log, looks)
+        learnt, facing, posteriors, path = _along_reference(log, observations)
         learnt = {tag: point for tag, point in learnt.items() if not known[tag]}
     else:
         if prior is None:
             if extend:
                 raise InputError(f"{log.name}: its map can be extended from odometry only with a known start")
             prior = PosePrior(log.span()[0], np.zeros(3), EXACT_SIGMA**2 * np.eye(3))
-            looks = replace(looks, facing=np.full(len(given), np.nan))
-        slam = tag_slam(log, looks, prior, known, progress)
-        learnt = focused(log, looks, slam.tags, Trajectory(slam.t, slam.poses))
-        facing, found, way = slam.facing, slam.found, slam.poses
+            observations = replace(observations, facing=np.full(len(given), np.nan))
+        slam = tag_slam(log, observations, prior, known, progress)
+        learnt = focused(log, observations, slam.tags, Trajectory(slam.t, slam.poses))
+        facing, posteriors, path = slam.facing, slam.posteriors, slam.poses
     if not learnt and not extend:
         raise RunFailedError(f"{log.name}: no tag was read often enough, from different enough places, to be located")
-    names = looks.names
-    landmarks = {n: _as_landmark(log, n, p) for n, p, g in zip(names, looks.positions, given, strict=True) if g}
+    names = observations.names
+    landmarks = {n: _as_landmark(log, n, p) for n, p, g in zip(names, observations.positions, given, strict=True) if g}
     stand_in = replace(log, world=World(landmarks=landmarks))
     by_name = {names[tag]: point for tag, point in learnt.items()}
     made = mapping.make_map(stand_in, by_name, extend=extend, in_frame=poses == "reference")
     turned = facing + made.frame[2]
     same = poses == "reference" or made.judged or extend
-    world = _world(log, looks, made, {names[tag]: float(turned[tag]) for tag in learnt}, in_given_frame=same)
+    world = _world(log, observations, made, {names[tag]: float(turned[tag]) for tag in learnt}, in_given_frame=same)
     why = {
-        name: _why(one, int(looks.hits[:, i].sum()))
-        for i, (name, one) in enumerate(zip(names, found, strict=True))
+        name: _why(posterior, int(observations.hits[:, i].sum()))
+        for i, (name, posterior) in enumerate(zip(names, posteriors, strict=True))
         if i not in learnt and not known[i]
     }
     doubtful = {
-        n: tuple(replace(m, position=se2.transform_from(made.frame, m.position)) for m in one.modes)
-        for n, one in zip(names, found, strict=True)
-        if n in why and one.is_explained and one.is_ambiguous
+        n: tuple(replace(m, position=se2.transform_from(made.frame, m.position)) for m in posterior.modes)
+        for n, posterior in zip(names, posteriors, strict=True)
+        if n in why and posterior.is_explained and posterior.is_ambiguous
     }
-    return MadeTags(world, made, se2.compose(made.frame, way), why, doubtful)
+    return MadeTags(world, made, se2.compose(made.frame, path), why, doubtful)
 
 
-def _along_reference(log: Log, looks: TagLooks) -> tuple[dict[int, LearntPoint], Array, list[TagPosterior], Array]:
+def _along_reference(
+    log: Log, observations: TagLooks
+) -> tuple[dict[int, LearntPoint], Array, list[TagPosterior], Array]:
     """Learnt tags by index; facings (T,); the search result of each tag; and the poses (K, 3) of the antenna observations."""
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference, expected one, or that the poses come from odometry")
     if not log.reference.has_heading:
         raise InputError(f"{log.name}: its reference has no headings, expected poses from odometry")
-    at = log.reference.at(looks.t, max_gap=MAX_GAP)
+    at = log.reference.at(observations.t, max_gap=MAX_GAP)
     which = np.asarray(np.isfinite(at).all(axis=1))
     if not which.any():
         raise InputError(f"{log.name}: no tag was read where the reference has poses, expected poses from odometry")
-    found = search(looks.model, looks.along(at[which], which), looks.heights, looks.facing)
+    posteriors = search(
+        observations.model, observations.along(at[which], which), observations.heights, observations.facing
+    )
     learnt = {
-        tag: LearntPoint(one.modes[0].position, one.modes[0].covariance)
-        for tag, one in enumerate(found)
-        if one.is_located
+        tag: LearntPoint(posterior.modes[0].position, posterior.modes[0].covariance)
+        for tag, posterior in enumerate(posteriors)
+        if posterior.is_located
     }
-    learnt = focused(log, looks, learnt)
-    facing = looks.facing.copy()
+    learnt = focused(log, observations, learnt)
+    facing = observations.facing.copy()
     for tag in learnt:
         if np.isnan(facing[tag]):
-            facing[tag] = found[tag].modes[0].facing
-    return learnt, facing, found, at[which]
+            facing[tag] = posteriors[tag].modes[0].facing
+    return learnt, facing, posteriors, at[which]
 
 
-def _why(one: TagPosterior, reads: int) -> Unlocated:
+def _why(posterior: TagPosterior, reads: int) -> Unlocated:
     """The reason why a tag is not in the map."""
     if not reads:
         return Unlocated("unread", "never read")
     count = f"read {reads} times" if reads > 1 else "read once"
-    if not one.is_explained:
+    if not posterior.is_explained:
         return Unlocated("chance", f"{count}: no position explains that significantly better than chance")
-    if one.is_ambiguous:
-        places = [f"({m.position[0]:.2f}, {m.position[1]:.2f}) m with {m.weight:.0%}" for m in one.modes[:3]]
+    if posterior.is_ambiguous:
+        places = [f"({m.position[0]:.2f}, {m.position[1]:.2f}) m with {m.weight:.0%}" for m in posterior.modes[:3]]
         return Unlocated("ambiguous", f"{count}: ambiguous, {' or '.join(places)}")
-    return Unlocated("uncertain", f"{count}: too uncertain, sigma {one.modes[0].sigma:.1f} m")
+    return Unlocated("uncertain", f"{count}: too uncertain, sigma {posterior.modes[0].sigma:.1f} m")
 
 
 def _as_landmark(log: Log, name: str, position: Array) -> Landmark:
@@ -171,12 +175,14 @@ def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
     return xx, xy, yy
 
 
-def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool) -> World:
+def _world(
+    log: Log, observations: TagLooks, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool
+) -> World:
     """The map as written: learnt tags in the frame of the rig's survey, kept tags as they were given."""
     survey: SurveySettings = log.rig.of(SurveySettings)
     transform = survey.transform()
     tags: dict[str, Tag] = {}
-    for i, name in enumerate(looks.names):
+    for i, name in enumerate(observations.names):
         landmark = made.world.landmarks.get(name)
         if landmark is None:
             continue
@@ -192,7 +198,7 @@ def _world(log: Log, looks: TagLooks, made: LandmarkMap, facing: Mapping[str, fl
         tags[name] = Tag.bounded(
             x=x,
             y=y,
-            z=float(looks.heights[i]),
+            z=float(observations.heights[i]),
             facing=None if np.isnan(direction) else se2.wrap_scalar(direction),
             covariance=covariance,
         )

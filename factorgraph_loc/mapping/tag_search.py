@@ -96,26 +96,27 @@ class TagPosterior:
         return self.is_explained and not self.is_ambiguous and self.modes[0].sigma < LARGEST_SIGMA
 
 
-def search(model: RfidModel, looks: TagReadCounts, heights: Array, facing: Array) -> list[TagPosterior]:
-    """Search for T tags with ``heights`` (T,) and ``facing`` (T,), NaN where unknown. ``looks``: read counts from known poses,
-    relative to the world's origin.
+def search(model: RfidModel, observations: TagReadCounts, heights: Array, facing: Array) -> list[TagPosterior]:
+    """Search for T tags with ``heights`` (T,) and ``facing`` (T,), NaN where unknown.
+
+    ``observations``: read counts from known poses, relative to the world's origin.
     """
-    looks = merged(looks, *FINE)
+    observations = merged(observations, *FINE)
     uses_facing = any(m.uses_facing for m in model.models)
-    nothing = math.log1p(-model.false_read) * looks.rounds.sum()
-    reads = looks.hits.sum(axis=0)
+    nothing = math.log1p(-model.false_read) * observations.rounds.sum()
+    reads = observations.hits.sum(axis=0)
     odds = math.log(max(model.false_read, 1e-12)) - math.log1p(-model.false_read)
     nowhere = -model.tempering * (nothing + reads * odds)
     # a tag with fewer reads cannot be located
     searched = -model.tempering * reads * odds > GAIN
     coarse = _lattice_search(
-        model, merged(looks, *COARSE), searched, heights, facing if uses_facing else np.full(len(facing), np.nan)
+        model, merged(observations, *COARSE), searched, heights, facing if uses_facing else np.full(len(facing), np.nan)
     )
     if uses_facing and np.isnan(facing[coarse.tag]).any():
         between = np.pi / DIRECTIONS * np.where(np.isnan(facing[coarse.tag]), 1.0, 0.0)
         sides = [TagCandidates(coarse.tag, coarse.places, coarse.facing + s * between) for s in (-1.0, 0.0, 1.0)]
         coarse = TagCandidates(*(np.concatenate([getattr(c, n) for c in sides]) for n in ("tag", "places", "facing")))
-    fine, nll, covariances = refine(model, looks, heights, coarse)
+    fine, nll, covariances = refine(model, observations, heights, coarse)
     out = []
     for t in range(len(heights)):
         mine = np.flatnonzero(fine.tag == t)
@@ -125,15 +126,15 @@ def search(model: RfidModel, looks: TagReadCounts, heights: Array, facing: Array
     return out
 
 
-def merged(looks: TagReadCounts, distance: float, angle: float) -> TagReadCounts:
+def merged(observations: TagReadCounts, distance: float, angle: float) -> TagReadCounts:
     """Read counts with those of one antenna added up while the robot stays within ``distance`` [m] and ``angle`` [rad]."""
-    group = np.empty(len(looks.antennas), dtype=np.int64)
+    group = np.empty(len(observations.antennas), dtype=np.int64)
     first: dict[int, int] = {}
     kept: list[int] = []
-    for k, antenna in enumerate(looks.antennas.tolist()):
+    for k, antenna in enumerate(observations.antennas.tolist()):
         i = first.get(antenna)
         if i is not None:
-            x, y, turned = looks.offsets[k] - looks.offsets[kept[i]]
+            x, y, turned = observations.offsets[k] - observations.offsets[kept[i]]
             if math.hypot(x, y) > distance or abs(wrap_scalar(turned)) > angle:
                 i = None
         if i is None:
@@ -141,29 +142,29 @@ def merged(looks: TagReadCounts, distance: float, angle: float) -> TagReadCounts
             kept.append(k)
         group[k] = i
     rounds = np.zeros(len(kept), dtype=np.int64)
-    hits = np.zeros((len(kept), looks.hits.shape[1]), dtype=np.int64)
-    np.add.at(rounds, group, looks.rounds)
-    np.add.at(hits, group, looks.hits)
-    return TagReadCounts(looks.offsets[kept], looks.antennas[kept], rounds, hits)
+    hits = np.zeros((len(kept), observations.hits.shape[1]), dtype=np.int64)
+    np.add.at(rounds, group, observations.rounds)
+    np.add.at(hits, group, observations.hits)
+    return TagReadCounts(observations.offsets[kept], observations.antennas[kept], rounds, hits)
 
 
 def _lattice_search(
-    model: RfidModel, looks: TagReadCounts, read: NDArray[np.bool_], heights: Array, facing: Array
+    model: RfidModel, observations: TagReadCounts, read: NDArray[np.bool_], heights: Array, facing: Array
 ) -> TagCandidates:
     """The best candidates of each tag that is ``read`` (T,), on a lattice wherever the antennas reach."""
-    cells = _cells(looks.offsets[:, :2], reach(model))
+    cells = _cells(observations.offsets[:, :2], reach(model))
     uses_facing = any(m.uses_facing for m in model.models)
     free = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS) if uses_facing else np.array([np.nan])
     levels = np.round(heights / LEVEL)
     tables: list[list[tuple[Array, float]]] = [[] for _ in heights]
     for level in np.unique(levels[read]):
-        here = read & (levels == level)
-        given = [(d, here & (facing == d)) for d in np.unique(facing[here & np.isfinite(facing)])]
-        for direction, wanted in (*given, *((d, here & np.isnan(facing)) for d in free)):
+        on_level = read & (levels == level)
+        given = [(d, on_level & (facing == d)) for d in np.unique(facing[on_level & np.isfinite(facing)])]
+        for direction, wanted in (*given, *((d, on_level & np.isnan(facing)) for d in free)):
             tags = np.flatnonzero(wanted)
             if not len(tags):
                 continue
-            nll = _nll(model, looks, tags, cells, float(level) * LEVEL, float(direction))
+            nll = _nll(model, observations, tags, cells, float(level) * LEVEL, float(direction))
             for column, t in enumerate(tags.tolist()):
                 tables[t].append((nll[:, column], float(direction)))
     rows = [(t, *c) for t, table in enumerate(tables) if table for c in _best(cells, table)]
@@ -185,20 +186,25 @@ def _cells(places: Array, distance: float) -> Array:
 
 
 def _nll(
-    model: RfidModel, looks: TagReadCounts, tags: NDArray[np.int64], cells: Array, height: float, direction: float
+    model: RfidModel,
+    observations: TagReadCounts,
+    tags: NDArray[np.int64],
+    cells: Array,
+    height: float,
+    direction: float,
 ) -> Array:
     """Tempered negative log-likelihood (G, S) of S ``tags`` at all cells."""
     points = np.column_stack((cells, np.full(len(cells), height)))
     likelihood = RfidLikelihood(model, TagArray(points, np.full(len(cells), direction)))
     out = np.zeros((len(cells), len(tags)))
     for antenna in range(len(model.antennas)):
-        mine = np.flatnonzero(looks.antennas == antenna)
+        mine = np.flatnonzero(observations.antennas == antenna)
         for first in range(0, len(mine), LOOKS):
             part = mine[first : first + LOOKS]
-            q = np.clip(likelihood.probabilities(looks.offsets[part], antenna), 1e-12, 1.0 - 1e-12)
+            q = np.clip(likelihood.probabilities(observations.offsets[part], antenna), 1e-12, 1.0 - 1e-12)
             missed = np.log1p(-q)
-            out -= (looks.rounds[part] @ missed)[:, None]
-            hits = looks.hits[np.ix_(part, tags)]
+            out -= (observations.rounds[part] @ missed)[:, None]
+            hits = observations.hits[np.ix_(part, tags)]
             some = hits.any(axis=1)
             out -= (np.log(q[some]) - missed[some]).T @ hits[some]
     return model.tempering * out
@@ -221,12 +227,12 @@ def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, f
     return out
 
 
-def _modes(found: TagCandidates, nll: Array, covariances: Array) -> tuple[TagMode, ...]:
+def _modes(optima: TagCandidates, nll: Array, covariances: Array) -> tuple[TagMode, ...]:
     """Optima of one tag, best first, as modes; neighbouring ones, which differ in facing, are merged."""
     kept: list[int] = []
     for i in range(len(nll)):
-        apart = np.hypot(*(found.places[kept] - found.places[i]).T)
-        turned = np.abs(np.nan_to_num(wrap(found.facing[kept] - found.facing[i])))
+        apart = np.hypot(*(optima.places[kept] - optima.places[i]).T)
+        turned = np.abs(np.nan_to_num(wrap(optima.facing[kept] - optima.facing[i])))
         if not np.any((apart < SAME) & (turned < SAME)):
             kept.append(i)
     if not kept:
@@ -237,7 +243,7 @@ def _modes(found: TagCandidates, nll: Array, covariances: Array) -> tuple[TagMod
     for k, i in enumerate(kept):
         for group in groups:
             head = kept[group[0]]
-            off = found.places[head] - found.places[i]
+            off = optima.places[head] - optima.places[i]
             if np.hypot(*off) < MERGED or off @ np.linalg.solve(covariances[head] + covariances[i], off) < OVERLAP:
                 group.append(k)
                 break
@@ -251,18 +257,23 @@ def _modes(found: TagCandidates, nll: Array, covariances: Array) -> tuple[TagMod
             if weights[group].sum() > 0.0
             else np.full(len(group), 1.0 / len(group))
         )
-        mean = share @ found.places[members]
-        off = found.places[members] - mean
-        spread = np.einsum("k,kij->ij", share, covariances[members] + off[:, :, None] * off[:, None, :])
+        mean = share @ optima.places[members]
+        off = optima.places[members] - mean
+        covariance = np.einsum("k,kij->ij", share, covariances[members] + off[:, :, None] * off[:, None, :])
         out.append(
-            TagMode(float(weights[group].sum()), mean, spread, float(found.facing[members[int(share.argmax())]]))
+            TagMode(float(weights[group].sum()), mean, covariance, float(optima.facing[members[int(share.argmax())]]))
         )
     return tuple(sorted(out, key=lambda mode: -mode.weight))
 
 
-def of_tags(looks: TagReadCounts, tags: Integers) -> TagReadCounts:
+def of_tags(observations: TagReadCounts, tags: Integers) -> TagReadCounts:
     """The read counts of some ``tags`` (C,)."""
-    return TagReadCounts(looks.offsets, looks.antennas, looks.rounds, np.ascontiguousarray(looks.hits[:, tags]))
+    return TagReadCounts(
+        observations.offsets,
+        observations.antennas,
+        observations.rounds,
+        np.ascontiguousarray(observations.hits[:, tags]),
+    )
 
 
 def reach(model: RfidModel) -> float:
@@ -281,7 +292,7 @@ def reach(model: RfidModel) -> float:
 
 
 def refine(
-    model: RfidModel, looks: TagReadCounts, heights: Array, candidates: TagCandidates
+    model: RfidModel, observations: TagReadCounts, heights: Array, candidates: TagCandidates
 ) -> tuple[TagCandidates, Array, Array]:
     """TagCandidates at the nearest local optimum, with negative log-likelihood (C,) and covariance (C, 2, 2)."""
     places, nll = candidates.places.copy(), np.empty(len(candidates.tag))
@@ -290,28 +301,28 @@ def refine(
     for first in range(0, len(nll), CHUNK):
         part = slice(first, first + CHUNK)
         tag, facing = candidates.tag[part], candidates.facing[part]
-        mine = of_tags(looks, tag)
+        mine = of_tags(observations, tag)
         places[part], nll[part], information = _refined(model, mine, heights[tag], facing, places[part])
         covariances[part] = np.linalg.inv(information + prior)
     return TagCandidates(candidates.tag, places, candidates.facing), nll, covariances
 
 
 def _refined(
-    model: RfidModel, looks: TagReadCounts, heights: Array, facing: Array, places: Array
+    model: RfidModel, observations: TagReadCounts, heights: Array, facing: Array, places: Array
 ) -> tuple[Array, Array, Array]:
     """Positions (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2), of C tags at once, each with its own
     column of hits. The information is the observed curvature where it is positive definite, else the Fisher information."""
 
     def at(places: Array, which: Integers) -> tuple[Array, Array, Array]:
         tags = TagArray(np.column_stack((places, heights[which])), facing[which])
-        return RfidLikelihood(model, tags).by_tag(np.zeros(3), of_tags(looks, which))
+        return RfidLikelihood(model, tags).by_tag(np.zeros(3), of_tags(observations, which))
 
-    found, every = minima(at, places, ITERATIONS, CONVERGED, largest=LARGEST_STEP), np.arange(len(places))
-    states, information = found.states, found.curvatures
+    optima, every = minima(at, places, ITERATIONS, CONVERGED, largest=LARGEST_STEP), np.arange(len(places))
+    states, information = optima.states, optima.curvatures
     columns = []
     for off in CURVATURE_STEP * np.eye(2):
         columns.append((at(states + off, every)[1] - at(states - off, every)[1]) / (2.0 * CURVATURE_STEP))
     curvature = np.stack(columns, axis=2)
     curvature = (curvature + curvature.transpose(0, 2, 1)) / 2.0
     good = np.linalg.eigvalsh(curvature)[:, 0] > 0.1 * np.linalg.eigvalsh(information)[:, 0]
-    return states, found.costs, np.where(good[:, None, None], curvature, information)
+    return states, optima.costs, np.where(good[:, None, None], curvature, information)

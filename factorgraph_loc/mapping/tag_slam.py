@@ -46,22 +46,23 @@ Factors = list[tuple[Factor, tuple[int, ...]]]
 
 @dataclass(frozen=True)
 class TagSlam:
-    """``t`` (M,) and ``poses`` (M, 3) of the keyframes; ``tags``: the located ones by index; ``facing`` (T,); ``found``: result
-    of the last search for each of T tags.
+    """``t`` (M,) and ``poses`` (M, 3) of the keyframes; ``tags``: the located ones by index; ``facing`` (T,).
+
+    ``posteriors``: results of the last search for each of T tags.
     """
 
     t: Array
     poses: Array
     tags: dict[int, LearntPoint]
     facing: Array
-    found: list[TagPosterior]
+    posteriors: list[TagPosterior]
 
 
 def tag_slam(
-    log: Log, looks: TagLooks, prior: PosePrior, known: NDArray[np.bool_], progress: Callable[[float], None]
+    log: Log, observations: TagLooks, prior: PosePrior, known: NDArray[np.bool_], progress: Callable[[float], None]
 ) -> TagSlam:
-    """Map the tags that are not ``known`` (T,); known ones stay at ``looks.positions``. The frame is that of the prior."""
-    problem = _Problem(log, looks, prior, known)
+    """Map the tags that are not ``known`` (T,); known ones stay at ``observations.positions``. The frame is that of the prior."""
+    problem = _Problem(log, observations, prior, known)
     count = len(problem.t)
     for end in (*range(STRETCH, count, STRETCH), count):
         problem.extend(end)
@@ -70,31 +71,31 @@ def tag_slam(
         progress(end / count)
     for _ in range(ROUNDS):
         problem.solve(FINAL_ITERATIONS)
-        found = problem.search(~known, 0)
-        if not problem.add_located(found):
+        posteriors = problem.search(~known, 0)
+        if not problem.add_located(posteriors):
             break
-    return problem.result(found)
+    return problem.result(posteriors)
 
 
 class _Problem:
     """The optimisation problem as built so far."""
 
-    def __init__(self, log: Log, looks: TagLooks, prior: PosePrior, known: NDArray[np.bool_]) -> None:
-        self._looks, self._prior, self._known = looks, prior, known
+    def __init__(self, log: Log, observations: TagLooks, prior: PosePrior, known: NDArray[np.bool_]) -> None:
+        self._looks, self._prior, self._known = observations, prior, known
         self._constants = log.rig.estimated("odometry")
         wheels = moving(log.streams)
         motion = whole_motion(log, (*wheels, *(name for name in moving(log.rig.sensors, TURN) if not moving((name,)))))
-        last = max(float(looks.t[-1]), prior.t)
-        self.t = _keyframes(prior.t, last, np.concatenate((looks.t, *(log.streams[name].t for name in wheels))))
+        last = max(float(observations.t[-1]), prior.t)
+        self.t = _keyframes(prior.t, last, np.concatenate((observations.t, *(log.streams[name].t for name in wheels))))
         states = [motion.state(float(t)) for t in self.t]
         self._steps = [motion.relative(a, b) for a, b in pairwise(states)]
-        self._used = looks.t >= prior.t
-        self._keyframe = np.searchsorted(self.t, looks.t, side="right") - 1
-        self._offsets = np.zeros((len(looks.t), 3))
+        self._used = observations.t >= prior.t
+        self._keyframe = np.searchsorted(self.t, observations.t, side="right") - 1
+        self._offsets = np.zeros((len(observations.t), 3))
         for k in np.flatnonzero(self._used):
-            self._offsets[k] = motion.relative(states[self._keyframe[k]], motion.state(float(looks.t[k]))).delta
-        self._reach = reach(looks.model) + MARGIN
-        self._facing = looks.facing.copy()
+            self._offsets[k] = motion.relative(states[self._keyframe[k]], motion.state(float(observations.t[k]))).delta
+        self._reach = reach(observations.model) + MARGIN
+        self._facing = observations.facing.copy()
         self.mapped = known.copy()
         self._values: Values = {pose_key(0): np.array(prior.pose)}
         if self._constants.names:
@@ -117,18 +118,18 @@ class _Problem:
         out = [TagPosterior((), 0, 0.0) for _ in wanted]
         if len(tags) and len(poses):
             mine = of_tags(along, tags)
-            found = search(self._looks.model, mine, self._looks.heights[tags], self._looks.facing[tags])
-            for tag, one in zip(tags.tolist(), found, strict=True):
-                out[tag] = one
+            posteriors = search(self._looks.model, mine, self._looks.heights[tags], self._looks.facing[tags])
+            for tag, posterior in zip(tags.tolist(), posteriors, strict=True):
+                out[tag] = posterior
         return out
 
-    def add_located(self, found: list[TagPosterior]) -> bool:
+    def add_located(self, posteriors: list[TagPosterior]) -> bool:
         """Add located tags, and move mapped ones that were located significantly elsewhere; whether anything changed."""
         changed = False
-        for tag, one in enumerate(found):
-            if self._known[tag] or not one.is_located:
+        for tag, posterior in enumerate(posteriors):
+            if self._known[tag] or not posterior.is_located:
                 continue
-            mode, key = one.modes[0], landmark_key(tag)
+            mode, key = posterior.modes[0], landmark_key(tag)
             if self.mapped[tag]:
                 off = mode.position - self._values[key]
                 if off @ np.linalg.solve(mode.covariance, off) < ELSEWHERE:
@@ -142,7 +143,7 @@ class _Problem:
     def solve(self, iterations: int) -> None:
         self._values = self._problem().solve(self._values, iterations).values
 
-    def result(self, found: list[TagPosterior]) -> TagSlam:
+    def result(self, posteriors: list[TagPosterior]) -> TagSlam:
         tags = np.flatnonzero(self.mapped & ~self._known).tolist()
         keys = [landmark_key(i) for i in tags]
         try:
@@ -150,7 +151,7 @@ class _Problem:
         except IndeterminateError as error:
             raise RunFailedError(f"{len(tags)} tags were located, but the reads do not determine how well") from error
         learnt = {i: LearntPoint(self._values[key], covariances[key]) for i, key in zip(tags, keys, strict=True)}
-        return TagSlam(self.t, self._poses(), learnt, self._facing, found)
+        return TagSlam(self.t, self._poses(), learnt, self._facing, posteriors)
 
     def _poses(self) -> Array:
         return np.array([self._values[pose_key(i)] for i in range(self._count)])
@@ -174,11 +175,11 @@ class _Problem:
         return Problem(factors + self._tag_factors())
 
     def _tag_factors(self) -> Factors:
-        looks, out = self._looks, list[tuple[Factor, tuple[int, ...]]]()
-        points = np.column_stack((np.nan_to_num(looks.positions), looks.heights))
-        everything = RfidLikelihood(looks.model, TagArray(points, self._facing))
+        observations, out = self._looks, list[tuple[Factor, tuple[int, ...]]]()
+        points = np.column_stack((np.nan_to_num(observations.positions), observations.heights))
+        everything = RfidLikelihood(observations.model, TagArray(points, self._facing))
         fixed = np.flatnonzero(self._known)
-        map_ = RfidLikelihood(looks.model, TagArray(points[fixed], self._facing[fixed]))
+        map_ = RfidLikelihood(observations.model, TagArray(points[fixed], self._facing[fixed]))
         variable = np.flatnonzero(self.mapped & ~self._known)
         places = np.array([self._values[landmark_key(i)] for i in variable.tolist()]).reshape(-1, 2)
         order = np.flatnonzero(self._used & (self._keyframe < self._count))
@@ -187,13 +188,13 @@ class _Problem:
             rows = order[bounds[i] : bounds[i + 1]]
             if not len(rows):
                 continue
-            hits = looks.hits[rows]
-            here = TagReadCounts(self._offsets[rows], looks.antennas[rows], looks.rounds[rows], hits)
+            hits = observations.hits[rows]
+            counts = TagReadCounts(self._offsets[rows], observations.antennas[rows], observations.rounds[rows], hits)
             if len(fixed):
-                out.append((RfidFactor(map_, of_tags(here, fixed)), (pose_key(i),)))
+                out.append((RfidFactor(map_, of_tags(counts, fixed)), (pose_key(i),)))
             near = np.hypot(*(places - self._values[pose_key(i)][:2]).T) < self._reach
             for tag in variable[near | hits[:, variable].any(axis=0)].tolist():
-                out.append((RfidTagFactor(everything, tag, here), (pose_key(i), landmark_key(tag))))
+                out.append((RfidTagFactor(everything, tag, counts), (pose_key(i), landmark_key(tag))))
         return out
 
 

@@ -78,11 +78,11 @@ class Triangulated:
         """Which points (T,) have two or more observations, lie in front of all their cameras, and have enough parallax
         and small errors.
         """
-        behind = (self.depths < NEAREST) | (self.depths > FARTHEST)
+        invalid = (self.depths < NEAREST) | (self.depths > FARTHEST)
         square = np.bincount(tracks.track, np.sum(self.errors**2, axis=1), minlength=tracks.count)
         rms = np.sqrt(square / np.maximum(tracks.lengths(), 1))
         good = (self.parallax >= parallax) & (tracks.lengths() >= 2) & (rms <= 4.0 * model.sigma)
-        good[tracks.track[behind]] = False
+        good[tracks.track[invalid]] = False
         return np.asarray(good & np.isfinite(self.positions).all(axis=1))
 
 
@@ -100,17 +100,19 @@ def triangulate(model: CameraModel, cameras: Cameras, tracks: Tracks) -> Triangu
     """Triangulate the points of ``tracks``, with exact camera poses (:mod:`factors.camera.triangulation_kernels`). A point that is
     not determined is at the origin, with no parallax."""
     points, covariances = np.zeros((tracks.count, 3)), np.zeros((tracks.count, 3, 3))
-    rays, found = reprojection.rays(model, tracks.pixels), np.zeros(tracks.count, dtype=bool)
+    rays, determined = reprojection.rays(model, tracks.pixels), np.zeros(tracks.count, dtype=bool)
     rays /= np.linalg.norm(rays, axis=1)[:, None]
     sigmas, lens = np.full(len(tracks), model.sigma), reprojection.lens_of(model)
     order = np.argsort(tracks.track, kind="stable")
     for i, rows in enumerate(np.split(order, np.cumsum(tracks.lengths())[:-1])):
         frames = tracks.frame[rows]
-        seen = cameras.positions[frames], cameras.rotations[frames], rays[rows], tracks.pixels[rows], sigmas[rows]
-        ended, points[i], covariances[i], _ = kernels.triangulated(lens, *seen, ANY_SPREAD, 0.0, NEAREST, model.robust)
-        found[i] = ended == kernels.FOUND
+        observed = cameras.positions[frames], cameras.rotations[frames], rays[rows], tracks.pixels[rows], sigmas[rows]
+        ended, points[i], covariances[i], _ = kernels.triangulated(
+            lens, *observed, ANY_SPREAD, 0.0, NEAREST, model.robust
+        )
+        determined[i] = ended == kernels.FOUND
     error, _, _, depth = reproject(model, cameras, points, tracks)
-    return Triangulated(points, covariances, error, depth, np.where(found, parallax(cameras, points, tracks), 0.0))
+    return Triangulated(points, covariances, error, depth, np.where(determined, parallax(cameras, points, tracks), 0.0))
 
 
 def parallax(cameras: Cameras, points: Array, tracks: Tracks) -> Array:
@@ -119,5 +121,5 @@ def parallax(cameras: Cameras, points: Array, tracks: Tracks) -> Array:
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
     order = np.argsort(tracks.track, kind="stable")
     bounds = np.cumsum(tracks.lengths())[:-1]
-    least = [float((one @ one.T).min(initial=1.0)) for one in np.split(rays[order], bounds)]
+    least = [float((directions @ directions.T).min(initial=1.0)) for directions in np.split(rays[order], bounds)]
     return np.asarray(np.arccos(np.clip(least, -1.0, 1.0)))

@@ -122,17 +122,17 @@ def distance_to_walls(world: Walled, points: Array) -> Array:
 
 def shortest_path(space: FreeSpace, start: int, end: int) -> Array:
     """Return the corners (N, 2) of a short path between two cells: the shortest one on the grid, straightened where possible."""
-    _, before = csgraph.dijkstra(space.graph, directed=False, indices=end, return_predecessors=True)
-    return straightened(space, space.centres[chain(before, start)])
+    _, predecessors = csgraph.dijkstra(space.graph, directed=False, indices=end, return_predecessors=True)
+    return straightened(space, space.centres[chain(predecessors, start)])
 
 
-def chain(before: NDArray[np.int32], start: int) -> list[int]:
-    """Return the cells from ``start`` to the root of a tree of shortest paths, given the predecessor ``before`` (K,) of each
+def chain(predecessors: NDArray[np.int32], start: int) -> list[int]:
+    """Return the cells from ``start`` to the root of a tree of shortest paths, given the predecessor ``predecessors`` (K,) of each
     cell.
     """
     cells = [start]
-    while before[cells[-1]] >= 0:
-        cells.append(int(before[cells[-1]]))
+    while predecessors[cells[-1]] >= 0:
+        cells.append(int(predecessors[cells[-1]]))
     return cells
 
 

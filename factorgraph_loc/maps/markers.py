@@ -88,5 +88,7 @@ def corner_points(markers: Mapping[str, Marker]) -> PointMap:
     """Return the corners of all markers as a map of named points."""
     names = [name for marker in markers for name in corner_names(marker)]
     positions = np.array([marker.corners() for marker in markers.values()]).reshape(-1, 3)
-    spread = np.array([marker.sigma**2 * np.eye(3) for marker in markers.values() for _ in CORNERS]).reshape(-1, 3, 3)
-    return PointMap.of(names, positions, spread)
+    covariances = np.array([marker.sigma**2 * np.eye(3) for marker in markers.values() for _ in CORNERS]).reshape(
+        -1, 3, 3
+    )
+    return PointMap.of(names, positions, covariances)

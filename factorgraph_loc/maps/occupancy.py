@@ -83,12 +83,12 @@ def _outlines(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:
     import cv2  # noqa: PLC0415 - worlds without such a map need no OpenCV
 
     contours, _ = cv2.findContours(occupied.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    found: dict[tuple[int, int, int, int], None] = {}
+    segments: dict[tuple[int, int, int, int], None] = {}
     for contour in contours:
         if math.hypot(*np.ptp(contour[:, 0], axis=0).tolist()) < MIN_EXTENT:
             continue
         corners = cv2.approxPolyDP(contour, TOLERANCE, True)[:, 0].tolist()
         for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
             if start != end:  # a wall one cell wide is traced in both directions
-                found[(*min(start, end), *max(start, end))] = None
-    return np.array(list(found), dtype=np.int64).reshape(-1, 4)
+                segments[(*min(start, end), *max(start, end))] = None
+    return np.array(list(segments), dtype=np.int64).reshape(-1, 4)

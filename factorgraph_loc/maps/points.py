@@ -81,12 +81,12 @@ class PointMap:
     @classmethod
     def of(cls, names: Sequence[str], positions: Array, covariances: Array | None = None) -> PointMap:
         """Return a map of points that are identified by name only; exact if no covariances are given."""
-        spread = np.zeros((len(names), 3, 3)) if covariances is None else covariances
+        spatial = np.zeros((len(names), 3, 3)) if covariances is None else covariances
         nothing = np.empty(0)
         return cls(
             tuple(names),
             positions,
-            spread,
+            spatial,
             "",
             np.empty(0, dtype=np.int64),
             np.empty((0, 0)),
@@ -94,23 +94,23 @@ class PointMap:
             nothing,
         )
 
-    def with_points(self, others: PointMap, source: object) -> PointMap:
-        """Return this map with the named points ``others`` added. Raises InputError if a name exists already."""
-        if double := [name for name in others.names if name in self.index]:
+    def with_points(self, added: PointMap, source: object) -> PointMap:
+        """Return this map with the named points ``added`` added. Raises InputError if a name exists already."""
+        if double := [name for name in added.names if name in self.index]:
             raise InputError(f"{source}: the point {double[0]} is there twice, expected unique names")
         return replace(
             self,
-            names=(*self.names, *others.names),
-            positions=np.concatenate((self.positions, others.positions)),
-            covariances=np.concatenate((self.covariances, others.covariances)),
+            names=(*self.names, *added.names),
+            positions=np.concatenate((self.positions, added.positions)),
+            covariances=np.concatenate((self.covariances, added.covariances)),
         )
 
 
 def write_points(points: PointMap, path: Path) -> None:
     """Write ``NAME.points.parquet``: one row per view, and one row without a descriptor for a point without views."""
-    seen = np.zeros(len(points), dtype=bool)
-    seen[points.owners] = True
-    unseen = np.flatnonzero(~seen)
+    viewed = np.zeros(len(points), dtype=bool)
+    viewed[points.owners] = True
+    unseen = np.flatnonzero(~viewed)
     rows = np.concatenate((points.owners, unseen))
     order = np.argsort(rows, kind="stable")
     rows, views = rows[order], np.concatenate((np.arange(len(points.owners)), np.full(len(unseen), -1)))[order]

@@ -91,7 +91,9 @@ class LearntPoint:
 
 def learnt_landmarks(blocks: Iterable[tuple[str, Array, Array]]) -> dict[str, LearntPoint]:
     """The landmarks among ``blocks``, each ``SENSOR/NAME`` with its mean and covariance, by name; points in space are none."""
-    return {name.partition("/")[2]: LearntPoint(mean, spread) for name, mean, spread in blocks if len(mean) == 2}
+    return {
+        name.partition("/")[2]: LearntPoint(mean, covariance) for name, mean, covariance in blocks if len(mean) == 2
+    }
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ class Diagnostics:
             dict(self.rejected),
             dict(self.late),
             list(self.events),
-            {kind: dict(found) for kind, found in self.doubted.items()},
+            {kind: dict(probabilities) for kind, probabilities in self.doubted.items()},
         )
 
     def record(self) -> list[Addition]:
@@ -101,6 +101,6 @@ class Diagnostics:
 def _remove(rows: list[Any], taken: Sequence[Any]) -> None:
     """Remove the last occurrence of each row."""
     for row in reversed(taken):
-        found = next((i for i in reversed(range(len(rows))) if rows[i] is row or rows[i] == row), None)
-        if found is not None:
-            del rows[found]
+        index = next((i for i in reversed(range(len(rows))) if rows[i] is row or rows[i] == row), None)
+        if index is not None:
+            del rows[index]

@@ -166,9 +166,9 @@ def joined(first: Stream, second: Stream) -> Stream:
     if type(first) is not type(second):
         kinds = f"{type(first).__name__} and one with {type(second).__name__}"
         raise InputError(f"a log with {kinds} cannot be joined, expected tables of the same kind")
-    others = columns_of(second)
+    second_columns = columns_of(second)
     both: dict[str, Any] = {
-        k: np.concatenate((v, others[k])) if isinstance(v, np.ndarray) else [*v, *others[k]]
+        k: np.concatenate((v, second_columns[k])) if isinstance(v, np.ndarray) else [*v, *second_columns[k]]
         for k, v in columns_of(first).items()
     }
     return replace(first, **both)

@@ -130,10 +130,10 @@ def on_floor(
             f"{source}: the height of poses varies by {rise:.1f} m, expected a robot on a floor (at most {MOST:g} m); set axes "
             'to the axes that point forward, left and up, or to "body" if these are x, y and z'
         )
-    told = [f"vary in height by {rise:.2f} m"] if rise > RISE else []
-    told += [f"tilt by up to {math.degrees(tilt):.0f} degrees"] if tilt > TILT else []
-    if told:
-        warnings.append(f"{source}: poses {' and '.join(told)}, which is ignored; check axes and mounting")
+    problems = [f"vary in height by {rise:.2f} m"] if rise > RISE else []
+    problems += [f"tilt by up to {math.degrees(tilt):.0f} degrees"] if tilt > TILT else []
+    if problems:
+        warnings.append(f"{source}: poses {' and '.join(problems)}, which is ignored; check axes and mounting")
     return poses
 
 

@@ -88,8 +88,8 @@ class RunResult:
 
     def first_localized(self) -> int | None:
         """Index of the first causal estimate that is localized, or None if none is."""
-        found = np.flatnonzero(np.array(self.status) == "localized")
-        return int(found[0]) if len(found) else None
+        localized = np.flatnonzero(np.array(self.status) == "localized")
+        return int(localized[0]) if len(localized) else None
 
     def causal(self) -> Trajectory | None:
         """The causal estimates from the first localized one, or None if there is none."""

@@ -34,20 +34,20 @@ class Rig(FileModel):
 
     def find(self, kind: type[S], section: str | None = None) -> S | None:
         """The settings of class ``kind``, or None; ``section`` selects one if several have the same class."""
-        found: S | None = getattr(self, section or _SECTIONS[kind])
-        return found
+        settings: S | None = getattr(self, section or _SECTIONS[kind])
+        return settings
 
     def of(self, kind: type[S], section: str | None = None) -> S:
         """As :meth:`find`; InputError if the rig lacks the section."""
-        found = self.find(kind, section)
-        if found is None:
+        settings = self.find(kind, section)
+        if settings is None:
             raise InputError(f"the rig {self.name} has no [{section or _SECTIONS[kind]}]")
-        return found
+        return settings
 
     def estimated(self, section: str) -> Estimated:
         """The constants of a sensor that are estimated; none if the rig lacks the sensor."""
-        found = getattr(self, section)
-        return found.estimated() if isinstance(found, SensorSettings) else NOTHING
+        settings = getattr(self, section)
+        return settings.estimated() if isinstance(settings, SensorSettings) else NOTHING
 
     def time_offset(self, channel: str) -> float:
         """Seconds to add to the timestamps of a channel."""
@@ -56,15 +56,15 @@ class Rig(FileModel):
 
     def placed(self, folder: Path) -> Self:
         """A copy whose file references are relative to ``folder``."""
-        return self.model_copy(update={name: found.placed(folder) for name, found in self._of_sensors().items()})
+        return self.model_copy(update={name: settings.placed(folder) for name, settings in self._of_sensors().items()})
 
     def write_beside(self, folder: Path) -> None:
         """Write the files that the rig refers to into ``folder``."""
-        for found in self._of_sensors().values():
-            found.write_beside(folder)
+        for settings in self._of_sensors().values():
+            settings.write_beside(folder)
 
     def _of_sensors(self) -> dict[str, SensorSettings]:
-        return {name: found for name in _KINDS if isinstance(found := getattr(self, name), SensorSettings)}
+        return {name: settings for name in _KINDS if isinstance(settings := getattr(self, name), SensorSettings)}
 
 
 _KINDS: dict[str, type[FileModel]] = {name: load(section.kind) for name, section in sections().items()}

@@ -59,22 +59,22 @@ class HasSections(Protocol):
 @cache
 def registered() -> Mapping[str, HasSections]:
     """The registered sensors by name, built-in ones first. InputError if one cannot be loaded or two share a name."""
-    found: dict[str, HasSections] = dict(SENSORS)
+    known: dict[str, HasSections] = dict(SENSORS)
     owners: dict[tuple[str, str], str] = {}
-    for name, sensor in found.items():
+    for name, sensor in known.items():
         names = {"channel": [c.name for c in sensor.channels], "setting": sensor.settings, "layer": sensor.layers}
         for key in ((kind, each) for kind, several in names.items() for each in several):
             if key in owners:
                 raise InputError(f"sensors: {plain(name)} and {owners[key]} both have the {key[0]} {plain(key[1])}")
             owners[key] = name
-    return found
+    return known
 
 
 def sections() -> dict[str, Section]:
     """The sections of a rig by name in the order in which they are written; those without a channel come last."""
-    found = {name: section for sensor in registered().values() for name, section in sensor.settings.items()}
+    by_name = {name: section for sensor in registered().values() for name, section in sensor.settings.items()}
     used = set(sections_of_channels().values())
-    return {name: found[name] for name in sorted(found, key=lambda name: name not in used)}
+    return {name: by_name[name] for name in sorted(by_name, key=lambda name: name not in used)}
 
 
 def sections_of_channels() -> dict[str, str]:

@@ -138,9 +138,9 @@ class Trajectory(Exchange):
         out = np.full((len(t), 3), np.nan)
         if len(self.t) == 0:
             return out
-        before, after, fraction, valid = neighbours(self.t, t, max_gap)
-        start = self.poses[before]
-        twist = se2.log(se2.between(start, self.poses[after]))
+        first, last, fraction, valid = neighbours(self.t, t, max_gap)
+        start = self.poses[first]
+        twist = se2.log(se2.between(start, self.poses[last]))
         out[valid] = se2.compose(start, se2.exp(fraction[:, None] * twist))[valid]
         return out
 
@@ -152,8 +152,8 @@ class Trajectory(Exchange):
         out = np.full((len(t), 3, 3), np.nan)
         if len(self.t) == 0:
             return out
-        before, after, fraction, valid = neighbours(self.t, t, max_gap)
-        out[valid] = averaged(self.covariances, before, after, fraction)[valid]
+        first, last, fraction, valid = neighbours(self.t, t, max_gap)
+        out[valid] = averaged(self.covariances, first, last, fraction)[valid]
         return out
 
     def to_numpy(self) -> Array:
@@ -167,12 +167,12 @@ class Trajectory(Exchange):
 
         InputError if a column is missing, or has values that are no numbers.
         """
-        found = super().from_polars(table)
+        trajectory = super().from_polars(table)
         if not any(name in table.columns for name in COVARIANCES):
-            return found
+            return trajectory
         if missing := [name for name in COVARIANCES if name not in table.columns]:
             raise InputError(f"the table has no column {missing[0]}, expected all or none of {', '.join(COVARIANCES)}")
-        return replace(found, covariances=symmetric(list(numbers(table, COVARIANCES).T)))
+        return replace(trajectory, covariances=symmetric(list(numbers(table, COVARIANCES).T)))
 
     def to_polars(self) -> pl.DataFrame:
         """The poses as a table with the columns of :meth:`from_polars`, those of covariances if there are any."""
@@ -202,18 +202,18 @@ def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integ
     """Bracket times ``t`` (M,) in sorted ``stamps`` (N,), N > 0: the indices before and after, which are equal at a stamp, the
     fraction between them, and whether a time is inside and not in a gap longer than ``max_gap``."""
     t = np.asarray(t, dtype=float)
-    after = np.clip(np.searchsorted(stamps, t, side="left"), 0, len(stamps) - 1)
-    before = np.where(stamps[after] == t, after, np.maximum(after - 1, 0))
-    gap = stamps[after] - stamps[before]
+    last = np.clip(np.searchsorted(stamps, t, side="left"), 0, len(stamps) - 1)
+    first = np.where(stamps[last] == t, last, np.maximum(last - 1, 0))
+    gap = stamps[last] - stamps[first]
     valid = (t >= stamps[0]) & (t <= stamps[-1]) & (gap <= max_gap + 1e-9)
-    fraction = np.where(gap > 0.0, (t - stamps[before]) / np.where(gap > 0.0, gap, 1.0), 0.0)
-    return before, after, fraction, valid
+    fraction = np.where(gap > 0.0, (t - stamps[first]) / np.where(gap > 0.0, gap, 1.0), 0.0)
+    return first, last, fraction, valid
 
 
-def averaged(covariances: Array, before: Integers, after: Integers, fraction: Array) -> Array:
+def averaged(covariances: Array, first: Integers, last: Integers, fraction: Array) -> Array:
     """Covariances (M, D, D) interpolated in ``covariances`` (N, D, D): see :func:`neighbours`."""
     weight = fraction[:, None, None]
-    return np.asarray((1.0 - weight) * covariances[before] + weight * covariances[after])
+    return np.asarray((1.0 - weight) * covariances[first] + weight * covariances[last])
 
 
 def write_tum(trajectory: Exchange, path: str | Path, t0_ns: int = 0) -> None:

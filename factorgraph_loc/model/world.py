@@ -36,18 +36,18 @@ class World(FileModel):
 
     def of(self, kind: type[L]) -> dict[str, L]:
         """The layer whose elements have class ``kind``."""
-        found: dict[str, L] = getattr(self, next(name for name, other in _KINDS.items() if other is kind))
-        return found
+        layer: dict[str, L] = getattr(self, next(name for name, of_layer in _KINDS.items() if of_layer is kind))
+        return layer
 
     def position(self, name: str, layer: str | None = None) -> Array | None:
         """Position (2,) of an element of ``layer``, by default the first layer; None if it is not in the map."""
-        found = getattr(self, layer or next(iter(_KINDS))).get(name)
-        return None if found is None else np.array((found.x, found.y))
+        element = getattr(self, layer or next(iter(_KINDS))).get(name)
+        return None if element is None else np.array((element.x, element.y))
 
     def positions(self, layer: str | None = None) -> Array:
         """Positions (K, 2) of all elements of ``layer``, by default the first layer, in the order of the map."""
-        things = getattr(self, layer or next(iter(_KINDS))).values()
-        return np.array([(thing.x, thing.y) for thing in things]).reshape(-1, 2)
+        elements = getattr(self, layer or next(iter(_KINDS))).values()
+        return np.array([(element.x, element.y) for element in elements]).reshape(-1, 2)
 
 
 _KINDS: dict[str, type[FileModel]] = {name: load(layer.kind) for name, layer in layers().items()}

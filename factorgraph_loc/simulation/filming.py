@@ -73,8 +73,8 @@ class Film:
     def _velocity(self, t: float) -> Array:
         """Velocity in the world frame (3,) [m/s, m/s, rad/s]."""
         a, b = max(t - MOMENT, float(self.truth.t[0])), min(t + MOMENT, float(self.truth.t[-1]))
-        before, after = self.truth.at(np.array((a, b)))
-        change = after - before
+        earlier, later = self.truth.at(np.array((a, b)))
+        change = later - earlier
         change[2] = se2.wrap_scalar(change[2])
         return np.asarray(change / (b - a))
 

@@ -99,12 +99,12 @@ def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: f
     """The first hit of the ray along (dx, dy, dz): a row of the table, :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`; and
     its distance in lengths of the ray.
     """
-    best, found = np.inf, NOTHING
+    best, row = np.inf, NOTHING
     x0, y0, z0, top, per_width, per_depth = place
     if dz < -1e-12:
-        best, found = -z0 / dz, GROUND
+        best, row = -z0 / dz, GROUND
     elif dz > 1e-12:
-        best, found = (top - z0) / dz, CEILING
+        best, row = (top - z0) / dz, CEILING
     flat = math.sqrt(dx * dx + dy * dy)
     b = int(_direction(dx, dy)) & (BINS - 1)
     for k in range(starts[b], starts[b + 1]):
@@ -122,13 +122,13 @@ def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: f
         if z > table[i, TOP] + SLACK or z < table[i, BOTTOM] - SLACK:
             continue
         if t < best:
-            best, found = t, i
-    if CEILING <= found < 0:
+            best, row = t, i
+    if CEILING <= row < 0:
         # a camera outside of the building may look past it
         x, y = (x0 + best * dx) * per_width, (y0 + best * dy) * per_depth
         if not (-SLACK <= x <= 1.0 + SLACK and -SLACK <= y <= 1.0 + SLACK):
-            best, found = np.inf, NOTHING
-    return found, best
+            best, row = np.inf, NOTHING
+    return row, best
 
 
 @compiled(error_model="numpy")
@@ -151,11 +151,11 @@ def expose(
     directions: Array,
     rotation: Array,
     pixel_at_one: float,
-    found: NDArray[np.int16],
+    rows: NDArray[np.int16],
     out: NDArray[np.float32],
 ) -> None:
     """Render the building: add to ``out`` (H, W, 3) the colours of pixels in ``directions`` (H, W, 2), at depth 1 in the camera
-    frame. At edges a pixel is the mean of four rays. ``pixel_at_one``: size of a pixel at 1 m in texels; ``found`` (H, W): work
+    frame. At edges a pixel is the mean of four rays. ``pixel_at_one``: size of a pixel at 1 m in texels; ``rows`` (H, W): work
     array.
     """
     height, width = directions.shape[:2]
@@ -167,9 +167,9 @@ def expose(
             for j in range(width):
                 across, along, first = 0.0, 0.0, 4
                 if edges == 1:  # remove the central ray and add four around it
-                    here, first = found[i, j], 0
+                    row, first = rows[i, j], 0
                     left, right, up, down = max(j - 1, 0), min(j + 1, width - 1), max(i - 1, 0), min(i + 1, height - 1)
-                    if found[i, left] == here == found[i, right] and found[up, j] == here == found[down, j]:
+                    if rows[i, left] == row == rows[i, right] and rows[up, j] == row == rows[down, j]:
                         continue
                     across = (directions[i, right, 0] - directions[i, left, 0]) / (right - left)
                     along = (directions[down, j, 1] - directions[up, j, 1]) / (down - up)
@@ -177,18 +177,18 @@ def expose(
                     a, b = (0.5 * (k % 2) - 0.25, 0.5 * (k // 2) - 0.25) if k < 4 else (0.0, 0.0)
                     weight = np.float32(0.25 if k < 4 else 1.0 - 2.0 * edges)
                     x, y = directions[i, j, 0] + a * across, directions[i, j, 1] + b * along
-                    hit, blue, green, red = _look(
+                    hit, blue, green, red = _shade(
                         table, starts, items, place, texels, layout, x, y, rotation, pixel_at_one
                     )
                     if edges == 0:
-                        found[i, j] = hit
+                        rows[i, j] = hit
                     out[i, j, 0] += weight * blue
                     out[i, j, 1] += weight * green
                     out[i, j, 2] += weight * red
 
 
 @compiled(inline="always", error_model="numpy")
-def _look(
+def _shade(
     table: Array,
     starts: Ints,
     items: Ints,
@@ -205,20 +205,20 @@ def _look(
     dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
     dy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
     dz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
-    found, depth = cast(table, starts, items, place, dx, dy, dz)
+    row, depth = cast(table, starts, items, place, dx, dy, dz)
     blue = green = red = np.float32(0.0)
-    if found == NOTHING:
-        return found, blue, green, red
+    if row == NOTHING:
+        return row, blue, green, red
     flat = math.sqrt(dx * dx + dy * dy)
     along_x, along_y = 1.0, 0.0  # direction of the slant on the texture
-    if found >= 0:
-        number = int(table[found, FACE])
-        s = table[found, FOOT] + depth * (table[found, AX] * dx + table[found, AY] * dy)
-        u = 1.0 - s * table[found, PER_LENGTH]
-        v = (table[found, TOP] - z0 - depth * dz) * table[found, PER_HEIGHT]
-        slant = flat / abs(table[found, NX] * dx + table[found, NY] * dy)
+    if row >= 0:
+        number = int(table[row, FACE])
+        s = table[row, FOOT] + depth * (table[row, AX] * dx + table[row, AY] * dy)
+        u = 1.0 - s * table[row, PER_LENGTH]
+        v = (table[row, TOP] - z0 - depth * dz) * table[row, PER_HEIGHT]
+        slant = flat / abs(table[row, NX] * dx + table[row, NY] * dy)
     else:
-        number = layout.shape[0] - (2 if found == GROUND else 1)
+        number = layout.shape[0] - (2 if row == GROUND else 1)
         u = (x0 + depth * dx) * per_width
         v = (y0 + depth * dy) * per_depth
         slant = math.sqrt(flat * flat + dz * dz) / abs(dz)
@@ -241,7 +241,7 @@ def _look(
         b, g, r = _sample(texels, first, column + offset * along_x, line + offset * along_y, width, height)
         blue, green, red = blue + b, green + g, red + r
     share = np.float32(1.0) / np.float32(taps)
-    return found, share * blue, share * green, share * red
+    return row, share * blue, share * green, share * red
 
 
 @compiled(inline="always", error_model="numpy")
@@ -256,8 +256,8 @@ def _sample(
     p = first + i * width + j
     q = p + (width if i + 1 < height else 0)
     right = 1 if j + 1 < width else 0
-    one = np.float32(1.0)
-    w00, w01, w10, w11 = (one - a) * (one - b), (one - a) * b, a * (one - b), a * b
+    unit = np.float32(1.0)
+    w00, w01, w10, w11 = (unit - a) * (unit - b), (unit - a) * b, a * (unit - b), a * b
     blue = w00 * np.float32(texels[p, 0]) + w01 * np.float32(texels[p + right, 0])
     blue += w10 * np.float32(texels[q, 0]) + w11 * np.float32(texels[q + right, 0])
     green = w00 * np.float32(texels[p, 1]) + w01 * np.float32(texels[p + right, 1])

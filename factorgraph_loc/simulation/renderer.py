@@ -120,13 +120,13 @@ class Renderer:
         nearest = self._distances(position, rays)
         for lid in self._below(position):
             t, shares, on = _on_lid(lid, position, rays)
-            seen = on & (t <= nearest)
-            if not seen.any():
+            visible = on & (t <= nearest)
+            if not visible.any():
                 continue
-            level = int(np.clip(np.round(np.log2(np.median(t[seen]) * pixel_at_one)), 0, LEVELS - 1))
+            level = int(np.clip(np.round(np.log2(np.median(t[visible]) * pixel_at_one)), 0, LEVELS - 1))
             first, width, height = scene.layout[int(lid[5]), level].tolist()
-            column, row = (np.minimum(shares[seen] * (width, height), (width - 1, height - 1)).astype(np.int64)).T
-            pixels = seen.reshape(shape)
+            column, row = (np.minimum(shares[visible] * (width, height), (width - 1, height - 1)).astype(np.int64)).T
+            pixels = visible.reshape(shape)
             light[pixels] += scene.texels[first + row * width + column] - below[pixels]
 
     def _below(self, position: Array) -> Array:
@@ -138,8 +138,8 @@ class Renderer:
         place = np.asarray(position, dtype=float)
         if not np.isfinite(place).all():
             raise ValueError(f"the camera's position is {place}, expected finite numbers")
-        found: Surroundings = raycasting.surroundings(scene.faces, scene.bottoms, scene.tops, place, self._size)
-        return found
+        around: Surroundings = raycasting.surroundings(scene.faces, scene.bottoms, scene.tops, place, self._size)
+        return around
 
 
 def _on_lid(lid: Array, position: Array, rays: Array) -> tuple[Array, Array, NDArray[np.bool_]]:

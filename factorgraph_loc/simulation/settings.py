@@ -115,12 +115,12 @@ class SimulationSettings(FileModel):
 
     @model_validator(mode="after")
     def _fits(self) -> SimulationSettings:
-        for what, looks in self.looks().items():
-            if looks > MOST_LOOKS:
-                raise ValueError(f"{what} are observed {looks:,.0f} times in all, expected at most {MOST_LOOKS:,}")
+        for what, count in self.observation_counts().items():
+            if count > MOST_LOOKS:
+                raise ValueError(f"{what} are observed {count:,.0f} times in all, expected at most {MOST_LOOKS:,}")
         return self
 
-    def looks(self) -> dict[str, float]:
+    def observation_counts(self) -> dict[str, float]:
         """The number of simulated observations of tags, landmarks and points, summed over all objects of a kind. Raises
         ValueError if the settings are inconsistent.
         """
@@ -192,9 +192,9 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
         return dict(changes)
     out = dict(base)
     for pair in EXCLUSIVE:
-        for key, other in (pair, pair[::-1]):
-            if key in changes and other not in changes:
-                out.pop(other, None)
+        for key, partner in (pair, pair[::-1]):
+            if key in changes and partner not in changes:
+                out.pop(partner, None)
     for key, value in changes.items():
         old = out.get(key)
         out[key] = merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value

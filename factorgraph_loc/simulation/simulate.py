@@ -53,8 +53,8 @@ def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.
 
     ``seed``: a number, or the seed sequence of another generator.
     """
-    other = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8])
-    key = names.index(name) if name in names else other
+    digest = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8])
+    key = names.index(name) if name in names else digest
     parent = np.random.SeedSequence(seed) if isinstance(seed, int) else seed
     return np.random.default_rng(np.random.SeedSequence(parent.entropy, spawn_key=(*parent.spawn_key, key)))
 
@@ -62,18 +62,18 @@ def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.
 def drive(world: World, settings: DriveSettings, rng: np.random.Generator) -> Trajectory:
     """Poses at ``settings.rate`` from t = 0 to the duration, of a robot that drives between random places."""
     space = free_space(world, settings.clearance)
-    here = int(rng.integers(len(space.centres)))
-    length, parts = 0.0, [space.centres[here][None]]
+    start = int(rng.integers(len(space.centres)))
+    length, parts = 0.0, [space.centres[start][None]]
     while length < settings.duration * settings.speed:
-        there = int(rng.integers(len(space.centres)))
-        if there == here:
+        goal = int(rng.integers(len(space.centres)))
+        if goal == start:
             if len(space.centres) == 1:
                 raise InputError(f"world {world.name}: has no room to drive in, expected a larger one")
             continue
-        leg = dense(shortest_path(space, here, there))
+        leg = dense(shortest_path(space, start, goal))
         length += SPACING * len(leg)
         parts.append(leg)
-        here = there
+        start = goal
     path = np.concatenate(parts)
     heading = rng.uniform(-math.pi, math.pi)
     return _follow(path, heading, settings)
@@ -117,7 +117,7 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
     truth = drive(world, settings.drive, generator(seed, "drive"))
     ride = Ride(settings, rig, world, truth, partial(generator, seed), partial(generator, of_world), recorded)
     made: list[Simulated] = [function(ride) for _, function in functions("simulate")]
-    streams = {name: stream for one in made for name, stream in one.streams.items()}
+    streams = {name: stream for simulated in made for name, stream in simulated.streams.items()}
     start = truth.poses[0] + START_SIGMAS * generator(seed, "start").standard_normal(3)
     start[2] = se2.wrap_scalar(start[2])
     metadata = {"origin": f"simulated by fgloc {__version__}", "preset": settings.name, "seed": str(seed)}
@@ -126,12 +126,12 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
     return Log(
         name=f"{settings.name}-{seed}",
         rig=with_sensors(rig, streams),
-        world=world.model_copy(update={name: layer for one in made for name, layer in one.layers.items()}),
+        world=world.model_copy(update={name: layer for simulated in made for name, layer in simulated.layers.items()}),
         streams=streams,
         reference=truth,
         start=StartPose(0.0, start, START_SIGMAS.copy()),
-        warnings=tuple(warning for one in made for warning in one.warnings),
-        metadata=metadata | {key: value for one in made for key, value in one.metadata.items()},
+        warnings=tuple(warning for simulated in made for warning in simulated.warnings),
+        metadata=metadata | {key: value for simulated in made for key, value in simulated.metadata.items()},
     )
 
 

@@ -150,10 +150,10 @@ def _small_things(canvas: Canvas, rng: np.random.Generator, texel: float) -> Non
     height, width = canvas.shape[:2]
     for _ in range(int(5.0 * width * texel)):
         h, w = (max(3, round(rng.uniform(*SMALL) / texel)) for _ in range(2))
-        thing = pictures.filled(h, w, pictures.PAPER if rng.random() < 0.5 else pictures.vivid(rng))
-        cv2.rectangle(thing, (0, 0), (w - 1, h - 1), pictures.INK, 1)
-        thing[h // 3 : 2 * h // 3, w // 3 : 2 * w // 3] = pictures.INK
-        _hang(canvas, thing, int(rng.uniform(0, width)), int(rng.uniform(0, height)))
+        picture = pictures.filled(h, w, pictures.PAPER if rng.random() < 0.5 else pictures.vivid(rng))
+        cv2.rectangle(picture, (0, 0), (w - 1, h - 1), pictures.INK, 1)
+        picture[h // 3 : 2 * h // 3, w // 3 : 2 * w // 3] = pictures.INK
+        _hang(canvas, picture, int(rng.uniform(0, width)), int(rng.uniform(0, height)))
 
 
 def _lit(canvas: Canvas, rng: np.random.Generator, texel: float) -> Canvas:

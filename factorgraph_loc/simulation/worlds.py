@@ -187,14 +187,14 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
     if "floor" in settings.surfaces and not plan.hanging:
         on_floor = round(count / len(settings.surfaces)) if len(faces) else count
     on_faces = 0 if plan.hanging else count - on_floor
-    places = _even(settings, on_faces) if settings.even else _spread(plan, faces, on_faces, rng)
+    places = _even(settings, on_faces) if settings.even else _distribute(plan, faces, on_faces, rng)
     for x, y, facing in places.tolist():
         tags[f"T{len(tags):03d}"] = Tag(x=x, y=y, z=settings.tag_height, facing=facing)
     for x, y in plan.hanging[:count]:
         tags[f"T{len(tags):03d}"] = Tag(x=x, y=y, z=settings.tag_height)
     for x, y in rng.uniform((0.2, 0.2), (plan.width - 0.2, plan.depth - 0.2), (on_floor, 2)).round(3).tolist():
         tags[f"T{len(tags):03d}"] = Tag(x=x, y=y, z=0.0)
-    landmarks = _spread(plan, walls, settings.landmarks, rng)[:, :2].tolist()
+    landmarks = _distribute(plan, walls, settings.landmarks, rng)[:, :2].tolist()
     return World(
         name=settings.plan,
         tags=tags,
@@ -204,7 +204,7 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
     )
 
 
-def _spread(plan: Plan, faces: Array, count: int, rng: np.random.Generator) -> Array:
+def _distribute(plan: Plan, faces: Array, count: int, rng: np.random.Generator) -> Array:
     """``count`` places (x, y, direction away from the surface) along ``faces`` (F, 4), by best-candidate sampling (Mitchell,
     SIGGRAPH 1991): each is the farthest from the previous ones among :data:`CANDIDATES`, uniform per metre. None is behind
     furniture.
@@ -223,10 +223,10 @@ def _spread(plan: Plan, faces: Array, count: int, rng: np.random.Generator) -> A
 
 def _points(plan: Plan, walls: Array, boxes: Array, count: int, rng: np.random.Generator) -> PointMap:
     """Points spread over walls and furniture, at heights from :data:`POINT_HEIGHTS`, on furniture up to its top."""
-    places = _spread(plan, np.concatenate((walls, boxes)), count, rng)
+    places = _distribute(plan, np.concatenate((walls, boxes)), count, rng)
     x, y, facing = places.T
-    behind = np.column_stack((x - 2.0 * STANDOFF * np.cos(facing), y - 2.0 * STANDOFF * np.sin(facing)))
-    on_wall = plan.open(behind) | ~plan.indoors(behind)
+    back = np.column_stack((x - 2.0 * STANDOFF * np.cos(facing), y - 2.0 * STANDOFF * np.sin(facing)))
+    on_wall = plan.open(back) | ~plan.indoors(back)
     low, high = POINT_HEIGHTS
     z = low + (np.where(on_wall, high, LOWEST_BOX) - low) * rng.random(count)
     return PointMap.of([f"P{i:04d}" for i in range(count)], np.column_stack((x, y, z.round(3))))

@@ -40,10 +40,10 @@ class FramePairs:
         """The keyframe of the last image, if it is still one of ``keyframes`` and not much older than ``keyframe``."""
         if self._last is None:
             return None
-        before = self._last.keyframe
-        if not 0.0 < keyframe.t - before.t <= MAX_TIME:
+        previous = self._last.keyframe
+        if not 0.0 < keyframe.t - previous.t <= MAX_TIME:
             return None
-        return before if keyframes.get(before.index) is before else None
+        return previous if keyframes.get(previous.index) is previous else None
 
     def take(
         self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, predicted: Increment | None
@@ -54,19 +54,19 @@ class FramePairs:
         ``predicted``: the motion from that image's keyframe. None if there is no previous image, or the tracks do not determine
         the motion.
         """
-        last, here = self._last, _Frame(keyframe, dict(zip(names, pixels, strict=True)))
+        last, frame = self._last, _Frame(keyframe, dict(zip(names, pixels, strict=True)))
         if last is None or predicted is None:
-            self._last = here
+            self._last = frame
             return None
         x, y, turn = predicted.delta
         if math.hypot(x, y) < LEAST_WAY and abs(turn) < LEAST_TURN and predicted.duration < LEAST_TIME:
             return None
-        self._last = here
-        common = [name for name in here.pixels if name in last.pixels]
+        self._last = frame
+        common = [name for name in frame.pixels if name in last.pixels]
         first = np.array([last.pixels[name] for name in common]).reshape(-1, 2)
-        second = np.array([here.pixels[name] for name in common]).reshape(-1, 2)
-        found = frame_motion(self._model, first, second, predicted, np.random.default_rng(0))
-        if found is None:
+        second = np.array([frame.pixels[name] for name in common]).reshape(-1, 2)
+        motion = frame_motion(self._model, first, second, predicted, np.random.default_rng(0))
+        if motion is None:
             return None
-        factor = VisualOdometryFactor(found.delta, SHARED * found.information)
+        factor = VisualOdometryFactor(motion.delta, SHARED * motion.information)
         return Node((last.keyframe.key, keyframe.key), factor, 3)

@@ -83,11 +83,11 @@ class KeyframeCameras:
         Relative poses come from points of the graph where these determine both keyframes, otherwise from odometry.
         """
         slacks = self._slacks(newest, graph)
-        found = {newest.index: self._camera(pose, newest.index, slacks, graph)}
+        cameras = {newest.index: self._camera(pose, newest.index, slacks, graph)}
         for i in {sighting.keyframe for name in names for sighting in waiting[name]}:
-            if i not in found and i in slacks and graph.is_open(i):
-                found[i] = self._camera(self.pose(i, graph), i, slacks, graph)
-        return found
+            if i not in cameras and i in slacks and graph.is_open(i):
+                cameras[i] = self._camera(self.pose(i, graph), i, slacks, graph)
+        return cameras
 
     def bundled(
         self, newest: Keyframe, pose: Array, waiting: Waiting, tilt: float, graph: GraphView
@@ -101,11 +101,11 @@ class KeyframeCameras:
             return None
         last = [index for index in sorted(self._slacks(newest, graph))[-BUNDLE:] if graph.is_open(index)]
         poses = [pose if i == newest.index else self.pose(i, graph) for i in last]
-        found = bundled(replace(self._model, tilt=tilt), [graph.keyframes[i] for i in last], poses, waiting)
-        if found is None:
+        result = bundled(replace(self._model, tilt=tilt), [graph.keyframes[i] for i in last], poses, waiting)
+        if result is None:
             return None
-        adjusted = zip(last[-len(found) :], found, strict=True)
-        return {i: KeyframeCamera.of(self._model, p, SLACK, leaning) for i, (p, leaning) in adjusted}, found[-1][0]
+        adjusted = zip(last[-len(result) :], result, strict=True)
+        return {i: KeyframeCamera.of(self._model, p, SLACK, leaning) for i, (p, leaning) in adjusted}, result[-1][0]
 
     def _camera(self, pose: Array, keyframe: int, slacks: Mapping[int, float], graph: GraphView) -> KeyframeCamera:
         return KeyframeCamera.of(self._model, pose, slacks[keyframe], graph.values[tilt_key(keyframe)])

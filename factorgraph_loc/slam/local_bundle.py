@@ -38,8 +38,8 @@ def bundled(
     """
     often = _seen_often(keyframes[0].index, waiting)
     shared, sees = np.zeros(len(keyframes)), np.zeros(len(keyframes))
-    for seen in often:
-        rows = np.array([s.keyframe for s in seen]) - keyframes[0].index
+    for sightings in often:
+        rows = np.array([s.keyframe for s in sightings]) - keyframes[0].index
         sees[rows] += 1
         shared[rows[1:]] += np.diff(rows) == 1
     begin = int(np.flatnonzero(shared < np.clip(sees / 3.0, FEW, ENOUGH))[-1])
@@ -49,11 +49,11 @@ def bundled(
         return None
     starts = _turned(model, poses, first, often)
     adjusted, tilts, fits = _adjusted(model, keyframes, starts, often)
-    frames = np.array([s.keyframe - first for seen in often for s in seen])
+    frames = np.array([s.keyframe - first for sightings in often for s in sightings])
     if np.any(np.bincount(frames, fits) < MOST * np.bincount(frames)):
         return None
     fitting = iter(fits.tolist())
-    often = [fitted for seen in often if len(fitted := [s for s in seen if next(fitting)]) >= FEWEST]
+    often = [fitted for sightings in often if len(fitted := [s for s in sightings if next(fitting)]) >= FEWEST]
     if len(often) < ENOUGH:
         return None
     adjusted, tilts, _ = _adjusted(model, keyframes, adjusted, often)
@@ -68,12 +68,12 @@ def _adjusted(
     first = keyframes[0].index
     places = [camera_pose(model, pose) for pose in poses]
     points = []
-    for seen in often:
-        middle = seen[len(seen) // 2]
+    for sightings in often:
+        middle = sightings[len(sightings) // 2]
         centre, rotation = places[middle.keyframe - first]
         points.append(centre + DISTANCE * (rotation @ middle.ray))
     steps = [k.from_previous for k in keyframes[1:] if k.from_previous is not None]
-    frames = np.array([s.keyframe - first for seen in often for s in seen])
+    frames = np.array([s.keyframe - first for sightings in often for s in sightings])
     try:
         adjusted, tilts, residuals = kernels.adjusted(
             lens_of(model),
@@ -83,7 +83,7 @@ def _adjusted(
             np.array(points),
             frames,
             np.cumsum([0, *map(len, often)]),
-            np.array([s.pixel for seen in often for s in seen]),
+            np.array([s.pixel for sightings in often for s in sightings]),
             np.array((model.sigma, model.robust, model.tilt)),
             np.array([step.delta for step in steps]),
             positive.whitener(np.array([step.covariance for step in steps])),
@@ -96,7 +96,7 @@ def _adjusted(
 
 def _seen_often(first: int, waiting: Mapping[Hashable, Sequence[PointSighting]]) -> list[list[PointSighting]]:
     """The sightings from keyframe number ``first`` on of each point that was seen from :data:`FEWEST` of these."""
-    return [seen for w in waiting.values() if len(seen := [s for s in w if s.keyframe >= first]) >= FEWEST]
+    return [sightings for w in waiting.values() if len(sightings := [s for s in w if s.keyframe >= first]) >= FEWEST]
 
 
 def _turned(
@@ -104,13 +104,13 @@ def _turned(
 ) -> list[Array]:
     """The ``poses`` (3,) of keyframes from number ``first`` on, turned as points turn between them where these contradict."""
     sides: list[dict[int, float]] = [{} for _ in poses]
-    for i, seen in enumerate(often):
-        for s in seen:
+    for i, sightings in enumerate(often):
+        for s in sightings:
             x, y, _ = model.rotation @ s.ray
             sides[s.keyframe - first][i] = float(np.arctan2(y, x))
     turned = [poses[0]]
-    for before, here, at, then in zip(poses, poses[1:], sides, sides[1:], strict=False):
-        step = se2.between(before, here)
+    for start, second, at, then in zip(poses, poses[1:], sides, sides[1:], strict=False):
+        step = se2.between(start, second)
         turns = [at[i] - then[i] for i in at.keys() & then.keys()]
         if len(turns) >= ENOUGH and abs(turn := float(np.median(turns)) - step[2]) > SLIPPED:
             step = np.array((step[0], step[1], step[2] + turn))

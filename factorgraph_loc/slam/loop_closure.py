@@ -42,23 +42,23 @@ FARTHEST = 15.0  # m
 
 @dataclass(frozen=True)
 class OldPoints:
-    """``points`` (N) of the graph with a view each, and their ``keys``; positions may be outdated. ``ways`` (N,): distance
+    """``points`` (N) of the graph with a view each, and their ``keys``; positions may be outdated. ``travelled`` (N,): distance
     travelled by the robot [m] when they were last seen.
     """
 
     points: PointMap
     keys: Sequence[int]
-    ways: Array
+    travelled: Array
 
 
 @dataclass(frozen=True)
 class Image:
-    """What was seen from a new ``keyframe`` at about ``guess``; ``way``: distance travelled [m]."""
+    """What was seen from a new ``keyframe`` at about ``guess``; ``travelled``: distance travelled [m]."""
 
     frame: CameraFrame
     keyframe: Keyframe
     guess: Guess
-    way: float
+    travelled: float
 
 
 @dataclass(frozen=True)
@@ -82,23 +82,25 @@ class LoopClosure:
         """Whether the image at time ``t`` is to be compared."""
         return t >= self._looked + INTERVAL
 
-    def look(self, model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
+    def compare(
+        self, model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]
+    ) -> Revisit | None:
         """The old points that an image shows, None if not certain. ``current``: the newest estimate of a variable by key."""
         self._looked = image.keyframe.t
-        found = _found(model, image, old, current)
-        if found is None:
+        revisit = _revisit(model, image, old, current)
+        if revisit is None:
             return None
         agrees = False
         if self._found and image.keyframe.t <= self._found[-1].keyframe.t + BREAK:
             last = self._found[-1]
             went = se2.between(current(last.keyframe.key), image.guess[0])
-            off = se2.log(se2.between(went, se2.between(last.pose, found.pose)))
+            off = se2.log(se2.between(went, se2.between(last.pose, revisit.pose)))
             agrees = bool(np.sum((off / APART) ** 2) < GATE)
-        self._found = [*self._found[1 - SUCCESSIVE :], found] if agrees else [found]
-        return found if len(self._found) == SUCCESSIVE else None
+        self._found = [*self._found[1 - SUCCESSIVE :], revisit] if agrees else [revisit]
+        return revisit if len(self._found) == SUCCESSIVE else None
 
 
-def _found(model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
+def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
     """The result of one image by itself."""
     near = np.flatnonzero(_in_reach(model, lifted(model, *image.guess), old.points))
     recognised = None if len(near) < FEWEST else _recognised(model, image.frame, _newest(old, near, current))
@@ -106,8 +108,8 @@ def _found(model: CameraModel, image: Image, old: OldPoints, current: Callable[[
         return None
     pose, points, features = recognised
     rows = near[points]
-    way = image.way - float(np.median(old.ways[rows]))
-    if not _spread(model, image.frame.pixels[features]) or not _believed(image.guess, pose, way):
+    travelled = image.travelled - float(np.median(old.travelled[rows]))
+    if not _is_spread_out(model, image.frame.pixels[features]) or not _believed(image.guess, pose, travelled):
         return None
     return Revisit(image.keyframe, pose, rows, features)
 
@@ -120,30 +122,32 @@ def _recognised(model: CameraModel, frame: CameraFrame, points: PointMap) -> tup
     somewhere = associator.relocalized(frame)
     if somewhere is None:
         return None
-    *camera, seen = somewhere
-    floor = _on_floor(model, CameraPose(*camera), points, frame, seen)
+    *camera, associations = somewhere
+    floor = _on_floor(model, CameraPose(*camera), points, frame, associations)
     if floor is None:
         return None
-    there = lifted(model, floor.pose, floor.covariance)
-    seen = associator.guided(frame, there.position, there.rotation, there.covariance, model)
-    enough = max(FEWEST, LEAST_SHARE * seen.expected)
-    floor = _on_floor(model, there, points, frame, seen) if len(seen) >= enough else None
+    placed = lifted(model, floor.pose, floor.covariance)
+    associations = associator.guided(frame, placed.position, placed.rotation, placed.covariance, model)
+    enough = max(FEWEST, LEAST_SHARE * associations.expected)
+    floor = _on_floor(model, placed, points, frame, associations) if len(associations) >= enough else None
     if floor is None or np.count_nonzero(floor.inliers) < enough:
         return None
-    return floor.pose, seen.points[floor.inliers], seen.features[floor.inliers]
+    return floor.pose, associations.points[floor.inliers], associations.features[floor.inliers]
 
 
 def _on_floor(
-    model: CameraModel, camera: CameraPose, points: PointMap, frame: CameraFrame, seen: Associations
+    model: CameraModel, camera: CameraPose, points: PointMap, frame: CameraFrame, associations: Associations
 ) -> FoundOnFloor | None:
-    pixels = np.asarray(frame.pixels[seen.features], dtype=float)
-    return on_floor(model, camera, points.positions[seen.points], pixels, points.covariances[seen.points])
+    pixels = np.asarray(frame.pixels[associations.features], dtype=float)
+    return on_floor(
+        model, camera, points.positions[associations.points], pixels, points.covariances[associations.points]
+    )
 
 
-def _believed(guess: Guess, pose: Array, way: float) -> bool:
-    """Whether the track may have drifted from ``pose`` to ``guess`` over a distance ``way`` [m]."""
+def _believed(guess: Guess, pose: Array, travelled: float) -> bool:
+    """Whether the track may have drifted from ``pose`` to ``guess`` over a distance ``travelled`` [m]."""
     off = se2.log(se2.between(guess[0], pose))
-    drift = DRIFT + DRIFT_OF_WAY * way
+    drift = DRIFT + DRIFT_OF_WAY * travelled
     return bool(positive.squared(off, guess[1] + np.diag(drift**2)) < GATE)
 
 
@@ -151,18 +155,18 @@ def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truth
     """Which points (N,) the camera may see from the same side as before, if its pose is correct within :data:`SHIFTED` and
     :data:`TURNED`.
     """
-    here, there = points.positions - camera.position, points.positions - points.seen_from
-    away, before = np.linalg.norm(here, axis=1), np.linalg.norm(there, axis=1)
+    rays, old_rays = points.positions - camera.position, points.positions - points.seen_from
+    away, old_distance = np.linalg.norm(rays, axis=1), np.linalg.norm(old_rays, axis=1)
     turn = np.arcsin(np.minimum(1.0, SHIFTED / away))
-    right, _, ahead = (here @ camera.rotation).T
+    right, _, ahead = (rays @ camera.rotation).T
     half = math.atan(max(model.cx, model.width - model.cx) / model.fx)
-    between = np.arccos(np.clip(np.einsum("ni,ni->n", here, there) / (away * before), -1.0, 1.0))
+    between = np.arccos(np.clip(np.einsum("ni,ni->n", rays, old_rays) / (away * old_distance), -1.0, 1.0))
     return np.asarray(
         (np.abs(np.arctan2(right, ahead)) < half + TURNED + turn)
         & (away < FARTHEST + SHIFTED)
         & (between < VIEWED + turn)
-        & (away < ZOOMED * before + SHIFTED)
-        & (before < ZOOMED * away + SHIFTED)
+        & (away < ZOOMED * old_distance + SHIFTED)
+        & (old_distance < ZOOMED * away + SHIFTED)
     )
 
 
@@ -182,7 +186,7 @@ def _newest(old: OldPoints, rows: Integers, current: Callable[[int], Array]) -> 
     )
 
 
-def _spread(model: CameraModel, pixels: Array) -> bool:
+def _is_spread_out(model: CameraModel, pixels: Array) -> bool:
     """Whether ``pixels`` (K, 2) are spread over the image."""
     cells = np.floor(pixels / (model.width, model.height) * GRID)
     return len(np.unique(cells, axis=0)) >= CELLS

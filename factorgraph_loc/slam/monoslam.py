@@ -130,27 +130,27 @@ class Monoslam(Filter):
         if state is None:
             return Learnt()
         sigmas = np.sqrt(np.diag(state.covariance)[ROBOT : state.base])
-        found = zip(state.constants.tolist(), sigmas.tolist(), strict=True)
-        values = dict(zip(self._constants.names, found, strict=True))
+        constants = zip(state.constants.tolist(), sigmas.tolist(), strict=True)
+        values = dict(zip(self._constants.names, constants, strict=True))
         points = {}
         for point, start in zip(state.points, state.starts().tolist(), strict=True):
             if not point.ray:
                 part = slice(state.base + start, state.base + start + 3)
-                position, spread = state.values[start : start + 3], state.covariance[part, part]
+                position, covariance = state.values[start : start + 3], state.covariance[part, part]
                 if self._origin is not None:
-                    spread = spread + self._origin.of_point(position)
-                points[point.name] = LearntPoint(position[:2], spread[:2, :2])
+                    covariance = covariance + self._origin.of_point(position)
+                points[point.name] = LearntPoint(position[:2], covariance[:2, :2])
         return Learnt(values, points)
 
     def trajectory(self) -> Trajectory:
         """The poses at the ticks, seen from above: smoothed (Rauch, Tung, Striebel, 1965) in a known map, else, or without
         ``smooth``, the causal ones."""
         is_known = self._settings.landmarks == "known"
-        found = smoothed(self._records) if self._smooth and is_known else self._records
+        records = smoothed(self._records) if self._smooth and is_known else self._records
         ticks = np.unique(np.array(self._ticks))
-        chosen = [found[i] for i in np.searchsorted([r.t for r in found], ticks, side="right") - 1]
-        seen = [seen_from_above(r.robot, self._spread(r.robot, r.covariance)) for r in chosen]
-        poses, covariances = np.array([p for p, _ in seen]), np.array([c for _, c in seen])
+        chosen = [records[i] for i in np.searchsorted([r.t for r in records], ticks, side="right") - 1]
+        planar_poses = [seen_from_above(r.robot, self._pose_covariance(r.robot, r.covariance)) for r in chosen]
+        poses, covariances = np.array([p for p, _ in planar_poses]), np.array([c for _, c in planar_poses])
         return Trajectory(ticks, poses.reshape(-1, 3), covariances.reshape(-1, 3, 3))
 
     def _start(self, prior: PosePrior) -> SlamState:
@@ -194,24 +194,24 @@ class Monoslam(Filter):
             self.diagnostics.ignore("camera", len(m.pixels))
             return
         self._check.add(m)
-        state, match = self._found(m, self._state, eye)
+        state, match = self._match(m, self._state, eye)
         state, self._anew = self._relocated(m, state, eye, match)
         if len(match.pixels) and not self._anew and not self._vague(state):
             state = self._corrected(m, state, eye, match)
         if not self._anew and self._settings.landmarks != "known":
             state = self._managed(m, state, eye, match)
-        self._state = replace(state, seen=self._odometry)
+        self._state = replace(state, image_odometry=self._odometry)
 
-    def _found(self, m: Pixels, state: SlamState, eye: Eye) -> tuple[SlamState, Match]:
+    def _match(self, m: Pixels, state: SlamState, eye: Eye) -> tuple[SlamState, Match]:
         """The state before an image, and its matches. Without a map, the state is widened if wheels slipped by the image."""
-        if self._settings.landmarks == "known" or state.seen is None:
+        if self._settings.landmarks == "known" or state.image_odometry is None:
             return state, self._looker.match(m, state, eye)
-        slip = self._motion.slip(self._motion.relative(state.seen, self._odometry))
+        slip = self._motion.slip(self._motion.relative(state.image_odometry, self._odometry))
         return self._looker.unless_slipped(m, state, eye, *slip)
 
     def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
         """The iterated Kalman update; beyond the gate the noise of a pixel is widened, and Huber weights are applied."""
-        known = match.mapped, match.points, match.spreads
+        known = match.mapped, match.points, match.covariances
         zero = np.zeros(len(prior.covariance))
         sights = eye.all(prior, *known)
         innovation = Innovation.of(sights, prior.covariance)
@@ -220,7 +220,7 @@ class Monoslam(Filter):
         self._report(m, match, residual, innovation, sights.noise)
         tempering = np.ones(len(residual))
         tempering[len(match.mapped) :] = match.tempering
-        delta, root, spread = zero, np.empty(0), np.empty(0)
+        delta, root, gain = zero, np.empty(0), np.empty(0)
         for i in range(self._settings.iterations if self._settings.landmarks == "known" else 1):
             if i:
                 moved = prior.plus(delta, prior.covariance)
@@ -229,15 +229,15 @@ class Monoslam(Filter):
                 residual = match.pixels - sights.pixels
                 weight = huber_weight(squared(residual, sights.noise), eye.model.robust)
                 noise = weighted(sights.noise, 1.0 / weight)
-            root, spread = innovation.gain(noise / tempering[:, None, None])
+            root, gain = innovation.gain(noise / tempering[:, None, None])
             whitened = np.linalg.solve(root, residual.ravel() + innovation.jacobian @ delta[innovation.columns])
-            before, delta = delta, spread.T @ whitened
-            if np.abs((delta - before)[:6]).max() < SETTLED:
+            last_delta, delta = delta, gain.T @ whitened
+            if np.abs((delta - last_delta)[:6]).max() < SETTLED:
                 break
-        after = prior.plus(delta, prior.covariance - spread.T @ spread)
+        posterior = prior.plus(delta, prior.covariance - gain.T @ gain)
         if self._settings.landmarks == "known":
-            return after
-        return replace(with_floor(prior, after, self._t), covariance=carried(prior, after, self._scale))
+            return posterior
+        return replace(with_floor(prior, posterior, self._t), covariance=carried(prior, posterior, self._scale))
 
     def _report(self, m: Pixels, match: Match, residual: Array, innovation: Innovation, noise: Array) -> None:
         whitened = np.linalg.solve(innovation.root(noise), residual.ravel())
@@ -251,29 +251,29 @@ class Monoslam(Filter):
         """
         lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0
         camera = self._looker.relocated(m, eye) if lost >= LOST_AFTER or self._vague(state) else None
-        found = None if camera is None else self._standing(camera, eye, state)
-        if found is None:
+        relocated = None if camera is None else self._standing(camera, eye, state)
+        if relocated is None:
             return replace(state, lost=lost), False
         self.diagnostics.events.append((m.t, "camera: found its place in the map"))
-        return found, True
+        return relocated, True
 
     def _vague(self, state: SlamState) -> bool:
         """Whether the pose in a known map is too uncertain for linearization."""
         return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > VAGUE**2)
 
-    def _standing(self, camera: CameraPose, eye: Eye, before: SlamState) -> SlamState | None:
+    def _standing(self, camera: CameraPose, eye: Eye, lost_state: SlamState) -> SlamState | None:
         """The state of a robot with the relocalized ``camera``; None if it would float or tilt."""
         s = self._settings
         position, rotation = carrier(eye.model, camera.position, camera.rotation)
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
-        covariance = starting(np.zeros(len(before.constants)))
-        covariance[ROBOT:, ROBOT:] = before.covariance[ROBOT : before.base, ROBOT : before.base]
+        covariance = starting(np.zeros(len(lost_state.constants)))
+        covariance[ROBOT:, ROBOT:] = lost_state.covariance[ROBOT : lost_state.base, ROBOT : lost_state.base]
         back = np.linalg.inv(eye.lift)
         covariance[:6, :6] = back @ camera.covariance @ back.T
         if abs(position[2]) > FLOATS or rotation[2, 2] < math.cos(TILTS):
             return None
         covariance[UPRIGHT, UPRIGHT] += np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
-        return SlamState(robot, before.constants, covariance, floor=before.floor)
+        return SlamState(robot, lost_state.constants, covariance, floor=lost_state.floor)
 
     def _managed(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> SlamState:
         """The state after counting, deleting, converting (to x, y, z) and adding points."""
@@ -295,10 +295,10 @@ class Monoslam(Filter):
 
     def _estimate(self) -> PoseEstimate:
         robot = self._state.robot
-        pose, covariance = seen_from_above(robot, self._spread(robot, self._state.covariance))
+        pose, covariance = seen_from_above(robot, self._pose_covariance(robot, self._state.covariance))
         return PoseEstimate(self._t, pose, covariance, "localized", doubts_model=self._check.told)
 
-    def _spread(self, robot: RobotState, covariance: Array) -> Array:
+    def _pose_covariance(self, robot: RobotState, covariance: Array) -> Array:
         """The covariance (6, 6) of a pose, including that of the start without a map, or of the camera's mounting in one."""
         return covariance[:6, :6] + (self._mounting if self._origin is None else self._origin.of_pose(robot))
 

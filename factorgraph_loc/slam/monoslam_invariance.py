@@ -15,52 +15,52 @@ from factors.camera import inverse_depth
 from factors.se2 import Array
 
 
-def carried(before: SlamState, after: SlamState, scale: int | None) -> Array:
-    """The covariance (12 + P + D, 12 + P + D) of ``after``, an update of ``before``, if the invariant error keeps that of the
+def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
+    """The covariance (12 + P + D, 12 + P + D) of ``posterior``, an update of ``prior``, if the invariant error keeps that of the
     update. ``scale``: index of the constant that scales distances; None if there is none.
     """
-    covariance = after.covariance
-    own, ours = before.robot, after.robot
-    by_turn, by_scale = _by_turn(before, after), _by_scale(before, after)
-    change = np.zeros((len(covariance), before.base if scale is not None else POSE))
+    covariance = posterior.covariance
+    own, ours = prior.robot, posterior.robot
+    by_turn, by_scale = _by_turn(prior, posterior), _by_scale(prior, posterior)
+    change = np.zeros((len(covariance), prior.base if scale is not None else POSE))
     change[TURN, TURN] = change[SHIFT, SHIFT] = ours.rotation.T @ own.rotation - np.eye(3)
     change[:, TURN] += by_turn @ own.rotation
     if scale is not None:
-        one = 1.0 + before.constants[scale]
-        change[:, ROBOT + scale] = by_scale / one
-        change[ROBOT + scale, ROBOT + scale] = (1.0 + after.constants[scale]) / one - 1.0
+        factor = 1.0 + prior.constants[scale]
+        change[:, ROBOT + scale] = by_scale / factor
+        change[ROBOT + scale, ROBOT + scale] = (1.0 + posterior.constants[scale]) / factor - 1.0
     known = change.shape[1]
     covariance = covariance + change @ covariance[:known]
     covariance += covariance[:, :known] @ change.T
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def _by_turn(before: SlamState, after: SlamState) -> Array:
+def _by_turn(prior: SlamState, posterior: SlamState) -> Array:
     """How the error (12 + P + D,) of one rotation (3,) of the world differs between two states; the turn itself is left out."""
-    own, ours = before.robot, after.robot
-    found = np.zeros((len(after.covariance), 3))
-    found[SHIFT] = ours.rotation.T @ cross(own.position - ours.position)
-    found[VELOCITY] = cross(own.velocity - ours.velocity)
-    for point, start in zip(before.points, before.starts().tolist(), strict=True):
-        place = before.base + start
-        found[place : place + 3] = cross(before.values[start : start + 3] - after.values[start : start + 3])
+    own, ours = prior.robot, posterior.robot
+    change = np.zeros((len(posterior.covariance), 3))
+    change[SHIFT] = ours.rotation.T @ cross(own.position - ours.position)
+    change[VELOCITY] = cross(own.velocity - ours.velocity)
+    for point, start in zip(prior.points, prior.starts().tolist(), strict=True):
+        place = prior.base + start
+        change[place : place + 3] = cross(prior.values[start : start + 3] - posterior.values[start : start + 3])
         if point.ray:
             angles = slice(start + 3, start + 5)
-            turned = inverse_depth.turned(after.values[angles]) - inverse_depth.turned(before.values[angles])
-            found[place + 3 : place + 5] = turned
-    return found
+            turned = inverse_depth.turned(posterior.values[angles]) - inverse_depth.turned(prior.values[angles])
+            change[place + 3 : place + 5] = turned
+    return change
 
 
-def _by_scale(before: SlamState, after: SlamState) -> Array:
+def _by_scale(prior: SlamState, posterior: SlamState) -> Array:
     """How the error (12 + P + D,) of one enlargement of the world differs between two states; the scale itself is left out."""
-    own, ours = before.robot, after.robot
-    found = np.zeros(len(after.covariance))
-    found[SHIFT] = ours.rotation.T @ (ours.position - own.position)
-    found[VELOCITY] = ours.velocity - own.velocity
-    found[before.base :] = after.values - before.values
-    for point, start in zip(before.points, before.starts().tolist(), strict=True):
+    own, ours = prior.robot, posterior.robot
+    change = np.zeros(len(posterior.covariance))
+    change[SHIFT] = ours.rotation.T @ (ours.position - own.position)
+    change[VELOCITY] = ours.velocity - own.velocity
+    change[prior.base :] = posterior.values - prior.values
+    for point, start in zip(prior.points, prior.starts().tolist(), strict=True):
         if point.ray:
-            place = before.base + start
-            found[place + 3 : place + 5] = 0.0
-            found[place + 5] *= -1.0
-    return found
+            place = prior.base + start
+            change[place + 3 : place + 5] = 0.0
+            change[place + 5] *= -1.0
+    return change

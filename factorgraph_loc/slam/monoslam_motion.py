@@ -44,11 +44,11 @@ class RobotState:
             self.rate + error[RATE],
         )
 
-    def minus(self, other: RobotState) -> Array:
-        """The error (12,) of this state relative to ``other``."""
-        turn = log(other.rotation.T @ self.rotation)
-        shift = other.rotation.T @ (self.position - other.position)
-        return np.concatenate((turn, shift, self.velocity - other.velocity, self.rate - other.rate))
+    def minus(self, reference: RobotState) -> Array:
+        """The error (12,) of this state relative to ``reference``."""
+        turn = log(reference.rotation.T @ self.rotation)
+        shift = reference.rotation.T @ (self.position - reference.position)
+        return np.concatenate((turn, shift, self.velocity - reference.velocity, self.rate - reference.rate))
 
 
 @dataclass(frozen=True)
@@ -65,12 +65,12 @@ class Step:
         """The ``covariance`` (12 + P + D, 12 + P + D) of an error state, of which others are constant."""
         known = self.transition.shape[1]
         carried = self.transition @ covariance[:known]
-        found = covariance.copy()
-        found[:ROBOT] = carried
-        found[ROBOT:, :ROBOT] = carried[:, ROBOT:].T
+        result = covariance.copy()
+        result[:ROBOT] = carried
+        result[ROBOT:, :ROBOT] = carried[:, ROBOT:].T
         corner = carried[:, :known] @ self.transition.T + self.noise
-        found[:ROBOT, :ROBOT] = 0.5 * (corner + corner.T)
-        return found
+        result[:ROBOT, :ROBOT] = 0.5 * (corner + corner.T)
+        return result
 
     def then(self, transition: Array, noise: Array, robot: RobotState) -> Step:
         """This step followed by another, of the robot alone."""
@@ -128,8 +128,8 @@ def measured(robot: RobotState, motion: Displacement, dt: float) -> Step:
     by_noise[:6] = np.eye(6)
     by_noise[VELOCITY, SHIFT] = rotation / dt
     by_noise[RATE, TURN] = np.eye(3) / dt
-    way = robot.rotation @ motion.shift
-    moved = RobotState(robot.position + way, rotation, way / dt, log(motion.rotation) / dt)
+    shift = robot.rotation @ motion.shift
+    moved = RobotState(robot.position + shift, rotation, shift / dt, log(motion.rotation) / dt)
     return Step(
         moved, np.hstack((transition, by_noise @ motion.by_constants)), by_noise @ motion.covariance @ by_noise.T
     )
@@ -140,10 +140,10 @@ def planar(delta: Array, covariance: Array, by_constants: Array) -> Displacement
     ``by_constants`` (3, P).
     """
     x, y, heading = delta.tolist()
-    spread, derivative = np.zeros((6, 6)), np.zeros((6, by_constants.shape[1]))
-    spread[np.ix_(PLANAR, PLANAR)] = covariance
+    spatial, derivative = np.zeros((6, 6)), np.zeros((6, by_constants.shape[1]))
+    spatial[np.ix_(PLANAR, PLANAR)] = covariance
     derivative[PLANAR] = by_constants
-    return Displacement(about_z(heading), np.array((x, y, 0.0)), spread, derivative)
+    return Displacement(about_z(heading), np.array((x, y, 0.0)), spatial, derivative)
 
 
 def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float, settling: float) -> Step:

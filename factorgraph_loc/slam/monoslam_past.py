@@ -29,24 +29,24 @@ class UpdateRecord:
 
 def smoothed(records: Sequence[UpdateRecord]) -> list[UpdateRecord]:
     """The records, smoothed with all later ones. Velocity and turn rate have no later influence and are not smoothed."""
-    found = list(records[-1:])
-    for after, here in zip(records[:0:-1], records[-2::-1], strict=True):
-        found.append(here if after.anew else _smoothed(here, after, found[-1]))
-    return found[::-1]
+    results = list(records[-1:])
+    for next_record, record in zip(records[:0:-1], records[-2::-1], strict=True):
+        results.append(record if next_record.anew else _smoothed(record, next_record, results[-1]))
+    return results[::-1]
 
 
-def _smoothed(here: UpdateRecord, after: UpdateRecord, later: UpdateRecord) -> UpdateRecord:
-    """The record ``here`` given ``later``, which is the smoothed ``after``."""
-    total, known = len(here.covariance), after.step.transition.shape[1]
+def _smoothed(record: UpdateRecord, next_record: UpdateRecord, later: UpdateRecord) -> UpdateRecord:
+    """The record ``record`` given ``later``, which is the smoothed ``next_record``."""
+    total, known = len(record.covariance), next_record.step.transition.shape[1]
     transition = np.zeros((POSE, total))
-    transition[:, :known] = after.step.transition[:POSE]
+    transition[:, :known] = next_record.step.transition[:POSE]
     kept = np.r_[0:POSE, ROBOT:total]
     block = np.ix_(kept, kept)
-    error = np.concatenate((later.robot.minus(after.step.robot), later.constants - here.constants))
-    motion = transition[:, kept], after.step.noise[:POSE, :POSE]
-    change, covariance = np.zeros(total), here.covariance.copy()
+    error = np.concatenate((later.robot.minus(next_record.step.robot), later.constants - record.constants))
+    motion = transition[:, kept], next_record.step.noise[:POSE, :POSE]
+    change, covariance = np.zeros(total), record.covariance.copy()
     change[kept], covariance[block] = positive.smoothed(
-        here.covariance[block], *motion, error[kept], later.covariance[block]
+        record.covariance[block], *motion, error[kept], later.covariance[block]
     )
-    robot, constants = here.robot.plus(change[:ROBOT]), here.constants + change[ROBOT:]
-    return replace(here, robot=robot, constants=constants, covariance=covariance, anew=False)
+    robot, constants = record.robot.plus(change[:ROBOT]), record.constants + change[ROBOT:]
+    return replace(record, robot=robot, constants=constants, covariance=covariance, anew=False)

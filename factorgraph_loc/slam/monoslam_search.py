@@ -30,17 +30,17 @@ def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
     each = innovation.each(noise)
     gains = blocks @ np.linalg.inv(each)[None]
     corrected = residual[:, None] - np.einsum("jiab,ib->jia", gains, residual)
-    spread = each[:, None] - gains @ blocks.transpose(0, 1, 3, 2)
+    covariances = each[:, None] - gains @ blocks.transpose(0, 1, 3, 2)
     # rounding must not leave less than the noise
-    spread[..., 0, 0] = np.maximum(spread[..., 0, 0], noise[:, None, 0, 0])
-    spread[..., 1, 1] = np.maximum(spread[..., 1, 1], noise[:, None, 1, 1])
-    distances = squared(corrected.reshape(-1, 2), spread.reshape(-1, 2, 2)).reshape(count, count)
+    covariances[..., 0, 0] = np.maximum(covariances[..., 0, 0], noise[:, None, 0, 0])
+    covariances[..., 1, 1] = np.maximum(covariances[..., 1, 1], noise[:, None, 1, 1])
+    distances = squared(corrected.reshape(-1, 2), covariances.reshape(-1, 2, 2)).reshape(count, count)
     i = np.arange(count)
-    distances[i, i], spread[i, i] = squared(residual, each), each
+    distances[i, i], covariances[i, i] = squared(residual, each), each
     inside = distances < GATE
     # a match of a point that is hardly known explains everything, as it tells nothing
-    told = np.log(np.linalg.det(each)[:, None] / np.linalg.det(spread))
-    best = int(np.argmax(np.where(inside, GATE - distances + told, 0.0).sum(axis=0)))
+    information = np.log(np.linalg.det(each)[:, None] / np.linalg.det(covariances))
+    best = int(np.argmax(np.where(inside, GATE - distances + information, 0.0).sum(axis=0)))
     return _confirmed(residual, total, inside[:, best])
 
 
@@ -62,6 +62,6 @@ def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
         cross = information[np.ix_(kept, ~kept)]
         information = information[np.ix_(kept, kept)] - cross @ own[worst] @ cross.T
         rows, pixels, count = np.delete(rows, worst), pixels[kept], count - 1
-    found = np.zeros(len(right), dtype=bool)
-    found[rows] = True
-    return found
+    confirmed = np.zeros(len(right), dtype=bool)
+    confirmed[rows] = True
+    return confirmed

@@ -33,7 +33,7 @@ FEWEST_FOUND, SHARE_FOUND = 5, 0.5  # named points that must agree in relocaliza
 @dataclass(frozen=True)
 class Match:
     """The inlier pixels (K, 2), of points ``mapped`` in the state, then of ``points`` (P, 3) of the map with covariances
-    ``spreads`` (P, 3, 3).
+    ``covariances`` (P, 3, 3).
 
     ``tempering``: exponent of the likelihood. ``taken``: their rows of the image, including rejected ones. ``expected``: points
     of the state that should have been found. ``wanted``: 0 if too few were predicted to conclude anything from missing matches.
@@ -42,7 +42,7 @@ class Match:
     pixels: Array
     mapped: tuple[int, ...]
     points: Array
-    spreads: Array | None
+    covariances: Array | None
     taken: frozenset[int]
     expected: tuple[int, ...]
     wanted: int
@@ -64,10 +64,10 @@ class FeatureMatcher:
         self._associator: Associator | None = None
         if self.eye is not None and "camera" in sensors and len(self._map.owners):
             self._associator = Associator(self._map, self.eye.model)
-        self._spreads_matter = False
+        self._has_uncertain_points = False
         if self.eye is not None and len(self._map):
             worst = float(np.trace(self._map.covariances, axis1=1, axis2=2).max())
-            self._spreads_matter = worst > (EXACT * self.eye.model.sigma / self.eye.model.fx) ** 2
+            self._has_uncertain_points = worst > (EXACT * self.eye.model.sigma / self.eye.model.fx) ** 2
 
     def match(self, m: Pixels, state: SlamState, eye: Eye) -> Match:
         """The pixels that belong to points; outliers are removed and counted as rejected."""
@@ -79,12 +79,12 @@ class FeatureMatcher:
         """The state, less certain by ``added`` (3, 3) in x, y and heading if the pixels tell of wheels that slipped, and
         :meth:`match`. ``rarity``: minus the logarithm of how probable that is."""
         slipped, diagnostics = state.widened(added), self._diagnostics
-        before, noted = diagnostics.added, diagnostics.record()
+        added_before, noted = diagnostics.added, diagnostics.record()
         match = self.match(m, slipped, eye)
-        diagnostics.added = before
+        diagnostics.added = added_before
         if len(match.pixels) >= ENOUGH and _slip(match, state, eye, added) > rarity:
-            if before is not None:
-                before += noted
+            if added_before is not None:
+                added_before += noted
             return slipped, match
         diagnostics.take_back(noted)
         return state, self.match(m, state, eye)
@@ -94,8 +94,8 @@ class FeatureMatcher:
         names unknown to map and state, at a distance from matched and predicted pixels.
         """
         if m.frame is None:
-            there = {p.name for p in state.points}
-            return [i for i, name in enumerate(m.names) if i not in match.taken and name not in there]
+            known_names = {p.name for p in state.points}
+            return [i for i, name in enumerate(m.names) if i not in match.taken and name not in known_names]
         followed = np.isin(m.frame.tracks, list(tracks))
         expected = eye.mapped(state, range(len(state.points))).pixels
         occupied = np.concatenate((m.pixels[list(match.taken)].reshape(-1, 2), expected))
@@ -132,9 +132,9 @@ class FeatureMatcher:
         ours = []
         if which:
             descriptors = np.array([state.points[i].descriptor for i in which])
-            spreads = Innovation.of(sights, state.covariance).each(sights.noise)
-            found = match_guided(descriptors, m.descriptors, sights.pixels, spreads, m.pixels, binary=binary)
-            ours = [(feature, which[row]) for row, feature in found.indices.tolist()]
+            covariances = Innovation.of(sights, state.covariance).each(sights.noise)
+            matches = match_guided(descriptors, m.descriptors, sights.pixels, covariances, m.pixels, binary=binary)
+            ours = [(feature, which[row]) for row, feature in matches.indices.tolist()]
         known, wanted = self._known(m, state, eye)
         ours = self._agreeing(m.pixels, ours, state, eye)
         in_map = {f for f, _ in known}
@@ -144,8 +144,8 @@ class FeatureMatcher:
     def relocated(self, m: Pixels, eye: Eye) -> CameraPose | None:
         """The camera pose from this image and the map alone; None if they do not determine it."""
         if m.frame is not None:
-            found = None if self._associator is None else self._associator.relocalized(m.frame)
-            return None if found is None else CameraPose(*found[:3])
+            relocated = None if self._associator is None else self._associator.relocalized(m.frame)
+            return None if relocated is None else CameraPose(*relocated[:3])
         known = [(i, self._map.index[name]) for i, name in enumerate(m.names) if name in self._map.index]
         if len(known) < FEWEST_FOUND:
             return None
@@ -164,12 +164,14 @@ class FeatureMatcher:
         if m.feature != self._associator.feature:
             self._diagnostics.ignore("camera: features of another kind than the map's", len(m.pixels))
             return [], 0
-        seen = self._associator.guided(m, *eye.pose(state.robot), eye.spread(state.covariance))
-        if seen.rejected:
-            self._diagnostics.reject(DISAGREES, seen.rejected)
+        associations = self._associator.guided(m, *eye.pose(state.robot), eye.camera_covariance(state.covariance))
+        if associations.rejected:
+            self._diagnostics.reject(DISAGREES, associations.rejected)
         # one that is left out must not become a new point
-        chosen = spread_out(m.pixels[seen.features], len(seen) if self._grows else MOST)
-        return list(zip(seen.features[chosen].tolist(), seen.points[chosen].tolist(), strict=True)), seen.expected
+        chosen = spread_out(m.pixels[associations.features], len(associations) if self._grows else MOST)
+        return list(
+            zip(associations.features[chosen].tolist(), associations.points[chosen].tolist(), strict=True)
+        ), associations.expected
 
     def _agreeing(
         self, pixels: Array, ours: list[tuple[int, int]], state: SlamState, eye: Eye
@@ -188,8 +190,8 @@ class FeatureMatcher:
         if len(known) < FEWEST:
             return known
         points = self._map.positions[[p for _, p in known]]
-        noise = eye.known(state.robot, points, self._spreads([p for _, p in known])).noise
-        camera = CameraPose(*eye.pose(state.robot), eye.spread(state.covariance))
+        noise = eye.known(state.robot, points, self._covariances([p for _, p in known])).noise
+        camera = CameraPose(*eye.pose(state.robot), eye.camera_covariance(state.covariance))
         try:
             right = consensus.agreeing(eye.model, camera, points, pixels[[i for i, _ in known]], noise)
         except np.linalg.LinAlgError:  # of a meaningless prediction
@@ -201,8 +203,8 @@ class FeatureMatcher:
             self._diagnostics.reject(DISAGREES, int(np.count_nonzero(~right)))
         return list(compress(pairs, right.tolist()))
 
-    def _spreads(self, points: Sequence[int]) -> Array | None:
-        return self._map.covariances[list(points)].reshape(-1, 3, 3) if self._spreads_matter else None
+    def _covariances(self, points: Sequence[int]) -> Array | None:
+        return self._map.covariances[list(points)].reshape(-1, 3, 3) if self._has_uncertain_points else None
 
     def _match(
         self,
@@ -217,7 +219,7 @@ class FeatureMatcher:
             pixels[[i for i, _ in both]].reshape(-1, 2),
             tuple(p for _, p in ours),
             self._map.positions[points].reshape(-1, 3),
-            self._spreads(points),
+            self._covariances(points),
             frozenset(i for i, _ in both),
             tuple(expected),
             wanted,
@@ -232,7 +234,7 @@ def _visible(eye: Eye, sights: Sights) -> tuple[Sights, Integers]:
 
 def _slip(match: Match, state: SlamState, eye: Eye, added: Array) -> float:
     """By how much pixels are more probable if the pose is less certain by ``added`` (3, 3): the difference of the logarithms."""
-    sights = eye.all(state, match.mapped, match.points, match.spreads)
+    sights = eye.all(state, match.mapped, match.points, match.covariances)
     covariance = Innovation.of(sights, state.covariance).total(sights.noise)
     # points of unknown depth all began at the same, so that they may be nearer or farther together, as after a slip
     depths = np.minimum(sights.starts + inverse_depth.SIZE - 1, len(state.covariance) - 1)

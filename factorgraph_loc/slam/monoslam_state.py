@@ -62,8 +62,8 @@ class SlamState:
     """``robot``, corrections ``constants`` (P,) of the odometry's constants, and ``values`` (D,) of ``points`` one after the other;
     ``covariance`` (12 + P + D, 12 + P + D) of the error state.
 
-    ``tracks``: in the newest image; ``met``: number of points so far; ``lost``: consecutive images without a match; ``seen``:
-    the odometry at the newest image; ``floor``: how level it is, where that is learnt.
+    ``tracks``: in the newest image; ``met``: number of points so far; ``lost``: consecutive images without a match;
+    ``image_odometry``: the odometry at the newest image; ``floor``: how level it is, if that is learnt.
     """
 
     robot: RobotState
@@ -74,7 +74,7 @@ class SlamState:
     tracks: frozenset[int] = frozenset()
     met: int = 0
     lost: int = 0
-    seen: ChainState | None = None
+    image_odometry: ChainState | None = None
     floor: TiltScale | None = None
 
     @property
@@ -99,10 +99,10 @@ class SlamState:
         """Standard deviation of the tilt [rad], ``usual`` where no floor is learnt, and its time constant [s]."""
         return (usual, SETTLING) if self.floor is None else (self.floor.sigma, UNEVEN)
 
-    def widened(self, spread: Array) -> SlamState:
-        """The state of a robot whose x, y and heading are less certain, by ``spread`` (3, 3)."""
+    def widened(self, planar: Array) -> SlamState:
+        """The state of a robot whose x, y and heading are less certain, by ``planar`` (3, 3)."""
         covariance = self.covariance.copy()
-        covariance[np.ix_(PLANAR, PLANAR)] += spread
+        covariance[np.ix_(PLANAR, PLANAR)] += planar
         return replace(self, covariance=covariance)
 
     def moved(self, step: Step) -> SlamState:
@@ -110,18 +110,24 @@ class SlamState:
         return replace(self, robot=step.robot, covariance=step.carried(self.covariance))
 
 
-def with_floor(before: SlamState, after: SlamState, t: float) -> SlamState:
-    """The state ``after`` an update at ``t`` that learns how level the floor is from how the tilt changed since the last image, as
-    points lean with the robot that saw them first."""
-    if before.floor is None or before.seen is None or t <= before.seen.t:
-        return replace(after, floor=before.floor)
-    sigma, share = before.floor.sigma, -math.expm1(-2.0 * (t - before.seen.t) / UNEVEN)  # of its variance that is new
-    was, now = (positive.inverse(s.covariance[:2, :2]) for s in (before, after))
-    told, known = now - was, before.covariance[:2, :2] - share * sigma**2 * np.eye(2)
-    weight = np.linalg.inv(np.eye(2) + told @ known)  # what is told of the new part
-    covariance = positive.inverse(share * weight @ told + np.eye(2) / sigma**2)
-    tilt = math.sqrt(share) * covariance @ weight @ now @ (tilt_of(after.robot) - tilt_of(before.robot))
-    return replace(after, floor=before.floor.learnt(tilt, covariance, sigma)[0])
+def with_floor(prior: SlamState, posterior: SlamState, t: float) -> SlamState:
+    """The state ``posterior`` with an update of how level the floor is.
+
+    The evidence is the change of tilt since the last image. Points lean with the robot that observed them first. ``t`` [s]: time of
+    the image.
+    """
+    if prior.floor is None or prior.image_odometry is None or t <= prior.image_odometry.t:
+        return replace(posterior, floor=prior.floor)
+    sigma, share = (
+        prior.floor.sigma,
+        -math.expm1(-2.0 * (t - prior.image_odometry.t) / UNEVEN),
+    )  # of its variance that is new
+    was, now = (positive.inverse(s.covariance[:2, :2]) for s in (prior, posterior))
+    gained, known = now - was, prior.covariance[:2, :2] - share * sigma**2 * np.eye(2)
+    weight = np.linalg.inv(np.eye(2) + gained @ known)  # what is told of the new part
+    covariance = positive.inverse(share * weight @ gained + np.eye(2) / sigma**2)
+    tilt = math.sqrt(share) * covariance @ weight @ now @ (tilt_of(posterior.robot) - tilt_of(prior.robot))
+    return replace(posterior, floor=prior.floor.learnt(tilt, covariance, sigma)[0])
 
 
 def of_mounting(camera: CameraSettings) -> Array:
@@ -184,18 +190,18 @@ class Eye:
         """Position and rotation of the camera in the world."""
         return mounted(self.model, robot.position, robot.rotation)
 
-    def spread(self, covariance: Array) -> Array:
+    def camera_covariance(self, covariance: Array) -> Array:
         """The covariance (6, 6) of the camera's perturbation, from that of the error state."""
         return self.lift @ covariance[:POSE, :POSE] @ self.lift.T
 
-    def known(self, robot: RobotState, points: Array, spreads: Array | None) -> Sights:
-        """Predicted pixels of map ``points`` (K, 3) with covariances ``spreads`` (K, 3, 3); None: exact."""
+    def known(self, robot: RobotState, points: Array, covariances: Array | None) -> Sights:
+        """Predicted pixels of map ``points`` (K, 3) with covariances ``covariances`` (K, 3, 3); None: exact."""
         position, rotation = self.pose(robot)
         pixels, by_camera, by_point = linearize_in_space(self.model, position, rotation, points)
         depths = (points - position) @ rotation[:, 2]
         noise = np.broadcast_to(self.model.sigma**2 * np.eye(2), (len(points), 2, 2))
-        if spreads is not None:
-            noise = noise + by_point @ spreads @ by_point.transpose(0, 2, 1)
+        if covariances is not None:
+            noise = noise + by_point @ covariances @ by_point.transpose(0, 2, 1)
         nothing = np.zeros(len(points), dtype=np.int64)
         by_pose = by_camera @ self.lift
         return Sights(pixels, depths, by_pose, np.zeros_like(by_pose), nothing, nothing, noise)
@@ -211,20 +217,20 @@ class Eye:
             rows = np.flatnonzero(rays == kind)
             values = state.values[starts[rows, None] + np.arange(size)]
             if kind:
-                found = inverse_depth.linearize(self.model, position, rotation, values)
+                linearized = inverse_depth.linearize(self.model, position, rotation, values)
                 ahead = values[:, 5, None] * (values[:, :3] - position) + inverse_depth.directions(values)[0]
             else:
-                found = linearize_in_space(self.model, position, rotation, values)
+                linearized = linearize_in_space(self.model, position, rotation, values)
                 ahead = values - position
-            pixels[rows], by_camera[rows], by_point[rows, :, :size] = found
+            pixels[rows], by_camera[rows], by_point[rows, :, :size] = linearized
             depths[rows] = ahead @ rotation[:, 2]
         noise = np.broadcast_to(self.model.sigma**2 * np.eye(2), (count, 2, 2))
         sizes = np.where(rays, inverse_depth.SIZE, 3)
         return Sights(pixels, depths, by_camera @ self.lift, by_point, starts + state.base, sizes, noise)
 
-    def all(self, state: SlamState, which: Sequence[int], points: Array, spreads: Array | None) -> Sights:
+    def all(self, state: SlamState, which: Sequence[int], points: Array, covariances: Array | None) -> Sights:
         """Predicted pixels (K, 2) of points of the state, then of the map."""
-        return joined(self.mapped(state, which), self.known(state.robot, points, spreads))
+        return joined(self.mapped(state, which), self.known(state.robot, points, covariances))
 
 
 def joined(first: Sights, second: Sights) -> Sights:

@@ -47,15 +47,20 @@ class MovingThings:
         """Whether a track stands still; as long as something moves, it must have agreed with the wheels."""
         return name not in self._moving and (not self._doubts or name in self._steady)
 
-    def look(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: GraphView) -> None:
+    def learn(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: GraphView) -> None:
         """Learn from the tracks ``names``, seen at ``pixels`` (K, 2) from a keyframe."""
-        here = dict(zip(names, pixels, strict=True))
+        new_pixels = dict(zip(names, pixels, strict=True))
         self._images = [image for image in self._images if image[0].t >= keyframe.t - MAX_TIME]
-        for before, there in reversed(self._images):
-            if before.t < keyframe.t:
-                self._compare([name for name in names if name in there], there, here, graph.between(before, keyframe))
-        self._images.append((keyframe, here))
-        known = set[Hashable]().union(*(seen for _, seen in self._images))
+        for old_keyframe, old_pixels in reversed(self._images):
+            if old_keyframe.t < keyframe.t:
+                self._compare(
+                    [name for name in names if name in old_pixels],
+                    old_pixels,
+                    new_pixels,
+                    graph.between(old_keyframe, keyframe),
+                )
+        self._images.append((keyframe, new_pixels))
+        known = set[Hashable]().union(*(pixels_by_name for _, pixels_by_name in self._images))
         self._moving &= known
         self._steady &= known
         self._doubts = not self._moving.isdisjoint(names)
@@ -63,21 +68,21 @@ class MovingThings:
     def _compare(
         self,
         common: Sequence[Hashable],
-        there: Mapping[Hashable, Array],
-        here: Mapping[Hashable, Array],
+        old_pixels: Mapping[Hashable, Array],
+        new_pixels: Mapping[Hashable, Array],
         step: Increment,
     ) -> None:
         """Learn from the ``common`` tracks of two images, and the ``step`` between these that wheels tell."""
         if not common:
             return
-        first, second = (np.array([seen[name] for name in common]) for seen in (there, here))
+        first, second = (np.array([by_name[name] for name in common]) for by_name in (old_pixels, new_pixels))
         right = fitting(self._model, first, second, step)
-        other = another(self._model, first, second, step, right)
+        with_other_turn = another(self._model, first, second, step, right)
         known = np.array([name in self._moving for name in common])
         many = 2 * np.count_nonzero(known & ~right) > np.count_nonzero(~right)
-        told = other.any() and (many or np.count_nonzero(right & ~other) >= ENOUGH)
+        moves = with_other_turn.any() and (many or np.count_nonzero(right & ~with_other_turn) >= ENOUGH)
         self._steady.update(name for name, fits in zip(common, right.tolist(), strict=True) if fits)
-        if told:
+        if moves:
             self._moving.update(name for name, fits in zip(common, right.tolist(), strict=True) if not fits)
 
 
@@ -85,17 +90,17 @@ def another(model: CameraModel, first: Array, second: Array, step: Increment, ri
     """Which pairs of pixels (K, 2) fit the turn that explains most of those that do not fit the ``step`` that wheels tell.
 
     None does if most fit the step (``right``), or if no turn explains :data:`COMMON` of the others."""
-    best, others = right, ~right
-    if 2 * np.count_nonzero(others) >= len(right):
+    best, unexplained = right, ~right
+    if 2 * np.count_nonzero(unexplained) >= len(right):
         for turn in TURNS.tolist():
             delta, covariance = step.delta.copy(), step.covariance.copy()
             delta[2] += turn
             covariance[2, 2] += BETWEEN**2
             fits = fitting(model, first, second, replace(step, delta=delta, covariance=covariance))
-            if np.count_nonzero(fits & others) > np.count_nonzero(best & others):
+            if np.count_nonzero(fits & unexplained) > np.count_nonzero(best & unexplained):
                 best = fits
-    explained = np.count_nonzero(best & others)
-    enough = explained > 0 and explained >= COMMON * np.count_nonzero(others)
+    explained = np.count_nonzero(best & unexplained)
+    enough = explained > 0 and explained >= COMMON * np.count_nonzero(unexplained)
     return best if enough else np.zeros(len(right), dtype=bool)
 
 
@@ -108,10 +113,12 @@ def fitting(model: CameraModel, first: Array, second: Array, step: Increment) ->
     for _ in range(DISTANCES):
         nearer = np.clip(nearer, 1.0 / FARTHEST, 1.0 / NEAREST)
         points = model.position + pairs.first / nearer[:, None]
-        seen, by_camera, by_point = linearize_in_space(model, camera.position, camera.rotation, points)
+        projected, by_camera, by_point = linearize_in_space(model, camera.position, camera.rotation, points)
         noise = by_camera @ camera.covariance @ by_camera.transpose(0, 2, 1) + 2.0 * model.sigma**2 * np.eye(2)
-        squared = np.minimum(squared, positive.squared(seen - second, noise))
+        squared = np.minimum(squared, positive.squared(projected - second, noise))
         by_nearness = -np.einsum("kij,kj->ki", by_point, pairs.first) / nearer[:, None] ** 2
         weighted = np.linalg.solve(noise, by_nearness[..., None])[..., 0]
-        nearer = nearer + np.einsum("ki,ki->k", weighted, second - seen) / np.einsum("ki,ki->k", weighted, by_nearness)
+        nearer = nearer + np.einsum("ki,ki->k", weighted, second - projected) / np.einsum(
+            "ki,ki->k", weighted, by_nearness
+        )
     return np.asarray(squared < GATE)

@@ -96,7 +96,7 @@ class NewPoints:
 
     def those(self, trusted: Callable[[Hashable], bool]) -> Mapping[Hashable, Sequence[PointSighting]]:
         """The collected sightings of ``trusted`` points."""
-        return {name: seen for name, seen in self._waiting.items() if trusted(name)}
+        return {name: sightings for name, sightings in self._waiting.items() if trusted(name)}
 
     def forget(self, keyframe: int, wrong: Container[Hashable] = ()) -> None:
         """Drop the points that were last seen long before a keyframe, and the ``wrong`` ones."""
@@ -110,95 +110,97 @@ class NewPoints:
 
         ``places``: camera poses of keyframes, None for a keyframe that nothing can be added to.
         """
-        found: list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]] = []
+        determined: list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]] = []
         known: dict[int, KeyframeCamera | None] = {}
         for name in names:
             waiting = self._waiting.get(name, [])
-            if len(waiting) < FEWEST or len(found) >= most:
+            if len(waiting) < FEWEST or len(determined) >= most:
                 continue
             for sighting in waiting:
                 if sighting.keyframe not in known:
                     known[sighting.keyframe] = places(sighting.keyframe)
-            seen = [(s, place) for s in waiting if (place := known[s.keyframe]) is not None]
-            if len(seen) < FEWEST or not apart(self._model, *seen[0], *seen[-1]):
+            placed = [(s, place) for s in waiting if (place := known[s.keyframe]) is not None]
+            if len(placed) < FEWEST or not apart(self._model, *placed[0], *placed[-1]):
                 continue
-            result = agreed(self._model, [s for s, _ in seen], [p for _, p in seen])
+            result = agreed(self._model, [s for s, _ in placed], [p for _, p in placed])
             if result is not None:
                 del self._waiting[name]
-                found.append((name, *result))
-        return found
+                determined.append((name, *result))
+        return determined
 
 
 def apart(
     model: CameraModel,
     first: PointSighting,
-    here: KeyframeCamera,
+    first_camera: KeyframeCamera,
     last: PointSighting,
-    there: KeyframeCamera,
+    last_camera: KeyframeCamera,
 ) -> bool:
     """Cheap test whether two rays alone nearly determine the point."""
-    sigma = math.hypot(model.sigma, max(here.slack, there.slack)) / model.fx
+    sigma = math.hypot(model.sigma, max(first_camera.slack, last_camera.slack)) / model.fx
     angle = max(MIN_PARALLAX, min(sigma / MAX_SPREAD, 0.5))
-    return float((here.rotation @ first.ray) @ (there.rotation @ last.ray)) < math.cos(angle)
+    return float((first_camera.rotation @ first.ray) @ (last_camera.rotation @ last.ray)) < math.cos(angle)
 
 
 def agreed(
-    model: CameraModel, seen: Sequence[PointSighting], places: Sequence[KeyframeCamera]
+    model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera]
 ) -> tuple[TriangulatedPoint, list[PointSighting]] | None:
-    """The point ``seen`` from ``places``, and its consistent sightings; None if they do not determine it. Of contradicting
+    """The point ``sightings`` from ``places``, and its consistent sightings; None if they do not determine it. Of contradicting
     sightings the one without which the others agree best is removed.
     """
-    seen, places = list(seen), list(places)
-    found = _triangulate(model, seen, places, MAX_SPREAD)
-    while found is not None and not _fits(found, seen):
-        if len(seen) <= FEWEST:
+    sightings, places = list(sightings), list(places)
+    point = _triangulate(model, sightings, places, MAX_SPREAD)
+    while point is not None and not _fits(point, sightings):
+        if len(sightings) <= FEWEST:
             return None
         best: tuple[float, int, TriangulatedPoint] | None = None
-        for i in range(len(seen)):
-            others = _triangulate(model, seen[:i] + seen[i + 1 :], places[:i] + places[i + 1 :], MAX_SPREAD)
-            if others is not None and (best is None or others.squared.sum() < best[0]):
-                best = float(others.squared.sum()), i, others
+        for i in range(len(sightings)):
+            without_one = _triangulate(
+                model, sightings[:i] + sightings[i + 1 :], places[:i] + places[i + 1 :], MAX_SPREAD
+            )
+            if without_one is not None and (best is None or without_one.squared.sum() < best[0]):
+                best = float(without_one.squared.sum()), i, without_one
         if best is None:
             return None
-        _, out, found = best
-        del seen[out], places[out]
-    return None if found is None else (found, seen)
+        _, out, point = best
+        del sightings[out], places[out]
+    return None if point is None else (point, sightings)
 
 
-def _fits(point: TriangulatedPoint, seen: Sequence[PointSighting]) -> bool:
-    """Whether all that is ``seen`` of a point is as far from it as noise may be."""
-    return bool(point.squared.sum() < chi_squared.quantile(GATE, 2 * len(seen) - 3))
+def _fits(point: TriangulatedPoint, sightings: Sequence[PointSighting]) -> bool:
+    """Whether all that is ``sightings`` of a point is as far from it as noise may be."""
+    return bool(point.squared.sum() < chi_squared.quantile(GATE, 2 * len(sightings) - 3))
 
 
 def triangulate(
-    model: CameraModel, seen: Sequence[PointSighting], places: Sequence[KeyframeCamera], spread: float = MAX_SPREAD
+    model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera], most: float = MAX_SPREAD
 ) -> TriangulatedPoint | None:
-    """Triangulate a point ``seen`` M times from ``places``, minimising the squared residuals in the images, from the point
+    """Triangulate a point ``sightings`` M times from ``places``, minimising the squared residuals in the images, from the point
     nearest to the rays.
 
-    None if the rays are nearly parallel, do not intersect in front of the camera, or do not determine the point to ``spread``
+    None if the rays are nearly parallel, do not intersect in front of the camera, or do not determine the point to ``most``
     times its least depth.
     """
-    found = _triangulate(model, seen, places, spread)
-    return None if found is None or not math.isfinite(found.squared.sum()) else found
+    point = _triangulate(model, sightings, places, most)
+    return None if point is None or not math.isfinite(point.squared.sum()) else point
 
 
 def _triangulate(
-    model: CameraModel, seen: Sequence[PointSighting], places: Sequence[KeyframeCamera], spread: float
+    model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera], most: float
 ) -> TriangulatedPoint | None:
     """As :func:`triangulate`, with infinite residuals where the rays do not intersect in front of the camera."""
-    ended, *found = kernels.triangulated(
+    ended, *result = kernels.triangulated(
         reprojection.lens_of(model),
         np.array([p.centre for p in places]),
         np.array([p.rotation for p in places]),
-        np.array([s.ray for s in seen]),
-        np.array([s.pixel for s in seen], dtype=float),
+        np.array([s.ray for s in sightings]),
+        np.array([s.pixel for s in sightings], dtype=float),
         np.array([math.hypot(model.sigma, p.slack) for p in places]),
-        spread,
+        most,
         MIN_PARALLAX,
         kernels.NEAREST,
         math.inf,
     )
     if ended == kernels.BEHIND:
-        return TriangulatedPoint(ORIGIN, UNTURNED, np.full(len(seen), np.inf))
-    return TriangulatedPoint(*found) if ended == kernels.FOUND else None
+        return TriangulatedPoint(ORIGIN, UNTURNED, np.full(len(sightings), np.inf))
+    return TriangulatedPoint(*result) if ended == kernels.FOUND else None

@@ -57,8 +57,8 @@ class PointMapper(Mapper):
         """Whether an image has little in common with that of the last keyframe."""
         if m.frame is None or not self._tracks:
             return False
-        seen = set(m.frame.tracks.tolist()) - self._things.moving()
-        return len(seen & self._tracks) < LEAST_COMMON * len(seen)
+        tracks = set(m.frame.tracks.tolist()) - self._things.moving()
+        return len(tracks & self._tracks) < LEAST_COMMON * len(tracks)
 
     def take(
         self, m: Pixels, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition, *, is_new: bool
@@ -69,7 +69,7 @@ class PointMapper(Mapper):
             used = {i for i, name in enumerate(m.names) if name in points.map.index}
         else:
             names, used = m.frame.tracks.tolist(), set(points.used.tolist())
-        self._things.look(keyframe, names, m.pixels, graph)
+        self._things.learn(keyframe, names, m.pixels, graph)
         moving = self._things.moving()
         used |= {i for i, name in enumerate(names) if name in moving}
         if self._unknown is not None:
@@ -82,9 +82,9 @@ class PointMapper(Mapper):
             if self._unknown is not None:
                 used |= {i for i, name in enumerate(names) if self._unknown.uses(name)}
             rows = [i for i in range(len(names)) if i not in used]
-            before, predicted = self._pairs.previous(keyframe, graph.keyframes), None
-            if before is not None and graph.is_open(before.index):
-                predicted = graph.between(before, keyframe)
+            previous, predicted = self._pairs.previous(keyframe, graph.keyframes), None
+            if previous is not None and graph.is_open(previous.index):
+                predicted = graph.between(previous, keyframe)
             node = self._pairs.take(keyframe, [names[i] for i in rows], m.pixels[rows], predicted)
             if node is not None:
                 addition.hang(keyframe, node)

@@ -28,18 +28,18 @@ def unless_slipped(
     keyframe: Keyframe,
     guess: Guess,
     slip: Callable[[Increment], tuple[Array, float]],
-    seen: tuple[Array, Array, Array, Array],
+    observed: tuple[Array, Array, Array, Array],
 ) -> Guess:
     """The ``guess`` of the pose of a new keyframe; if wheels slipped on the step to it, both are less certain from now on.
 
-    ``slip``: see :class:`~factorgraph_loc.sensors.motion.Motion`. ``seen``: points (K, 3), their pixels (K, 2), their
+    ``slip``: see :class:`~factorgraph_loc.sensors.motion.Motion`. ``observed``: points (K, 3), their pixels (K, 2), their
     covariances (K, 3, 3), and those (K, 2, 2) of the pixels [px^2].
     """
     step = keyframe.from_previous
-    if step is None or keyframe.factor is not None or len(seen[0]) < ENOUGH:
+    if step is None or keyframe.factor is not None or len(observed[0]) < ENOUGH:
         return guess
     added, rarity = slip(step)
-    if _evidence(model, guess[0], (step.covariance, step.covariance + added), seen) < rarity:
+    if _evidence(model, guess[0], (step.covariance, step.covariance + added), observed) < rarity:
         return guess
     keyframe.from_previous = replace(step, covariance=step.covariance + added)
     return guess[0], guess[1] + added
@@ -59,25 +59,25 @@ def moved_since(keyframes: Mapping[int, Keyframe], newest: Keyframe, t: float, m
 
 
 def _evidence(
-    model: CameraModel, pose: Array, spreads: tuple[Array, Array], seen: tuple[Array, Array, Array, Array]
+    model: CameraModel, pose: Array, covariances: tuple[Array, Array], observed: tuple[Array, Array, Array, Array]
 ) -> float:
     """By how much the second of two covariances (3, 3) of a predicted ``pose`` (3,) makes what is seen more probable than the
     first: the difference of the logarithms."""
-    points, pixels, of_points, noise = seen
-    agrees = agreeing(model, lifted(model, pose, spreads[1]), points, pixels, noise)
+    points, pixels, of_points, noise = observed
+    agrees = agreeing(model, lifted(model, pose, covariances[1]), points, pixels, noise)
     if np.count_nonzero(agrees) < ENOUGH:
         return 0.0
     factor = ReprojectionFactor(model, points[agrees], pixels[agrees], point_covariances=of_points[agrees])
-    found = image_update(factor, pose, spreads[1], ITERATIONS, SETTLED)
+    update = image_update(factor, pose, covariances[1], ITERATIONS, SETTLED)
     # what the image tells by itself
-    after = positive.inverse(found.covariance)
-    told = positive.inverse(positive.nearest(after - positive.inverse(spreads[1])))
-    off, told = told @ after @ found.delta, told + COMMON
-    return more_probable(off, (spreads[0] + told, spreads[1] + told))
+    posterior = positive.inverse(update.covariance)
+    gained = positive.inverse(positive.nearest(posterior - positive.inverse(covariances[1])))
+    off, gained = gained @ posterior @ update.delta, gained + COMMON
+    return more_probable(off, (covariances[0] + gained, covariances[1] + gained))
 
 
-def more_probable(off: Array, spreads: tuple[Array, Array]) -> float:
+def more_probable(off: Array, covariances: tuple[Array, Array]) -> float:
     """By how much the second of two covariances (D, D) of an error ``off`` (D,) makes it more probable than the first: the
     difference of the logarithms."""
-    fits = [positive.squared(off, spread) + np.linalg.slogdet(spread)[1] for spread in spreads]
+    fits = [positive.squared(off, covariance) + np.linalg.slogdet(covariance)[1] for covariance in covariances]
     return 0.5 * float(fits[0] - fits[1])

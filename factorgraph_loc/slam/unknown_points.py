@@ -23,7 +23,7 @@ from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints
 from factorgraph_loc.slam.moving_things import MovingThings
 from factorgraph_loc.slam.new_points import FEWEST as FEWEST_SIGHTINGS
 from factorgraph_loc.slam.new_points import NewPoints, PointSighting, sightings_of
-from factorgraph_loc.slam.point_looks import PointLooks
+from factorgraph_loc.slam.point_views import PointViews
 from factorgraph_loc.slam.slipping import moved_since, unless_slipped
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
@@ -95,7 +95,7 @@ class UnknownPoints:
         self._astray: list[_Point] = []  # in the graph, but no longer seen under their name
         self._gone: list[_Point] = []  # that have left the graph
         self._count = 0  # of all points that ever were in the graph
-        self._new, self._looks = NewPoints(model), PointLooks(model)
+        self._new, self._views = NewPoints(model), PointViews(model)
         self._cameras = KeyframeCameras(model, estimated)
         self._loops = LoopClosure()
         self._distance_travelled = 0.0  # m
@@ -109,7 +109,7 @@ class UnknownPoints:
         guess: Guess,
         graph: GraphView,
         addition: Addition,
-        things: MovingThings,
+        movers: MovingThings,
     ) -> Guess:
         """Turn ``rows`` of what is seen from a new keyframe into factors and variables, and return its pose, corrected by the
         points.
@@ -128,9 +128,9 @@ class UnknownPoints:
         rows = list(rows) if m.frame is None else sorted(rows, key=m.frame.tracks.__getitem__)
         names = self._named(m, rows, lifted(model, *guess), graph)
         certain = self._revisited(image, guess, rows, names)
-        seen = self._chosen(image, rows, names)
-        guess, count = self._see_again(image, guess, seen, certain)
-        pose = self._begin(image, guess, seen, PER_KEYFRAME - count, things)
+        sighted = self._chosen(image, rows, names)
+        guess, count = self._see_again(image, guess, sighted, certain)
+        pose = self._begin(image, guess, sighted, PER_KEYFRAME - count, movers)
         return self._cameras.at_stamp(keyframe.index, (pose, guess[1]), graph)
 
     def _chosen(self, image: _NewImage, rows: Sequence[int], names: Sequence[Hashable]) -> _ChosenSightings:
@@ -143,49 +143,51 @@ class UnknownPoints:
         return _ChosenSightings([rows[i] for i in chosen], [names[i] for i in chosen], pixels, sightings)
 
     def _see_again(
-        self, image: _NewImage, guess: Guess, seen: _ChosenSightings, certain: set[int]
+        self, image: _NewImage, guess: Guess, sighted: _ChosenSightings, certain: set[int]
     ) -> tuple[Guess, int]:
         """Add the observations of points that are in the graph: the guess, corrected by them, and their number. Those in the rows
         ``certain`` are identified without doubt."""
         m, keyframe = image.m, image.keyframe
-        old = [i for i, name in enumerate(seen.names) if name in self._points]
-        old = [old[i] for i in spread_out(seen.pixels[old], PER_KEYFRAME).tolist()]
-        names = [seen.names[i] for i in old]
-        known = np.array([seen.rows[i] in certain for i in old], dtype=bool)
+        old = [i for i, name in enumerate(sighted.names) if name in self._points]
+        old = [old[i] for i in spread_out(sighted.pixels[old], PER_KEYFRAME).tolist()]
+        names = [sighted.names[i] for i in old]
+        known = np.array([sighted.rows[i] in certain for i in old], dtype=bool)
         points = [self._points[name] for name in names]
-        guess, tilt, sigma, right = self._placed(image, points, seen.pixels[old], guess, known)
+        guess, tilt, sigma, right = self._placed(image, points, sighted.pixels[old], guess, known)
         self._tilts(image, tilt, sigma)
         if m.frame is not None:
-            self._remember(m.frame, [seen.rows[i] for i in old], names, right, keyframe.key, guess)
+            self._remember(m.frame, [sighted.rows[i] for i in old], names, right, keyframe.key, guess)
         for i, agrees in zip(old, right.tolist(), strict=True):
-            self._again(image, seen.names[i], seen.sightings[i], agrees, guess[0])
+            self._again(image, sighted.names[i], sighted.sightings[i], agrees, guess[0])
         self._cameras.anchor(keyframe, int(np.count_nonzero(right)))
         return guess, len(old)
 
-    def _begin(self, image: _NewImage, guess: Guess, seen: _ChosenSightings, most: int, things: MovingThings) -> Array:
+    def _begin(
+        self, image: _NewImage, guess: Guess, sighted: _ChosenSightings, most: int, movers: MovingThings
+    ) -> Array:
         """Collect the sightings of other points, and make variables of at ``most`` this many that are determined now. Returns the
         pose (3,) of the keyframe, adjusted where the points of the graph do not determine it."""
         m, keyframe, graph, addition = image.m, image.keyframe, image.graph, image.addition
-        fresh = [i for i, name in enumerate(seen.names) if name not in self._points]
+        fresh = [i for i, name in enumerate(sighted.names) if name not in self._points]
         for i in fresh:
-            self._new.add(seen.names[i], seen.sightings[i])
-        self._new.forget(keyframe.index, things.moving())
-        waiting = [n for i in fresh if self._new.count(n := seen.names[i]) >= FEWEST_SIGHTINGS and things.trusts(n)]
-        bundle = self._cameras.bundled(keyframe, guess[0], self._new.those(things.trusts), self._floor.sigma, graph)
+            self._new.add(sighted.names[i], sighted.sightings[i])
+        self._new.forget(keyframe.index, movers.moving())
+        waiting = [n for i in fresh if self._new.count(n := sighted.names[i]) >= FEWEST_SIGHTINGS and movers.trusts(n)]
+        bundle = self._cameras.bundled(keyframe, guess[0], self._new.those(movers.trusts), self._floor.sigma, graph)
         cameras, pose = bundle or (
             self._cameras.cameras(keyframe, guess[0], waiting, self._new.waiting(), graph),
             guess[0],
         )
-        for name, found, sightings in self._new.ready(waiting, cameras.get, most):
+        for name, point, sightings in self._new.ready(waiting, cameras.get, most):
             key, label = point_key(self._count), f"track{name}" if m.names is None else str(name)
             self._count += 1
-            self._points[name] = _Point(key, keyframe.t, positive.inverse(found.covariance), label)
+            self._points[name] = _Point(key, keyframe.t, positive.inverse(point.covariance), label)
             if m.frame is not None:
-                row = seen.rows[seen.names.index(name)]
-                self._looks.keep(key, m.frame, row, self._distance_travelled, keyframe.key, guess)
-            addition.values[key] = found.position
-            graph.values[key], graph.spreads[key] = found.position, found.covariance
-            prior = PointPrior.of(pose, found.position, OPEN)
+                row = sighted.rows[sighted.names.index(name)]
+                self._views.keep(key, m.frame, row, self._distance_travelled, keyframe.key, guess)
+            addition.values[key] = point.position
+            graph.values[key], graph.spreads[key] = point.position, point.covariance
+            prior = PointPrior.of(pose, point.position, OPEN)
             addition.hang(keyframe, Node((keyframe.key, key), prior, 3))
             for sighting in sightings:
                 self._hang(image, graph.keyframes[sighting.keyframe], key, sighting)
@@ -199,14 +201,14 @@ class UnknownPoints:
         gone = self._points.keys() - set(tracks)  # the track that a point was added with may itself return
         self._again_as = {track: name for track, name in self._again_as.items() if name in gone}
         names: list[Hashable] = [self._again_as.get(track, track) for track in tracks]
-        seen = set(names)
+        assigned = set(names)
         lately = [name for name, point in self._points.items() if m.t - point.last < LOST]
-        lost = [name for name in lately if name not in seen and self._points[name].key in self._looks]
+        lost = [name for name in lately if name not in assigned and self._points[name].key in self._views]
         free = [i for i, name in zip(rows, names, strict=True) if name not in self._points]
         keys = [self._points[name].key for name in lost]
         positions = np.array([graph.values[key] for key in keys]).reshape(-1, 3)
         place = {row: i for i, row in enumerate(rows)}
-        for which, row in self._looks.refound(camera, keys, positions, m.frame, free):
+        for which, row in self._views.refound(camera, keys, positions, m.frame, free):
             track = names[place[row]]
             if self._new.count(track) < FEWEST_SIGHTINGS:
                 names[place[row]] = lost[which]
@@ -215,7 +217,7 @@ class UnknownPoints:
 
     def _follow(self, track: Hashable, name: Hashable) -> None:
         """Assign the point ``name`` to ``track`` and to no other."""
-        self._again_as = {other: of for other, of in self._again_as.items() if of != name}
+        self._again_as = {new_track: of for new_track, of in self._again_as.items() if of != name}
         self._again_as[track] = name
 
     def _revisited(self, image: _NewImage, guess: Guess, rows: Sequence[int], names: list[Hashable]) -> set[int]:
@@ -223,17 +225,17 @@ class UnknownPoints:
         frame, t, graph = image.m.frame, image.keyframe.t, image.graph
         if frame is None or not self._loops.due(image.m.t):
             return set()
-        old = [name for name, point in self._points.items() if t - point.last >= LOST and point.key in self._looks]
+        old = [name for name, point in self._points.items() if t - point.last >= LOST and point.key in self._views]
         if not old:
             return set()
         points = [self._points[name] for name in old]
         keys = [point.key for point in points]
         covariances = positive.inverse(np.array([point.information for point in points]))
         positions = np.array([graph.values[key] for key in keys])
-        seen = self._looks.map_of([str(name) for name in old], keys, positions, covariances)
-        ways = np.array([self._looks[key].way for key in keys])
-        here = Image(frame, image.keyframe, guess, self._distance_travelled)
-        revisit = self._loops.look(image.model, here, OldPoints(seen, keys, ways), graph.current)
+        old_map = self._views.map_of([str(name) for name in old], keys, positions, covariances)
+        travelled = np.array([self._views[key].travelled for key in keys])
+        current = Image(frame, image.keyframe, guess, self._distance_travelled)
+        revisit = self._loops.compare(image.model, current, OldPoints(old_map, keys, travelled), graph.current)
         if revisit is None:
             return set()
         certain: set[int] = set()
@@ -259,7 +261,7 @@ class UnknownPoints:
         for row, name, agrees in zip(rows, names, right.tolist(), strict=True):
             if agrees:
                 point = self._points[name].key
-                self._looks.keep(point, frame, row, self._distance_travelled, keyframe, guess)
+                self._views.keep(point, frame, row, self._distance_travelled, keyframe, guess)
             elif self._again_as.pop(int(frame.tracks[row]), None) is not None:
                 self._points[name].strikes -= 1  # not the fault of the point
 
@@ -277,7 +279,7 @@ class UnknownPoints:
 
     def keep_only(self, keys: set[int]) -> None:
         """Remove the points of the graph without these ``keys``, and all waiting ones."""
-        self._looks.forget({point.key for point in (*self._points.values(), *self._astray)} - keys)
+        self._views.forget({point.key for point in (*self._points.values(), *self._astray)} - keys)
         self._points = {name: point for name, point in self._points.items() if point.key in keys}
         self._astray = [point for point in self._astray if point.key in keys]
         self._new, self._loops = NewPoints(self.model), LoopClosure()
@@ -287,7 +289,7 @@ class UnknownPoints:
         Returns the keys of these points."""
         forgotten = [point.key for point in self._gone if point.last < first.t]
         self._gone = [point for point in self._gone if point.last >= first.t]
-        self._looks.forget(forgotten)
+        self._views.forget(forgotten)
         self._cameras.forget(first.index)
         return forgotten
 
@@ -302,7 +304,7 @@ class UnknownPoints:
             return None
         positions, covariances = (np.array([part[key] for key in keys.values()]) for part in (values, spreads))
         points = PointMap.of(tuple(keys), positions, covariances)
-        return self._looks.settled(points, tuple(keys.values()), values, spreads)
+        return self._views.settled(points, tuple(keys.values()), values, spreads)
 
     def _tilts(self, image: _NewImage, tilt: Array, sigma: float) -> None:
         """Make a variable of the ``tilt`` of the robot at a new keyframe, of a floor that is level to ``sigma`` [rad]."""
@@ -329,13 +331,16 @@ class UnknownPoints:
         if not points:
             return guess, LEVEL, sigma, np.zeros(0, dtype=bool)
         positions = np.array([graph.current(point.key) for point in points])
-        spreads = positive.inverse(np.array([point.information for point in points]))
+        covariances = positive.inverse(np.array([point.information for point in points]))
         camera = lifted(model, *guess)
         _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, positions)
-        noise = (model.sigma**2 + SLACK**2) * np.eye(2) + by_point @ spreads @ by_point.transpose(0, 2, 1)
+        noise = (model.sigma**2 + SLACK**2) * np.eye(2) + by_point @ covariances @ by_point.transpose(0, 2, 1)
         recent = np.array([keyframe.t - point.last < RECENT for point in points])
-        level, seen = replace(model, tilt=sigma), (positions[recent], pixels[recent], spreads[recent], noise[recent])
-        guess = unless_slipped(level, keyframe, guess, graph.slip, seen)
+        level, observed = (
+            replace(model, tilt=sigma),
+            (positions[recent], pixels[recent], covariances[recent], noise[recent]),
+        )
+        guess = unless_slipped(level, keyframe, guess, graph.slip, observed)
         since = moved_since(graph.keyframes, keyframe, keyframe.t - RECENT, HORIZON)
         near = guess if since is None else (guess[0], since)  # of a pose among the points that were seen since
         camera, right, placed, tilt = lifted(model, *guess), known.copy(), guess, LEVEL
@@ -346,7 +351,9 @@ class UnknownPoints:
             if which.any():
                 agrees[which] = agreeing(model, camera, positions[which], pixels[which], noise[which])
             if np.count_nonzero(agrees) >= enough and placed is guess:
-                factor = ReprojectionFactor(model, positions[agrees], pixels[agrees], point_covariances=spreads[agrees])
+                factor = ReprojectionFactor(
+                    model, positions[agrees], pixels[agrees], point_covariances=covariances[agrees]
+                )
                 leaning = pixel_kernels.leaning(factor.packed(), *guess)
                 floor, unlevel = self._floor.learnt(*leaning, model.tilt)
                 factor = replace(factor, model=replace(model, tilt=unlevel))
@@ -383,9 +390,9 @@ class UnknownPoints:
         point.information += by_point[0].T @ by_point[0] / image.model.sigma**2
         self._hang(image, image.keyframe, point.key, sighting)
 
-    def _hang(self, image: _NewImage, keyframe: Keyframe, key: int, seen: PointSighting) -> None:
-        """Add the factor of a point ``seen`` from a keyframe."""
+    def _hang(self, image: _NewImage, keyframe: Keyframe, key: int, sighting: PointSighting) -> None:
+        """Add the factor of a point ``sighting`` from a keyframe."""
         keys = (keyframe.key, *image.graph.shared, tilt_key(keyframe.index), key)
         twist = self._cameras.twists.get(keyframe.index)
-        factor = PointFactor(self.model, self._lens, seen.pixel, self.estimated.indices, twist)
+        factor = PointFactor(self.model, self._lens, sighting.pixel, self.estimated.indices, twist)
         image.addition.hang(keyframe, Node(keys, factor, 2))

@@ -115,12 +115,12 @@ class Associator:
         kept = (np.diff(begins) > 0) & model.contains(predicted, MARGIN)
         if not kept.any():
             return NONE
-        spreads = by_point @ self._covariances[ahead] @ by_point.transpose(0, 2, 1)
-        spreads += model.sigma**2 * np.eye(2)
+        covariances = by_point @ self._covariances[ahead] @ by_point.transpose(0, 2, 1)
+        covariances += model.sigma**2 * np.eye(2)
         if focal > 0.0:
             away = focal * (predicted - (model.cx, model.cy))
-            spreads += away[:, :, None] * away[:, None, :]
-        inverses, reaches = _gates(by_camera @ covariance @ by_camera.transpose(0, 2, 1) + spreads)
+            covariances += away[:, :, None] * away[:, None, :]
+        inverses, reaches = _gates(by_camera @ covariance @ by_camera.transpose(0, 2, 1) + covariances)
         features = np.ascontiguousarray(frame.pixels, dtype=float)
         pairs = gated_pairs(predicted[kept], inverses[kept], reaches[kept], features, CELL)
         pairs[:, 0] = np.flatnonzero(kept)[pairs[:, 0]]
@@ -129,15 +129,15 @@ class Associator:
         pairs, costs = pairs[near], costs[near]
         ratio = RATIO if self._binary else RATIO**2
         pairs = pairs[clear_pairs(pairs, costs, predicted, features, ratio, SAME)]
-        rows, seen = pairs[:, 0], pairs[:, 1]
+        rows, matched_features = pairs[:, 0], pairs[:, 1]
         if len(rows) < FEWEST:
-            return Associations(rows[:0], seen[:0], int(kept.sum()))
+            return Associations(rows[:0], matched_features[:0], int(kept.sum()))
         camera = CameraPose(position, rotation, covariance)
-        right = agreeing(model, camera, points[rows], features[seen], spreads[rows])
+        right = agreeing(model, camera, points[rows], features[matched_features], covariances[rows])
         expected, agreed = int(kept.sum()), int(np.count_nonzero(right))
         if agreed < LEAST_SHARE * min(expected, len(features)):
             right[:] = False
-        return Associations(ahead[rows[right]], seen[right], expected, int(np.count_nonzero(~right)))
+        return Associations(ahead[rows[right]], matched_features[right], expected, int(np.count_nonzero(~right)))
 
     def relocalized(self, frame: CameraFrame) -> tuple[Array, Array, Array, Associations] | None:
         """Relocalize: camera position (3,), rotation (3, 3), covariance (6, 6) as in :meth:`guided`, and the matches; None if the
@@ -146,14 +146,16 @@ class Associator:
             return None
         points, features = self._alike(frame)
         pixels = np.asarray(frame.pixels, dtype=float)[features]
-        found = located(self._model, self._positions[points], pixels, self._covariances[points])
-        if found is None:
+        resection = located(self._model, self._positions[points], pixels, self._covariances[points])
+        if resection is None:
             return None
-        count = int(np.count_nonzero(found.inliers))
+        count = int(np.count_nonzero(resection.inliers))
         if count < max(FEWEST_FOUND, SHARE_FOUND * len(points)):
             return None
-        seen = Associations(points[found.inliers], features[found.inliers], len(points), len(points) - count)
-        return found.camera.position, found.camera.rotation, found.camera.covariance, seen
+        associations = Associations(
+            points[resection.inliers], features[resection.inliers], len(points), len(points) - count
+        )
+        return resection.camera.position, resection.camera.rotation, resection.camera.covariance, associations
 
     def _alike(self, frame: CameraFrame) -> tuple[Integers, Integers]:
         """Points and features that are similar, and pass the ratio test against all other points."""
@@ -169,17 +171,17 @@ class Associator:
         candidates, nearest, rows = nearest_owners(distances, starts, min(8, len(owners)))
         best = candidates[:, 0]
         away = np.linalg.norm(self._positions[owners[candidates]] - self._positions[owners[best]][:, None], axis=2)
-        others = np.where(away > SAME_POINT, nearest, np.inf).min(axis=1)
-        kept = (nearest[:, 0] < GLOBAL_RATIO * others) & (rows[best] == np.arange(len(best)))
+        second_best = np.where(away > SAME_POINT, nearest, np.inf).min(axis=1)
+        kept = (nearest[:, 0] < GLOBAL_RATIO * second_best) & (rows[best] == np.arange(len(best)))
         return owners[best[kept]], np.flatnonzero(kept)
 
-    def _costs(self, pairs: Integers, begins: Integers, views: Integers, seen: Descriptors) -> Array:
+    def _costs(self, pairs: Integers, begins: Integers, views: Integers, frame_descriptors: Descriptors) -> Array:
         if self._binary:
-            found = bit_distances(pairs, begins, views, self._descriptors, seen, BITS)
+            costs = bit_distances(pairs, begins, views, self._descriptors, frame_descriptors, BITS)
         else:
-            seen = np.ascontiguousarray(seen, dtype=np.float32)
-            found = distances(pairs, begins, views, self._descriptors, seen)
-        return np.asarray(found)
+            frame_descriptors = np.ascontiguousarray(frame_descriptors, dtype=np.float32)
+            costs = distances(pairs, begins, views, self._descriptors, frame_descriptors)
+        return np.asarray(costs)
 
     def _look_alike(self) -> float:
         """Upper limit of the cost of a match: few pairs of views of different points are below it."""
@@ -194,9 +196,9 @@ class Associator:
         return limit if self._binary else limit**2
 
 
-def _gates(spreads: Array) -> tuple[Array, Array]:
+def _gates(covariances: Array) -> tuple[Array, Array]:
     """Gates of innovations with covariances (C, 2, 2) [px^2]: inverse matrices (C, 2, 2) and largest radii (C,)."""
-    gates = GATE * spreads
+    gates = GATE * covariances
     mean = 0.5 * (gates[:, 0, 0] + gates[:, 1, 1])
     half = np.hypot(0.5 * (gates[:, 0, 0] - gates[:, 1, 1]), gates[:, 0, 1])
     largest = mean + half
@@ -221,15 +223,15 @@ def agreeing_views(
         begins[i] = n
         p = rows[i]
         ax, ay, az = place[0] - positions[p, 0], place[1] - positions[p, 1], place[2] - positions[p, 2]
-        here = np.sqrt(ax * ax + ay * ay + az * az)
+        distance_now = np.sqrt(ax * ax + ay * ay + az * az)
         for v in range(starts[p], starts[p + 1]):
             bx = seen_from[v, 0] - positions[p, 0]
             by = seen_from[v, 1] - positions[p, 1]
             bz = seen_from[v, 2] - positions[p, 2]
-            there = np.sqrt(bx * bx + by * by + bz * bz)
-            if here > ratio * there or there > ratio * here:
+            distance_then = np.sqrt(bx * bx + by * by + bz * bz)
+            if distance_now > ratio * distance_then or distance_then > ratio * distance_now:
                 continue
-            if ax * bx + ay * by + az * bz >= cosine * here * there:
+            if ax * bx + ay * by + az * bz >= cosine * distance_now * distance_then:
                 views[n] = v
                 n += 1
     begins[len(rows)] = n
@@ -287,14 +289,16 @@ def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Arr
 
 
 @compiled(fastmath=True)
-def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, seen: Any) -> Array:
-    """Squared distance (N,) of each pair's feature (descriptors ``seen`` (K, D)) from the nearest of the point's views (``known``
-    (V, D))."""
+def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, frame_descriptors: Any) -> Array:
+    """Squared distance (N,) of each pair's feature from the nearest view of its point.
+
+    ``frame_descriptors`` (K, D): of the features; ``known`` (V, D): of the views.
+    """
     out = np.empty(len(pairs))
     size = known.shape[1]
     for i in range(len(pairs)):
         best = np.float32(np.inf)
-        f = seen[pairs[i, 1]]
+        f = frame_descriptors[pairs[i, 1]]
         for j in range(begins[pairs[i, 0]], begins[pairs[i, 0] + 1]):
             k = known[views[j]]
             total = np.float32(0.0)
@@ -306,7 +310,9 @@ def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, se
 
 
 @compiled
-def bit_distances(pairs: Integers, begins: Integers, views: Integers, known: Any, seen: Any, bits: Integers) -> Array:
+def bit_distances(
+    pairs: Integers, begins: Integers, views: Integers, known: Any, frame_descriptors: Any, bits: Integers
+) -> Array:
     """As :func:`distances`, with the Hamming distance."""
     out = np.empty(len(pairs))
     for i in range(len(pairs)):
@@ -314,7 +320,7 @@ def bit_distances(pairs: Integers, begins: Integers, views: Integers, known: Any
         for j in range(begins[pairs[i, 0]], begins[pairs[i, 0] + 1]):
             total = 0
             for d in range(known.shape[1]):
-                total += bits[seen[pairs[i, 1], d] ^ known[views[j], d]]
+                total += bits[frame_descriptors[pairs[i, 1], d] ^ known[views[j], d]]
             best = min(best, total)
         out[i] = best
     return out

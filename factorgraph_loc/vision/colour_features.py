@@ -63,15 +63,15 @@ class ColourExtractor:
         self._space: ScaleSpace | None = None
 
     def detect(self, image: object, mask: object = None) -> Keypoints:
-        return self._found(image, mask)[1]
+        return self._detect(image, mask)[1]
 
     def compute(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, Descriptors]:
         """The ``keypoints`` inside the image, and their descriptors; missing orientations are computed."""
-        kept, found = self.record(image, keypoints)
-        return kept, shipped_weights()(descriptor.values(found))
+        kept, described = self.record(image, keypoints)
+        return kept, shipped_weights()(descriptor.values(described))
 
     def detectAndCompute(self, image: object, mask: object = None) -> tuple[Keypoints, Descriptors]:  # noqa: N802 (as OpenCV)
-        space, keypoints = self._found(image, mask)
+        space, keypoints = self._detect(image, mask)
         return keypoints, shipped_weights()(descriptor.values(self._records(space, keypoints)))
 
     def record(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, NDArray[np.void]]:
@@ -88,7 +88,7 @@ class ColourExtractor:
         kept = Keypoints(kept.points, kept.sizes, angles, kept.responses, kept.levels)
         return kept, self._records(space, kept)
 
-    def _found(self, image: object, mask: object) -> tuple[ScaleSpace | None, Keypoints]:
+    def _detect(self, image: object, mask: object) -> tuple[ScaleSpace | None, Keypoints]:
         pixels = as_image(image)
         where = as_mask(mask, pixels)
         if is_blank(pixels):

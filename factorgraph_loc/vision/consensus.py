@@ -45,26 +45,26 @@ class CameraPose:
     covariance: Array
 
 
-def compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array) -> bool:
-    """Whether all ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise covariances ``spreads`` (K, 2, 2) [px^2], are jointly
+def compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> bool:
+    """Whether all ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise covariances ``covariances`` (K, 2, 2) [px^2], are jointly
     compatible with the prediction."""
-    seen = (np.ascontiguousarray(part, dtype=float) for part in (points, pixels, spreads))
+    arrays = (np.ascontiguousarray(part, dtype=float) for part in (points, pixels, covariances))
     try:
-        joint = _joint(reprojection.lens_of(model), camera.position, camera.rotation, camera.covariance, *seen)
+        joint = _joint(reprojection.lens_of(model), camera.position, camera.rotation, camera.covariance, *arrays)
     except np.linalg.LinAlgError:  # an extreme covariance: each point is tested by itself
         return False
     return bool(joint < _largest(2 * len(points)))
 
 
-def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array) -> Truths:
-    """The inliers among ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise covariances ``spreads`` (K, 2, 2) [px^2], for a
+def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> Truths:
+    """The inliers among ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise covariances ``covariances`` (K, 2, 2) [px^2], for a
     pose near the predicted ``camera``: all if :func:`compatible`, none with fewer than :data:`FEWEST`."""
     count = len(points)
-    if compatible(model, camera, points, pixels, spreads):
+    if compatible(model, camera, points, pixels, covariances):
         return np.ones(count, dtype=bool)
     if count < FEWEST:
         return np.zeros(count, dtype=bool)
-    whiteners, root = positive.whitener(spreads), root_of(camera)
+    whiteners, root = positive.whitener(covariances), root_of(camera)
     position, rotation, squared = _best_of_samples(model, camera, points, pixels, whiteners, REACH * root)
     inside = squared < LOOSE
     for _ in range(2):
@@ -123,14 +123,14 @@ def _largest(dof: int) -> float:
 
 @compiled(error_model="numpy")
 def _joint(
-    lens: Lens, position: Array, rotation: Array, covariance: Array, points: Array, pixels: Array, spreads: Array
+    lens: Lens, position: Array, rotation: Array, covariance: Array, points: Array, pixels: Array, covariances: Array
 ) -> float:
     """Normalised squared innovation of points (K, 3) seen at pixels (K, 2) with noise (K, 2, 2), by a camera with perturbation
     covariance (6, 6)."""
     predicted, jacobian, _ = reprojection_kernels.linearize_in_space(lens, position, rotation, points)
     information, pull, total = np.zeros((6, 6)), np.zeros((6, 1)), 0.0
     for i in range(len(points)):
-        a, b, c = spreads[i, 0, 0], spreads[i, 0, 1], spreads[i, 1, 1]
+        a, b, c = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
         determinant = a * c - b * b
         u, v = predicted[i, 0] - pixels[i, 0], predicted[i, 1] - pixels[i, 1]
         wu, wv = (c * u - b * v) / determinant, (a * v - b * u) / determinant
@@ -160,8 +160,8 @@ def root_of(camera: CameraPose) -> Array:
 
 def moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:
     """H camera poses after perturbations (H, 6)."""
-    there = position + (rotation @ step[:, 3:, None])[..., 0]
-    return there, rotation @ scipy.spatial.transform.Rotation.from_rotvec(step[:, :3]).as_matrix()
+    shifted = position + (rotation @ step[:, 3:, None])[..., 0]
+    return shifted, rotation @ scipy.spatial.transform.Rotation.from_rotvec(step[:, :3]).as_matrix()
 
 
 def whitened(

@@ -77,8 +77,8 @@ def values(record: NDArray[np.void]) -> Float:
 
 def _nearest(points: Array) -> Integers:
     """The four nearest others (N, 4) of each of ``points`` (N, 2), nearest first; the point itself if there are too few."""
-    found = cKDTree(points).query(points, k=np.arange(2, 6))[1] if len(points) else np.empty((0, 4), dtype=np.int64)
-    return np.where(found < len(points), found, np.arange(len(points))[:, None]).astype(np.int64)
+    indices = cKDTree(points).query(points, k=np.arange(2, 6))[1] if len(points) else np.empty((0, 4), dtype=np.int64)
+    return np.where(indices < len(points), indices, np.arange(len(points))[:, None]).astype(np.int64)
 
 
 def _unit(block: Float) -> Float:

@@ -57,10 +57,10 @@ def detect(
     corners = corners[np.argsort(-corners[:, 3], kind="stable")]
     places, scales = corners[:, :2].astype(np.float32), corners[:, 2].astype(np.float32)
     alone = lonely(places, scales, CLEARANCE, STEP, len(corners) if everywhere else count)
-    best, others = np.flatnonzero(alone), np.flatnonzero(~alone)
+    best, crowded = np.flatnonzero(alone), np.flatnonzero(~alone)
     if everywhere:
         best = best[spread_out(corners[best, :2], count, cells=PARTS)]
-    corners = corners[np.sort(np.concatenate((best, others[: count - len(best)])))]
+    corners = corners[np.sort(np.concatenate((best, crowded[: count - len(best)])))]
     points, sigmas = corners[:, :2], corners[:, 2]
     angles = orientations(space, points, sigmas)
     return Keypoints(points, 2.0 * sigmas, angles, corners[:, 3], space.levels(sigmas))
@@ -75,19 +75,19 @@ def orientations(space: ScaleSpace, points: Array, sigmas: Array) -> Array:
     for _ in range(2):
         histograms = 0.25 * np.roll(histograms, 1, axis=1) + 0.5 * histograms + 0.25 * np.roll(histograms, -1, axis=1)
     best = histograms.argmax(axis=1)
-    before, peak, after = (
+    left, peak, right = (
         np.take_along_axis(histograms, ((best + i) % ORIENTATION_BINS)[:, None], axis=1)[:, 0].astype(float)
         for i in (-1, 0, 1)
     )
-    bend = before - 2.0 * peak + after
-    shift = np.divide(0.5 * (before - after), bend, out=np.zeros(len(points)), where=bend < 0.0)
+    bend = left - 2.0 * peak + right
+    shift = np.divide(0.5 * (left - right), bend, out=np.zeros(len(points)), where=bend < 0.0)
     turns = (best + shift) / ORIENTATION_BINS
     return np.asarray(2.0 * np.pi * (turns - np.ceil(turns - 0.5)), dtype=float)
 
 
 def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
     """Corners (N, 4) of each characteristic scale: x and y [px], scale [px], response."""
-    found = []
+    by_scale = []
     for o, octave in enumerate(space.octaves):
         if o > 0:
             octave.colours[:] = space.octaves[o - 1].colours[:, ::2, ::2]
@@ -96,10 +96,10 @@ def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
                 blur(source, plane, SIGMAS[0])
         for i in range(1, SCALES + 1):
             fill_strength(octave, i)
-            found.append(_peaks(octave, i))
+            by_scale.append(_peaks(octave, i))
             for plane in octave.colours:
                 blur(plane, plane, more_blur(SIGMAS[i - 1], SIGMAS[i]))
-    return found
+    return by_scale
 
 
 def fill_strength(octave: Octave, i: int) -> None:
@@ -113,10 +113,10 @@ def fill_strength(octave: Octave, i: int) -> None:
 def _peaks(octave: Octave, i: int) -> Array:
     inner = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))
     cv2.dilate(octave.strength, _NEIGHBOURS, dst=octave.largest)
-    found = cv2.findNonZero(cv2.compare(octave.strength[inner], octave.largest[inner], cv2.CMP_EQ))
+    maxima = cv2.findNonZero(cv2.compare(octave.strength[inner], octave.largest[inner], cv2.CMP_EQ))
     pixels: Int32 = np.empty((0, 2), dtype=np.int32)
-    if found is not None:
-        pixels = (found.reshape(-1, 2) + BORDER).astype(np.int32)
+    if maxima is not None:
+        pixels = (maxima.reshape(-1, 2) + BORDER).astype(np.int32)
     peaks = np.empty((len(pixels), 5))
     around = slice(i - 1, i + 2)
     count = refined_peaks(octave.strength, WEAKEST, octave.planes[around], SIGMAS[around] ** 2, pixels, peaks)

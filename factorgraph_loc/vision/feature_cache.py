@@ -65,8 +65,8 @@ _MARK = b"FGLC"
 
 def cache_folder() -> Path:
     """The folder that ``FGLOC_CACHE`` names, else the user's cache folder of the system."""
-    told = os.environ.get(VARIABLE)
-    return Path(told) if told else platformdirs.user_cache_path("factorgraph-loc", appauthor=False)
+    folder_name = os.environ.get(VARIABLE)
+    return Path(folder_name) if folder_name else platformdirs.user_cache_path("factorgraph-loc", appauthor=False)
 
 
 class FeatureCache:

@@ -35,8 +35,8 @@ class OpenCvExtractor:
         where = as_mask(mask, pixels)
         if is_blank(pixels):
             return Keypoints.empty()
-        found = Keypoints.from_cv2(self._feature.detect(pixels, where))
-        return found[self._chosen(found)]
+        keypoints = Keypoints.from_cv2(self._feature.detect(pixels, where))
+        return keypoints[self._chosen(keypoints)]
 
     def compute(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, Descriptors]:
         pixels = as_image(image)
@@ -53,10 +53,10 @@ class OpenCvExtractor:
         where = as_mask(mask, pixels)
         if is_blank(pixels):
             return Keypoints.empty(), self._none()
-        found, descriptors = self._feature.detectAndCompute(pixels, where)
+        detected, descriptors = self._feature.detectAndCompute(pixels, where)
         if descriptors is None:
             return Keypoints.empty(), self._none()
-        keypoints = Keypoints.from_cv2(found)
+        keypoints = Keypoints.from_cv2(detected)
         order = self._chosen(keypoints)
         return keypoints[order], np.asarray(descriptors)[order]
 
@@ -77,8 +77,8 @@ def _colour(count: int, everywhere: bool) -> Extractor:
 
 
 def _sift(count: int, everywhere: bool) -> Extractor:
-    found = count * MORE if everywhere else count
-    feature = cv2.SIFT.create(nfeatures=found, contrastThreshold=SIFT_CONTRAST)
+    detected = count * MORE if everywhere else count
+    feature = cv2.SIFT.create(nfeatures=detected, contrastThreshold=SIFT_CONTRAST)
     return OpenCvExtractor("sift", feature, count, everywhere=everywhere)
 
 

@@ -83,13 +83,13 @@ def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) ->
     for _ in range(2):  # the second time without outliers, such as a shadow or an occlusion
         centre = points.mean(axis=0)
         direction = np.linalg.svd(points - centre, full_matrices=False)[2][0]
-        found = np.array((-direction[1], direction[0]))
-        off = np.abs((points - centre) @ found)
+        fitted = np.array((-direction[1], direction[0]))
+        off = np.abs((points - centre) @ fitted)
         keep = off <= max(3.0 * float(np.median(off)), 0.1)
         if np.count_nonzero(keep) < 4:
             return None
         points = points[keep]
-    return found, float(found @ centre)
+    return fitted, float(fitted @ centre)
 
 
 def find_markers(image: Image, family: MarkerFamily) -> list[tuple[int, Array]]:
@@ -99,12 +99,12 @@ def find_markers(image: Image, family: MarkerFamily) -> list[tuple[int, Array]]:
     detector = _detector(family)
     corners, numbers, _ = detector.detectMarkers(grey)
     bits = detector.getDictionary().markerSize + 2
-    found = [] if numbers is None else [int(number) for number in np.ravel(numbers)]
-    count = Counter(found)
-    pairs = zip(found, corners, strict=True)
+    detected = [] if numbers is None else [int(number) for number in np.ravel(numbers)]
+    count = Counter(detected)
+    pairs = zip(detected, corners, strict=True)
     return [
-        (number, refined_corners(grey, np.asarray(seen, dtype=float).reshape(4, 2), bits))
-        for number, seen in pairs
+        (number, refined_corners(grey, np.asarray(corner_pixels, dtype=float).reshape(4, 2), bits))
+        for number, corner_pixels in pairs
         if count[number] == 1
     ]
 

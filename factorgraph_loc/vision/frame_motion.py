@@ -66,8 +66,8 @@ def frame_motion(
         return None
     pairs = RayPairs.of(model, first, second)
     turn = _turn(pairs, predicted, model.robust)
-    way = float(np.linalg.norm(translation(pairs.position, predicted.delta)))
-    may_rest = way < AGREES * float(np.sqrt(np.trace(predicted.covariance[:2, :2])))
+    distance = float(np.linalg.norm(translation(pairs.position, predicted.delta)))
+    may_rest = distance < AGREES * float(np.sqrt(np.trace(predicted.covariance[:2, :2])))
     if may_rest and turn.agrees.mean() >= TURN_EXPLAINS:
         return turn
     moved = _refined(pairs, _start(pairs, predicted.delta, rng), model.robust)
@@ -86,18 +86,18 @@ def turned(
     if len(first) < MIN_MATCHES:
         return None
     pairs = RayPairs.of(model, first, second)
-    found = _refined(pairs, min(starts, key=lambda motion: _misfit(pairs, motion)), model.robust)
-    if found.agrees.sum() < max(MIN_MATCHES, MIN_SHARE * len(pairs)):
+    refined = _refined(pairs, min(starts, key=lambda motion: _misfit(pairs, motion)), model.robust)
+    if refined.agrees.sum() < max(MIN_MATCHES, MIN_SHARE * len(pairs)):
         return None
-    residual, _, signal = sampson(pairs, found.delta)
-    weight = _weight(pairs, found.delta, residual, model.robust)
+    residual, _, signal = sampson(pairs, refined.delta)
+    weight = _weight(pairs, refined.delta, residual, model.robust)
     longer, shorter = (
-        sampson(RayPairs.of(replace(model, fx=s * model.fx, fy=s * model.fy), first, second), found.delta)[0]
+        sampson(RayPairs.of(replace(model, fx=s * model.fx, fy=s * model.fy), first, second), refined.delta)[0]
         for s in (1.0 + SCALED, 1.0 - SCALED)
     )
     by_focal = (longer - shorter) / (2.0 * SCALED)
     # there is no information along the translation, only across it and of the rotation
-    x, y, _ = _along(found.delta, pairs.position)
+    x, y, _ = _along(refined.delta, pairs.position)
     jacobian = np.column_stack((signal @ (-y, x, 0.0), signal[:, 2], by_focal))
     information = (weight[:, None] * jacobian).T @ jacobian
     if np.linalg.cond(information) > WORST:
@@ -105,7 +105,7 @@ def turned(
     covariance = np.linalg.inv(information)
     focal = -float(covariance[2] @ (jacobian.T @ (weight * residual)))
     turn_sigma = math.sqrt(np.linalg.inv(information[:2, :2])[1, 1])
-    return (float(found.delta[2]), turn_sigma), (focal, math.sqrt(covariance[2, 2]))
+    return (float(refined.delta[2]), turn_sigma), (focal, math.sqrt(covariance[2, 2]))
 
 
 def _start(pairs: RayPairs, predicted: Array, rng: np.random.Generator) -> Array:
@@ -146,13 +146,13 @@ def _refined(pairs: RayPairs, motion: Array, robust: float) -> FrameMotion:
         step = -np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ (jacobian.T @ (weight * residual))
         for _ in range(HALVINGS):
             moved = _stepped(motion, step, start, pairs.position)
-            there = _misfit(pairs, moved)
-            if there <= misfit:
+            new_misfit = _misfit(pairs, moved)
+            if new_misfit <= misfit:
                 break
             step = 0.5 * step
         else:
             break
-        motion, misfit = moved, there
+        motion, misfit = moved, new_misfit
         if np.abs(step).max() < SMALLEST:
             break
     residual, _, signal = sampson(pairs, motion)
@@ -169,18 +169,18 @@ def _weight(pairs: RayPairs, motion: Array, residual: Array, robust: float) -> A
 
 def _along(motion: Array, position: Array) -> Array:
     """The direction (3,) of the camera's translation as a perturbation of the robot's motion."""
-    way = translation(position, motion)
-    x, y = se2.transform_to(np.array((0.0, 0.0, motion[2])), way) / max(float(np.linalg.norm(way)), 1e-12)
+    shift = translation(position, motion)
+    x, y = se2.transform_to(np.array((0.0, 0.0, motion[2])), shift) / max(float(np.linalg.norm(shift)), 1e-12)
     return np.array((x, y, 0.0))
 
 
 def _stepped(motion: Array, step: Array, like: Array, position: Array) -> Array:
     """``motion`` after a step (3,), with the camera's translation as long as that of the motion ``like``."""
     moved = se2.compose(motion, se2.exp(np.clip(step, -0.5, 0.5)))
-    way, length = translation(position, moved), float(np.linalg.norm(translation(position, like)))
-    there = float(np.linalg.norm(way))
-    if there > 0.0:
-        moved[:2] += way * (max(length, SHORTEST) / there - 1.0)
+    shift, length = translation(position, moved), float(np.linalg.norm(translation(position, like)))
+    shift_length = float(np.linalg.norm(shift))
+    if shift_length > 0.0:
+        moved[:2] += shift * (max(length, SHORTEST) / shift_length - 1.0)
     return moved
 
 
@@ -218,8 +218,8 @@ def _turn(pairs: RayPairs, predicted: Increment, robust: float) -> FrameMotion:
     normal = np.einsum("k,kri,krj->ij", weight, jacobian, jacobian) + np.diag(prior**2)
     # the effect of varying depth is part of the residual
     excess = max(1.0, float(np.sum(weight[:, None] * residual**2)) / max(2.0 * weight.sum() - 1.0, 1.0))
-    told = normal[0, 0] - normal[0, 1:] @ np.linalg.solve(normal[1:, 1:], normal[1:, 0])
-    variance = excess / max(told, 1e-9) + (DEPTHS * NEAR * allowed) ** 2
+    information = normal[0, 0] - normal[0, 1:] @ np.linalg.solve(normal[1:, 1:], normal[1:, 0])
+    variance = excess / max(information, 1e-9) + (DEPTHS * NEAR * allowed) ** 2
     return FrameMotion(delta, np.diag((0.0, 0.0, 1.0 / variance)), agrees)
 
 
@@ -246,11 +246,11 @@ def _displaced(pairs: RayPairs, turn: float, shift: Array) -> tuple[Array, Array
     inverse = np.linalg.inv(
         np.concatenate((pairs.first_noise, np.broadcast_to(pairs.axis[:, None], (len(b), 3, 1))), axis=2)
     )
-    here, by = np.einsum("kij,kj->ki", inverse, ahead), inverse @ by
-    there = np.einsum("kij,kj->ki", inverse, pairs.first)
-    depth = np.maximum(here[:, 2:], 0.05)
-    residual = (here[:, :2] / depth - there[:, :2]) / np.sqrt(2.0)
-    jacobian = (by[:, :2] - here[:, :2, None] / depth[:, :, None] * by[:, 2:]) / depth[:, :, None] / np.sqrt(2.0)
+    predicted, by = np.einsum("kij,kj->ki", inverse, ahead), inverse @ by
+    measured = np.einsum("kij,kj->ki", inverse, pairs.first)
+    depth = np.maximum(predicted[:, 2:], 0.05)
+    residual = (predicted[:, :2] / depth - measured[:, :2]) / np.sqrt(2.0)
+    jacobian = (by[:, :2] - predicted[:, :2, None] / depth[:, :, None] * by[:, 2:]) / depth[:, :, None] / np.sqrt(2.0)
     return residual, jacobian
 
 

@@ -120,21 +120,21 @@ def lonely(points: Float, scales: Float, reach: float, alike: float, most: int) 
     """Which of the points (N, 2), sorted by descending strength, have no stronger one nearby: the first ones, at ``most`` so many.
 
     Nearby: within ``reach`` times their own of the ``scales`` (N,), with a scale ratio of at most ``alike``."""
-    found, count = np.zeros(len(points), np.bool_), 0
+    alone, count = np.zeros(len(points), np.bool_), 0
     for n in range(len(points)):
         if count == most:
             break
         radius = (reach * scales[n]) ** 2
-        found[n] = True
+        alone[n] = True
         for m in range(n):
             ratio = scales[m] / scales[n]
             if ratio <= alike and ratio * alike >= 1.0:
                 dx, dy = points[m, 0] - points[n, 0], points[m, 1] - points[n, 1]
                 if dx * dx + dy * dy < radius:
-                    found[n] = False
+                    alone[n] = False
                     break
-        count += found[n]
-    return found
+        count += alone[n]
+    return alone
 
 
 @compiled(fastmath=FAST)

@@ -63,13 +63,13 @@ def match(
         distances[~allowed] = np.inf
     if distances.size == 0:
         return Matches(np.empty((0, 2), dtype=np.int64), np.empty(0))
-    there = nearest_neighbours(distances, resolution(first, binary=binary))
-    keep = np.isfinite(there.best) & there.alone & (there.best < ratio * there.second)
+    forward = nearest_neighbours(distances, resolution(first, binary=binary))
+    keep = np.isfinite(forward.best) & forward.alone & (forward.best < ratio * forward.second)
     if mutual:
         back = nearest_neighbours(distances.T, resolution(second, binary=binary))
-        keep &= (back.index[there.index] == np.arange(len(keep))) & back.alone[there.index]
+        keep &= (back.index[forward.index] == np.arange(len(keep))) & back.alone[forward.index]
     chosen = np.flatnonzero(keep)
-    return Matches(np.stack([chosen, there.index[chosen]], axis=1), there.best[chosen].astype(float))
+    return Matches(np.stack([chosen, forward.index[chosen]], axis=1), forward.best[chosen].astype(float))
 
 
 def match_guided(
@@ -96,8 +96,8 @@ def gates(predicted: Array, covariances: Array, points: Array, probability: floa
         raise InputError(f"matching: probability of a gate is {probability}, expected between 0 and 1")
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     determinant = a * c - b * b
-    seen = np.isfinite(predicted).all(axis=1)
-    if len(bad := np.flatnonzero(seen & ~((a > 0.0) & (determinant > 0.0)))):
+    finite = np.isfinite(predicted).all(axis=1)
+    if len(bad := np.flatnonzero(finite & ~((a > 0.0) & (determinant > 0.0)))):
         raise InputError(f"matching: covariance {bad[0]} is {covariances[bad[0]].tolist()}, expected positive definite")
     dx, dy = (points[None, :, axis] - predicted[:, axis, None] for axis in (0, 1))
     scaled = c[:, None] * dx * dx - 2.0 * b[:, None] * dx * dy + a[:, None] * dy * dy

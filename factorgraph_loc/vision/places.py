@@ -37,18 +37,18 @@ class KeyframeLooks:
 
     def views(self, descriptors: Descriptors) -> Integers:
         """The rows of the map's descriptors that the keyframes see that are most like an image with ``descriptors`` (N, D)."""
-        (look,) = self._described(_values(descriptors), np.zeros(len(descriptors), dtype=np.int64))
+        (description,) = self._described(_values(descriptors), np.zeros(len(descriptors), dtype=np.int64))
         alike = np.zeros(len(self), dtype=bool)
-        alike[np.argsort(-(self._looks @ look), kind="stable")[:NEAREST]] = True
+        alike[np.argsort(-(self._looks @ description), kind="stable")[:NEAREST]] = True
         return np.flatnonzero(alike[self._of])
 
     def _described(self, values: Array, of: Integers) -> Array:
         """The descriptions (K, WORDS * D) of K images, from the values (M, D) in image ``of`` (M,)."""
         (nearest, _), count = vq(values, self._words), len(self._words)
-        looks = np.zeros((int(of.max()) + 1, count, values.shape[1]))
-        np.add.at(looks, (of, nearest), values - self._words[nearest])
-        looks /= np.maximum(np.linalg.norm(looks, axis=2), 1e-9)[..., None]
-        flat = looks.reshape(len(looks), -1)
+        descriptions = np.zeros((int(of.max()) + 1, count, values.shape[1]))
+        np.add.at(descriptions, (of, nearest), values - self._words[nearest])
+        descriptions /= np.maximum(np.linalg.norm(descriptions, axis=2), 1e-9)[..., None]
+        flat = descriptions.reshape(len(descriptions), -1)
         return np.asarray(flat / np.maximum(np.linalg.norm(flat, axis=1), 1e-9)[:, None])
 
 

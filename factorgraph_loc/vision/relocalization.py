@@ -46,10 +46,10 @@ class FoundOnFloor:
     inliers: Truths
 
 
-def located(model: CameraModel, points: Array, pixels: Array, spreads: Array | None = None) -> Resection | None:
+def located(model: CameraModel, points: Array, pixels: Array, covariances: Array | None = None) -> Resection | None:
     """The pose with most inliers among ``points`` (K, 3), seen at ``pixels`` (K, 2); None if there is none.
 
-    ``spreads`` (K, 3, 3) [m^2]: covariances of the points.
+    ``covariances`` (K, 3, 3) [m^2]: covariances of the points.
     """
     if len(points) < FEWEST:
         return None
@@ -61,19 +61,19 @@ def located(model: CameraModel, points: Array, pixels: Array, spreads: Array | N
     parameters.randomGeneratorState, parameters.isParallel = 0, False
     ideal = reprojection.undistorted(model, pixels) * (model.fx, model.fy) + (model.cx, model.cy)
     try:
-        found, _, turn, shift, inliers = cv2.solvePnPRansac(
+        is_solved, _, turn, shift, inliers = cv2.solvePnPRansac(
             np.ascontiguousarray(points), ideal, model.matrix(), None, params=parameters
         )
     except cv2.error:  # degenerate samples
         return None
-    if not found or inliers is None or not np.all(np.isfinite(turn)) or not np.all(np.isfinite(shift)):
+    if not is_solved or inliers is None or not np.all(np.isfinite(turn)) or not np.all(np.isfinite(shift)):
         return None
     rotation = scipy.spatial.transform.Rotation.from_rotvec(turn.ravel()).as_matrix().T
-    return _refined(model, -rotation @ shift.ravel(), rotation, points, pixels, spreads)
+    return _refined(model, -rotation @ shift.ravel(), rotation, points, pixels, covariances)
 
 
 def on_floor(
-    model: CameraModel, camera: CameraPose, points: Array, pixels: Array, spreads: Array | None = None
+    model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array | None = None
 ) -> FoundOnFloor | None:
     """The pose of a robot on the floor whose camera was found at ``camera``; None if it floats, tilts or is not determined."""
     position, rotation = reprojection.carrier(model, camera.position, camera.rotation)
@@ -81,7 +81,7 @@ def on_floor(
     if abs(position[2]) > FLOATS or tilt > TILTS:
         return None
     pose = np.array((position[0], position[1], math.atan2(rotation[1, 0], rotation[0, 0])))
-    factor = ReprojectionFactor(model, points, pixels, point_covariances=spreads)
+    factor = ReprojectionFactor(model, points, pixels, point_covariances=covariances)
     information = np.zeros((3, 3))
     for _ in range(REFINEMENTS):
         residual, (jacobian,) = factor.linearize([pose])
@@ -100,15 +100,15 @@ def on_floor(
 
 
 def _refined(
-    model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, spreads: Array | None
+    model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, covariances: Array | None
 ) -> Resection | None:
     information = np.zeros((6, 6))
     for i in range(REFINEMENTS):
         predicted, by_camera, by_point = reprojection.linearize_in_space(model, position, rotation, points)
         residual = predicted - pixels
         noise = np.broadcast_to(model.sigma**2 * np.eye(2), (len(points), 2, 2))
-        if spreads is not None:
-            noise = noise + by_point @ spreads @ by_point.transpose(0, 2, 1)
+        if covariances is not None:
+            noise = noise + by_point @ covariances @ by_point.transpose(0, 2, 1)
         whitener = positive.whitener(noise)
         residual = np.einsum("kij,kj->ki", whitener, residual)
         squared = np.sum(residual**2, axis=1)
@@ -131,14 +131,16 @@ def _refined(
 
 
 def found_on_floor(
-    model: CameraModel, points: Array, pixels: Array, spreads: Array | None = None
+    model: CameraModel, points: Array, pixels: Array, covariances: Array | None = None
 ) -> FoundOnFloor | None:
     """The pose of a robot on the floor from K points with outliers; ``inliers`` refers to all of them."""
-    found = located(model, points, pixels, spreads)
-    if found is None:
+    resection = located(model, points, pixels, covariances)
+    if resection is None:
         return None
-    rows = found.inliers
-    planar = on_floor(model, found.camera, points[rows], pixels[rows], None if spreads is None else spreads[rows])
+    rows = resection.inliers
+    planar = on_floor(
+        model, resection.camera, points[rows], pixels[rows], None if covariances is None else covariances[rows]
+    )
     if planar is None:
         return None
     inliers = rows.copy()

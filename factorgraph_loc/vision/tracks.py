@@ -62,10 +62,10 @@ class FeatureTracker:
     def _continued(self, earlier: _TrackedImage, image: _TrackedImage) -> _TrackedImage:
         """Continue tracks of an earlier image in the features without a number; the rest of the earlier image is returned."""
         rows = np.flatnonzero(image.numbers < 0)
-        here = image.directions[rows], image.descriptors[rows]
-        found = pairs(earlier[:2], here, self._camera, binary=self._binary)
-        image.numbers[rows[found[:, 1]]] = earlier.numbers[found[:, 0]]
-        missed = np.setdiff1d(np.arange(len(earlier.numbers)), found[:, 0])
+        current = image.directions[rows], image.descriptors[rows]
+        matched = pairs(earlier[:2], current, self._camera, binary=self._binary)
+        image.numbers[rows[matched[:, 1]]] = earlier.numbers[matched[:, 0]]
+        missed = np.setdiff1d(np.arange(len(earlier.numbers)), matched[:, 0])
         return _TrackedImage(earlier.directions[missed], earlier.descriptors[missed], earlier.numbers[missed])
 
 
@@ -79,17 +79,17 @@ def pairs(
     a, b = (np.asarray(directions * focal, dtype=np.float32) for directions, _ in (first, second))
     away = [np.square(a[:, None, axis] - b[None, :, axis]) for axis in (0, 1)]
     reach = (RADIUS * max(camera.width, camera.height)) ** 2
-    found = match(first[1], second[1], binary=binary, allowed=away[0] + away[1] < reach).indices
-    if len(found) < FEWEST:
-        return found
-    a, b = a[found[:, 0]], b[found[:, 1]]
+    matched = match(first[1], second[1], binary=binary, allowed=away[0] + away[1] < reach).indices
+    if len(matched) < FEWEST:
+        return matched
+    a, b = a[matched[:, 0]], b[matched[:, 1]]
     right = _of_one_geometry(a, b, focal)
-    others = np.flatnonzero(~right)
-    if len(others) >= FEWEST:
-        too = _of_one_geometry(a[others], b[others], focal)
-        if np.count_nonzero(too) > ALIKE * len(others):
-            right[others] = too
-    return found[right]
+    rejected = np.flatnonzero(~right)
+    if len(rejected) >= FEWEST:
+        too = _of_one_geometry(a[rejected], b[rejected], focal)
+        if np.count_nonzero(too) > ALIKE * len(rejected):
+            right[rejected] = too
+    return matched[right]
 
 
 def _of_one_geometry(first: Float, second: Float, focal: float) -> Truths:

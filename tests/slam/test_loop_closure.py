@@ -41,7 +41,7 @@ def shown(film, poses=POSES, off=DRIFT, memory=None, sigmas=SIGMAS, way=10.0):
         keyframe = Keyframe(i, float(i), None, None)
         image = Image(frame, keyframe, (guess, np.diag(sigmas**2)), way)
         assert closure.due(keyframe.t)
-        said.append((closure.look(MODEL, image, old, estimates.__getitem__), truth))
+        said.append((closure.compare(MODEL, image, old, estimates.__getitem__), truth))
     return said
 
 
@@ -100,7 +100,7 @@ def test_no_image_twice_a_second():
     keyframe = Keyframe(0, 3.0, None, None)
     frame, _ = camera_world.frame(ROOM, POSES[0], 3.0, np.random.default_rng(1))
     nothing = OldPoints(ROOM, [point_key(i) for i in range(len(ROOM))], np.zeros(len(ROOM)))
-    closure.look(MODEL, Image(frame, keyframe, (AWAY, np.eye(3)), 0.0), nothing, {}.__getitem__)
+    closure.compare(MODEL, Image(frame, keyframe, (AWAY, np.eye(3)), 0.0), nothing, {}.__getitem__)
     assert not closure.due(3.5)
     assert closure.due(4.0)
 

@@ -41,7 +41,7 @@ def looked(seed, slid=(0.0, 0.0, 0.0), across=0.0, room=ROOM, count=OBJECT, imag
     for i, pose in enumerate(poses):
         pixels = np.concatenate((predict(MODEL, pose, points)[0], others + np.array((i * across, 0.0))))
         seen = pixels + rng.standard_normal(pixels.shape)
-        things.look(Keyframe(i, 0.6 * i, chain[i], None), names, seen, graph)
+        things.learn(Keyframe(i, 0.6 * i, chain[i], None), names, seen, graph)
     return things
 
 

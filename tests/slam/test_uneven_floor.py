@@ -28,7 +28,7 @@ def learnt(sigma, seed, lean, count=200):
         off = tilt + lean + TOLD * rng.standard_normal(2) - tilt_of(before.robot)
         after = before.plus(gain @ off, before.covariance - gain @ before.covariance[:2])
         after = with_floor(before, after, k * RATE)
-        state = replace(after, seen=ChainState(k * RATE, *np.zeros(7)))
+        state = replace(after, image_odometry=ChainState(k * RATE, *np.zeros(7)))
     return state.floor.sigma
 
 

@@ -177,10 +177,10 @@ def _strongest(strengths: Plane, across: Plane, peaks: Truths, sigmas: Array, co
     return Keypoints(points, 2.0 * scale, none, response.astype(float), level.astype(np.int64))
 
 
-def _vertex(before: Plane, at: Plane, after: Plane) -> Array:
+def _vertex(left: Plane, at: Plane, right: Plane) -> Array:
     """Offset of the vertex of the parabola through three equally spaced values, from -0.5 to 0.5."""
-    bend = (before - 2.0 * at + after).astype(float)
-    slope = 0.5 * (after - before).astype(float)
+    bend = (left - 2.0 * at + right).astype(float)
+    slope = 0.5 * (right - left).astype(float)
     top = np.divide(-slope, bend, out=np.zeros_like(slope), where=bend < 0.0)
     return np.asarray(np.clip(top, -0.5, 0.5))
 
@@ -190,11 +190,11 @@ def _merged(parts: list[Keypoints], count: int) -> Keypoints:
     columns = [np.concatenate([getattr(part, name) for part in parts]) for name in Keypoints.__dataclass_fields__]
     everything = Keypoints(*columns)
     order = np.argsort(-everything.responses, kind="stable")
-    kept, seen = [], set()
+    kept, keys = [], set()
     for i in order.tolist():
         key = (*np.rint(everything.points[i]).astype(int).tolist(), round(float(np.log(everything.sizes[i])) * 5))
-        if key not in seen:
-            seen.add(key)
+        if key not in keys:
+            keys.add(key)
             kept.append(i)
     return everything[np.array(kept[:count], dtype=np.int64)]
 

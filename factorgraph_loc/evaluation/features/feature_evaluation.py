@@ -97,15 +97,15 @@ def evaluate(sequence: Sequence, what: Feature, progress: Callable[[], None] = l
         (keypoints, descriptors), _ = _timed(what, sequence.first)
         progress()
         for k, (image, homography) in enumerate(zip(sequence.others, sequence.homographies, strict=True)):
-            (others, others_described), milliseconds = _timed(what, image)
+            (second, second_descriptors), milliseconds = _timed(what, image)
             shapes = (sequence.first.shape, image.shape)
-            again = repeatability(keypoints, others, homography, shapes)
+            again = repeatability(keypoints, second, homography, shapes)
             matched = MatchScores()
-            if descriptors is not None and others_described is not None:
-                matches = mutual_matches(descriptors, others_described)
-                matched = match_scores(keypoints, others, matches, homography, shapes)
+            if descriptors is not None and second_descriptors is not None:
+                matches = mutual_matches(descriptors, second_descriptors)
+                matched = match_scores(keypoints, second, matches, homography, shapes)
             about = (what.name, sequence.name, sequence.change, k + 2, sequence.amounts[k])
-            yield PairScores(*about, len(others), milliseconds, again, matched)
+            yield PairScores(*about, len(second), milliseconds, again, matched)
             progress()
 
 
@@ -121,12 +121,12 @@ def mutual_matches(first: Descriptors, second: Descriptors) -> Matched:
         return none, none, np.empty(0)
     binary = first.dtype == np.uint8
     distances = distance_matrix(first, second, binary=binary)
-    there = nearest_neighbours(distances, resolution(first, binary=binary))
+    forward = nearest_neighbours(distances, resolution(first, binary=binary))
     back = nearest_neighbours(distances.T, resolution(second, binary=binary))
-    i = np.flatnonzero(back.index[there.index] == np.arange(len(first)))
-    j = there.index[i]
-    best, runner_up = (values[i].astype(float) for values in (there.best, there.second))
-    return i, j, np.divide(best, runner_up, out=np.ones(len(i)), where=there.alone[i] & back.alone[j])
+    i = np.flatnonzero(back.index[forward.index] == np.arange(len(first)))
+    j = forward.index[i]
+    best, runner_up = (values[i].astype(float) for values in (forward.best, forward.second))
+    return i, j, np.divide(best, runner_up, out=np.ones(len(i)), where=forward.alone[i] & back.alone[j])
 
 
 def match_scores(
@@ -145,8 +145,8 @@ def match_scores(
 def _timed(what: Feature, image: Image) -> tuple[tuple[Keypoints, Descriptors | None], float]:
     """The features of an image, and the time [ms]."""
     started = time.perf_counter()
-    found = what.find(image)
-    return found, 1e3 * (time.perf_counter() - started)
+    result = what.find(image)
+    return result, 1e3 * (time.perf_counter() - started)
 
 
 @contextmanager

@@ -121,11 +121,11 @@ def figure3(scores: FeatureScores) -> Any:
     warp are averaged.
     """
     groups = _groups(scores)
-    others = [name for name in scores.names() if name != OURS]
-    both = OURS in scores.names() and bool(others)
+    competitors = [name for name in scores.names() if name != OURS]
+    both = OURS in scores.names() and bool(competitors)
     figure, axes = grid(len(groups), 1 + both, 4.2 * len(groups) + 1.2, "Repeatability (overlap error below 40 %)")
     for row, (title, members) in zip(axes, groups.items(), strict=True):
-        left = {name: _means(scores, name, members) for name in (others or scores.names())}
+        left = {name: _means(scores, name, members) for name in (competitors or scores.names())}
         for name, (x, y) in left.items():
             row[0].plot(x, y, label=_label(name), **_style(name, scores.names()))
         if both:

@@ -17,7 +17,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import read_text
-from factorgraph_loc.text import told
+from factorgraph_loc.text import error_text
 from factorgraph_loc.vision.images import Image, read_image
 from factors.se2 import Array
 
@@ -114,14 +114,14 @@ def read_homography(path: Path, shape: tuple[int, ...]) -> Array:
         try:
             data = ET.fromstring(text.lstrip()).find(".//data")
         except ET.ParseError as error:
-            raise InputError(f"{path}: is not XML: {told(error)}") from error
+            raise InputError(f"{path}: is not XML: {error_text(error)}") from error
         if data is None:
             raise InputError(f"{path}: has no <data>, expected a matrix as OpenCV writes it")
         text = data.text or ""
     try:
         numbers = np.array([float(word) for word in text.split()])
     except ValueError as error:
-        raise InputError(f"{path}: is not a matrix: {told(error)}, expected nine numbers") from error
+        raise InputError(f"{path}: is not a matrix: {error_text(error)}, expected nine numbers") from error
     return checked(numbers.reshape(3, 3) if numbers.size == 9 else numbers, shape, path)
 
 
@@ -145,21 +145,21 @@ def find_sequences(paths: Several[Path]) -> list[Sequence]:
 
     Raises InputError for anything else, or damaged files.
     """
-    found: list[Sequence] = []
+    sequences: list[Sequence] = []
     for path in paths:
         if path.is_file():
-            found += warped(read_image(path), path)
+            sequences += warped(read_image(path), path)
         elif path.is_dir():
             folders = [path] if _images(path) else sorted(p for p in path.iterdir() if p.is_dir() and _images(p))
             if not folders:
                 raise InputError(f"{path}: has no images, expected img1, img2, ... or folders with such images")
-            found += [read_sequence(folder) for folder in folders]
+            sequences += [read_sequence(folder) for folder in folders]
         else:
             raise InputError(f"{path}: there is no such image or folder")
-    names = [one.name for one in found]
+    names = [sequence.name for sequence in sequences]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"{twice[0]}: several sequences have that name, expected one each")
-    return found
+    return sequences
 
 
 def read_sequence(folder: Path) -> Sequence:
@@ -169,16 +169,16 @@ def read_sequence(folder: Path) -> Sequence:
         missing = next(k for k in range(1, max(paths, default=0) + 2) if k not in paths)
         raise InputError(f"{folder}: has no img{missing}, expected img1, img2, ... without gaps")
     first = read_image(paths[1])
-    others, homographies = [], []
+    images, homographies = [], []
     for k in range(2, len(paths) + 1):
         candidates = [folder / f"H1to{k}p{suffix}" for suffix in _SUFFIXES]
         file = next((candidate for candidate in candidates if candidate.exists()), None)
         if file is None:
             raise InputError(f"{folder}: has no homography H1to{k}p (plain text, .txt, or .xml of OpenCV) for img{k}")
-        others.append(read_image(paths[k]))
+        images.append(read_image(paths[k]))
         homographies.append(read_homography(file, first.shape))
     change, amounts = _change([view(h, first.shape) for h in homographies])
-    return Sequence(folder.resolve().name, first, tuple(others), tuple(homographies), change, amounts)
+    return Sequence(folder.resolve().name, first, tuple(images), tuple(homographies), change, amounts)
 
 
 def warped(photograph: Image, source: Path) -> list[Sequence]:
@@ -199,19 +199,19 @@ def warped(photograph: Image, source: Path) -> list[Sequence]:
 
 def _zoomed(photograph: Image, name: str) -> Sequence:
     height, width = photograph.shape[:2]
-    others, homographies = [], []
+    images, homographies = [], []
     for zoom in ZOOMS:
         size = (round(width / zoom), round(height / zoom))
         small = np.asarray(cv2.resize(photograph, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         left, top = (width - size[0]) // 2, (height - size[1]) // 2
         whole = photograph[:, ::-1].copy()
         whole[top : top + size[1], left : left + size[0]] = small
-        others.append(whole)
+        images.append(whole)
         # (0, 0) is the centre of a pixel, not its corner
         x, y = size[0] / width, size[1] / height
         shift = (0.5 * (x - 1.0) + left, 0.5 * (y - 1.0) + top)
         homographies.append(np.array(((x, 0.0, shift[0]), (0.0, y, shift[1]), (0.0, 0.0, 1.0))))
-    return Sequence(name, photograph, tuple(others), tuple(homographies), SCALE, ZOOMS)
+    return Sequence(name, photograph, tuple(images), tuple(homographies), SCALE, ZOOMS)
 
 
 def _rotated(photograph: Image, name: str) -> Sequence:
@@ -239,15 +239,15 @@ def _rotated(photograph: Image, name: str) -> Sequence:
 
 def _images(folder: Path) -> dict[int, Path]:
     """The files ``imgK.*`` of a folder by K. Raises InputError for several files with one K."""
-    found: dict[int, Path] = {}
+    files: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         match = re.fullmatch(r"img(\d+)\.\w+", path.name)
         if match and path.is_file():
             k = int(match[1])
-            if k in found:
-                raise InputError(f"{folder}: has both {found[k].name} and {path.name}, expected one img{k}")
-            found[k] = path
-    return found
+            if k in files:
+                raise InputError(f"{folder}: has both {files[k].name} and {path.name}, expected one img{k}")
+            files[k] = path
+    return files
 
 
 def _change(views: Several[ViewChange]) -> tuple[str, tuple[float, ...]]:

@@ -128,8 +128,8 @@ def _read(results: Results, metric: str, runs: Callable[[str], RunFiles]) -> dic
 
 def _known(results: Results, keys: Sequence[str], *, whole: bool = True) -> list[Metric]:
     """The metrics that have any score; with ``whole`` all of them if there is none."""
-    found = [metric_of(k) for k in keys if any(score(row, k) is not None for row in results.rows)]
-    return found or ([metric_of(k) for k in keys] if whole else [])
+    known = [metric_of(k) for k in keys if any(score(row, k) is not None for row in results.rows)]
+    return known or ([metric_of(k) for k in keys] if whole else [])
 
 
 def _toml(content: Any) -> Any:

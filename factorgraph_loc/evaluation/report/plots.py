@@ -47,8 +47,8 @@ def ratios(results: Results, comparisons: Sequence[MetricComparison]) -> Picture
     for c in comparisons:
         rows = []
         for variant, colour in zip(results.variants, cycle(COLOURS), strict=False):
-            found = c.contrasts.get(variant)
-            values = [a / b for a, b in found.by_log.values() if a > 0.0 and b > 0.0] if found else []
+            contrast = c.contrasts.get(variant)
+            values = [a / b for a, b in contrast.by_log.values() if a > 0.0 and b > 0.0] if contrast else []
             if values:
                 is_grey = c.p[variant] is not None and not c.is_significant(variant)
                 rows.append(_Row(variant, _GREY if is_grey else colour, values, median(values)))
@@ -141,17 +141,17 @@ def _points(
     metric: Metric, by_value: Mapping[float, dict[str, dict[int, float | None]]]
 ) -> Iterator[tuple[float, float, float, float]]:
     for value, scores in sorted(by_value.items()):
-        found = pooled(scores, rms=metric.rms)
-        if found is not None:
-            low = found.least if found.low is None else found.low
-            high = found.most if found.high is None else found.high
-            yield value, metric.factor * found.value, metric.factor * low, metric.factor * high
+        figure = pooled(scores, rms=metric.rms)
+        if figure is not None:
+            low = figure.least if figure.low is None else figure.low
+            high = figure.most if figure.high is None else figure.high
+            yield value, metric.factor * figure.value, metric.factor * low, metric.factor * high
 
 
 def _line_name(results: Results, variant: str, row: Mapping[str, Any], column: str) -> str:
     """The label and the swept settings other than that of the axis."""
-    others = [c for c in results.sweeps if c != column and row.get(c) is not None]
-    return ", ".join([results.variants[variant], *(f"{short_name(c)} {row[c]}" for c in others)])
+    columns = [c for c in results.sweeps if c != column and row.get(c) is not None]
+    return ", ".join([results.variants[variant], *(f"{short_name(c)} {row[c]}" for c in columns)])
 
 
 def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:

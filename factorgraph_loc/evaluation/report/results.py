@@ -63,7 +63,7 @@ class RunData:
 
 def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) -> RunData:
     """Read the files of all successful runs; of several seeds the trajectory with the median ``metric`` is drawn."""
-    found = RunData()
+    data = RunData()
     chosen = {
         (variant, log): row
         for log in results.logs
@@ -86,42 +86,42 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
             if left > 0:
                 plain = {kind: tracks.thinned(s, poses) for kind, s in series.items()}
                 drawn.append({"v": place, "seed": row["seed"], **plain})
-                _add_config(found, f"{variant}, {log}, seed {row['seed']}", files.read(CONFIG).decode())
+                _add_config(data, f"{variant}, {log}, seed {row['seed']}", files.read(CONFIG).decode())
             trust = tracks.consistency(series["causal"]) if "causal" in series else None
             if trust is not None and score(row, "causal.position_rmse") is not None:
                 counts.setdefault(variant, []).append(trust)
-                found.nees[variant, log] = trust[0]
-            well = [one for one in results.runs(variant, log) if one["status"] == "ok"]
-            every = [(one, series if one is row else _series(runs(str(one["key"])))) for one in well]
+                data.nees[variant, log] = trust[0]
+            well = [run for run in results.runs(variant, log) if run["status"] == "ok"]
+            every = [(run, series if run is row else _series(runs(str(run["key"])))) for run in well]
             for kind in KINDS:
                 scored = [
                     s[kind].errors["error_position"]
-                    for one, s in every
-                    if kind in s and score(one, f"{kind}.position_rmse") is not None
+                    for run, s in every
+                    if kind in s and score(run, f"{kind}.position_rmse") is not None
                 ]
                 if len(quantiles := tracks.quantiles(scored)):
-                    found.errors[kind][variant, log] = quantiles
+                    data.errors[kind][variant, log] = quantiles
         if drawn:
-            found.tracks[log] = {"scene": scene.model_dump() if scene else None, "runs": drawn}
+            data.tracks[log] = {"scene": scene.model_dump() if scene else None, "runs": drawn}
             left -= len(drawn)
     for variant, values in counts.items():
         means, independent, dofs = zip(*values, strict=True)
         band = mean_nees_band(independent, sum(dofs) / len(dofs))
-        found.trust[variant] = (sum(means) / len(means), *band)
-    return found
+        data.trust[variant] = (sum(means) / len(means), *band)
+    return data
 
 
 def _series(files: RunFiles) -> dict[str, Estimates]:
     """The estimates of a run by kind, without kinds that it lacks."""
-    found = ResultFiles(files.read, files.scene.t0_ns if files.scene else None).estimates()
-    return {kind: estimates for kind, estimates in found.items() if len(estimates.trajectory)}
+    estimates_by_kind = ResultFiles(files.read, files.scene.t0_ns if files.scene else None).estimates()
+    return {kind: estimates for kind, estimates in estimates_by_kind.items() if len(estimates.trajectory)}
 
 
-def _add_config(found: RunData, run: str, text: str) -> None:
-    found.configs[run] = text
-    if not found.versions:
+def _add_config(data: RunData, run: str, text: str) -> None:
+    data.configs[run] = text
+    if not data.versions:
         content = tomllib.loads(text)
-        found.versions = {str(name): str(version) for name, version in content.get("versions", {}).items()}
+        data.versions = {str(name): str(version) for name, version in content.get("versions", {}).items()}
 
 
 @dataclass(frozen=True)
@@ -198,8 +198,8 @@ class Results:
 
     def scores(self, metric: str, variant: str) -> dict[str, dict[int, float | None]]:
         """The scores of a variant by log and seed, None for failed runs and missing scores."""
-        found = {log: {row["seed"]: score(row, metric) for row in self.runs(variant, log)} for log in self.logs}
-        return {log: seeds for log, seeds in found.items() if seeds}
+        by_log = {log: {row["seed"]: score(row, metric) for row in self.runs(variant, log)} for log in self.logs}
+        return {log: seeds for log, seeds in by_log.items() if seeds}
 
     def representative(self, variant: str, log: str, metric: str) -> Row | None:
         """The run that represents all seeds: that with the median score, or the first successful one."""
@@ -210,8 +210,8 @@ class Results:
     def compare(self, metric: Metric, reference: str | None = None) -> MetricComparison:
         """Compare all variants with a reference, by default with the best and without intervals of the differences."""
         scores = {name: self.scores(metric.key, name) for name in self.variants}
-        found = {name: p for name in scores if (p := self._pool(metric, name, scores[name])) is not None}
-        best = _best(metric, scores, found)
+        figures = {name: p for name in scores if (p := self._pool(metric, name, scores[name])) is not None}
+        best = _best(metric, scores, figures)
         against = reference or best or next(iter(self.variants))
         contrasts = {
             name: c
@@ -220,7 +220,7 @@ class Results:
             and (c := self._contrast(metric, scores[name], scores[against], interval=reference is not None)) is not None
         }
         corrected = holm([c.p for c in contrasts.values()])
-        return MetricComparison(metric, found, best, against, contrasts, dict(zip(contrasts, corrected, strict=True)))
+        return MetricComparison(metric, figures, best, against, contrasts, dict(zip(contrasts, corrected, strict=True)))
 
     def unscored(self) -> list[str]:
         """Logs with too short a reference to be scored."""
@@ -283,18 +283,18 @@ def score(row: Row, metric: str) -> float | None:
     return float(value)
 
 
-def _best(metric: Metric, scores: Mapping[str, ByLog], found: Mapping[str, Pooled]) -> str | None:
+def _best(metric: Metric, scores: Mapping[str, ByLog], figures: Mapping[str, Pooled]) -> str | None:
     """The best variant among those with a score of each log that any variant has."""
-    if metric.better is None or not found:
+    if metric.better is None or not figures:
         return None
     complete = {
         name: {log for log, seeds in scores[name].items() if any(v is not None for v in seeds.values())}
-        for name in found
+        for name in figures
     }
     every = set().union(*complete.values())
-    whole = [name for name in found if complete[name] == every]
+    whole = [name for name in figures if complete[name] == every]
     pick = min if metric.better == "low" else max
-    return pick(whole, key=lambda name: found[name].value) if whole else None
+    return pick(whole, key=lambda name: figures[name].value) if whole else None
 
 
 def _labels_with_several_sensors(rows: Sequence[Row]) -> set[str]:

@@ -36,7 +36,7 @@ class Scene(BaseModel, frozen=True, allow_inf_nan=False):
         """The scene of a log to a millimetre, with objects where estimators assume them."""
         return cls(
             walls=_plain(np.array(log.world.walls, dtype=float).reshape(-1, 4)),
-            layers={one.layer: _plain(_thinned(one)) for one in marks(log)},
+            layers={layer.layer: _plain(_thinned(layer)) for layer in marks(log)},
             reference=[_plain(piece) for piece in _pieces(log)],
             t0_ns=log.t0_ns,
         )
@@ -51,9 +51,9 @@ class Scene(BaseModel, frozen=True, allow_inf_nan=False):
         return cls.model_validate_json(path.read_bytes())
 
 
-def _thinned(one: Marks) -> Array:
-    places = one.positions[:, :2]
-    return places[:: len(places) // _POINTS + 1] if one.dense else places
+def _thinned(layer: Marks) -> Array:
+    places = layer.positions[:, :2]
+    return places[:: len(places) // _POINTS + 1] if layer.dense else places
 
 
 def _pieces(log: Log) -> tuple[Array, ...]:

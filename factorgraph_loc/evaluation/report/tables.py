@@ -52,11 +52,11 @@ def by_log(results: Results, metric: Metric) -> Table:
     """A row per log, a column per variant; the best of each row marked."""
     rows = []
     for log in results.logs:
-        found = {v: _known(results.runs(v, log), metric) for v in results.variants}
-        values = {v: float(average(known, rms=metric.rms)) for v, known in found.items() if known}
+        scores = {v: _known(results.runs(v, log), metric) for v in results.variants}
+        values = {v: float(average(known, rms=metric.rms)) for v, known in scores.items() if known}
         pick = {"low": min, "high": max}.get(metric.better or "")
         best = pick(values.values()) if pick and len(values) > 1 else None
-        cells = [_log_cell(metric, found[v], len(results.runs(v, log)), best) for v in results.variants]
+        cells = [_log_cell(metric, scores[v], len(results.runs(v, log)), best) for v in results.variants]
         rows.append([Cell(log), *cells, _poses([row for v in results.variants for row in results.runs(v, log)])])
     return ["log", *(name(results, v) for v in results.variants), "poses scored"], rows
 
@@ -68,8 +68,8 @@ def timing(results: Results, metrics: Sequence[Metric]) -> Table:
         cells = []
         for metric in metrics:
             known = sorted(_known(results.of(variant), metric))
-            spread = [metric.range(known[0], known[-1])] if len(known) > 1 else []
-            cells.append(Cell(metric.text(median(known)), spread) if known else Cell(_NONE))
+            bounds = [metric.range(known[0], known[-1])] if len(known) > 1 else []
+            cells.append(Cell(metric.text(median(known)), bounds) if known else Cell(_NONE))
         rows.append([name(results, variant), *cells])
     return ["", *(m.heading for m in metrics)], rows
 
@@ -147,15 +147,15 @@ def _pooled_cell(c: MetricComparison, variant: str) -> Cell:
 
 
 def _difference_cell(c: MetricComparison, variant: str) -> Cell:
-    found = c.contrasts.get(variant)
-    if found is None:
+    contrast = c.contrasts.get(variant)
+    if contrast is None:
         return Cell(_NONE, kind="grey")
-    value = c.metric.text(found.difference, sign=True)
-    if found.low is None or found.high is None or found.effect is None:
-        apart = [x - y for x, y in found.by_log.values()]
+    value = c.metric.text(contrast.difference, sign=True)
+    if contrast.low is None or contrast.high is None or contrast.effect is None:
+        apart = [x - y for x, y in contrast.by_log.values()]
         return Cell(value, [c.metric.range(min(apart), max(apart), sign=True)] if len(apart) > 1 else [], "grey")
-    bounds = f"[{c.metric.text(found.low, sign=True)}, {c.metric.text(found.high, sign=True)}]"
-    tested = f"p {p_value(c.p[variant])}, effect {significant(found.effect, sign=True)}"
+    bounds = f"[{c.metric.text(contrast.low, sign=True)}, {c.metric.text(contrast.high, sign=True)}]"
+    tested = f"p {p_value(c.p[variant])}, effect {significant(contrast.effect, sign=True)}"
     return Cell(value, [bounds, tested], "" if c.is_significant(variant) else "grey")
 
 
@@ -179,9 +179,9 @@ def _poses(runs: Sequence[Row]) -> Cell:
     return Cell(counted(runs) or _NONE)
 
 
-def _share(held: Sequence[bool]) -> Cell:
-    low, high = wilson(sum(held), len(held))
-    return Cell(f"{sum(held)} of {len(held)}", [f"[{100 * low:.0f}, {100 * high:.0f}] %"])
+def _share(outcomes: Sequence[bool]) -> Cell:
+    low, high = wilson(sum(outcomes), len(outcomes))
+    return Cell(f"{sum(outcomes)} of {len(outcomes)}", [f"[{100 * low:.0f}, {100 * high:.0f}] %"])
 
 
 def _known(rows: Sequence[Row], metric: Metric) -> list[float]:

@@ -57,23 +57,23 @@ def associate(
         return Associated(estimate, reference, np.empty(0, dtype=np.int64), from_reference=False)
     if how == "nearest":
         rows, of_reference = _nearest(estimate.seconds(), reference.seconds(), max_diff)
-        found = Associated(
+        paired = Associated(
             estimate.rows(rows), reference.rows(of_reference), np.empty(0, dtype=np.int64), from_reference=False
         )
     else:
-        found = _interpolated(estimate, reference, max_gap)
-    if not len(found.estimate):
+        paired = _interpolated(estimate, reference, max_gap)
+    if not len(paired.estimate):
         raise _nothing_in_common(estimate, reference, how, max_diff, max_gap)
-    return found
+    return paired
 
 
 def _nearest(estimate: Array, reference: Array, max_diff: float) -> tuple[Integers, Integers]:
     """Rows of the estimate and of the reference, for their stamps [s]."""
     swapped = len(estimate) > len(reference)
     short, long = (reference, estimate) if swapped else (estimate, reference)
-    after = np.searchsorted(long, short).clip(max=len(long) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(np.abs(short - long[before]) <= np.abs(long[after] - short), before, after)
+    later = np.searchsorted(long, short).clip(max=len(long) - 1)
+    earlier = np.maximum(later - 1, 0)
+    nearest = np.where(np.abs(short - long[earlier]) <= np.abs(long[later] - short), earlier, later)
     kept = np.flatnonzero(np.abs(long[nearest] - short) <= max_diff)
     return (nearest[kept], kept) if swapped else (kept, nearest[kept])
 
@@ -101,9 +101,9 @@ def in_plane(
     known = np.isfinite(pair.poses[:, 0]) & np.isfinite(pair.truth[:, 0])
     kept = np.flatnonzero(known)
     gaps = np.searchsorted(kept, np.concatenate((pauses(pair.t), np.flatnonzero(~known))))
-    found = Trajectory(pair.t[kept], pair.poses[kept], has_heading=estimate.has_heading)
+    estimated = Trajectory(pair.t[kept], pair.poses[kept], has_heading=estimate.has_heading)
     truth = Trajectory(pair.t[kept], pair.truth[kept], has_heading=reference.has_heading)
-    paths = path_of(found, names[0], t0_ns), path_of(truth, names[1], t0_ns)
+    paths = path_of(estimated, names[0], t0_ns), path_of(truth, names[1], t0_ns)
     return Associated(*paths, np.asarray(gaps, dtype=np.int64), from_reference=True)
 
 
@@ -113,8 +113,8 @@ def _nothing_in_common(
     ours, theirs = estimate.seconds(), reference.seconds()
     if ours[0] > theirs[-1] or theirs[0] > ours[-1]:
         spans = (f"{t[0]:.3f} to {t[-1]:.3f} s" for t in (ours, theirs))
-        told = " and ".join(f"{path.name} {span}" for path, span in zip((estimate, reference), spans, strict=True))
-        return InputError(f"the trajectories do not overlap in time: {told}, expected one clock")
+        named = " and ".join(f"{path.name} {span}" for path, span in zip((estimate, reference), spans, strict=True))
+        return InputError(f"the trajectories do not overlap in time: {named}, expected one clock")
     if how == "nearest":
         expected = "a larger --max-diff, or --associate interpolate"
         return InputError(
@@ -180,7 +180,7 @@ def _planar(estimate: PosePath, reference: PosePath) -> Similarity:
 def _umeyama(estimate: PosePath, reference: PosePath, *, with_scale: bool) -> Similarity:
     centre, target = estimate.positions.mean(axis=0), reference.positions.mean(axis=0)
     a, b = estimate.positions - centre, reference.positions - target
-    left, spread, right = np.linalg.svd(b.T @ a / len(a))
+    left, singular, right = np.linalg.svd(b.T @ a / len(a))
     for path, places in ((estimate, a), (reference, b)):
         of_path = np.linalg.svd(places, compute_uv=False)
         if not of_path[1] ** 2 > _DEGENERATE * of_path[0] ** 2:
@@ -190,5 +190,5 @@ def _umeyama(estimate: PosePath, reference: PosePath, *, with_scale: bool) -> Si
             )
     signs = np.array((1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))))
     rotation = (left * signs) @ right
-    scale = float(spread @ signs / np.mean(np.sum(a**2, axis=1))) if with_scale else 1.0
+    scale = float(singular @ signs / np.mean(np.sum(a**2, axis=1))) if with_scale else 1.0
     return Similarity(rotation, target - scale * rotation @ centre, scale)

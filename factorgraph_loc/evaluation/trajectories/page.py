@@ -50,14 +50,14 @@ def _trajectories(score: TrajectoryScore) -> Figure:
     figure, axes = grid(1, 1 if flat else 2, height, "trajectories, at the compared poses")
     x, label = _over(score)
     breaks = pauses(x) if score.seconds() is not None else np.empty(0, dtype=np.int64)  # NaN interrupts a line
-    for path, look, name in (
+    for path, style, name in (
         (score.reference, {"color": "0.75", "linewidth": 4.0}, REFERENCE),
         (score.estimate, {"color": COLOURS[0], "linewidth": 1.2}, ESTIMATE),
     ):
         positions = np.insert(path.positions, breaks, np.nan, axis=0)
-        axes[0, 0].plot(*positions[:, :2].T, label=name, **look)
+        axes[0, 0].plot(*positions[:, :2].T, label=name, **style)
         if not flat:
-            axes[0, 1].plot(np.insert(x, breaks, np.nan), positions[:, 2], label=name, **look)
+            axes[0, 1].plot(np.insert(x, breaks, np.nan), positions[:, 2], label=name, **style)
     axes[0, 0].plot(
         *score.estimate.positions[0, :2], "o", color=COLOURS[0], markersize=5, label="start of the estimate"
     )
@@ -109,20 +109,20 @@ def errors_table(score: TrajectoryScore) -> Rows:
 
 def extents(score: TrajectoryScore) -> dict[str, str]:
     """What was compared with what, how, and by which alignment, in words."""
-    told = {}
+    rows = {}
     for name, path, poses, length in zip(
         ("estimate", "reference"), (score.estimate, score.reference), score.poses, score.lengths, strict=True
     ):
-        told[name] = f"{path.name}: {poses} poses, {length:.2f} m"
+        rows[name] = f"{path.name}: {poses} poses, {length:.2f} m"
     t = score.seconds()
-    told["pairs"] = f"{len(score.estimate)}, {_association(score)}" + ("" if t is None else f"; {t[-1]:.1f} s")
+    rows["pairs"] = f"{len(score.estimate)}, {_association(score)}" + ("" if t is None else f"; {t[-1]:.1f} s")
     pieces = {"metre": score.rpe_per_m, "second": score.rpe_per_s}
     counts = [f"{len(errors.position)} of a {unit}" for unit, errors in pieces.items() if errors is not None]
     if counts:
         overlap = "that may overlap" if score.settings["all_pairs"] else "one after the other"
-        told["pieces"] = f"{', '.join(counts)}, {overlap}"
-    told["alignment"] = _alignment(score)
-    return told
+        rows["pieces"] = f"{', '.join(counts)}, {overlap}"
+    rows["alignment"] = _alignment(score)
+    return rows
 
 
 def page(score: TrajectoryScore) -> str:
@@ -154,8 +154,8 @@ def _alignment(score: TrajectoryScore) -> str:
         return "none"
     turn = Rotation.from_matrix(transform.rotation).as_rotvec()
     translation, vector = (tuple((np.round(values, 4) + 0.0).tolist()) for values in (transform.translation, turn))
-    told = f"{how}: translation {translation} m, rotation vector {vector} rad"
-    return f"{told}, scale {transform.scale:.5f}" if how == "sim3" else told
+    text = f"{how}: translation {translation} m, rotation vector {vector} rad"
+    return f"{text}, scale {transform.scale:.5f}" if how == "sim3" else text
 
 
 def write_score(score: TrajectoryScore, out: Path) -> None:
@@ -183,8 +183,8 @@ def errors_of(score: TrajectoryScore) -> pl.DataFrame:
         pl.Series(name, [None] * len(path) if path.t_ns is None else path.t_ns, pl.Int64)
         for name, path in (("t_ns", score.estimate), ("reference_t_ns", score.reference))
     ]
-    for before, path in (("", score.estimate), ("reference_", score.reference)):
-        columns += [pl.Series(f"{before}{axis}", path.positions[:, i]) for i, axis in enumerate("xyz")]
+    for prefix, path in (("", score.estimate), ("reference_", score.reference)):
+        columns += [pl.Series(f"{prefix}{axis}", path.positions[:, i]) for i, axis in enumerate("xyz")]
     columns.append(pl.Series("error_position", score.ape.position))
     columns.append(
         pl.Series("error_rotation", [None] * len(score.estimate) if rotation is None else rotation, pl.Float64)

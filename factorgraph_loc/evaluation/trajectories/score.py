@@ -13,7 +13,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation import pairing
-from factorgraph_loc.evaluation.pairing import DELTA, TOLERANCE, pauses, spread
+from factorgraph_loc.evaluation.pairing import DELTA, TOLERANCE, pauses, summarize
 from factorgraph_loc.evaluation.trajectories.association import Associated, Similarity, alignment, associate
 from factorgraph_loc.model.planar import MOST, RISE
 from factorgraph_loc.model.pose_path import PosePath, require_poses
@@ -43,11 +43,11 @@ class PoseErrors:
 
     def figures(self, name: str) -> dict[str, float | None]:
         """Statistics as ``NAME.position_rmse``, ...; None where there are no errors."""
-        told: dict[str, float | None] = {}
+        figures: dict[str, float | None] = {}
         for what, values in (("position", self.position), ("rotation", self.rotation)):
-            statistics = spread(np.empty(0) if values is None else values)
-            told |= {f"{name}.{what}_{how}": value for how, value in statistics.items()}
-        return told
+            statistics = summarize(np.empty(0) if values is None else values)
+            figures |= {f"{name}.{what}_{how}": value for how, value in statistics.items()}
+        return figures
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,12 @@ class TrajectoryScore:
         ``mean``, ``median``, ``p95``, ``max``, ``min`` and ``std``. ``rpe_per_m.pieces``, ``rpe_per_s.pieces``: number of
         relative errors.
         """
-        told: dict[str, float | None] = {"pairs": len(self.estimate)}
-        told |= self.ape.figures("ape")
+        figures: dict[str, float | None] = {"pairs": len(self.estimate)}
+        figures |= self.ape.figures("ape")
         for name, errors in (("rpe_per_m", self.rpe_per_m), ("rpe_per_s", self.rpe_per_s)):
             known = errors or _NONE
-            told |= known.figures(name) | {f"{name}.pieces": len(known.position) if errors else None}
-        return told
+            figures |= known.figures(name) | {f"{name}.pieces": len(known.position) if errors else None}
+        return figures
 
     def seconds(self) -> Array | None:
         """Times (N,) of the pairs from the first one on [s], None without stamps."""
@@ -134,42 +134,42 @@ def score_paths(
     require_poses(estimate)
     require_poses(reference)
     pair = associate(estimate, reference, associate_by, max_diff=max_diff, max_gap=max_gap)
-    found, truth = pair.estimate, pair.reference
+    aligned, truth = pair.estimate, pair.reference
     if align == "se2":
-        found, truth = found.seen_from_above(), truth.seen_from_above()
-    transform = alignment(found, truth, align)
-    found = transform.of(found)
+        aligned, truth = aligned.seen_from_above(), truth.seen_from_above()
+    transform = alignment(aligned, truth, align)
+    aligned = transform.of(aligned)
     settings: dict[str, Any] = {"align": align, "associate": associate_by, "all_pairs": all_pairs}
-    if found.t_ns is not None and truth.t_ns is not None:
+    if aligned.t_ns is not None and truth.t_ns is not None:
         settings |= {"max_diff": max_diff} if associate_by == "nearest" else {"max_gap": max_gap}
-    errors = pose_errors(replace(pair, estimate=found, reference=truth), all_pairs=all_pairs)
+    errors = pose_errors(replace(pair, estimate=aligned, reference=truth), all_pairs=all_pairs)
     lengths = float(_steps(estimate).sum()), float(_steps(reference).sum())
     poses = len(estimate), len(reference)
     warnings = [*estimate.warnings, *reference.warnings, *_doubts(estimate, reference, associate_by, align)]
-    if associate_by == "nearest" and len(found) < _MANY * min(poses):
+    if associate_by == "nearest" and len(aligned) < _MANY * min(poses):
         warnings.append(
-            f"{estimate.name}: {len(found)} of {min(poses)} poses have a stamp within {max_diff:g} s in {reference.name}: a larger "
-            "max_diff finds more, and associate interpolate needs none"
+            f"{estimate.name}: {len(aligned)} of {min(poses)} poses have a stamp within {max_diff:g} s in {reference.name}: "
+            "a larger max_diff finds more, and associate interpolate needs none"
         )
-    return TrajectoryScore(found, truth, transform, *errors, lengths, poses, settings, tuple(warnings))
+    return TrajectoryScore(aligned, truth, transform, *errors, lengths, poses, settings, tuple(warnings))
 
 
 def pose_errors(
     pair: Associated, *, all_pairs: bool = False
 ) -> tuple[PoseErrors, PoseErrors | None, PoseErrors | None]:
     """Absolute errors, and relative ones over a metre and over a second; see :class:`TrajectoryScore`."""
-    found, truth = pair.estimate, pair.reference
-    distance = np.linalg.norm(found.positions - truth.positions, axis=1)
-    ape = PoseErrors(distance, None, np.arange(len(found)))
-    if not (found.has_rotations and truth.has_rotations):
+    estimate, truth = pair.estimate, pair.reference
+    distance = np.linalg.norm(estimate.positions - truth.positions, axis=1)
+    ape = PoseErrors(distance, None, np.arange(len(estimate)))
+    if not (estimate.has_rotations and truth.has_rotations):
         return ape, None, None
-    ape = replace(ape, rotation=_angles(found.rotations.transpose(0, 2, 1) @ truth.rotations))
-    path = _steps(truth if pair.from_reference else found)
-    per_m = _relative(found, truth, path, DELTA, pair.gaps, all_pairs=all_pairs)
-    if (t := _seconds(found, truth)) is None:
+    ape = replace(ape, rotation=_angles(estimate.rotations.transpose(0, 2, 1) @ truth.rotations))
+    path = _steps(truth if pair.from_reference else estimate)
+    per_m = _relative(estimate, truth, path, DELTA, pair.gaps, all_pairs=all_pairs)
+    if (t := _seconds(estimate, truth)) is None:
         return ape, per_m, None
     gaps = np.union1d(pair.gaps, pauses(t))
-    return ape, per_m, _relative(found, truth, np.diff(t), DELTA - TOLERANCE, gaps, all_pairs=all_pairs)
+    return ape, per_m, _relative(estimate, truth, np.diff(t), DELTA - TOLERANCE, gaps, all_pairs=all_pairs)
 
 
 def _check(align: str, associate_by: str, max_diff: float, max_gap: float) -> None:
@@ -182,23 +182,23 @@ def _check(align: str, associate_by: str, max_diff: float, max_gap: float) -> No
 
 
 def _relative(
-    found: PosePath, truth: PosePath, steps: Array, length: float, gaps: Integers, *, all_pairs: bool
+    estimate: PosePath, truth: PosePath, steps: Array, length: float, gaps: Integers, *, all_pairs: bool
 ) -> PoseErrors:
     """The translation and rotation of ``Q^-1 P`` for the motions Q of the reference and P of the estimate over each piece."""
     cut = pairing.all_pairs if all_pairs else pairing.successive
-    ranges = pairing.between(len(found), gaps.tolist())
-    begins, ends = pairing.indices([one for a, b in ranges for one in cut(steps[a : b - 1], length, a)])
-    (turn, way), (true_turn, true_way) = (_motions(path, begins, ends) for path in (found, truth))
+    ranges = pairing.between(len(estimate), gaps.tolist())
+    begins, ends = pairing.indices([piece for a, b in ranges for piece in cut(steps[a : b - 1], length, a)])
+    (turn, shift), (true_turn, true_shift) = (_motions(path, begins, ends) for path in (estimate, truth))
     back = true_turn.transpose(0, 2, 1)
-    error = np.linalg.norm(np.einsum("kij,kj->ki", back, way - true_way), axis=1)
+    error = np.linalg.norm(np.einsum("kij,kj->ki", back, shift - true_shift), axis=1)
     return PoseErrors(error, _angles(back @ turn), ends)
 
 
 def _motions(path: PosePath, begins: Integers, ends: Integers) -> tuple[Array, Array]:
     """Rotations (K, 3, 3) and translations (K, 3) from poses to later ones."""
     back = path.rotations[begins].transpose(0, 2, 1)
-    ways = path.positions[ends] - path.positions[begins]
-    return back @ path.rotations[ends], np.einsum("kij,kj->ki", back, ways)
+    shifts = path.positions[ends] - path.positions[begins]
+    return back @ path.rotations[ends], np.einsum("kij,kj->ki", back, shifts)
 
 
 def _steps(path: PosePath) -> Array:
@@ -212,8 +212,8 @@ def _angles(rotations: Array) -> Array:
     return np.asarray(np.arctan2(sine, cosine))
 
 
-def _seconds(found: PosePath, truth: PosePath) -> Array | None:
-    t_ns = truth.t_ns if found.t_ns is None else found.t_ns
+def _seconds(estimate: PosePath, truth: PosePath) -> Array | None:
+    t_ns = truth.t_ns if estimate.t_ns is None else estimate.t_ns
     return None if t_ns is None else (t_ns - t_ns[:1]) / 1e9
 
 
@@ -226,13 +226,13 @@ def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, 
             for name, rise in rises
             if rise > MOST
         ]
-    flat, other = (estimate, reference) if estimate.is_planar else (reference, estimate)
+    flat, uneven = (estimate, reference) if estimate.is_planar else (reference, estimate)
     if associate_by == "interpolate" or not flat.is_planar or align in ("se3", "sim3"):
         return []
-    apart = float(np.abs(other.positions[:, 2] - flat.positions[0, 2]).max())
+    apart = float(np.abs(uneven.positions[:, 2] - flat.positions[0, 2]).max())
     if apart <= RISE:
         return []
     return [
-        f"{flat.name} is planar, and {other.name} is up to {apart:.1f} m above or below it: heights count, but not with "
+        f"{flat.name} is planar, and {uneven.name} is up to {apart:.1f} m above or below it: heights count, but not with "
         "align se2 or associate interpolate"
     ]

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import DEFINITION, opened, require_size
 from factorgraph_loc.files.models import inside, nearest
-from factorgraph_loc.text import quoted, told
+from factorgraph_loc.text import error_text, quoted
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection, MessageDefinition
@@ -70,17 +70,17 @@ def unpacked(make: Callable[[], Any], data: bytes) -> bytes:
     parts: list[bytes] = []
     count = 0
     while data:
-        one = make()
-        while not one.eof:
-            part = one.decompress(data, max_length=STEP)
+        decompressor = make()
+        while not decompressor.eof:
+            part = decompressor.decompress(data, max_length=STEP)
             data = b""
             parts.append(part)
             count += len(part)
             if count > limit:
                 raise ValueError(f"a chunk or message unpacks to more than {limit:,} bytes, which is too much")
-            if not part and one.needs_input:
+            if not part and decompressor.needs_input:
                 raise ValueError("a chunk or message is cut off")
-        data = one.unused_data or b""
+        data = decompressor.unused_data or b""
     return b"".join(parts)
 
 
@@ -152,10 +152,10 @@ class Bag:
         topic = self.topics[name]
         if not topic.count:
             raise InputError(f"{self.path}: topic {name} ({topic.type}) has no messages: leave it out of the manifest")
-        found = {connection.msgtype for connection in self._connections[name]}
-        if len(found) > 1:
+        kinds = {connection.msgtype for connection in self._connections[name]}
+        if len(kinds) > 1:
             raise InputError(
-                f"{self.path}: topic {name} has messages of {' and of '.join(sorted(found))}, expected one type"
+                f"{self.path}: topic {name} has messages of {' and of '.join(sorted(kinds))}, expected one type"
             )
         if types and topic.type not in types:
             expected = "one of " * (len(types) > 1) + ", ".join(types)
@@ -170,7 +170,7 @@ class Bag:
             require_size(
                 self.path, f"the length of the definition of {connection.msgtype}", len(definition.data), DEFINITION
             )
-            with _told(self.path):
+            with _bag_errors(self.path):
                 self._stores[name] = _store(connection.msgtype, definition)
             if connection.msgtype not in self._stores[name].fielddefs:
                 raise InputError(
@@ -192,7 +192,7 @@ class Bag:
         rows = dict.fromkeys(topics, 0)
         source = iter(self._reader.messages(chosen))
         while True:
-            with _told(self.path):
+            with _bag_errors(self.path):
                 try:
                     connection, received, raw = next(source)
                 except StopIteration:
@@ -240,7 +240,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     from rosbags.rosbag1 import Reader as Reader1  # noqa: PLC0415 - an optional library
     from rosbags.rosbag2 import Reader as Reader2  # noqa: PLC0415
 
-    with _told(path):
+    with _bag_errors(path):
         reader: Any = Reader1(path) if path.suffix == ROS1 else Reader2(path)
         reader.open()
     try:
@@ -280,7 +280,7 @@ def _store(msgtype: str, definition: MessageDefinition) -> Typestore:
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _bag_errors(path: Path) -> Iterator[None]:
     """Convert exceptions of ``rosbags``, which raises nearly anything on damaged files, to InputError."""
     try:
         yield
@@ -289,6 +289,6 @@ def _told(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise InputError(f"{path}: may not be read") from error
     except Exception as error:
-        text = told(error)
+        text = error_text(error)
         hint = next((hint for words, hint in HINTS.items() if words in text), "")
         raise InputError(f"{path}: cannot be read as a bag: {text.rstrip('.')}{'; ' + hint if hint else ''}") from error

@@ -101,11 +101,11 @@ class Proposal:
             self.notes.append(f"{sensor} could also be {', '.join(topic.name for topic in topics[1:])}")
 
 
-def manifest_of_bag(bag: Path, here: Path) -> BagManifest:
-    """Propose a manifest to be saved in ``here``, if the bag is below that folder, else beside the bag. InputError if the bag
+def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
+    """Propose a manifest to be saved in ``folder``, if the bag is below that folder, else beside the bag. InputError if the bag
     cannot be read."""
-    path, here = Path(os.path.realpath(bag)), here.resolve()
-    root = here if path.is_relative_to(here) else path.parent
+    path, folder = Path(os.path.realpath(bag)), folder.resolve()
+    root = folder if path.is_relative_to(folder) else path.parent
     with open_bag(path) as opened:
         proposal = propose(opened)
         span = opened.duration
@@ -155,7 +155,7 @@ def propose(bag: Bag) -> Proposal:
     _ranges(out, custom)
     if STATIC in bag.topics:
         out.uses[STATIC] = "sensor mounting"
-    used = [bag.topics[one["topic"]] for one in out.options.values()]
+    used = [bag.topics[option["topic"]] for option in out.options.values()]
     if not any(topic.type in TF or has_header(bag, topic) for topic in used):
         out.options["clock"] = "receive"
     if (robot := tree.robot()) not in (None, ROBOT[0]):
@@ -220,8 +220,10 @@ def _has_no_pose(bag: Bag, topic: Topic) -> bool:
 def _pairs(topics: Sequence[Topic]) -> dict[str, str]:
     """Topics of numbers that are of a left and a right wheel by their names: the right one of each left one."""
     names = {topic.name for topic in topics if topic.type in SCALARS}
-    others = {name: LEFT.sub(lambda found: "Right" if found[0][0] == "L" else "right", name) for name in sorted(names)}
-    return {name: other for name, other in others.items() if other != name and other in names}
+    right_of = {
+        name: LEFT.sub(lambda match: "Right" if match[0][0] == "L" else "right", name) for name in sorted(names)
+    }
+    return {name: right for name, right in right_of.items() if right != name and right in names}
 
 
 def _joints(bag: Bag, topic: Topic, notes: list[str]) -> dict[str, Any]:
@@ -258,8 +260,8 @@ def _reference(out: Proposal, topics: Sequence[Topic], tree: Tree) -> None:
 
 
 def _camera(out: Proposal, topics: Sequence[Topic]) -> None:
-    found = [topic for topic in topics if topic.type in {COMPRESSED, RAW}]
-    images = [topic for topic in found if "depth" not in topic.name.lower()]
+    candidates = [topic for topic in topics if topic.type in {COMPRESSED, RAW}]
+    images = [topic for topic in candidates if "depth" not in topic.name.lower()]
     if not images:
         return
     infos = {topic.name.rsplit("/", 1)[0]: topic for topic in topics if topic.type == INFO}
@@ -276,25 +278,25 @@ def _camera(out: Proposal, topics: Sequence[Topic]) -> None:
 
 def _custom(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:
     """The topics without a use whose messages are not of ROS itself, with the paths of their fields."""
-    found = []
+    custom = []
     for topic in topics:
         if topic.name in out.uses or topic.type.startswith(
             ("sensor_msgs/", "nav_msgs/", "geometry_msgs/", "tf2_msgs/")
         ):
             continue
         try:
-            found.append((topic, leaves(bag.store(topic.name), topic.type)))
+            custom.append((topic, leaves(bag.store(topic.name), topic.type)))
         except InputError as error:  # the topic may be irrelevant
             out.notes.append(str(error))
-    return found
+    return custom
 
 
 def _rfid(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
     """The topic with a field for the EPC, and most other fields of a read."""
-    found = [(topic, fields) for topic, paths in custom if "epc" in (fields := read_fields(paths))]
-    if not found:
+    candidates = [(topic, fields) for topic, paths in custom if "epc" in (fields := read_fields(paths))]
+    if not candidates:
         return
-    topic, fields = max(found, key=lambda entry: len(entry[1]))
+    topic, fields = max(candidates, key=lambda entry: len(entry[1]))
     settings: dict[str, Any] = {"fields": fields}
     if "antenna" not in fields:
         settings["antenna"] = "antenna"
@@ -306,7 +308,7 @@ def _rfid(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
         out.notes.append(
             "rfid: each message is treated as one inventory round of its antenna, an empty one as a round without reads"
         )
-    out.take("rfid", [topic, *(other for other, _ in found if other is not topic)], **settings)
+    out.take("rfid", [topic, *(candidate for candidate, _ in candidates if candidate is not topic)], **settings)
     doubtful = [name for name in UNITS if name in fields and name not in units]
     if doubtful:
         out.notes.append(f"rfid: {', '.join(doubtful)}: assumed to be in rad, Hz and us, set units otherwise")
@@ -314,10 +316,10 @@ def _rfid(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
 
 def _ranges(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
     """The topic with a field for a distance and one beside it for the name of what is that far away."""
-    found = [(t, fields) for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))]
-    if found and "bearing_range" not in out.options:
-        topic, fields = found[0]
-        out.take("bearing_range", [other for other, _ in found], fields=fields)
+    candidates = [(t, fields) for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))]
+    if candidates and "bearing_range" not in out.options:
+        topic, fields = candidates[0]
+        out.take("bearing_range", [candidate for candidate, _ in candidates], fields=fields)
         out.notes.append(
             f"{topic.name} is taken for ranges [m] to landmarks of the map that {fields['landmark']} names"
         )

@@ -88,9 +88,9 @@ class TwoWheels:
         """Timestamps (N,), and the left and the right number (N, 2). InputError if the topics have no time in common."""
         l_ns, left = self.rows.in_order(("wheel",), warnings)
         r_ns, right = self._right.in_order(("wheel",), warnings)
-        after = np.clip(np.searchsorted(r_ns, l_ns), 0, len(r_ns) - 1)
-        before = np.maximum(after - 1, 0)
-        near = np.where(np.abs(r_ns[before] - l_ns) <= np.abs(r_ns[after] - l_ns), before, after)
+        later = np.clip(np.searchsorted(r_ns, l_ns), 0, len(r_ns) - 1)
+        earlier = np.maximum(later - 1, 0)
+        near = np.where(np.abs(r_ns[earlier] - l_ns) <= np.abs(r_ns[later] - l_ns), earlier, later)
         usual = float(np.median(np.diff(l_ns))) if len(l_ns) > 1 else 0.0
         keep = np.flatnonzero(np.abs(r_ns[near] - l_ns) <= APART * usual)
         t_ns = np.maximum(l_ns, r_ns[near])[keep]
@@ -205,8 +205,8 @@ def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettin
 def _wheel(bag: Bag, topic: str, path: str) -> TopicRows:
     """Collects the number of a wheel from each message of a topic."""
     source = f"{bag.path} {topic}"
-    found = bag.topic(topic)
-    check_path(bag.store(topic), found, path, f"{bag.path}: topic {topic}: wheel")
+    known = bag.topic(topic)
+    check_path(bag.store(topic), known, path, f"{bag.path}: topic {topic}: wheel")
     if LIST in path:
         raise InputError(f"{source}: odometry.wheels has {quoted(path)}, expected the field of one number")
     return TopicRows(source, 1, (path,))

@@ -21,7 +21,7 @@ from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.planar import Turned, rotations_of
 from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
-from factorgraph_loc.text import listed, quoted, told
+from factorgraph_loc.text import error_text, listed, quoted
 from factors.se2 import Array, Integers
 
 SEVEN = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -96,9 +96,9 @@ class Start:
 
     def add(self, item: Stamped, t_ns: int) -> None:
         if self._found is None:
-            told = item.message.pose
-            variances = np.asarray(told.covariance, dtype=float)[[0, 7, 35]]
-            self._found = (t_ns, np.array([seven(told.pose)], dtype=float), variances)
+            stated = item.message.pose
+            variances = np.asarray(stated.covariance, dtype=float)[[0, 7, 35]]
+            self._found = (t_ns, np.array([seven(stated.pose)], dtype=float), variances)
 
     def pose(self, t0_ns: int, warnings: list[str]) -> StartPose:
         """The start; InputError if a variance of x, y or heading is not positive."""
@@ -149,8 +149,8 @@ class StaticFrames:
         """As :meth:`pose`; InputError if no transforms connect the frames."""
         pose = self.pose(frame)
         if pose is None:
-            there = listed(sorted(self.parents)) or "none"
-            raise InputError(f"{source}: tf_static has no pose of {frame} on {self.base}; frames: {there}")
+            frames = listed(sorted(self.parents)) or "none"
+            raise InputError(f"{source}: tf_static has no pose of {frame} on {self.base}; frames: {frames}")
         return pose
 
     def _up(self, frame: str) -> dict[str, Array]:
@@ -284,11 +284,11 @@ class Tree:
         """The first of ``names`` that is above ``frame``, which moves in it."""
         moves = False
         known: set[str] = set()
-        seen = {frame}
-        while frame in self.parents and self.parents[frame] not in seen:
+        visited = {frame}
+        while frame in self.parents and self.parents[frame] not in visited:
             moves |= frame in self.moving
             frame = self.parents[frame]
-            seen.add(frame)
+            visited.add(frame)
             if moves:
                 known.add(frame)
         return next((name for name in names if name in known), None)
@@ -299,20 +299,20 @@ def tree_of(bag: Bag, notes: list[str]) -> Tree:
     parents: dict[str, str] = {}
     moving: set[str] = set()
     topic = ""
-    for one in bag.topics.values():
-        if one.type not in TF or not one.count:
+    for candidate in bag.topics.values():
+        if candidate.type not in TF or not candidate.count:
             continue
-        found: dict[str, str] = {}
+        edges: dict[str, str] = {}
         try:
-            found.update(_edges(bag, one.name))
+            edges.update(_edges(bag, candidate.name))
         except InputError as error:
             notes.append(str(error))
         except (AttributeError, TypeError, ValueError) as error:
-            notes.append(f"{bag.path}: topic {one.name} is defined in the bag unlike in ROS: {told(error)}")
-        parents |= found
-        if one.name != STATIC:
-            moving |= found.keys()
-            topic = topic or one.name
+            notes.append(f"{bag.path}: topic {candidate.name} is defined in the bag unlike in ROS: {error_text(error)}")
+        parents |= edges
+        if candidate.name != STATIC:
+            moving |= edges.keys()
+            topic = topic or candidate.name
     return Tree(parents, topic, frozenset(moving))
 
 

@@ -128,8 +128,8 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     if options.camera and options.camera.info:
         info = Info(bag, options.camera.info)
         listeners.add(options.camera.info, info, listeners.stamper(options.camera.info, None), timed=False)
-    told = options.reference
-    poses = poses_of_topic(listeners, told, frames) if told else None
+    of_reference = options.reference
+    poses = poses_of_topic(listeners, of_reference, frames) if of_reference else None
     start = listeners.listen(options.start, Start(bag, options.start)) if options.start else None
     listeners.run()
 
@@ -139,12 +139,12 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     streams: dict[str, Stream] = {"odometry": odometry_stream(t_ns, moves, t0_ns)}
     streams |= {name: sensor.stream(t0_ns, warnings) for name, sensor in sensors.items()}
     reference = None
-    if poses and told:
+    if poses and of_reference:
         path = poses.path(warnings, t0_ns)
         assert path.t_ns is not None
-        has_heading = told.has_heading and path.has_rotations
+        has_heading = of_reference.has_heading and path.has_rotations
         t = checks.seconds(path.t_ns, t0_ns)
-        reference = Trajectory(t, path.on_floor(warnings, told), has_heading=has_heading)
+        reference = Trajectory(t, path.on_floor(warnings, of_reference), has_heading=has_heading)
     notes: list[str] = []  # on the bag's own rig
     rig = _rig(streams, info, options, frames, notes)
     name = bag.path.resolve().stem
@@ -165,8 +165,8 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
 
 def _left_out(bag: Bag, listeners: Listeners) -> str:
     """The topics with messages that the manifest does not name, with their types."""
-    there = [topic for topic in bag.topics.values() if topic.count and topic.name not in (*listeners.topics, STATIC)]
-    return ", ".join(f"{topic.name} ({topic.type})" for topic in there)
+    unread = [topic for topic in bag.topics.values() if topic.count and topic.name not in (*listeners.topics, STATIC)]
+    return ", ".join(f"{topic.name} ({topic.type})" for topic in unread)
 
 
 def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack: ExitStack) -> dict[str, Streamed]:
@@ -182,8 +182,8 @@ def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack
     if options.camera:
         out["camera"] = _images(listeners, options.camera, stack)
     for table in OTHERS:
-        if (told := getattr(options, table.name)) is not None:
-            out[table.name] = listeners.listen(told, rows_of_table(bag, told, table))
+        if (mapping := getattr(options, table.name)) is not None:
+            out[table.name] = listeners.listen(mapping, rows_of_table(bag, mapping, table))
     return out
 
 
@@ -217,9 +217,9 @@ def read_trajectory(path: Path, topic: str) -> PosePath:
     name, _, frames = topic.partition(FRAMES)
     with open_bag(path) as bag:
         if not name:
-            known = [one.name for one in bag.topics.values() if one.type in (*POSES, POINT, *TF)]
-            told = listed(known) or "none has poses"
-            raise InputError(f"{path}: is a bag, expected {path}:TOPIC, with one of its topics: {told}")
+            known = [candidate.name for candidate in bag.topics.values() if candidate.type in (*POSES, POINT, *TF)]
+            names = listed(known) or "none has poses"
+            raise InputError(f"{path}: is a bag, expected {path}:TOPIC, with one of its topics: {names}")
         listeners, warnings = Listeners(bag, "header"), list[str]()
         parent, _, child = frames.partition(WITHIN)
         if bag.topic(name).type in TF and not (parent and child):

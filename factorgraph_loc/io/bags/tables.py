@@ -87,19 +87,19 @@ class RowsOfTopic:
     def add(self, item: Stamped, t_ns: int) -> None:
         """Add the rows of a message."""
         for values in self._fields.rows(item.message, item.row):
-            found = dict(zip(self._fields.names, values, strict=True))
-            stamp = self._stamp(found, t_ns, item.row)
+            row = dict(zip(self._fields.names, values, strict=True))
+            stamp = self._stamp(row, t_ns, item.row)
             for column in self._named:
-                self._names[column.name].append(self._name(column, found, item.row))
-            self._rows.append(item, stamp, [found.get(name, math.nan) for name in self._numbered])
+                self._names[column.name].append(self._name(column, row, item.row))
+            self._rows.append(item, stamp, [row.get(name, math.nan) for name in self._numbered])
 
-    def _stamp(self, found: Mapping[Any, Any], t_ns: int, row: int) -> int:
-        """The timestamp [ns] of a row with the values ``found`` by field, in a message that has ``t_ns``."""
+    def _stamp(self, values: Mapping[Any, Any], t_ns: int, row: int) -> int:
+        """The timestamp [ns] of a row with the values ``values`` by field, in a message that has ``t_ns``."""
         return t_ns
 
-    def _name(self, column: Column, found: Mapping[Any, Any], row: int) -> str:
-        """The name in ``column`` of a row with the values ``found`` by field; InputError if it is empty."""
-        if text := as_text(found[column.name]):
+    def _name(self, column: Column, values: Mapping[Any, Any], row: int) -> str:
+        """The name in ``column`` of a row with the values ``values`` by field; InputError if it is empty."""
+        if text := as_text(values[column.name]):
             return text
         raise bad_field(self._rows.source, column.name, text, column.doc, row=row)
 
@@ -161,8 +161,8 @@ class Reads(RowsOfTopic):
         if not antennas and self._options.antenna:
             antennas = [self._options.antenna]
         elif not antennas and self._listening is not None:
-            found = {"antenna": self._listening.rows(item.message, item.row)[0][0]}
-            antennas = [self._name(RFID["antenna"], found, item.row)]
+            values = {"antenna": self._listening.rows(item.message, item.row)[0][0]}
+            antennas = [self._name(RFID["antenna"], values, item.row)]
         numbers = {name: len(self._rounds) + i for i, name in enumerate(antennas)}
         self._number += [numbers[name] for name in of_reads]
         self._rounds += [(t_ns, reads, name) for name in antennas]
@@ -181,23 +181,23 @@ class Reads(RowsOfTopic):
         reads = native_rfid.ReadsByRound(table.t_ns, number, table.names["epc"], signals, end_ns, antennas)
         return reads.stream(t0_ns)
 
-    def _stamp(self, found: Mapping[Any, Any], t_ns: int, row: int) -> int:
-        if "stamp" not in found:
+    def _stamp(self, values: Mapping[Any, Any], t_ns: int, row: int) -> int:
+        if "stamp" not in values:
             return t_ns
         try:
-            stamp = as_nanoseconds(found["stamp"], self._stamp_unit)
+            stamp = as_nanoseconds(values["stamp"], self._stamp_unit)
             if abs(stamp) > LATEST:
                 raise OverflowError
             return stamp
         except (ValueError, OverflowError):
-            raise bad_field(self._rows.source, "stamp", found["stamp"], "a time, or a number", row=row) from None
+            raise bad_field(self._rows.source, "stamp", values["stamp"], "a time, or a number", row=row) from None
 
-    def _name(self, column: Column, found: Mapping[Any, Any], row: int) -> str:
+    def _name(self, column: Column, values: Mapping[Any, Any], row: int) -> str:
         if column.name != "antenna":
-            return super()._name(column, found, row)
+            return super()._name(column, values, row)
         if self._options.antenna is not None:
             return self._options.antenna
-        name = super()._name(column, found, row)
+        name = super()._name(column, values, row)
         return self._options.antennas.get(name, name)
 
 
@@ -265,10 +265,10 @@ class Corners(RowsOfTopic):
 
     def add(self, item: Stamped, t_ns: int) -> None:
         """Add the pixels of a message."""
-        for found in item.message.detections:
-            names = corner_names(f"{found.family}-{found.id}")
+        for detection in item.message.detections:
+            names = corner_names(f"{detection.family}-{detection.id}")
             # apriltag starts at the lower left corner and continues with the lower right one
-            for name, corner in zip(reversed(names), found.corners, strict=True):
+            for name, corner in zip(reversed(names), detection.corners, strict=True):
                 self._names["landmark"].append(name)
                 self._rows.append(item, t_ns, (corner.x, corner.y))
 

@@ -19,7 +19,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.io.bags.file import Bag, Stamped, Topic
-from factorgraph_loc.text import listed, quoted, told
+from factorgraph_loc.text import error_text, listed, quoted
 from factors.se2 import Array, Integers
 
 if TYPE_CHECKING:
@@ -65,8 +65,10 @@ class Fields:
             return [tuple(values)]
         lengths = [len(value) for value, is_list in zip(values, self._are_lists, strict=True) if is_list]
         if len(set(lengths)) > 1:
-            told = ", ".join(map(str, lengths))
-            raise InputError(f"{self._where}: message {row} has lists of {told} elements, expected lists of one length")
+            counts = ", ".join(map(str, lengths))
+            raise InputError(
+                f"{self._where}: message {row} has lists of {counts} elements, expected lists of one length"
+            )
         columns = (v if is_list else repeat(v) for v, is_list in zip(values, self._are_lists, strict=True))
         return list(zip(*columns, strict=False))  # as many as the lists have elements
 
@@ -158,8 +160,8 @@ class TopicRows:
     def add(self, item: Stamped, t_ns: int) -> None:
         """Add the row of a message."""
         assert self._get is not None
-        found = self._get(item.message)
-        self.append(item, t_ns, found if self._width > 1 else (found,))
+        values = self._get(item.message)
+        self.append(item, t_ns, values if self._width > 1 else (values,))
 
     def append(self, item: Stamped, t_ns: int, values: Sequence[Any]) -> None:
         self._row.append(item.row)
@@ -235,7 +237,9 @@ class Listeners:
                 except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
                     kind = self.bag.topics[item.topic].type
                     where = f"{self.bag.path} {item.topic}:{item.row}"
-                    raise InputError(f"{where}: {kind} is defined in the bag unlike in ROS: {told(error)}") from error
+                    raise InputError(
+                        f"{where}: {kind} is defined in the bag unlike in ROS: {error_text(error)}"
+                    ) from error
         for stamper in self.stampers:
             stamper.check()
 

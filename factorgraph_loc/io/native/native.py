@@ -124,18 +124,18 @@ def read_tables(folder: Path, warnings: list[str]) -> dict[str, TableRows]:
 def streams_of(tables: Mapping[str, TableRows], reading: Reading) -> dict[str, Stream]:
     """The streams of all channels with tables."""
     rows: dict[Channel, dict[str, TableRows]] = {}
-    for name, found in tables.items():
-        rows.setdefault(native_tables()[name][0], {})[name] = found
-    return {channel.name: assemble(channel, found, reading) for channel, found in rows.items()}
+    for name, table in tables.items():
+        rows.setdefault(native_tables()[name][0], {})[name] = table
+    return {channel.name: assemble(channel, table, reading) for channel, table in rows.items()}
 
 
 def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory | None:
     if not path.is_file():
         return None
-    found = read_pose_file(inside(path.parent, path.name, path.parent), "tum")
-    warnings += found.warnings
-    assert found.t_ns is not None
-    return Trajectory(checks.seconds(found.t_ns, t0_ns), found.on_floor(warnings), has_heading=has_heading)
+    poses = read_pose_file(inside(path.parent, path.name, path.parent), "tum")
+    warnings += poses.warnings
+    assert poses.t_ns is not None
+    return Trajectory(checks.seconds(poses.t_ns, t0_ns), poses.on_floor(warnings), has_heading=has_heading)
 
 
 def write_native(
@@ -172,8 +172,8 @@ def require_new(folder: Path, *, overwrite: bool = False) -> None:
         raise InputError(
             f"{folder}: exists and is not an empty folder, expected a new one{_OR_LOG if overwrite else ''}"
         )
-    if others := sorted(f.name for f in folder.iterdir() if f.suffix not in OF_LOGS and f.name != "camera"):
-        raise InputError(f"{folder}: holds {listed(others)} beside its log, which would be lost: expected a log alone")
+    if foreign := sorted(f.name for f in folder.iterdir() if f.suffix not in OF_LOGS and f.name != "camera"):
+        raise InputError(f"{folder}: holds {listed(foreign)} beside its log, which would be lost: expected a log alone")
 
 
 def write_files(log: Log, folder: Path, format: str) -> None:

@@ -57,8 +57,8 @@ def write_world(world: World, path: str | Path) -> None:
     content = world.model_dump(mode="json", exclude_none=True, exclude={"points"})
     base = path.name.removesuffix(".toml").removesuffix(".world")
     for name, layer in layers().items():
-        if layer.write and (told := load(layer.write)(getattr(world, name), path.parent / base)) is not None:
-            content[name] = told
+        if layer.write and (entry := load(layer.write)(getattr(world, name), path.parent / base)) is not None:
+            content[name] = entry
     if world.points is not None:
         content["points"] = base + POINTS_SUFFIX
         write_points(world.points, path.parent / content["points"])

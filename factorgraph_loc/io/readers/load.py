@@ -115,7 +115,7 @@ def load_all(
 ) -> list[Log]:
     """The logs that one or several values refer to, as in :func:`load`."""
     several = [logs] if isinstance(logs, (Log, str, Path)) else logs
-    return [found for log in several for found in load(log, rig=rig, world=world)]
+    return [loaded for log in several for loaded in load(log, rig=rig, world=world)]
 
 
 def read_log(
@@ -130,7 +130,7 @@ def read_log(
     """The log that ``log`` refers to, as in :func:`load`; InputError if there are several."""
     logs = load(log, data_root=data_root, reader=reader, options=options, rig=rig, world=world)
     if len(logs) > 1:
-        raise InputError(f"{log} refers to {len(logs)} logs, expected one: {listed(found.name for found in logs)}")
+        raise InputError(f"{log} refers to {len(logs)} logs, expected one: {listed(loaded.name for loaded in logs)}")
     return logs[0]
 
 

@@ -156,11 +156,11 @@ def read(path: Path | None, options: Options) -> Log:
     if rounds:
         streams["rfid"] = rounds.stream(t0_ns)
     reference = None
-    if (told := options.reference) is not None:
-        reference = _reference(folder, told, t0_ns)
+    if (of_reference := options.reference) is not None:
+        reference = _reference(folder, of_reference, t0_ns)
         if reference.t[0] > (stamps[0][-1] - t0_ns) / 1e9 or reference.t[-1] < (stamps[0][0] - t0_ns) / 1e9:
             warnings.append(
-                f"{told.file}: the reference and the odometry do not overlap: t = {reference.t[0]:.3f} s and "
+                f"{of_reference.file}: the reference and the odometry do not overlap: t = {reference.t[0]:.3f} s and "
                 f"{(stamps[0][0] - t0_ns) / 1e9:.3f} s begin them; check units.t and clock_offset"
             )
     name = path.resolve().name
@@ -210,8 +210,8 @@ def _in_map(table: TableRows, folder: TableFolder, naming: NamesFile) -> TableRo
     if skipped := len(names) - len(kept):
         among = f"a {column} that is not among the names taken from {path.name}"
         folder.warnings.append(f"{table.path}: {skipped} rows have {among}: skipped")
-    found = table.rows_at(kept)
-    return replace(found, names={column: [known[name] for name in found.names[column]]})
+    selected = table.rows_at(kept)
+    return replace(selected, names={column: [known[name] for name in selected.names[column]]})
 
 
 def _names(path: Path, naming: NamesFile) -> dict[str, str]:
@@ -229,8 +229,8 @@ def _names(path: Path, naming: NamesFile) -> dict[str, str]:
 def _shapes(table: Table) -> tuple[tuple[str, ...], ...]:
     """The sets of fields that may be mapped: all columns, with or without the optional ones."""
     needed = ("t", *(column.name for column in table.columns[1:] if not column.may_lack))
-    others = [column.name for column in table.columns if column.may_lack]
-    some = (names for count in range(1, len(others) + 1) for names in itertools.combinations(others, count))
+    optional = [column.name for column in table.columns if column.may_lack]
+    some = (names for count in range(1, len(optional) + 1) for names in itertools.combinations(optional, count))
     return tuple((*needed, *names) for names in some) or (needed,)
 
 
@@ -251,14 +251,14 @@ def _rounds(folder: TableFolder, options: Options) -> ReadsByRound | None:
         if options.inventories is not None:
             raise InputError(f"{path}: [options] has inventories without rfid")
         return None
-    tables = [read_all_reads(folder, told) for told in files]
+    tables = [read_all_reads(folder, file) for file in files]
     reads = tables[0] if len(tables) == 1 else joined(path, tables)
-    gaps = {told.round_gap for told in files if told.round_gap is not None}
+    gaps = {file.round_gap for file in files if file.round_gap is not None}
     inventories = None
     if (mapping := options.inventories) is not None:
         if gaps:
             raise InputError(f"{path}: round_gap has no effect with inventories, which define the rounds")
-        antennas = {name: given for told in files for name, given in told.antennas.items()}
+        antennas = {name: given for file in files for name, given in file.antennas.items()}
         inventories = _table(folder, native_tables()["inventories"][1], mapping)
         named = [antennas.get(name, name) for name in inventories.names["antenna"]]
         inventories = replace(inventories, names={"antenna": named})
@@ -328,14 +328,14 @@ def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array
         raise InputError(f"{path}: format kitti and times, the file of the stamps, are needed together")
     turned: Turned = options
     if options.times is not None:
-        found = read_kitti(path, folder.file(options.times))
+        poses = read_kitti(path, folder.file(options.times))
         if not options.axes:
             turned = Turned(axes="body", mounting=options.mounting)  # the format defines the axes
     else:
-        found = read_pose_file(path, "euroc" if options.format == "euroc" else "tum")
-    folder.warnings += found.warnings
-    assert found.t_ns is not None
-    return found.t_ns + round(options.clock_offset * 1e9), found.on_floor(folder.warnings, turned)
+        poses = read_pose_file(path, "euroc" if options.format == "euroc" else "tum")
+    folder.warnings += poses.warnings
+    assert poses.t_ns is not None
+    return poses.t_ns + round(options.clock_offset * 1e9), poses.on_floor(folder.warnings, turned)
 
 
 def _columns(mapped: Cells, offset: float) -> tuple[Integers, dict[str, Array]]:

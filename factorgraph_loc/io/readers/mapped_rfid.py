@@ -55,12 +55,12 @@ def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
     units = {field: unit for field, unit in mapping.units.items() if field != "rssi"}
     narrow = read_mapped(path, mapping.model_copy(update={"columns": fixed, "units": units}), (tuple(fixed),))
     named = re.compile("(.+)".join(map(re.escape, pattern.split("*", 1))), re.DOTALL)
-    names = {column: found[1] for column in narrow.left_out if (found := named.fullmatch(column))}
+    names = {column: match[1] for column in narrow.left_out if (match := named.fullmatch(column))}
     if not names:
         raise InputError(f"{path}: has no column {quoted(pattern)}, it has {listed(narrow.left_out)}")
     strengths = {f"{NAME}{column}": column for column in names}
-    told = mapping.model_copy(update={"columns": fixed | strengths, "units": units})
-    wide = read_mapped(path, told, (tuple(fixed),), tuple(strengths))
+    wide_mapping = mapping.model_copy(update={"columns": fixed | strengths, "units": units})
+    wide = read_mapped(path, wide_mapping, (tuple(fixed),), tuple(strengths))
     reads = [(i, name) for i in range(len(wide.rows)) for name in strengths if wide.columns[name][i]]
     if not reads:
         raise InputError(f"{path}: contains no reads: all cells of {quoted(pattern)} are empty")
@@ -84,8 +84,8 @@ class Channels(FileModel):
 @cache
 def presets() -> dict[str, dict[str, dict[str, str]]]:
     """The columns and units of the files of known tools, by name."""
-    found: dict[str, dict[str, dict[str, str]]] = read_toml(shipped.readers()["mapped"])
-    return found
+    content: dict[str, dict[str, dict[str, str]]] = read_toml(shipped.readers()["mapped"])
+    return content
 
 
 class RfidFile(TimedMapping, ReadNames):
@@ -133,11 +133,11 @@ def read_all_reads(folder: TableFolder, options: RfidFile) -> TableRows:
 
 def joined(path: Path, tables: Sequence[TableRows]) -> TableRows:
     """The reads of several tables, named ``path``, sorted by time, because readers report in batches in any order."""
-    together = _together(path, tables)
-    return together.rows_at(np.argsort(together.t_ns, kind="stable"))
+    reads = _concatenated(path, tables)
+    return reads.rows_at(np.argsort(reads.t_ns, kind="stable"))
 
 
-def _together(path: Path, tables: Sequence[TableRows]) -> TableRows:
+def _concatenated(path: Path, tables: Sequence[TableRows]) -> TableRows:
     return TableRows(
         path,
         np.concatenate([table.rows for table in tables]),
@@ -232,4 +232,4 @@ def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: lis
             warnings.append(f"{table.path}: {more} reads between the first and the last of their row are skipped")
     repeated = table.rows_at(np.flatnonzero(several))
     unknown = {name: np.full(len(repeated.rows), np.nan) for name in repeated.numbers}
-    return _together(table.path, (table, replace(repeated, t_ns=last_ns[several], numbers=unknown)))
+    return _concatenated(table.path, (table, replace(repeated, t_ns=last_ns[several], numbers=unknown)))

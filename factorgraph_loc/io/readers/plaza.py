@@ -45,7 +45,7 @@ def read(path: Path | None, options: Options) -> Log:
     """The run in the file ``path``, by default that of the gtsam wheel; t = 0 at the first row of its ground truth. InputError
     names file, field and row (counted from 1 within the field)."""
     file = path or shipped(options.run)
-    fields, others = read_matlab(file, FIELDS)
+    fields, unread = read_matlab(file, FIELDS)
     warnings: list[str] = []
     truth, driven, observed = (
         _rows(f"{file}:{name}", fields[name], columns)
@@ -67,7 +67,7 @@ def read(path: Path | None, options: Options) -> Log:
         reference=Trajectory(checks.seconds(truth.t_ns, t0_ns), poses, has_heading=HAS_HEADING[options.run]),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
-        metadata={NOT_READ: listed([*others, "TD: column 2"])},
+        metadata={NOT_READ: listed([*unread, "TD: column 2"])},
     )
 
 

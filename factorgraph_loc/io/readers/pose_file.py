@@ -85,14 +85,14 @@ def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
     """The poses in a file of TUM, KITTI or EuRoC format, by default the one that its first row has; the last one of equal
     timestamps. InputError names file and row."""
     row, first = _first_row(path)
-    found = _format(first)
-    if found is None or kind not in (None, found):
+    detected = _format(first)
+    if detected is None or kind not in (None, detected):
         raise bad_field(path, "row", first, EXPECTED if kind is None else FORMATS[kind], row=row)
-    if found == "kitti":
+    if detected == "kitti":
         matrices = read_matrices(path)
         return PosePath(str(path), matrices[:, :, 3], matrices[:, :, :3], None)
     warnings: list[str] = []
-    cells = _read(path, EUROC, ",", "ns") if found == "euroc" else _read(path, TUM, " ", "s")
+    cells = _read(path, EUROC, ",", "ns") if detected == "euroc" else _read(path, TUM, " ", "s")
     cells = replace(cells, labels={})  # names of columns say more than numbers
     table = np.column_stack([cells.numbers(name, POSES[name]) for name in TUM[1:]])
     t_ns = cells.stamps("t")

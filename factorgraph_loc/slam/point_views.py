@@ -29,43 +29,47 @@ FARTHEST = 15.0  # m of its depth
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class PointView:
     """The feature's ``descriptor`` (D,) and ``size`` [px], the camera position ``seen_from`` (3,), and the distance travelled by
-    the robot until then, ``way`` [m]; the key of the ``keyframe``, and the ``guess`` of its pose.
+    the robot until then, ``travelled`` [m]; the key of the ``keyframe``, and the ``guess`` of its pose.
     """
 
     descriptor: NDArray[Any]
     size: float
     seen_from: Array
-    way: float
+    travelled: float
     keyframe: int
     guess: Guess
 
 
-class PointLooks:
+class PointViews:
     """The last view of each point, by key, by a camera ``model``; others are there for the map at the end."""
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
-        self._looks: dict[int, Look] = {}
-        self._earlier: dict[int, list[Look]] = {}
+        self._views: dict[int, PointView] = {}
+        self._earlier: dict[int, list[PointView]] = {}
         self._feature = ""
 
     def __contains__(self, key: int) -> bool:
-        return key in self._looks
+        return key in self._views
 
-    def __getitem__(self, key: int) -> Look:
-        return self._looks[key]
+    def __getitem__(self, key: int) -> PointView:
+        return self._views[key]
 
-    def keep(self, point: int, frame: CameraFrame, row: int, way: float, keyframe: int, guess: Guess) -> None:
+    def keep(self, point: int, frame: CameraFrame, row: int, travelled: float, keyframe: int, guess: Guess) -> None:
         """Store the view of a ``point`` from the feature ``row`` of a frame, taken at a ``keyframe``."""
         self._feature = frame.feature
         seen_from = camera_pose(self._model, guess[0])[0]
-        look = Look(frame.descriptors[row], float(frame.sizes[row]), seen_from, way, keyframe, guess)
-        before, earlier = self._looks.get(point), self._earlier.setdefault(point, [])
-        if before is not None and len(earlier) < VIEWS - 1 and (not earlier or before.way >= earlier[-1].way + APART):
-            earlier.append(before)
-        self._looks[point] = look
+        view = PointView(frame.descriptors[row], float(frame.sizes[row]), seen_from, travelled, keyframe, guess)
+        last_view, earlier = self._views.get(point), self._earlier.setdefault(point, [])
+        if (
+            last_view is not None
+            and len(earlier) < VIEWS - 1
+            and (not earlier or last_view.travelled >= earlier[-1].travelled + APART)
+        ):
+            earlier.append(last_view)
+        self._views[point] = view
 
     def refound(
         self, camera: CameraPose, points: Sequence[int], positions: Array, frame: CameraFrame, rows: Sequence[int]
@@ -75,28 +79,30 @@ class PointLooks:
         if not len(points) or not rows:
             return []
         model = self._model
-        seen, by_camera, _ = linearize_in_space(model, camera.position, camera.rotation, positions)
+        projected, by_camera, _ = linearize_in_space(model, camera.position, camera.rotation, positions)
         depth = ((positions - camera.position) @ camera.rotation)[:, 2]
-        near = np.flatnonzero(model.contains(seen) & (depth > NEAREST) & (depth < FARTHEST))
+        near = np.flatnonzero(model.contains(projected) & (depth > NEAREST) & (depth < FARTHEST))
         if not len(near):
             return []
         jacobian = by_camera[near]
-        spreads = jacobian @ camera.covariance @ jacobian.transpose(0, 2, 1) + NOISE**2 * np.eye(2)
-        descriptors, chosen = np.array([self._looks[points[i]].descriptor for i in near.tolist()]), list(rows)
+        covariances = jacobian @ camera.covariance @ jacobian.transpose(0, 2, 1) + NOISE**2 * np.eye(2)
+        descriptors, chosen = np.array([self._views[points[i]].descriptor for i in near.tolist()]), list(rows)
         offered, pixels = frame.descriptors[chosen], frame.pixels[chosen]
-        found = match_guided(descriptors, offered, seen[near], spreads, pixels, binary=offered.dtype == np.uint8)
-        return [(int(near[a]), rows[b]) for a, b in found.indices.tolist()]
+        matches = match_guided(
+            descriptors, offered, projected[near], covariances, pixels, binary=offered.dtype == np.uint8
+        )
+        return [(int(near[a]), rows[b]) for a, b in matches.indices.tolist()]
 
     def forget(self, points: Iterable[int]) -> None:
         """Forget the views of these points, by key."""
         for point in points:
-            self._looks.pop(point, None)
+            self._views.pop(point, None)
             self._earlier.pop(point, None)
 
     def map_of(self, names: Sequence[str], keys: Sequence[int], positions: Array, covariances: Array) -> PointMap:
         """A map of the points, with their last views, in the given order."""
-        looks = [(i, self._looks[key]) for i, key in enumerate(keys) if key in self._looks]
-        return self._seen(PointMap.of(tuple(names), positions, covariances), looks)
+        views = [(i, self._views[key]) for i, key in enumerate(keys) if key in self._views]
+        return self._with_views(PointMap.of(tuple(names), positions, covariances), views)
 
     def settled(
         self, points: PointMap, keys: Sequence[int], values: Mapping[int, Array], spreads: Mapping[int, Array]
@@ -104,24 +110,28 @@ class PointLooks:
         """The map of the points ``keys`` with all their views at the poses of their keyframes, which are among ``values``: their
         body-frame covariances among ``spreads`` are those of the error that all points seen from there have in common."""
         rows = [
-            (i, look)
+            (i, view)
             for i, key in enumerate(keys)
-            if key in self._looks
-            for look in (
-                *(one for one in self._earlier[key] if self._looks[key].way >= one.way + APART),
-                self._looks[key],
+            if key in self._views
+            for view in (
+                *(
+                    earlier_view
+                    for earlier_view in self._earlier[key]
+                    if self._views[key].travelled >= earlier_view.travelled + APART
+                ),
+                self._views[key],
             )
         ]
         if not rows:
             return points
-        looks = [look for _, look in rows]
-        poses = np.array([values.get(look.keyframe, look.guess[0]) for look in looks])
-        body = np.array([spreads.get(look.keyframe, look.guess[1]) for look in looks])
+        views = [view for _, view in rows]
+        poses = np.array([values.get(view.keyframe, view.guess[0]) for view in views])
+        body = np.array([spreads.get(view.keyframe, view.guess[1]) for view in views])
         seen_from = np.array([camera_pose(self._model, pose)[0] for pose in poses])
         common = carried(se2.body_to_world(poses, body), seen_from[:, :2] - poses[:, :2])
-        return replace(self._seen(points, rows), seen_from=seen_from, common=common)
+        return replace(self._with_views(points, rows), seen_from=seen_from, common=common)
 
-    def _seen(self, points: PointMap, rows: Sequence[tuple[int, Look]]) -> PointMap:
+    def _with_views(self, points: PointMap, rows: Sequence[tuple[int, PointView]]) -> PointMap:
         """The map with these views, each with the number of its point."""
         if not rows:
             return points
@@ -129,7 +139,7 @@ class PointLooks:
             points,
             feature=self._feature,
             owners=np.array([i for i, _ in rows]),
-            descriptors=np.array([look.descriptor for _, look in rows]),
-            seen_from=np.array([look.seen_from for _, look in rows]),
-            sizes=np.array([look.size for _, look in rows]),
+            descriptors=np.array([view.descriptor for _, view in rows]),
+            seen_from=np.array([view.seen_from for _, view in rows]),
+            sizes=np.array([view.size for _, view in rows]),
         )
