@@ -43,7 +43,10 @@ def tables() -> list[str]:
     lines += [*_columns(), "", "### Settings", ""]
     for name, model in FILES.items():
         lines += [f"**{name[0].upper()}{name[1:]}**", "", "| key | least | most |", "|---|---|---|"]
-        lines += [f"| `{s.key}` | {bound_text(s.low)} | {bound_text(s.high)} |" for s in numbers_of(model)]
+        keys: dict[str, list[str]] = {}
+        for s in numbers_of(model):
+            keys.setdefault(f"{bound_text(s.low)} | {bound_text(s.high)}", []).append(f"`{s.key}`")
+        lines += [f"| {', '.join(these)} | {bounds} |" for bounds, these in keys.items()]
         lines.append("")
     return lines[:-1]
 
