@@ -40,14 +40,6 @@ def test_particles_begin_evenly_over_free_space_and_headings():
     assert np.abs(headings - 2500).max() <= 6
 
 
-def test_fewer_particles_are_enough_once_the_place_is_known():
-    estimator, robot, _ = made()
-    for m in (*robot.begin(), *robot.wait(3.0)):
-        estimator.process(m)
-    assert estimator.estimate().status == "localized"
-    assert 1000 <= len(estimator.belief().particles) < 4000  # besides those anywhere
-
-
 def test_stated_errors_fit_the_real_ones():
     """Squared errors over covariances of 6 robots that stand still: the mean of 6 chi-squares of 3 degrees of freedom is below 9
     in all but 2 of 100,000 cases; a third more is left to the few particles."""
@@ -139,21 +131,3 @@ def test_particles_that_have_lost_the_robot_find_it_again_where_tags_are_read():
     for m in robot.wait(3.0):
         estimator.process(m)
     assert np.hypot(*(estimator.estimate().pose - robot.pose)[:2]) < 0.5
-
-
-def test_landmarks_in_sight_tell_the_place():
-    """Two bearings and ranges tell all three coordinates at once: one look of a robot that has read no tag."""
-    simulation = preset("symmetric", {"world": {"landmarks": 30}})
-    world = make_world(simulation.world, np.random.default_rng(0))
-    space = free_space(world, 0.35)
-    setup = Setup(simulation.rig, world, ("odometry", "rfid", "bearing_range"), np.random.default_rng(1))
-    start = np.array((1.5, 18.0, 1.0))
-    robot = SimulatedRobot(world, space, simulation, start, ActiveSettings(), np.random.default_rng(2))
-    estimator = ActiveMcl(setup, 2000, space)
-    reports = list(robot.begin())
-    assert len(reports[-1].landmarks) >= 2
-    for m in (*reports, *robot.wait(1.0)):
-        estimator.process(m)
-    error = estimator.estimate().pose - robot.pose
-    assert np.hypot(*error[:2]) < 0.3
-    assert abs(se2.wrap_scalar(float(error[2]))) < 0.1

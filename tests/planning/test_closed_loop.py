@@ -145,15 +145,6 @@ def test_modes_that_are_next_to_each_other_are_one_place() -> None:
     assert [tuple(place.pose) for place in places] == [at["here"], at["turned"]]
 
 
-@pytest.mark.parametrize("estimator", ["active_mcl", "smoother"])
-def test_landmarks_are_seen_too(estimator: str) -> None:
-    """Where there are some on all walls, the place is known much sooner than by the three tags."""
-    world = preset("symmetric", {"world": {"landmarks": 40}})
-    run = run_active(world, "information", estimator, 1006, ActiveSettings(max_metres=20.0))
-    assert run.localized
-    assert run.metres < 5.0
-
-
 def test_the_belief_is_of_where_the_robot_is_now(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports of odometry come five times as often as scans: what is known by them is in the belief that the policy sees."""
     seen = []

@@ -1,14 +1,11 @@
 """Visual odometry as a part of a graph: which pairs of images are compared, and that no pixel counts twice."""
 
-from dataclasses import replace
-
 import camera_world
 import numpy as np
 import pytest
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.graph.graph import Keyframe
-from factorgraph_loc.model.world import World
 from factorgraph_loc.slam.frame_pairs import FramePairs
 from factors import se2
 from factors.camera import model as reprojection
@@ -69,14 +66,3 @@ def test_pixels_of_points_are_not_used_again(name, landmarks):
         run(log, RunConfig(name, {"landmarks": landmarks, "visual_odometry": on})) for on in (False, True)
     )
     np.testing.assert_array_equal(plain.final.poses, compared.final.poses)
-
-
-def test_without_points_it_tells_the_heading_better_than_the_wheels():
-    squares = {False: 0.0, True: 0.0}
-    for seed in (1, 2):
-        log = replace(camera_world.simulate(seed, 24.0, limit=60), world=World())
-        for on in squares:
-            result = run(log, RunConfig("smoother", {"landmarks": "known", "visual_odometry": on}))
-            error = se2.wrap(result.final.poses[:, 2] - log.reference.at(result.final.t)[:, 2])
-            squares[on] += float(np.mean(error**2))
-    assert squares[True] < 0.6 * squares[False]

@@ -76,28 +76,6 @@ def rmse(result, log):
     return float(np.sqrt(np.mean(np.sum(errors(result, log)[:, :2] ** 2, axis=1))))
 
 
-def truth_of(points, log):
-    true = log.world.points
-    return np.array([true.positions[true.index[name]] for name in points.names])
-
-
-@pytest.mark.parametrize("name", CONFIGS)
-def test_points_without_a_map_hold_the_robot(mapped, log, name):
-    alone = run(log, RunConfig("dead_reckoning"))
-    result = mapped(name)
-    assert rmse(result, log) < 0.35 * rmse(alone, log)
-    assert result.diagnostics.events == []
-
-
-@pytest.mark.parametrize("name", CONFIGS)
-def test_the_points_are_where_they_are(mapped, log, name):
-    points = mapped(name).learnt.points
-    off = np.linalg.norm(points.positions - truth_of(points, log), axis=1)
-    assert len(points) > 60
-    assert np.median(off) < 0.25
-    assert np.all(np.linalg.eigvalsh(points.covariances) > 0.0)
-
-
 def test_errors_are_as_large_as_the_covariances_say(mapped, logs):
     # the last pose of five runs; the mean leaves this band once in a thousand
     total = 0.0

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import short_logs
 from camera_world import CAMERA, room, simulate
 from scipy.spatial.transform import Rotation
@@ -73,33 +72,6 @@ def test_the_camera_moves_with_a_robot_that_tilts():
     np.testing.assert_allclose(
         lifted(model, pose, np.zeros((3, 3))).covariance, np.transpose(columns) @ columns, atol=2e-6
     )
-
-
-@pytest.mark.parametrize("name", ["ekf", "smoother", "particle_filter"])
-def test_covariances_hold_on_an_uneven_floor(name):
-    found = []
-    for seed in SEEDS:
-        log = uneven(simulate(seconds=15.0, seed=seed))
-        scores = score(run(log, RunConfig(name, {"particles": 500} if name == "particle_filter" else {})), log)
-        found.append([scores[f"causal.{figure}"] for figure in ("position_rmse", "anees")])
-    position, anees = np.mean(found, axis=0)
-    assert position < 0.03
-    # of 450 NEES of 3 degrees of freedom, of which some 15 are independent: five standard deviations below 6.2
-    assert anees < 6.2
-
-
-def test_a_level_floor_is_recognised():
-    """Known points tell more of a pose there: with one standard deviation of the tilt for all floors, equal to 0.02 %."""
-    for seed in SEEDS:
-        log = simulate(seconds=15.0, seed=seed, limit=100)
-        level, other = (run(one, RunConfig("smoother")).final for one in (log, uneven(log)))
-        assert spread_of(other) > 1.01 * spread_of(level)
-
-
-def spread_of(trajectory):
-    """Median standard deviation of a position in the last half, in m."""
-    covariances = trajectory.covariances[len(trajectory) // 2 :, :2, :2]
-    return np.median(np.sqrt(np.trace(covariances, axis1=1, axis2=2)))
 
 
 def test_covariances_hold_where_the_points_are_estimated_too():

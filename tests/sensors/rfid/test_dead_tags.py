@@ -1,7 +1,6 @@
 """Dead tags, as a robot can know of them: by the way it goes, not by the whole log."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,8 +8,6 @@ import pytest
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import Log, RfidScan, Rig, Tag, VelocityOdometry, World
-from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.simulation import preset, simulate
 
@@ -22,36 +19,6 @@ def office(seed: int = 2) -> tuple[Log, frozenset[str]]:
     """A minute with 30 % of the tags dead, and which these are."""
     log = simulate(preset("office", {"drive": {"duration": 60.0}, "faults": {"dead": 0.3}}), seed)
     return log, frozenset(log.metadata["dead"].split(", "))
-
-
-def without(log: Log, tags: frozenset[str]) -> Log:
-    left = {name: tag for name, tag in log.world.tags.items() if name not in tags}
-    return replace(log, world=log.world.model_copy(update={"tags": left}))
-
-
-@pytest.mark.parametrize("estimator", ["smoother", "particle_filter"])
-def test_hardly_worse_than_who_is_told(estimator: str) -> None:
-    """After half a minute, two logs pooled. All that are named are dead, and most of the dead are named."""
-    errors: list[list[float]] = []
-    for seed in (2, 3):
-        log, dead = office(seed)
-        assert log.reference is not None
-        config = RunConfig(estimator, {"particles": 1000} if estimator == "particle_filter" else {})
-        result, told = run(log, config), run(without(log, dead), config)
-        late = result.t > 30.0
-        errors.append(
-            [
-                np.mean(np.sum((r.poses - log.reference.at(r.t, max_gap=0.2))[late, :2] ** 2, axis=1))
-                for r in (result, told)
-            ]
-        )
-        named = set(result.diagnostics.doubted["dead_tags"])
-        assert named <= dead
-        assert len(named) >= 8  # of 12, some of which the robot hardly passes
-        assert score(result, log)["dead_tags.total"] == len(named)
-    found, best = np.sqrt(np.mean(errors, axis=0))
-    assert found < 1.15 * best
-    assert any(f"{len(named)} of 40 tags of the map are believed dead" in w for w in result.warnings)
 
 
 def robot(estimator: str, **settings: float) -> fgloc.Localizer:
