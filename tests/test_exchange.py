@@ -27,13 +27,6 @@ def require_alike(found, trajectory, atol=1e-8):
         assert found.rotations == pytest.approx(trajectory.rotations, abs=atol)
 
 
-def test_a_map_is_no_rig(tmp_path):
-    fgloc.write_world(fgloc.World(name="hall", tags={"E2": fgloc.Tag(x=1, y=1)}), tmp_path / "hall.world.toml")
-    assert (tmp_path / "hall.tags.csv").is_file()
-    with pytest.raises(fgloc.InputError, match=r"hall.world.toml: unknown key tags"):
-        fgloc.read_rig(tmp_path / "hall.world.toml")
-
-
 @BOTH
 def test_a_trajectory_comes_back_from_its_file(tmp_path, trajectory):
     fgloc.write_trajectory(trajectory, tmp_path / "poses.tum", T0)
@@ -48,14 +41,6 @@ def test_a_floor_is_no_staircase(tmp_path):
     fgloc.write_trajectory(SPACE, tmp_path / "poses.tum")
     with pytest.raises(fgloc.InputError, match="the height of poses varies by"):
         fgloc.Trajectory.of(fgloc.read_trajectory(tmp_path / "poses.tum"))
-
-
-def test_the_reference_of_a_log_is_a_trajectory():
-    log = fgloc.read_log("plaza2")
-    read = fgloc.Trajectory.of(fgloc.read_trajectory("plaza2"), log.t0_ns)
-    assert read.poses == pytest.approx(log.reference.poses, abs=1e-9)
-    assert read.t == pytest.approx(log.reference.t, abs=1e-9)
-    assert read.has_heading == log.reference.has_heading
 
 
 @BOTH

@@ -1,6 +1,5 @@
 """Processes that are started: what comes of their jobs, and that none outlives the one that started it."""
 
-import gc
 import multiprocessing
 import os
 import signal
@@ -54,16 +53,6 @@ def test_a_job_that_fails_or_dies_takes_nothing_with_it(monkeypatch):
     assert 'File "<string>", line 1' in "".join(traceback.format_exception(outcomes[1]))
     assert isinstance(outcomes[2], ProcessDiedError)
     assert outcomes[3] == "1"
-
-
-def test_children_search_for_garbage_as_rarely_as_their_parent():
-    before = gc.get_threshold()
-    gc.set_threshold(12_345, 7, 8)
-    try:
-        outcomes = dict(run_each(eval, ["__import__('gc').get_threshold()[:2]"], workers=1))
-    finally:
-        gc.set_threshold(*before)
-    assert outcomes == {0: (12_345, 7)}
 
 
 def test_each_job_has_a_process_of_its_own_unless_they_last():

@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import factorgraph_loc as fgloc
@@ -52,52 +51,6 @@ def test_a_run_on_the_floor_loads_no_optimizers_and_no_rotations_of_scipy(tmp_pa
 def test_examples_import_from_the_package_alone(script):
     found = re.findall(r"^(?:from|import) ((?:factorgraph_loc|factors)\S*)", script.read_text(), re.MULTILINE)
     assert set(found) == {"factorgraph_loc"}
-
-
-def made_log():
-    """Two seconds along a wall, made by hand."""
-    t = np.arange(20) / 10.0
-    ones = np.ones(20)
-    world = fgloc.World(name="hall", landmarks={"door": fgloc.Landmark(x=3.0, y=1.0)}, tags={"E2": fgloc.Tag(x=1, y=1)})
-    rig = fgloc.Rig(name="cart", sensors=["odometry", "bearing_range"])
-    streams = {
-        "odometry": fgloc.VelocityStream(t, 0.5 * ones, 0.0 * ones),
-        "bearing_range": fgloc.BearingRangeStream(
-            t, ["door"] * 20, np.hypot(3.0 - 0.5 * t, 1.0), np.arctan2(1.0, 3.0 - 0.5 * t)
-        ),
-    }
-    start = fgloc.StartPose(0.0, np.zeros(3), np.array([0.1, 0.1, 0.05]))
-    truth = fgloc.Trajectory(t, np.column_stack((0.5 * t, 0.0 * t, 0.0 * t)))
-    return fgloc.Log("hall", rig, world, streams, reference=truth, start=start)
-
-
-def test_a_script_makes_writes_reads_and_runs_a_log(tmp_path):
-    log = made_log()
-    fgloc.write_native(log, str(tmp_path / "hall"))
-    read = fgloc.read_log(str(tmp_path / "hall"))
-    assert read.name == "hall"
-    assert read.streams["odometry"].v == pytest.approx(log.streams["odometry"].v)
-    fgloc.write_native(log, str(tmp_path / "copy"), format="parquet")
-    assert (tmp_path / "copy/odometry.parquet").is_file()
-    found = fgloc.run(read, "ekf").result
-    assert found.final.poses[-1] == pytest.approx((0.95, 0.0, 0.0), abs=0.1)
-    fgloc.write_trajectory(found.final, str(tmp_path / "ekf.tum"))
-    read = fgloc.Trajectory.of(fgloc.read_trajectory(str(tmp_path / "ekf.tum")))
-    assert read.poses == pytest.approx(found.final.poses, abs=1e-8)
-
-
-def test_a_script_keeps_rig_map_and_grid(tmp_path):
-    log = made_log()
-    fgloc.write_rig(log.rig, str(tmp_path / "cart.rig.toml"))
-    assert fgloc.read_rig(str(tmp_path / "cart.rig.toml")) == log.rig
-    points = fgloc.PointMap.of(["a", "b"], np.array([[1.0, 2.0, 0.5], [2.0, 2.0, 0.5]]))
-    fgloc.write_world(log.world.model_copy(update={"points": points}), str(tmp_path / "hall.world.toml"))
-    world = fgloc.read_world(str(tmp_path / "hall.world.toml"))
-    assert (world.landmarks, world.tags) == (log.world.landmarks, log.world.tags)
-    assert world.points.positions == pytest.approx(points.positions)
-    shipped = fgloc.read_grid(str(ROOT / "datasets/rfid-aisle.default.npz"))
-    fgloc.write_grid(shipped, str(tmp_path / "grid.npz"))
-    assert np.array_equal(fgloc.read_grid(tmp_path / "grid.npz").logits, shipped.logits)
 
 
 def test_several_logs_are_not_one():

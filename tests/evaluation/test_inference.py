@@ -63,16 +63,6 @@ def test_holm_lies_between_none_and_bonferroni(p_values):
         assert p <= c <= min(1.0, len(p_values) * p) + 1e-12
 
 
-def test_false_alarms_of_a_family():
-    """Five estimators that are all alike: together a false alarm in at most 5 % of 400 trials; more than 36 in one of 10^4."""
-    rng = np.random.default_rng(2)
-    alarms = 0
-    for _ in range(400):
-        scores = rng.normal(size=(5, 12))
-        alarms += min(holm([signed_rank(scores[0] - other) for other in scores[1:]])) < 0.05
-    assert alarms <= 36
-
-
 def test_pooled_counts_each_log_once():
     scores = {"one": {0: 0.3, 1: 0.4, 2: None}, "two": {0: 0.1}}
     found = pooled(scores, rms=True)

@@ -1,7 +1,5 @@
 """Figures on cases whose answer is known, and against the evo package."""
 
-import math
-
 import numpy as np
 import pytest
 from evo.core import metrics as evo
@@ -40,13 +38,6 @@ def result_of(t, poses, status, final=None, diagnostics=None, learnt=None, confi
     diagnostics = Diagnostics() if diagnostics is None else diagnostics
     learnt = Learnt() if learnt is None else learnt
     return RunResult("log", config or {}, t, poses, covariances, status, final, diagnostics, learnt, TIMINGS, {})
-
-
-def test_heading_errors_wrap():
-    t = np.arange(3) * 0.1
-    truth = np.array([(0.0, 0.0, math.pi - 0.01)] * 3)
-    estimate = np.array([(0.0, 0.0, -math.pi + 0.02)] * 3)
-    assert accuracy(Trajectory(t, estimate), Trajectory(t, truth))["heading_rmse"] == pytest.approx(0.03)
 
 
 def test_in_a_gap_of_the_reference_nothing_is_scored():

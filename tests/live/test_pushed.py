@@ -32,12 +32,7 @@ def started(log, name="smoother", **options):
 
 ONE = np.ones(1)
 BAD = [
-    (VelocityOdometry(1.0, math.nan, 0.0), r"VelocityOdometry at 1.000 s: v is nan, expected a finite number"),
     (VelocityOdometry(1.0, "fast", 0.0), r"v is 'fast', expected numbers"),
-    (
-        BearingRange(1.0, ("a",), -ONE, ONE),
-        r"range is -1.0, expected a finite number of m in 0.001 to 100000, or NaN where",
-    ),
     (BearingRange(1.0, ("a", "b"), ONE, ONE), r"range has shape \(1,\), expected \(2,\)"),
     (BearingRange(1.0, "ab", ONE, ONE), r"landmarks is 'ab', expected names"),
     (

@@ -3,16 +3,15 @@
 import struct
 from dataclasses import fields, is_dataclass, replace
 
+import camera_world
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import factorgraph_loc as fgloc
-from factorgraph_loc import BearingRange, Log, PointMap, Rig, SightingStream, Trajectory, VelocityStream, World
+from factorgraph_loc import BearingRange
 from factorgraph_loc.experiments.preparation import resolve_prior
-from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factors.camera import model as reprojection
 
 ASKED = ("estimate", "belief", "learnt", "trajectory", "diagnostics")
 BOTH, SEEN = ("odometry", "rfid", "bearing_range"), ("odometry", "sightings")
@@ -66,25 +65,7 @@ def bits(value):
 @pytest.fixture(scope="module")
 def seen():
     """A short drive in a room whose points a camera sees by name."""
-    t = np.arange(0.0, 2.5, 0.05)
-    rng = np.random.default_rng(2)
-    points = PointMap.of(tuple(f"p{i}" for i in range(30)), rng.uniform((3.0, -2.0, 0.2), (6.0, 2.0, 2.0), (30, 3)))
-    camera = CameraSettings(fx=500.0, fy=500.0, cx=320.0, cy=240.0, z=0.9)
-    poses = np.column_stack((0.3 * t, 0.0 * t, 0.0 * t))
-    rows = [
-        (at, i, *pixel) for at in t[2::4] for i, pixel in enumerate(pixels(camera, points, (0.3 * at, 0.0, 0.0), rng))
-    ]
-    stamps, names, u, v = zip(*rows, strict=True)
-    sightings = SightingStream(np.array(stamps), [f"p{i}" for i in names], np.array(u), np.array(v))
-    odometry = VelocityStream(t, np.full(len(t), 0.3), np.zeros(len(t)))
-    rig = Rig(sensors=("odometry", "sightings"), camera=camera)
-    streams = {"odometry": odometry, "sightings": sightings}
-    return Log("seen", rig, World(points=points), streams, Trajectory(t, poses))
-
-
-def pixels(camera, points, pose, rng):
-    found, _ = reprojection.predict(camera.model(), np.array(pose), points.positions)
-    return found + rng.standard_normal(found.shape)
+    return camera_world.simulate(seconds=2.5)
 
 
 def started(log, case):

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from recorded_logs import recorded_log
 from scipy.io import savemat
 from scripts_here import run_script
 
@@ -90,21 +89,3 @@ def test_a_missing_file_is_named(script, tmp_path):
     with pytest.raises(SystemExit, match="nothing"):
         run_script(script, tmp_path / "nothing", *number, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(("name", "sightings"), [("woods-r1", 7598), ("woods-r3", 40118), ("woods-r5", 58135)])
-def test_the_recorded_woods(data_root, name, sightings):
-    log = recorded_log(name, data_root)
-    assert (len(log.streams["bearing_range"].t), len(log.world.landmarks)) == (sightings, 17)
-    assert (len(log.reference), log.rig.name) == (12278, "woods")
-
-
-@pytest.mark.parametrize(("run", "reads", "rounds"), [(13, 63752, 3383), (16, 69503, 3709)])
-def test_the_recorded_aisle(data_root, run, reads, rounds):
-    log = recorded_log(f"rfid-aisle-run{run}", data_root)
-    stream = log.streams["rfid"]
-    assert (len(stream.t), len(list(log.measurements(("rfid",))))) == (reads, rounds)
-    assert set(stream.antenna) == set(log.rig.rfid.all_antennas())
-    assert set(log.world.tags) <= set(stream.epc)  # each tag is read
-    assert stream.t.max() <= log.streams["odometry"].t[-1]
-    assert 2.5 < rounds / 3 / (log.span()[1] - log.span()[0]) < 3.5  # about three rounds per second and antenna

