@@ -68,7 +68,7 @@ def run(
     learnt: tuple[FittedConstant, ...] = ()
     if learn:
         learning = run_and_learn(loaded, config, progress)
-        result, learnt = learning.result, tuple(learning.turns.knowledge.constants)
+        result, learnt = learning.result, tuple(learning.knowledge.constants)
     else:
         result = running.run(loaded, config, progress)
     if out is None:

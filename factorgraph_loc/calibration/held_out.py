@@ -4,10 +4,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factorgraph_loc.calibration.learn import calibrators
 from factorgraph_loc.errors import InputError, RunFailedError
@@ -15,14 +15,13 @@ from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.scoring import KINDS
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.odometry.calibration import odometry_of
+from factorgraph_loc.sensors.motion import odometry_of, overlap
+from factorgraph_loc.sensors.smoothed import recordings
 
 ESTIMATORS = ("ekf", "smoother")
-PARTS = 2  # of a single recording, each held out once
-LONGEST = 150.0  # s of each part that is run
+RIGS = ("input", "learnt")
+LONGEST = 150.0  # s of each stretch that is run
 MOST = 4  # stretches of a log
-WARM_UP = 2.0  # s of odometry before a stretch, for the delay of commands
 FEWEST_POSES = 20  # poses of the reference that a stretch needs
 WORSE, WORST = 1.02, 1.10  # growth of the pooled error, and of that of a log, with which a rig is refused
 
@@ -43,148 +42,129 @@ Run = Callable[[Log, str], Scored]
 
 
 @dataclass(frozen=True)
-class Fold:
-    """A split of the logs: ``train`` to learn from, ``tests`` held out."""
-
-    train: tuple[Log, ...]
-    tests: tuple[Log, ...]
-
-
-@dataclass(frozen=True)
 class Trial:
-    """Scores of an ``estimator`` on a held-out stretch of ``log``, with the rig ``before`` and ``after``; None where it failed.
-    ``doubted``: by kind of doubt, what in the map is probably not as the map has it, according to the run after."""
+    """The ``scores`` of an ``estimator`` on a held-out stretch of ``log``, with the rigs of :data:`RIGS`; None if it failed.
+    ``doubted``: elements of the map that the run with the learnt rig doubts, with their probabilities, by kind of doubt."""
 
     log: str
     estimator: str
-    before: Scores | None
-    after: Scores | None
+    scores: Mapping[str, Scores | None]
     doubted: Mapping[str, Mapping[str, float]]
 
 
-def folds_of(logs: Sequence[Log]) -> tuple[Fold, ...]:
-    """Folds over the recordings, or over the parts of a single one."""
-    parts = recordings(logs)
-    if len(set(parts)) > 1:
-        return tuple(
-            Fold(
-                tuple(log for log, p in zip(logs, parts, strict=True) if p != part),
-                tuple(
-                    test for log, p in zip(logs, parts, strict=True) if p == part for test in _stretches(log, 0.0, 1.0)
-                ),
-            )
-            for part in dict.fromkeys(parts)
+def folds_of(logs: Sequence[Log]) -> list[tuple[list[Log], list[Log]]]:
+    """Logs to learn from, and held-out stretches, for each recording, or for each half of a single one."""
+    parts = list(zip(recordings(logs), logs, strict=True))
+    if len({number for number, _ in parts}) == 1:
+        parts = [(half, _share(log, half / 2, (half + 1) / 2)) for half in range(2) for log in logs]
+    return [
+        (
+            [log for part, log in parts if part != number],
+            [stretch for part, log in parts if part == number for stretch in _stretches(log)],
         )
-    shares = [(k / PARTS, (k + 1) / PARTS) for k in range(PARTS)]
-    return tuple(
-        Fold(
-            tuple(_silenced(log, a, b) for log in logs),
-            tuple(test for log in logs for test in _stretches(log, a, b)),
-        )
-        for a, b in shares
-    )
+        for number in dict.fromkeys(number for number, _ in parts)
+    ]
 
 
-def recordings(logs: Sequence[Log]) -> list[int]:
-    """The number of the recording behind each log: logs with the same measurements are not independent."""
-    found = [one.recordings(logs) for one in calibrators().values() if one.channel in logs[0].streams]
-    return next((numbers for numbers in found if len(set(numbers)) < len(logs)), list(range(len(logs))))
-
-
-def tried(tests: Sequence[Log], before: Rig, after: Rig, run: Run) -> list[Trial]:
+def trials_of(tests: Sequence[Log], initial: Rig, learnt: Rig, run: Run) -> list[Trial]:
     """Both estimators on held-out stretches, with both rigs. A rig that lacks what its sensors need is not tried."""
-    complete = all(one.is_complete(before) for one in calibrators().values())
+    complete = all(calibrator.is_complete(initial) for calibrator in calibrators().values())
+    rigs = {"learnt": learnt} | ({"input": initial} if complete else {})
     out = []
     for test in tests:
         for estimator in ESTIMATORS:
-            found: list[Scored | None] = [None, None]
-            for i, rig in ((0, before), (1, after))[0 if complete else 1 :]:
+            runs = dict[str, Scored]()
+            for name, rig in rigs.items():
                 with suppress(InputError, RunFailedError):
-                    found[i] = run(replace(test, rig=rig), estimator)
-            doubted = {} if found[1] is None else found[1].result.diagnostics.doubted
-            scores = [None if one is None else one.scores for one in found]
-            out.append(Trial(test.name, estimator, scores[0], scores[1], doubted))
+                    runs[name] = run(replace(test, rig=rig), estimator)
+            doubted = runs["learnt"].result.diagnostics.doubted if "learnt" in runs else {}
+            scores = {name: runs[name].scores if name in runs else None for name in RIGS}
+            out.append(Trial(test.name, estimator, scores, doubted))
     return out
 
 
-def pooled(trials: Sequence[Trial], which: int, key: str) -> float:
-    """The root mean square over poses of stretches with the rig before (0) or after (1), or the mean for ``anees``; NaN if there
-    are none. Stretches without scores of both rigs count only if all are such."""
+def pooled(trials: Sequence[Trial], rig: str, key: str) -> float:
+    """The root mean square over poses of stretches with a ``rig`` of :data:`RIGS`, or the mean for ``anees``; NaN if there are
+    none. Stretches without scores of both rigs count only if all are such."""
     kind = key.partition(".")[0]
-    known = [t for t in trials if _known(t, key)]
-    scores = [(t.before, t.after)[which] for t in known or trials]
-    found = [(float(s[f"{kind}.scored"]), float(s[key])) for s in scores if s is not None and s.get(key) is not None]
-    if not sum(weight for weight, _ in found):
+    known = [t for t in trials if _is_known(t, key)]
+    scores = [t.scores[rig] for t in known or trials]
+    rows = [(float(s[f"{kind}.scored"]), float(s[key])) for s in scores if s is not None and s.get(key) is not None]
+    if not sum(weight for weight, _ in rows):
         return math.nan
-    weights, values = np.array(found).T
+    weights, values = np.array(rows).T
     if key.endswith("anees"):
         return float(np.average(values, weights=weights))
     return math.sqrt(np.average(values**2, weights=weights))
 
 
-def _known(trial: Trial, key: str) -> bool:
-    return all(one is not None and one.get(key) is not None for one in (trial.before, trial.after))
+def _is_known(trial: Trial, key: str) -> bool:
+    return all(scores is not None and scores.get(key) is not None for scores in trial.scores.values())
 
 
 def growth(trials: Sequence[Trial]) -> float:
-    """Position error after, divided by that before: geometric mean over estimators, causal and final poses; NaN if unknown."""
+    """Position error with the learnt rig divided by that with the input rig: geometric mean over estimators, causal and final
+    poses; NaN if unknown."""
+    return _ratio(trials, _error)
+
+
+def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], float]) -> float:
+    """The ``loss`` with the learnt rig divided by that with the input rig, as the geometric mean over estimators and poses."""
     ratios = [
-        pooled(mine, 1, key) / max(pooled(mine, 0, key), 1e-9)
+        loss(mine, "learnt", kind) / max(loss(mine, "input", kind), 1e-9)
         for estimator in ESTIMATORS
-        for key in (f"{kind}.position_rmse" for kind in KINDS)
-        if (mine := [t for t in trials if t.estimator == estimator and _known(t, key)])
+        for kind in KINDS
+        if (mine := [t for t in trials if t.estimator == estimator and _is_known(t, f"{kind}.position_rmse")])
     ]
     return math.exp(np.mean(np.log(ratios))) if ratios else math.nan
 
 
+def _error(trials: Sequence[Trial], rig: str, kind: str) -> float:
+    return pooled(trials, rig, f"{kind}.position_rmse")
+
+
+def _effective_error(trials: Sequence[Trial], rig: str, kind: str) -> float:
+    """The position error of consistent estimates with the same logarithmic score.
+
+    The score of a Gaussian estimate (Gneiting and Raftery, "Strictly proper scoring rules, prediction, and estimation", JASA 102,
+    2007, section 4) is worst by the divergence of Kullback and Leibler if the covariance is wrong by the factor ``ANEES / D``.
+    """
+    dimensions = 3.0 if math.isfinite(pooled(trials, rig, f"{kind}.heading_rmse")) else 2.0
+    factor = max(pooled(trials, rig, f"{kind}.anees") / dimensions, 1e-9)
+    return _error(trials, rig, kind) * math.exp(0.5 * (factor - 1.0 - math.log(factor)))
+
+
 def refusal(trials: Sequence[Trial]) -> str:
-    """Why the learnt rig is refused; empty if it is not."""
-    failed = [t for t in trials if t.after is None and t.before is not None]
+    """The reason to refuse the learnt rig; empty if there is none."""
+    failed = [t for t in trials if t.scores["learnt"] is None and t.scores["input"] is not None]
     if failed:
         return f"the {failed[0].estimator} fails on {failed[0].log} with what was learnt from the rest"
-    every = growth(trials)
-    if every > WORSE:
-        return f"errors on held-out logs are {every:.2f} times those with the input rig"
+    if (pooled_growth := growth(trials)) > WORSE:
+        return f"errors on held-out logs are {pooled_growth:.2f} times those with the input rig"
     for log in dict.fromkeys(t.log for t in trials):
         if (own := growth([t for t in trials if t.log == log])) > WORST:
             return f"errors on {log}, held out, are {own:.2f} times those with the input rig"
+    if (effective := _ratio(trials, _effective_error)) > WORSE:
+        ratio = f"{pooled_growth:.2f} times those with the input rig"
+        return f"errors on held-out logs are {ratio}, but ANEES is so far from its ideal that they count {effective:.2f} times"
     return ""
 
 
-def _bounds(log: Log) -> tuple[float, float]:
-    """The interval [s] in which the log has both odometry and reference."""
-    assert log.reference is not None
-    t = odometry_of(log).t + log.rig.time_offset("odometry")
-    return max(float(t[0]), float(log.reference.t[0])), min(float(t[-1]), float(log.reference.t[-1]))
+def _share(log: Log, begin: float, end: float) -> Log:
+    """The part of a log between two fractions of the time that has both odometry and reference."""
+    first, last = overlap(log)
+    return cut(log, first + begin * (last - first), first + end * (last - first))
 
 
-def _silenced(log: Log, begin: float, end: float) -> Log:
-    """The log without its reference between two fractions of its duration."""
-    assert log.reference is not None
-    first, last = _bounds(log)
-    share = (log.reference.t - first) / max(last - first, 1e-9)
-    return replace(log, reference=_kept(log.reference, (share < begin) | (share >= end)))
-
-
-def _kept(reference: Trajectory, keep: NDArray[np.bool_]) -> Trajectory:
-    covariances = None if reference.covariances is None else reference.covariances[keep]
-    return replace(reference, t=reference.t[keep], poses=reference.poses[keep], covariances=covariances)
-
-
-def _stretches(log: Log, begin: float, end: float) -> list[Log]:
-    """Stretches of a log between two fractions of its duration, without those that lack reference or measurements."""
-    first, last = _bounds(log)
-    whole = (last - first) * (end - begin)
-    count = min(MOST, max(1, round(whole / LONGEST)))
-    edges = first + (last - first) * np.linspace(begin, end, count + 1)
+def _stretches(log: Log) -> list[Log]:
+    """Stretches of a log, without those that lack reference or measurements."""
+    first, last = overlap(log)
+    edges = np.linspace(0.0, 1.0, min(MOST, max(1, round((last - first) / LONGEST))) + 1)
     out = []
-    for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        margin = max(0.0, 0.5 * (b - a - LONGEST))
+    for begin, end in pairwise(edges.tolist()):
+        margin = max(0.0, 0.5 * (end - begin - LONGEST / (last - first)))
         with suppress(InputError):  # no measurements there
-            part = cut(log, a + margin - WARM_UP, b - margin)
-            reference = part.reference
-            if reference is not None and len(odometry_of(part).t):
-                keep = reference.t >= a + margin
-                if keep.sum() >= FEWEST_POSES:
-                    out.append(replace(part, reference=_kept(reference, keep)))
+            part = _share(log, begin + margin, end - margin)
+            if part.reference is not None and len(odometry_of(part).t) and len(part.reference) >= FEWEST_POSES:
+                out.append(part)
     return out

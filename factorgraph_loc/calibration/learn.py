@@ -12,22 +12,35 @@ from factorgraph_loc.sensors.calibrating import Calibrator, SensorKnowledge
 from factorgraph_loc.sensors.registry import functions
 from factorgraph_loc.sensors.smoothed import Traced
 
+SETTLED = 0.3  # standard errors that the last turn may change
+
 
 @dataclass(frozen=True)
 class Knowledge:
-    """A learnt ``rig``, and what was ``found``, by sensor."""
+    """A learnt ``rig``, and the results of its ``sensors`` by name.
+
+    ``turns``: for logs without a reference, the largest change of a constant in each turn of smoothing and learning, in standard
+    errors.
+    """
 
     rig: Rig
-    found: Mapping[str, SensorKnowledge]
+    sensors: Mapping[str, SensorKnowledge]
+    turns: tuple[float, ...] = ()
 
     @property
     def constants(self) -> tuple[FittedConstant, ...]:
-        return tuple(constant for found in self.found.values() for constant in found.constants)
+        return tuple(constant for sensor in self.sensors.values() for constant in sensor.constants)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Messages on parameters that were not learnt, one line each."""
-        return tuple(note for found in self.found.values() for note in found.notes)
+        """Warnings, one line each."""
+        notes = [note for sensor in self.sensors.values() for note in sensor.notes]
+        if self.turns and self.turns[-1] >= SETTLED:
+            notes.append(
+                f"The last of {len(self.turns)} turns still changed a value by {self.turns[-1]:.1f} standard errors: the logs "
+                "hardly determine it."
+            )
+        return tuple(notes)
 
 
 @cache
@@ -38,7 +51,7 @@ def calibrators() -> Mapping[str, Calibrator]:
 
 def senses() -> tuple[str, ...]:
     """The exteroceptive channels that can be calibrated."""
-    return tuple(one.channel for one in calibrators().values() if one.senses)
+    return tuple(calibrator.channel for calibrator in calibrators().values() if calibrator.senses)
 
 
 def learn(
@@ -51,13 +64,13 @@ def learn(
     """Learn a rig from logs along their trajectories, starting from ``rig``: see
     :meth:`~factorgraph_loc.sensors.calibrating.Calibrator.learn`. Along a given trajectory the sensors are independent, so
     that each is a problem of its own."""
-    traced = [replace(one, log=replace(one.log, rig=rig)) for one in traced]
-    found, changed = {}, rig
+    traced = [replace(trace, log=replace(trace.log, rig=rig)) for trace in traced]
+    sensors, learnt = {}, rig
     for name, calibrator in calibrators().items():
-        known = None if like is None else like.found.get(name)
-        found[name] = calibrator.learn(traced, rig, first or rig, grids, known)
-        changed = changed.model_copy(update=dict(found[name].sections))
-    return Knowledge(changed, found)
+        known = None if like is None else like.sensors.get(name)
+        sensors[name] = calibrator.learn(traced, rig, first or rig, grids, known)
+        learnt = learnt.model_copy(update=dict(sensors[name].sections))
+    return Knowledge(learnt, sensors)
 
 
 def sensing(rig: Rig, log: Log) -> Rig:

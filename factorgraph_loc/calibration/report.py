@@ -1,39 +1,40 @@
 """The report of a calibration: a few lines, a self-contained HTML page, and a document for programs."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
 from factorgraph_loc.calibration.calibrate import Calibration
-from factorgraph_loc.calibration.held_out import ESTIMATORS, Trial, growth, pooled
+from factorgraph_loc.calibration.held_out import ESTIMATORS, RIGS, Trial, growth, pooled
 from factorgraph_loc.calibration.learn import calibrators
-from factorgraph_loc.drawing.pages import Part, Rows, sectioned
+from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
+from factorgraph_loc.drawing.pages import Part, Picture, Rows, sectioned
 from factorgraph_loc.files.settings import settings_in
 from factorgraph_loc.fitting.posterior import FittedConstant
 from factorgraph_loc.model.scoring import KINDS
 from factorgraph_loc.model.sections import sections
 from factorgraph_loc.plugins import load
+from factorgraph_loc.sensors.calibrating import Residuals
 from factorgraph_loc.text import listed, number
 
 FIGURES = {"position RMSE [m]": ("position_rmse", 3), "heading RMSE [rad]": ("heading_rmse", 4), "ANEES": ("anees", 1)}
-MOST = 8  # lines of constants
+MOST = 5  # lines of constants
 CLEAR = 2.0  # standard deviations; smaller changes are within chance
+DOTS = 3000  # per log and panel
+VIEW = 5.0  # standard deviations; larger residuals are drawn at the edge
 
 
-def constants_table(constants: Sequence[FittedConstant]) -> Rows:
-    """The constants before and after, with standard deviations, those of the priors too."""
-    header = ("constant", "input rig", "learnt", "standard deviation", "before", "")
-    rows: list[tuple[str, ...]] = [
-        (
-            _label(c),
-            number(c.before),
-            number(c.fitted),
-            number(c.error),
-            number(c.prior),
-            "" if c.is_determined else "hardly determined",
-        )
-        for c in constants
-    ]
+def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = ()) -> Rows:
+    """The initial and learnt constants, their standard deviations and those of the priors, and the values of single ``logs``."""
+    header = ("constant", "input rig", "learnt", "standard deviation", "prior", "", *logs)
+    rows = []
+    for c in constants:
+        figures = [number(value) for value in (c.initial, c.fitted, c.error, c.prior)]
+        each = [number(value) for value in c.per_log] if len(c.per_log) == len(logs) else ["-"] * len(logs)
+        rows.append((_label(c), *figures, "" if c.is_determined else "not determined", *each))
     return header, rows
 
 
@@ -45,24 +46,24 @@ def accuracy_table(calibration: Calibration) -> Rows:
     for log in (*logs, "all") if len(logs) > 1 else logs:
         for estimator in ESTIMATORS:
             trials = [t for t in calibration.trials if t.estimator == estimator and log in (t.log, "all")]
-            for which, name in enumerate(("input", "learnt")):
-                found = [number(pooled(trials, which, f"{k}.{f}"), n) for k in KINDS for f, n in FIGURES.values()]
-                rows.append((log, estimator, name, *found))
+            for name in RIGS:
+                values = [number(pooled(trials, name, f"{k}.{f}"), n) for k in KINDS for f, n in FIGURES.values()]
+                rows.append((log, estimator, name, *values))
     return header, rows
 
 
 def summary(calibration: Calibration) -> list[str]:
     """The result in about ten lines: changed constants, undetermined ones, correlations, and held-out errors."""
     constants = calibration.knowledge.constants
-    clear = [c for c in constants if c.is_determined and abs(c.fitted - c.before) > CLEAR * c.error]
+    clear = [c for c in constants if c.is_determined and abs(c.fitted - c.initial) > CLEAR * c.error]
     same = [_name(c) for c in constants if c.is_determined and c not in clear]
-    lines = [f"learnt: {_name(c)} {number(c.before)} -> {number(c.fitted)} +- {number(c.error)}" for c in clear[:MOST]]
+    lines = [f"learnt: {_name(c)} {number(c.initial)} -> {number(c.fitted)} +- {number(c.error)}" for c in clear[:MOST]]
     if more := [_name(c) for c in clear[MOST:]]:
         lines.append(f"learnt, see the report: {listed(more)}")
     if same:
         lines.append(f"as in the input rig, within chance: {listed(same)}")
     if vague := [_name(c) for c in constants if not c.is_determined]:
-        lines.append(f"hardly determined, so near the input rig: {listed(vague)}")
+        lines.append(f"not determined by the logs, near the input rig: {listed(vague)}")
     if alike := [f"{a} and {b} ({rho:+.2f})" for a, b, rho in _correlations(calibration)]:
         lines.append(f"known mainly by their sum or difference (correlation): {listed(alike)}")
     for estimator in ESTIMATORS if calibration.trials else ():
@@ -71,8 +72,11 @@ def summary(calibration: Calibration) -> list[str]:
             f"{k} {_change(trials, f'{k}.position_rmse')} m, ANEES {_change(trials, f'{k}.anees', 1)}" for k in KINDS
         ]
         lines.append(f"held-out errors of {estimator}: {'; '.join(figures)}")
-    if calibration.turns:
-        lines.append(f"learnt without a reference, in {len(calibration.turns)} turns with the smoother")
+    if calibration.knowledge.turns:
+        turns = len(calibration.knowledge.turns)
+        lines.append(
+            f"learnt without a reference, in {turns} turns with the smoother; noise and survey are not determined"
+        )
     elif calibration.refused:
         lines.append(f"the input rig is kept: {calibration.refused}")
     elif math.isfinite(ratio := growth(calibration.trials)):
@@ -87,37 +91,17 @@ def document(calibration: Calibration) -> dict[str, Any]:
     wanted = [f"{kind}.{figure}" for kind in KINDS for figure, _ in FIGURES.values()]
     return {
         "logs": list(calibration.logs),
-        "constants": [
-            {
-                "sensor": c.sensor,
-                "name": c.name,
-                "before": c.before,
-                "learnt": c.fitted,
-                "standard_deviation": c.error,
-                "prior": c.prior,
-                "determined": c.is_determined,
-                "per_log": list(c.per_log),
-                "uncertainty": c.uncertainty,
-            }
-            for c in calibration.knowledge.constants
-        ],
+        "constants": [asdict(c) | {"is_determined": c.is_determined} for c in calibration.knowledge.constants],
         "correlations": [{"constants": [a, b], "correlation": rho} for a, b, rho in _correlations(calibration)],
-        **{
-            key: value
-            for name, found in calibration.knowledge.found.items()
-            for key, value in calibrators()[name].document(found, calibration.rig).items()
-        },
+        "figures": {name: dict(sensor.figures) for name, sensor in calibration.knowledge.sensors.items()},
         "held_out": [
             {"log": t.log, "estimator": t.estimator}
-            | {
-                name: s and {key: s.get(key) for key in wanted}
-                for name, s in (("before", t.before), ("after", t.after))
-            }
+            | {rig: scores and {key: scores.get(key) for key in wanted} for rig, scores in t.scores.items()}
             for t in calibration.trials
         ],
         "growth": growth(calibration.trials),
         "refused": calibration.refused,
-        "turns": list(calibration.turns),
+        "turns": list(calibration.knowledge.turns),
         "doubts": list(calibration.doubts),
         "rig": calibration.rig.model_dump(mode="json", exclude_none=True),
     }
@@ -125,55 +109,86 @@ def document(calibration: Calibration) -> dict[str, Any]:
 
 def page(calibration: Calibration) -> str:
     """The report as one HTML page with embedded plots."""
-    content: dict[str, list[Part]] = {"Summary": list(summary(calibration)), "Constants": [], "Noise": []}
-    content["Constants"] = [_how(calibration), _long_constants(calibration)]
+    logs = calibration.logs if len(calibration.logs) > 1 else ()
+    content: dict[str, list[Part]] = {
+        "Summary": list(summary(calibration)),
+        "Constants": [_how(calibration), constants_table(calibration.knowledge.constants, logs)],
+    }
     if calibration.trials:
         explained = (
             "Each log is held out, or each half of a single one: the learnt rig is that of the rest. ANEES is ideal at 3 (at 2 "
             "without the reference's heading); above it the estimator is overconfident."
         )
         content["Accuracy"] = [explained, accuracy_table(calibration)]
-    for name, found in calibration.knowledge.found.items():
-        for title, parts in calibrators()[name].report(found, calibration.rig).items():
-            content.setdefault(title, []).extend(parts)
+    for name, sensor in calibration.knowledge.sensors.items():
+        parts = [*_tables(sensor.figures), *calibrators()[name].pictures(sensor)]
+        if residuals := calibrators()[name].residuals(sensor):
+            parts.append(_residuals_figure(residuals))
+        if parts:
+            content[name.capitalize()] = parts
     lead = f"From {', '.join(calibration.logs)}."
     return sectioned(f"Calibration of {calibration.rig.name}", lead, calibration.doubts, content)
 
 
 def _how(calibration: Calibration) -> str:
-    """How the constants were found."""
-    if calibration.turns:
-        turns = ", ".join(number(one, 1) for one in calibration.turns)
+    """The method of the calibration."""
+    if calibration.knowledge.turns:
+        turns = ", ".join(number(change, 1) for change in calibration.knowledge.turns)
         return (
-            "The logs have no reference. Smoothing the logs, and learning from the smoothed trajectories, took turns: the "
-            f"largest change of a constant in each was {turns} of its standard deviations."
+            "Smoothing the logs, and learning from the smoothed trajectories, took turns. Largest change in each turn, in "
+            f"standard deviations: {turns}."
         )
     return (
-        "All constants of a sensor are estimated together from all logs, with priors about the input rig. Where the standard "
-        "deviation is not much smaller than that of the prior, before, the logs hardly determine a constant."
+        "All constants of a sensor are estimated together from all logs, with priors about the input rig. A constant is "
+        "determined if its standard deviation is clearly below that of the prior."
     )
 
 
-def _long_constants(calibration: Calibration) -> Rows:
-    header, rows = constants_table(calibration.knowledge.constants)
-    parts = calibration.logs if len(calibration.logs) > 1 else ()
-    long = []
-    for row, c in zip(rows, calibration.knowledge.constants, strict=True):
-        each = [number(v) for v in c.per_log] if len(c.per_log) == len(parts) else ["-"] * len(parts)
-        long.append((*row, *each, number(c.uncertainty)))
-    return (*header, *parts, "differs between logs by"), long
+def _tables(figures: Mapping[str, Any]) -> list[Part]:
+    """A table of plain values, and one for each list of such."""
+    single = [{"figure": name, "value": value} for name, value in figures.items() if not isinstance(value, list)]
+    tables: list[Part] = []
+    for rows in filter(None, (single, *(value for value in figures.values() if isinstance(value, list)))):
+        texts = [[number(v) if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
+        tables.append((tuple(rows[0]), [tuple(row) for row in texts]))
+    return tables
+
+
+def _residuals_figure(logs: Sequence[Residuals]) -> Picture:
+    """The distribution of residuals, and their size over distance and time, by column."""
+    known = [i for i in range(len(logs[0].units)) if any(np.isfinite(log.errors[:, i]).any() for log in logs)]
+    figure, axes = grid(len(known), 3, 4.0 * len(known))
+    for panels, column in zip(axes, known, strict=True):
+        name, unit = list(logs[0].units.items())[column]
+        sigmas = np.concatenate([log.sigmas[:, column] for log in logs])
+        limit = VIEW * float(np.nanmedian(sigmas))
+        edges = np.linspace(-limit, limit, 61)
+        for i, log in enumerate(logs):
+            values = np.clip(log.errors[:, column], -limit, limit)
+            dots = slice(None, None, max(1, len(values) // DOTS))
+            style: dict[str, Any] = {"color": COLOURS[i % len(COLOURS)], "label": log.log}
+            panels[0].hist(values[np.isfinite(values)], edges, density=True, histtype="step", linewidth=1.5, **style)
+            panels[1].plot(log.distance[dots], values[dots], ".", markersize=2, **style)
+            panels[2].plot(log.t[dots], values[dots], ".", markersize=2, **style)
+        density = np.exp(-0.5 * (edges[:, None] / sigmas) ** 2) / (sigmas * np.sqrt(2.0 * np.pi))
+        panels[0].plot(edges, np.nanmean(density, axis=1), color="0.3", linestyle="--", label="learnt noise")
+        panels[0].set(xlabel=f"{name} residual [{unit}]", ylabel=f"density [1/{unit}]")
+        panels[1].set(xlabel="distance [m]", ylabel=f"{name} residual [{unit}]")
+        panels[2].set(xlabel="time [s]", ylabel=f"{name} residual [{unit}]")
+    legend(figure, axes.flat, markers=3.0)
+    return png(figure)
 
 
 def _correlations(calibration: Calibration) -> list[tuple[str, str, float]]:
     return [
         (f"{calibrators()[name].section}.{a}", f"{calibrators()[name].section}.{b}", rho)
-        for name, found in calibration.knowledge.found.items()
-        for a, b, rho in found.correlations
+        for name, sensor in calibration.knowledge.sensors.items()
+        for a, b, rho in sensor.correlations
     ]
 
 
 def _change(trials: Sequence[Trial], key: str, digits: int = 3) -> str:
-    return " -> ".join(number(pooled(trials, which, key), digits) for which in (0, 1))
+    return " -> ".join(number(pooled(trials, rig, key), digits) for rig in RIGS)
 
 
 def _name(c: FittedConstant) -> str:
@@ -182,5 +197,5 @@ def _name(c: FittedConstant) -> str:
 
 def _label(c: FittedConstant) -> str:
     settings = settings_in(load(sections()[c.sensor].kind))
-    unit = next((one.unit for one in settings if one.key == c.name), "")
+    unit = next((setting.unit for setting in settings if setting.key == c.name), "")
     return f"{_name(c)} [{unit}]" if unit else _name(c)

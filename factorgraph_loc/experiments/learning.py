@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
 
-from factorgraph_loc.calibration.turns import TURNS, Turns, learn_by_turns
+from factorgraph_loc.calibration.learn import Knowledge
+from factorgraph_loc.calibration.turns import TURNS, learn_by_turns
 from factorgraph_loc.experiments.preparation import used_sensors
 from factorgraph_loc.experiments.run import run
 from factorgraph_loc.files.temporary import of_system, temporary_folder
@@ -20,11 +21,11 @@ SMOOTHER = "smoother"
 
 @dataclass(frozen=True)
 class LearningRun:
-    """A ``result`` whose final trajectory has what the ``turns`` of smoothing and learning found; all else in it is of the rig as
-    it was given."""
+    """A ``result`` whose final trajectory is that of the learnt rig; all else in it is of the given rig. ``knowledge``: the result
+    of learning."""
 
     result: RunResult
-    turns: Turns
+    knowledge: Knowledge
 
 
 def run_and_learn(log: Log, config: RunConfig, progress: Callable[[float], None] | None = None) -> LearningRun:
@@ -41,14 +42,14 @@ def run_and_learn(log: Log, config: RunConfig, progress: Callable[[float], None]
     start = log.rig.model_copy(update={"sensors": used_sensors(log, config.sensors)})
     started = perf_counter()
     with temporary_folder(of_system("grids")) as folder:
-        turns = learn_by_turns(
+        knowledge = learn_by_turns(
             [log],
             start,
             lambda learnt_log: run(replace(log, rig=learnt_log.rig), smoothing),
             folder / "learnt",
             lambda done, _all: report((1.0 + done) / runs),
         )
-        rig = turns.knowledge.rig
+        rig = knowledge.rig
         again = run(replace(log, rig=rig), config)
     report(1.0)
     return LearningRun(
@@ -57,7 +58,7 @@ def run_and_learn(log: Log, config: RunConfig, progress: Callable[[float], None]
             config={**given.config, "learnt_rig": rig.model_dump(mode="json", exclude_none=True)},
             final=again.final,
             timings=replace(given.timings, final_seconds=perf_counter() - started),
-            warnings=(*given.warnings, *turns.doubts),
+            warnings=(*given.warnings, *knowledge.notes),
         ),
-        turns,
+        knowledge,
     )

@@ -3,7 +3,7 @@
 The cost is the negative log-likelihood of all logs, plus that of Gaussian priors. All parameters take each damped Gauss-Newton step
 together. Parameters with nearly the same effect, such as two kinds of drift, may be correlated.
 
-Measurements are correlated within a block of time. The likelihood is weighted by the share of them that is worth independent ones
+Measurements are correlated within a block of time. The likelihood is weighted by their share of independent information
 (Pauli, Racugno, Ventura, "Bayesian composite marginal likelihoods", Statistica Sinica 21, 2011), and the covariance is that of the
 scores of the blocks (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986). Residuals have the
 soft-L1 loss (Charbonnier et al., "Two deterministic half-quadratic regularization algorithms for computed imaging", 1994).
@@ -71,23 +71,23 @@ class Posterior:
 
     def correlations(self) -> list[tuple[str, str, float]]:
         """The pairs of parameters with a correlation above :data:`CORRELATED`."""
-        found = self.covariance / np.outer(self.errors, self.errors)
-        rows, columns = np.nonzero(np.abs(np.triu(found, 1)) > CORRELATED)
+        matrix = self.covariance / np.outer(self.errors, self.errors)
+        rows, columns = np.nonzero(np.abs(np.triu(matrix, 1)) > CORRELATED)
         names = [p.name for p in self.parameters]
-        return [(names[i], names[k], float(found[i, k])) for i, k in zip(rows, columns, strict=True)]
+        return [(names[i], names[k], float(matrix[i, k])) for i, k in zip(rows, columns, strict=True)]
 
 
 @dataclass(frozen=True)
 class FittedConstant:
-    """The result for one constant: its value ``before`` and ``fitted``, with its standard ``error``.
+    """The result for one constant: its ``initial`` and ``fitted`` values, with its standard ``error``.
 
-    ``prior``: standard deviation before, None if there was none. ``per_log``: values of each log alone. ``uncertainty``: standard
-    deviation between logs, None where it is unknown.
+    ``prior``: standard deviation of its prior, None without one. ``per_log``: values of each log alone. ``uncertainty``: standard
+    deviation between logs, None if unknown.
     """
 
     sensor: str
     name: str
-    before: float
+    initial: float
     fitted: float
     error: float
     prior: float | None = None
@@ -101,28 +101,35 @@ class FittedConstant:
 
 
 def maximise(
-    parameters: Sequence[Parameter], likelihood: Likelihood, start: Mapping[str, float] | None = None
+    parameters: Sequence[Parameter],
+    likelihood: Likelihood,
+    start: Mapping[str, float] | None = None,
+    covariance: Array | None = None,
 ) -> Posterior:
-    """The maximum of the posterior density of ``parameters`` (P,), from ``start`` or the means of the priors."""
+    """The maximum of the posterior density of ``parameters`` (P,), from ``start`` or the means of the priors.
+
+    ``covariance`` (P, P) of the priors; without it they are independent.
+    """
     mean, sigma, low, high = (
         np.array([getattr(p, name) for p in parameters], dtype=float) for name in ("mean", "sigma", "low", "high")
     )
-    precision = np.diag(sigma**-2.0)
+    precision = np.asarray(np.linalg.inv(np.diag(sigma**2) if covariance is None else covariance), dtype=float)
     values = np.clip([(start or {}).get(p.name, p.mean) for p in parameters], low, high)
     share = 1.0
     for _ in range(2):
 
         def at(values: Array, share: float = share) -> tuple[float, Array, Array]:
-            found, away = likelihood(values), (values - mean) / sigma
-            gradient = share * found.scores.sum(axis=0) + away / sigma
-            return share * found.cost + 0.5 * float(away @ away), gradient, share * found.information + precision
+            terms, away = likelihood(values), values - mean
+            gradient = share * terms.scores.sum(axis=0) + precision @ away
+            cost = share * terms.cost + 0.5 * float(away @ precision @ away)
+            return cost, gradient, share * terms.information + precision
 
         values, _, _ = minimum(at, values, ITERATIONS, CONVERGED * sigma, largest=LARGEST * sigma, low=low, high=high)
-        found = likelihood(values)
-        share = independent_share(found.scores, found.information, precision)
-    spread = np.linalg.inv(share * found.information + precision)
-    scatter = share**2 * (found.scores.T @ found.scores) + precision
-    return Posterior(tuple(parameters), values, spread @ scatter @ spread, share)
+        terms = likelihood(values)
+        share = independent_share(terms.scores, terms.information, precision)
+    inverse = np.linalg.inv(share * terms.information + precision)
+    scatter = share**2 * (terms.scores.T @ terms.scores) + precision
+    return Posterior(tuple(parameters), values, inverse @ scatter @ inverse, share)
 
 
 def independent_share(scores: Array, information: Array, precision: Array | float = 0.0) -> float:
@@ -172,7 +179,7 @@ def blocks(times: Sequence[Array], length: float) -> Integers:
     return np.concatenate(out)
 
 
-def spread(values: Array) -> Array:
+def robust_sigma(values: Array) -> Array:
     """Return the robust standard deviation (D,) about zero of the columns of ``values`` (M, D)."""
     return np.asarray(MAD_TO_SIGMA * np.nanmedian(np.abs(values), axis=0))
 

@@ -18,8 +18,8 @@ from factorgraph_loc.mapping.tag_looks import TagLooks
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.rfid.calibration.phase import phase_reads
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
+from factorgraph_loc.sensors.rfid.stream import phase_reads
 from factors.least_squares import minimum
 from factors.rfid.detection import TagArray
 from factors.rfid.signals import PhaseLikelihood, PhaseModel, PhaseReads

@@ -1,4 +1,4 @@
-"""The interface by which sensor packages take part in :mod:`factorgraph_loc.calibration`."""
+"""The interface of sensor packages to :mod:`factorgraph_loc.calibration`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,14 +33,34 @@ def upper_bounds(kind: type[FileModel]) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
+class Residuals:
+    """Residuals of a log for the report.
+
+    ``errors`` (K, D) and their standard deviations ``sigmas`` (K, D), NaN if not measured; timestamps ``t`` (K,) [s] and the
+    ``distance`` (K,) [m] that errors may depend on. ``units``: by the names of the D columns.
+    """
+
+    log: str
+    units: Mapping[str, str]
+    t: Array
+    distance: Array
+    errors: Array
+    sigmas: Array
+
+
+@dataclass(frozen=True)
 class SensorKnowledge:
-    """The result for a sensor: ``sections`` of the rig, the ``constants`` with their ``correlations`` (see
-    :meth:`~factorgraph_loc.fitting.posterior.Posterior.correlations`), ``notes`` (one line each) on what could not be learnt, and
-    ``details`` for its report."""
+    """The result for a sensor.
+
+    ``sections`` of the rig; the ``constants``; ``notes``: warnings, one line each; ``figures``: plain values for the report;
+    ``details``: the data that its pictures show; ``correlations``: see
+    :meth:`~factorgraph_loc.fitting.posterior.Posterior.correlations`.
+    """
 
     sections: Mapping[str, Any] = field(default_factory=dict)
     constants: Sequence[FittedConstant] = ()
     notes: Sequence[str] = ()
+    figures: Mapping[str, Any] = field(default_factory=dict)
     details: Any = None
     correlations: Sequence[tuple[str, str, float]] = ()
 
@@ -59,13 +79,6 @@ class Calibrator:
     uncertain: ClassVar[Mapping[str, float]] = {}
     first: ClassVar[FileModel | None] = None
 
-    def recordings(self, logs: Sequence[Log]) -> list[int]:
-        """An identifier of the recording of each log; logs with the same measurements cannot validate each other."""
-        return list(range(len(logs)))
-
-    def check_alike(self, first: Log, log: Log) -> None:
-        """InputError if two logs cannot be of the same robot."""
-
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
@@ -77,9 +90,9 @@ class Calibrator:
         """
         raise NotImplementedError
 
-    def widened(self, rig: Rig, first: Rig) -> Rig:
-        """The rig with the uncertainties of the ``first`` one: those that are learnt hold for later runs, and would bind the next
-        turn to what the last one found."""
+    def with_priors(self, rig: Rig, first: Rig) -> Rig:
+        """The rig with the uncertainties of the ``first`` one. Learnt ones are for later runs: in the next turn they would hold
+        constants near the values of the last."""
         if getattr(rig, self.section) is None or not self.uncertain:
             return rig
         uncertainty = getattr(first, self.section).uncertainty
@@ -94,17 +107,13 @@ class Calibrator:
         """Whether a rig has everything that the sensor needs."""
         return self.channel not in rig.sensors or getattr(rig, self.section) is not None
 
-    def doubts(self, _found: SensorKnowledge) -> Sequence[str]:
-        """Warnings for the reader of the report."""
+    def residuals(self, _knowledge: SensorKnowledge) -> Sequence[Residuals]:
+        """The residuals of each log, which the report shows."""
         return ()
 
-    def document(self, _found: SensorKnowledge, _rig: Rig) -> Mapping[str, Any]:
-        """The sensor's part of the machine-readable document; ``rig``: the one that is written."""
-        return {}
-
-    def report(self, _found: SensorKnowledge, _rig: Rig) -> Mapping[str, Sequence[Part]]:
-        """Parts of the report by the title of their section, such as ``Noise``."""
-        return {}
+    def pictures(self, _knowledge: SensorKnowledge) -> Sequence[Part]:
+        """Further pictures of the report."""
+        return ()
 
 
 class ConstantsCalibrator(Calibrator):
@@ -126,11 +135,11 @@ class ConstantsCalibrator(Calibrator):
         return parts, settings
 
     def finished(
-        self, _logs: Sequence[Log], _parts: Sequence[Any], rig: Rig, learnt: SensorKnowledge
+        self, _logs: Sequence[Log], _parts: Sequence[Any], rig: Rig, knowledge: SensorKnowledge
     ) -> SensorKnowledge:
         """Complete the result for a ``rig`` that has the constants."""
         del rig
-        return learnt
+        return knowledge
 
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, _grids: Path | None, _like: SensorKnowledge | None = None
@@ -140,60 +149,62 @@ class ConstantsCalibrator(Calibrator):
             return SensorKnowledge()
         if traced[0].constants is not None:
             return self._pooled(traced, rig, first)
-        logs = [replace(one.log, rig=rig) for one in traced]
-        parts, settings, found = self.estimated([self.part(log) for log in logs], self.settings(rig))
-        constants = [] if found is None else self._constants(parts, settings, self.settings(rig), found)
+        logs = [replace(trace.log, rig=rig) for trace in traced]
+        parts, settings, posterior = self.estimated([self.part(log) for log in logs], self.settings(rig))
+        constants = [] if posterior is None else self._constants(parts, settings, self.settings(rig), posterior)
         if self.uncertain and len(parts) > 1:
-            spreads = {
+            uncertainties = {
                 c.name: min(c.uncertainty, self.uncertain[c.name]) for c in constants if c.uncertainty is not None
             }
-            settings = settings.model_copy(update={"uncertainty": settings.uncertainty.model_copy(update=spreads)})
-        learnt = SensorKnowledge(
-            {self.section: settings}, constants, correlations=found.correlations() if found else ()
+            settings = settings.model_copy(
+                update={"uncertainty": settings.uncertainty.model_copy(update=uncertainties)}
+            )
+        knowledge = SensorKnowledge(
+            {self.section: settings}, constants, correlations=posterior.correlations() if posterior else ()
         )
-        return self.finished(logs, parts, rig.model_copy(update=dict(learnt.sections)), learnt)
+        return self.finished(logs, parts, rig.model_copy(update=dict(knowledge.sections)), knowledge)
 
     def estimated(self, parts: Sequence[Any], settings: Any) -> tuple[Sequence[Any], Any, Posterior | None]:
         """Data and settings with constants and noise of maximal posterior density."""
         parameters = self.parameters(parts, settings)
         start = {p.name: p.mean for p in parameters}
-        found = None
+        posterior = None
         for _ in range(self.rounds if parameters else 0):
             parts, settings = self.with_noise(parts, settings)
-            found = maximise(parameters, self._likelihood(parts, settings, parameters), start)
-            start = found.as_dict()
+            posterior = maximise(parameters, self._likelihood(parts, settings, parameters), start)
+            start = posterior.as_dict()
             settings = settings.model_copy(update=start)
-        return *self.with_noise(parts, settings), found
+        return *self.with_noise(parts, settings), posterior
 
     def _likelihood(self, parts: Sequence[Any], settings: Any, parameters: Sequence[Parameter]) -> Likelihood:
         names = [p.name for p in parameters]
 
         def whitened(values: Array) -> Array:
             changed = settings.model_copy(update=dict(zip(names, values.tolist(), strict=True)))
-            return np.concatenate([one.residuals(changed) for one in parts])
+            return np.concatenate([part.residuals(changed) for part in parts])
 
-        return least_squares(whitened, parameters, blocks([one.t for one in parts], BLOCK))
+        return least_squares(whitened, parameters, blocks([part.t for part in parts], BLOCK))
 
-    def _constants(self, parts: Sequence[Any], settings: Any, before: Any, found: Posterior) -> list[FittedConstant]:
+    def _constants(
+        self, parts: Sequence[Any], settings: Any, initial: Any, posterior: Posterior
+    ) -> list[FittedConstant]:
         """The constants, with their differences between logs if there are several."""
-        values = found.as_dict()
-        own = centred(found.parameters, values)
+        values = posterior.as_dict()
+        own = centred(posterior.parameters, values)
         alone = [
-            maximise(own, self._likelihood([one], settings, own)).values for one in (parts if len(parts) > 1 else ())
+            maximise(own, self._likelihood([part], settings, own)).values for part in (parts if len(parts) > 1 else ())
         ]
         out = []
-        for i, p in enumerate(found.parameters):
-            error, uncertainty = float(found.errors[i]), None
-            each = [float(one[i]) for one in alone]
+        for i, p in enumerate(posterior.parameters):
+            error, uncertainty = float(posterior.errors[i]), None
+            each = [float(estimate[i]) for estimate in alone]
             if len(alone) > 1:
                 between = float(np.sqrt(np.sum((np.array(each) - values[p.name]) ** 2) / (len(each) - 1)))
                 error = max(error, between / np.sqrt(len(each)))
                 if p.name in self.uncertain:
                     uncertainty = max(between, error) / (abs(values[p.name]) if "scale" in p.name else 1.0)
-            known = float(getattr(before, p.name))
-            out.append(
-                FittedConstant(self.section, p.name, known, values[p.name], error, p.sigma, tuple(each), uncertainty)
-            )
+            start, fitted = float(getattr(initial, p.name)), values[p.name]
+            out.append(FittedConstant(self.section, p.name, start, fitted, error, p.sigma, tuple(each), uncertainty))
         return out
 
     def _pooled(self, traced: Sequence[Traced], rig: Rig, first: Rig) -> SensorKnowledge:
@@ -201,6 +212,6 @@ class ConstantsCalibrator(Calibrator):
         if getattr(rig, self.section) is None or not self.uncertain:
             return SensorKnowledge()
         prefix = f"{self.channel}." if self.senses else ""
-        now, before = getattr(rig, self.section), getattr(first, self.section)
-        settings, constants = pooled_constants(self.section, prefix, now, before, self.uncertain, traced)
+        settings, initial = getattr(rig, self.section), getattr(first, self.section)
+        settings, constants = pooled_constants(self.section, prefix, settings, initial, self.uncertain, traced)
         return SensorKnowledge({self.section: settings}, constants)

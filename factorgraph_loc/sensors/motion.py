@@ -12,7 +12,13 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Measurement, Rows
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.settings import NOTHING
-from factorgraph_loc.sensors.odometry.measurement import IncrementOdometry, VelocityOdometry, YawRate
+from factorgraph_loc.sensors.odometry.measurement import (
+    IncrementOdometry,
+    IncrementStream,
+    VelocityOdometry,
+    VelocityStream,
+    YawRate,
+)
 from factorgraph_loc.sensors.odometry.settings import ImuSettings, OdometrySettings
 from factors import se2
 from factors.motion import ChainState, Increment
@@ -144,3 +150,29 @@ def whole_motion(log: Log, sensors: Sequence[str]) -> Motion:
         if isinstance(m, VelocityOdometry | IncrementOdometry | YawRate):
             motion.add(m)
     return motion
+
+
+def odometry_of(log: Log) -> VelocityStream | IncrementStream:
+    """The odometry stream."""
+    stream = log.streams["odometry"]
+    assert isinstance(stream, VelocityStream | IncrementStream)
+    return stream
+
+
+def overlap(log: Log) -> tuple[float, float]:
+    """The first and the last time [s] that have both odometry and reference."""
+    assert log.reference is not None
+    t = odometry_of(log).t + log.rig.time_offset("odometry")
+    return max(float(t[0]), float(log.reference.t[0])), min(float(t[-1]), float(log.reference.t[-1]))
+
+
+def integrated(log: Log, model: OdometryModel) -> OdometryChain:
+    """The integrated odometry of a log."""
+    chain = OdometryChain(model, horizon=np.inf)
+    stream = odometry_of(log)
+    t = stream.t + log.rig.time_offset("odometry")
+    if isinstance(stream, VelocityStream):
+        chain.add_velocities(t, stream.v, stream.w)
+    else:
+        chain.add_increments(t, stream.dx, stream.dy, stream.dtheta)
+    return chain

@@ -14,9 +14,10 @@ import numpy as np
 from factorgraph_loc.fitting.posterior import FittedConstant
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.registry import moving
 from factors.se2 import Array
 
-WORTH = 2.0  # logs that the uncertainty of the input rig counts as: few logs tell little of a scatter
+WORTH = 2.0  # logs that the uncertainty of the input rig counts as: the scatter of few logs is uncertain
 REFERENCE_GAP = 0.35  # s; longest interpolated gap between reference poses
 
 
@@ -34,37 +35,56 @@ class Traced:
     doubted: frozenset[str] = frozenset()
 
 
+def recordings(logs: Sequence[Log]) -> list[int]:
+    """The number of the recording of each log. Logs that differ in their odometry only are not independent: they are one."""
+    keys = [_exteroceptive(log) or i for i, log in enumerate(logs)]
+    return [keys.index(key) for key in keys]
+
+
+def _exteroceptive(log: Log) -> bytes:
+    """The arrays of all streams but those of the motion."""
+    streams = [log.streams[name] for name in sorted(set(log.streams) - set(moving(log.streams)))]
+    arrays = [array for stream in streams for array in vars(stream).values() if isinstance(array, np.ndarray)]
+    return b"".join(array.tobytes() for array in arrays)
+
+
 @dataclass(frozen=True)
 class Corrections:
-    """Corrections ``each`` (N,) of one constant in N logs: their ``mean``, and ``spread``, the standard deviation between logs."""
+    """Corrections ``each`` (N,) of one constant in N logs: their ``mean``, and their ``scatter`` (standard deviation)."""
 
     each: Array
     mean: float
-    spread: float
+    scatter: float
 
     @property
     def error(self) -> float:
         """Standard error of the mean."""
-        return self.spread / float(np.sqrt(len(self.each)))
+        return self.scatter / float(np.sqrt(len(self.each)))
 
 
-def pooled(found: Sequence[tuple[float, float]], known: float) -> Corrections:
-    """The mean and the scatter of corrections, each with a standard deviation; ``known``: the scatter that is known before.
+def pooled(corrections: Sequence[tuple[float, float]], known: float) -> Corrections:
+    """The mean and the scatter of corrections, each with a standard deviation; ``known``: the scatter according to the input rig.
 
-    The scatter is that of the corrections less what their own errors explain, by moments; with what was known before it is
-    averaged as if that came from :data:`WORTH` logs. The mean has the errors of the corrections in its own.
+    The scatter is that of the corrections, less the part that their own errors explain, by moments. The known scatter is averaged
+    with it as if it came from :data:`WORTH` logs. The scatter of the corrections includes the errors of the mean.
     """
-    each, errors = np.array(found).T
+    each, errors = np.array(corrections).T
     beyond = float(np.sum((each - each.mean()) ** 2) - (len(each) - 1) * np.mean(errors**2))
     variance = (WORTH * known**2 + max(beyond, 0.0)) / (WORTH + len(each) - 1)
     return Corrections(each, float(each.mean()), float(np.sqrt(variance)))
 
 
+def corrections_of(name: str, traced: Sequence[Traced]) -> list[tuple[float, float]]:
+    """The correction of a constant in each log, with its standard deviation; empty if it was not estimated in all logs."""
+    corrections = [trace.constants[name] for trace in traced if trace.constants and name in trace.constants]
+    return corrections if len(corrections) == len(traced) else []
+
+
 def pooled_constants(
-    section: str, prefix: str, settings: Any, first: Any, names: Mapping[str, float], smoothed: Sequence[Traced]
+    section: str, prefix: str, settings: Any, first: Any, names: Mapping[str, float], traced: Sequence[Traced]
 ) -> tuple[Any, list[FittedConstant]]:
     """The ``settings`` of a section with those of its constants ``names`` (with upper bounds of their uncertainties) that were
-    estimated in all logs, and what was found. ``first``: the settings before anything was learnt.
+    estimated in all logs, and these constants. ``first``: the settings before anything was learnt.
 
     Scales are corrected by factors, others by sums. The uncertainty is written if there are several logs.
     """
@@ -72,28 +92,18 @@ def pooled_constants(
     uncertainties: dict[str, float] = {}
     out = []
     for name, most in names.items():
-        told = [one.constants or {} for one in smoothed]
-        found = [constants[prefix + name] for constants in told if prefix + name in constants]
-        if len(found) < len(smoothed):
+        if not (corrections := corrections_of(prefix + name, traced)):
             continue
-        before, now = float(getattr(first, name)), float(getattr(settings, name))
-        unit, unit_now = (before, now) if "scale" in name else (1.0, 1.0)
-        changes = [((now + unit_now * c - before) / unit, s) for c, s in found]
+        initial, current = float(getattr(first, name)), float(getattr(settings, name))
+        unit, current_unit = (initial, current) if "scale" in name else (1.0, 1.0)
+        changes = [((current + current_unit * c - initial) / unit, s) for c, s in corrections]
         result = pooled(changes, float(getattr(first.uncertainty, name)))
-        values[name] = before + unit * result.mean
-        if len(found) > 1:
-            uncertainties[name] = min(result.spread, most)
-        out.append(
-            FittedConstant(
-                section,
-                name,
-                before=before,
-                fitted=values[name],
-                error=abs(unit) * result.error,
-                per_log=tuple((before + unit * result.each).tolist()),
-                uncertainty=uncertainties.get(name),
-            )
-        )
+        values[name] = initial + unit * result.mean
+        if len(changes) > 1:
+            uncertainties[name] = min(result.scatter, most)
+        each = tuple((initial + unit * result.each).tolist())
+        error, uncertainty = abs(unit) * result.error, uncertainties.get(name)
+        out.append(FittedConstant(section, name, initial, values[name], error, None, each, uncertainty))
     uncertainty = first.uncertainty.model_copy(update=uncertainties)
     return settings.model_copy(update=values | {"uncertainty": uncertainty}), out
 

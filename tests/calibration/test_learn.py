@@ -40,11 +40,11 @@ def test_the_constants_are_found(knowledge, name, truth):
     (found,) = (c for c in knowledge.constants if c.name == name)
     assert found.is_determined
     assert found.fitted == pytest.approx(truth, abs=4.0 * found.error + 5e-4)
-    assert found.error < 0.1 * abs(truth - found.before)
+    assert found.error < 0.1 * abs(truth - found.initial)
 
 
 def test_the_scatter_is_found_without_the_outliers(knowledge):
-    sensor = knowledge.found["landmarks"].details.scatter
+    sensor = knowledge.sensors["landmarks"].details.scatter
     at_4_m = np.hypot(sensor.range_sigma, 4.0 * sensor.range_sigma_relative)
     assert at_4_m == pytest.approx(0.03, rel=0.1)
     assert sensor.bearing_sigma == pytest.approx(0.01, rel=0.1)
@@ -52,7 +52,7 @@ def test_the_scatter_is_found_without_the_outliers(knowledge):
 
 def test_white_errors_are_worth_independent_ones(knowledge, simulate):
     """Errors of a landmark that last for 3 s, as of a Gauss-Markov process, are not."""
-    assert knowledge.found["landmarks"].details.share > 0.6
+    assert knowledge.sensors["landmarks"].details.share > 0.6
     log = simulate(seconds=240.0, range_sigma=1e-6)
     seen, rng = log.streams["bearing_range"], np.random.default_rng(3)
     errors = np.zeros(len(seen.t))
@@ -66,13 +66,13 @@ def test_white_errors_are_worth_independent_ones(knowledge, simulate):
     one = replace(
         log, streams={"odometry": log.streams["odometry"], "bearing_range": replace(seen, range=seen.range + errors)}
     )
-    assert learn(one).found["landmarks"].details.share < 0.3
+    assert learn(one).sensors["landmarks"].details.share < 0.3
 
 
 def test_constants_that_the_robot_does_not_have_are_within_chance(simulate):
     found = constants(simulate(seconds=200.0, scale_distance=0.95))
     assert found["scale_distance"].fitted == pytest.approx(0.95, abs=0.005)
-    assert all(abs(c.fitted - c.before) < 4.0 * c.error for c in found.values() if c.name != "scale_distance")
+    assert all(abs(c.fitted - c.initial) < 4.0 * c.error for c in found.values() if c.name != "scale_distance")
 
 
 def test_late_commands_have_a_delay(simulate):
@@ -99,7 +99,7 @@ def test_gross_ranges_do_not_widen_the_noise(simulate):
     found = learn(replace(log, streams=streams))
     (scale,) = (c for c in found.constants if c.name == "range_scale")
     assert scale.fitted == pytest.approx(1.0, abs=4.0 * scale.error + 1e-3)
-    assert found.found["landmarks"].details.scatter.range_sigma < 0.06
+    assert found.sensors["landmarks"].details.scatter.range_sigma < 0.06
 
 
 @pytest.mark.parametrize(("depth", "kind"), [(True, "depth"), (False, "distance")])
@@ -107,7 +107,7 @@ def test_depths_are_told_from_distances(simulate, depth, kind):
     log = simulate(seconds=100.0, depth=depth)
     knowledge = learn(log)
     assert knowledge.rig.bearing_range.range_kind == kind
-    fit = knowledge.found["landmarks"].details.scatter
+    fit = knowledge.sensors["landmarks"].details.scatter
     scatter = np.hypot(fit.range_sigma, 4.0 * fit.range_sigma_relative)
     assert scatter == pytest.approx(0.03, rel=0.15)
 
@@ -140,7 +140,7 @@ def test_logs_that_do_not_go_together_are_refused(simulate, headless):
         check([log, log])
     odometry = other.streams["odometry"]
     increments = IncrementStream(odometry.t, odometry.v, odometry.v, odometry.w)
-    with pytest.raises(InputError, match=r"simulated-2: its odometry has increments, that of simulated-1 velocities"):
+    with pytest.raises(InputError, match=r"simulated-2: its odometry is of another kind than that of simulated-1"):
         check([log, replace(other, streams={**other.streams, "odometry": increments})])
     with pytest.raises(InputError, match=r"simulated-1: odometry and reference overlap in 14 windows"):
         learn(log)

@@ -7,14 +7,15 @@ import pytest
 
 from factorgraph_loc.calibration import report
 from factorgraph_loc.calibration.calibrate import calibrate
-from factorgraph_loc.calibration.held_out import growth, recordings
+from factorgraph_loc.calibration.held_out import growth
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.rfid.settings import BeamSettings
+from factorgraph_loc.sensors.smoothed import recordings
 
 
-def outcome(error):
+def outcome(error, anees=3.0):
     kinds = {f"{kind}.{name}": error for kind in ("causal", "final") for name in ("position_rmse", "heading_rmse")}
-    scores = kinds | {"causal.anees": 3.0, "final.anees": 3.0, "causal.scored": 1000, "final.scored": 1000}
+    scores = kinds | {"causal.anees": anees, "final.anees": anees, "causal.scored": 1000, "final.scored": 1000}
     diagnostics = Diagnostics(doubted={"moved_tags": {"tag3": 0.9}, "dead_tags": {}})
     return SimpleNamespace(scores=scores, result=SimpleNamespace(diagnostics=diagnostics))
 
@@ -27,13 +28,13 @@ def logs(read_tags):
     return [replace(log, rig=rig) for log in made]
 
 
-def calibrated(logs, folder, factor):
-    """With an estimator whose error is that many times larger with any rig but that of the logs."""
+def calibrated(logs, folder, factor, anees=3.0):
+    """With an estimator whose error is that many times larger with any rig but that of the logs, and whose ANEES is another."""
     runs = []
 
     def run(log, estimator):
         runs.append((log.name, estimator, log.rig))
-        return outcome(0.1 if log.rig == logs[0].rig else 0.1 * factor)
+        return outcome(0.1) if log.rig == logs[0].rig else outcome(0.1 * factor, anees)
 
     return calibrate(logs, run, grids=folder / "cart"), runs
 
@@ -52,9 +53,12 @@ def test_each_log_is_tried_with_a_rig_from_the_others(logs, tmp_path):
     assert any("moved tags tag3" in doubt for doubt in found.doubts)
 
 
-@pytest.mark.parametrize(("factor", "refused"), [(1.01, False), (1.05, True)])
-def test_a_rig_with_larger_errors_is_refused(logs, tmp_path, factor, refused):
-    found, _ = calibrated(logs, tmp_path, factor)
+@pytest.mark.parametrize(
+    ("factor", "anees", "refused"),
+    [(1.01, 3.0, False), (1.05, 3.0, True), (0.95, 3.8, False), (0.95, 7.0, True), (0.7, 7.0, False)],
+)
+def test_a_rig_with_larger_or_less_consistent_errors_is_refused(logs, tmp_path, factor, anees, refused):
+    found, _ = calibrated(logs, tmp_path, factor, anees)
     assert bool(found.refused) == refused
     assert found.rig == (found.input_rig if refused else found.knowledge.rig)
     assert any("input rig is kept" in doubt for doubt in found.doubts) == refused

@@ -59,7 +59,7 @@ def test_the_antennas_are_learnt_without_a_reference(found):
     for name, true in {"p0": 0.9, "r_max": 4.5, "s_r": 0.3, "sigma_phi": 0.698}.items():
         assert getattr(beam, name) == pytest.approx(true, abs=4.0 * errors[name] + 1e-3), name
         assert errors[name] < 0.06 * true, name
-    assert found.turns[-1] < 0.3 < found.turns[0]
+    assert found.knowledge.turns[-1] < 0.3 < found.knowledge.turns[0]
 
 
 def test_independent_reads_keep_their_tempering(found):
@@ -73,7 +73,7 @@ def test_bursts_lower_the_tempering(tmp_path):
     faults = {"fading": {"duration": 5.0, "share": 0.4}}
     log = simulate(preset("office", {"drive": {"duration": 90.0}, "faults": faults}), 3)
     turns = learn_by_turns([log], log.rig, smoothed, tmp_path / "cart")
-    assert 0.12 < turns.knowledge.rig.rfid.tempering < 0.5
+    assert 0.12 < turns.rig.rfid.tempering < 0.5
 
 
 def test_priors_come_from_the_scatter_between_logs(found):
@@ -93,21 +93,19 @@ def test_a_grid_learns_its_range_and_rate(blind, tmp_path):
     models = {"default": GridSettings(file="given.npz").placed(tmp_path)}
     rig = blind[0].rig.model_copy(update={"rfid": rfid.model_copy(update={"models": models})})
     turns = learn_by_turns(blind[:1], rig, smoothed, tmp_path / "cart")
-    (scale,) = (c for c in turns.knowledge.constants if c.name.endswith("range_scale"))
+    (scale,) = (c for c in turns.constants if c.name.endswith("range_scale"))
     assert scale.fitted == pytest.approx(-np.log(1.1), abs=0.03)
-    assert turns.knowledge.rig.rfid.models["default"].model().cell == pytest.approx(
-        0.25 * np.exp(scale.fitted), rel=1e-6
-    )
+    assert turns.rig.rfid.models["default"].model().cell == pytest.approx(0.25 * np.exp(scale.fitted), rel=1e-6)
 
 
 def test_what_logs_agree_on_becomes_the_rigs_and_their_scatter_its_uncertainty():
     same = pooled([(0.1, 0.001), (0.1, 0.001), (0.1, 0.001)], 0.02)
     assert same.mean == pytest.approx(0.1)
-    assert same.spread == pytest.approx(0.02 * np.sqrt(2.0 / 4.0))
+    assert same.scatter == pytest.approx(0.02 * np.sqrt(2.0 / 4.0))
     apart = pooled([(0.2, 0.001), (0.0, 0.001)], 0.02)
-    assert 0.05 < apart.spread < 0.15
+    assert 0.05 < apart.scatter < 0.15
     vague = pooled([(0.14, 0.1), (0.0, 0.1)], 0.02)  # as far apart as their errors let them be
-    assert vague.spread < 0.03
+    assert vague.scatter < 0.03
 
 
 def test_the_final_trajectory_alone_is_of_what_was_learnt(offices):
@@ -128,13 +126,13 @@ def test_the_reference_is_not_used(offices, tmp_path):
     log = cut(offices[0], 0.0, 40.0)
     shifted = replace(log.reference, poses=log.reference.poses + 1.0)
     pair = [replace(log, reference=one) for one in (None, shifted)]
-    found = [learn_by_turns([one], one.rig, smoothed, tmp_path / "cart").knowledge.rig for one in pair]
+    found = [learn_by_turns([one], one.rig, smoothed, tmp_path / "cart").rig for one in pair]
     assert found[0] == found[1]
 
 
 def test_what_does_not_tell_enough_is_named(offices, blind, tmp_path):
     with pytest.raises(
-        InputError, match=r"office-2: has no reference, expected one to calibrate against; logs without any"
+        InputError, match=r"office-2: has no reference, expected one to calibrate against; calibrate logs without"
     ):
         check([offices[0], blind[1]])
     lost = replace(blind[0], world=blind[0].world.model_copy(update={"tags": {}}))

@@ -52,7 +52,7 @@ def test_a_key_depends_on_what_a_run_imports_and_on_nothing_else(copied):
         "factors/se2.py",
         "factorgraph_loc/fusion/ekf.py",
         "factorgraph_loc/evaluation/metrics.py",
-        "factorgraph_loc/sensors/odometry/calibration.py",
+        "factorgraph_loc/sensors/motion.py",
         "factorgraph_loc/vision/weights.npz",
     ):
         assert counts(name), name

@@ -4,34 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import nnls
 
-from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
-from factorgraph_loc.drawing.pages import Part, Picture
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import bounds
 from factorgraph_loc.fitting.posterior import (
-    LikelihoodTerms,
     Parameter,
     Posterior,
     blocks,
     independent_share,
     least_squares,
-    spread,
+    robust_sigma,
 )
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, SensorKnowledge, upper_bounds
+from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, Residuals, SensorKnowledge, upper_bounds
 from factorgraph_loc.sensors.landmarks.measurement import (
     BearingRangeSettings,
     BearingRangeStream,
     BearingRangeUncertainty,
 )
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
-from factorgraph_loc.text import number
 from factors import se2
 from factors.landmarks import model as bearing_range
 from factors.se2 import Array
@@ -40,6 +35,12 @@ MAX_OFFSET = 0.5  # s between the clocks of the sensor and the reference
 GROSS = 4.0  # least standard deviation of gross errors, in those of the others
 SEPARATIONS = 20  # steps of expectation-maximisation
 SMALLEST = 1e-3  # m, rad, m per m; standard deviation
+MIN_SIGHTINGS = 100
+MOST_SIGHTINGS = 12000  # per log
+BETTER_KIND = 0.9  # ratio of the scatters below which ranges are of the other kind, distance or depth
+SIGMAS = ("range_sigma", "range_sigma_relative", "bearing_sigma")
+WINDOW = 10.0  # s; errors of the sightings in different windows are independent
+FIRST = BearingRangeSettings(range_sigma=0.1)  # settings of an unknown sensor
 
 
 @dataclass(frozen=True)
@@ -54,13 +55,6 @@ class Sightings:
     bearings: Array
     sound: Array
 
-    def thinned(self, count: int) -> Sightings:
-        """About ``count`` of the sightings, by keeping every n-th timestamp."""
-        _, stamp = np.unique(self.t, return_inverse=True)
-        rows = stamp % max(1, round(len(self.t) / count)) == 0
-        columns = ("t", "points", "ranges", "bearings", "sound")
-        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
-
     def whitened(self, settings: BearingRangeSettings, moved: Array | float = 0.0) -> Array:
         """Range and bearing residuals (K, 2), predicted minus measured, in standard deviations; zero if not measured. ``moved``
         (3,): a body-frame perturbation of the poses."""
@@ -71,7 +65,7 @@ class Sightings:
         return bearing_range.residuals(settings.model(), poses, self.points, self.ranges, self.bearings)
 
     def residuals(self, settings: BearingRangeSettings, moved: Array | float = 0.0) -> Array:
-        """Those, weighted by the probability not to be gross."""
+        """Residuals in standard deviations, weighted by the probability not to be gross."""
         return np.sqrt(self.sound) * self.whitened(settings, moved)
 
     def errors(self, settings: BearingRangeSettings) -> Array:
@@ -80,58 +74,6 @@ class Sightings:
         out[np.isnan(self.ranges), 0] = np.nan
         out[np.isnan(self.bearings), 1] = np.nan
         return out
-
-
-def sightings_of(log: Log) -> Sightings:
-    """The sightings of mapped landmarks within the reference, with a margin for clock offsets; InputError if there are too few."""
-    stream = log.streams["bearing_range"]
-    assert isinstance(stream, BearingRangeStream)
-    assert log.reference is not None
-    numbers = {name: i for i, name in enumerate(log.world.landmarks)}
-    landmark = np.array([numbers.get(name, -1) for name in stream.landmark], dtype=np.int64)
-    good = (landmark >= 0) & np.isfinite(log.reference.at(stream.t, max_gap=REFERENCE_GAP)[:, 0])
-    good &= (stream.t > log.reference.t[0] + MAX_OFFSET) & (stream.t < log.reference.t[-1] - MAX_OFFSET)
-    bearings = stream.bearing if log.reference.has_heading else np.full_like(stream.bearing, np.nan)
-    good &= np.isfinite(stream.range) | np.isfinite(bearings)
-    if (count := np.count_nonzero(good)) < MIN_SIGHTINGS:
-        found = f"has {count} sightings of mapped landmarks within the reference"
-        raise InputError(f"{log.name}: {found}, expected {MIN_SIGHTINGS} or more")
-    points = log.world.positions()[landmark[good]]
-    return Sightings(log, stream.t[good], points, stream.range[good], bearings[good], np.ones((count, 2)))
-
-
-def parameters_of(seen: Sequence[Sightings], settings: BearingRangeSettings) -> list[Parameter]:
-    """The constants, with priors about the rig's values; only the range scale without reference headings."""
-    has_range = any(np.isfinite(one.ranges).any() for one in seen)
-    has_bearing = any(np.isfinite(one.bearings).any() for one in seen)
-    has_heading = all(one.log.reference is not None and one.log.reference.has_heading for one in seen)
-    candidates = (
-        (has_heading, "x", 0.2, -10.0, 10.0),
-        (has_heading, "y", 0.2, -10.0, 10.0),
-        (has_bearing, "bearing_bias", 0.1, -np.pi, np.pi),
-        (has_range, "range_scale", 0.1, 0.2, 5.0),
-        (settings.range_kind == "depth", "depth_axis", 0.1, -np.pi, np.pi),
-        (has_heading, "time_offset", 0.1, -MAX_OFFSET, MAX_OFFSET),
-    )
-    return [Parameter(name, getattr(settings, name), *scale) for use, name, *scale in candidates if use]
-
-
-def with_scatter(
-    seen: Sequence[Sightings], settings: BearingRangeSettings
-) -> tuple[list[Sightings], BearingRangeSettings]:
-    """The sightings with their probabilities not to be gross, and the settings with the scatter of the others as noise."""
-    errors = np.concatenate([one.errors(settings) for one in seen])
-    ranges = np.nan_to_num(np.concatenate([one.ranges for one in seen]))
-    found, sound = dict[str, float](), np.ones(errors.shape)
-    if np.isfinite(errors[:, 0]).any():
-        (constant, relative), sound[:, 0] = separated(errors[:, 0], ranges)
-        found |= {"range_sigma": constant, "range_sigma_relative": relative if relative > 1e-3 else 0.0}
-    if np.isfinite(errors[:, 1]).any():
-        (sigma, _), sound[:, 1] = separated(errors[:, 1], 0.0 * ranges)
-        found["bearing_sigma"] = sigma
-    ends = np.cumsum([len(one.t) for one in seen])[:-1]
-    parts = [replace(one, sound=rows) for one, rows in zip(seen, np.split(sound, ends), strict=True)]
-    return parts, settings.model_copy(update=_bounded(found))
 
 
 def _bounded(values: Mapping[str, float]) -> dict[str, float]:
@@ -148,18 +90,18 @@ def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]
     "Finite mixture models", 2000, section 3.2). The wider one has the gross errors.
     """
     known = np.isfinite(errors)
-    error, near = errors[known], ranges[known]
-    constant, relative = max(float(spread(error[:, None])[0]), SMALLEST), SMALLEST
-    gross, wide = 0.05, GROSS**2 * np.mean(np.hypot(constant, relative * near) ** 2) + np.mean(error**2)
+    error, distance = errors[known], ranges[known]
+    constant, relative = max(float(robust_sigma(error[:, None])[0]), SMALLEST), SMALLEST
+    gross, wide = 0.05, GROSS**2 * np.mean(np.hypot(constant, relative * distance) ** 2) + np.mean(error**2)
     inside = np.ones(len(error))
     for _ in range(SEPARATIONS):
-        variance = constant**2 + (relative * near) ** 2
+        variance = constant**2 + (relative * distance) ** 2
         likely = (1.0 - gross) * np.exp(-0.5 * error**2 / variance) / np.sqrt(variance)
         unlikely = gross * np.exp(-0.5 * error**2 / wide) / np.sqrt(wide)
         inside = likely / np.maximum(likely + unlikely, 1e-300)
         gross = float(np.clip(np.mean(1.0 - inside), 1e-4, 0.9))
-        constant, relative = _scatter(error, near, inside, (constant, relative))
-        widest = GROSS**2 * np.mean(constant**2 + (relative * near) ** 2)
+        constant, relative = _scatter(error, distance, inside, (constant, relative))
+        widest = GROSS**2 * np.mean(constant**2 + (relative * distance) ** 2)
         wide = max(float(np.sum((1.0 - inside) * error**2) / max(np.sum(1.0 - inside), 1e-9)), widest)
     out = np.ones(len(errors))
     out[known] = inside
@@ -167,32 +109,19 @@ def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]
 
 
 def _scatter(errors: Array, ranges: Array, weights: Array, start: tuple[float, float]) -> tuple[float, float]:
-    """Standard deviation of weighted errors: constant and relative part, by scoring (Nelder and Pregibon, "An extended
+    """Standard deviation of weighted errors: constant and relative part, by a step of scoring (Nelder and Pregibon, "An extended
     quasi-likelihood function", Biometrika 74(2), 1987)."""
     design = np.column_stack((np.ones(len(errors)), ranges**2))
-    variances = np.array((start[0] ** 2, start[1] ** 2))
-    for _ in range(3):
-        weight = weights / (design @ variances) ** 2
-        variances = nnls((design * np.sqrt(weight)[:, None]), errors**2 * np.sqrt(weight))[0]
-        variances[0] = max(variances[0], SMALLEST**2)
-    return float(np.sqrt(variances[0])), float(np.sqrt(variances[1]))
-
-
-MIN_SIGHTINGS = 100
-MOST_SIGHTINGS = 12000  # per log
-BETTER_KIND = 0.9  # share of the spread below which ranges are of the other kind, distance or depth
-SIGMAS = {"range_sigma": "m", "range_sigma_relative": "m per m", "bearing_sigma": "rad"}
-WINDOW = 10.0  # s; errors of the sightings in different windows are independent
-FIRST = BearingRangeSettings(range_sigma=0.1)  # settings of an unknown sensor
-_SHOWN = 3000  # dots per log and panel
-_VIEW = 5.0  # robust standard deviations; larger residuals are drawn at the edge
+    root = np.sqrt(weights) / (design @ np.square(start))
+    constant, relative = np.sqrt(nnls(design * root[:, None], errors**2 * root)[0])
+    return max(float(constant), SMALLEST), float(relative)
 
 
 @dataclass(frozen=True)
 class SensorFit:
-    """The sightings ``seen``, the settings with their ``scatter`` as noise, and the ``share`` of independent ones."""
+    """The ``sightings``, the settings with their ``scatter`` as noise, and the ``share`` of independent ones."""
 
-    seen: Sequence[Sightings]
+    sightings: Sequence[Sightings]
     scatter: BearingRangeSettings
     share: float
 
@@ -205,110 +134,103 @@ class LandmarkCalibrator(ConstantsCalibrator):
     first = FIRST
 
     def part(self, log: Log) -> Sightings:
-        """The sightings of mapped landmarks; InputError if there are too few."""
-        return sightings_of(log).thinned(MOST_SIGHTINGS)
+        """The sightings of mapped landmarks, with a margin for clock offsets; InputError if there are too few."""
+        stream, reference = log.streams["bearing_range"], log.reference
+        assert isinstance(stream, BearingRangeStream)
+        assert reference is not None
+        numbers = {name: i for i, name in enumerate(log.world.landmarks)}
+        landmark = np.array([numbers.get(name, -1) for name in stream.landmark], dtype=np.int64)
+        good = (landmark >= 0) & np.isfinite(reference.at(stream.t, max_gap=REFERENCE_GAP)[:, 0])
+        good &= (stream.t > reference.t[0] + MAX_OFFSET) & (stream.t < reference.t[-1] - MAX_OFFSET)
+        bearings = stream.bearing if reference.has_heading else np.full_like(stream.bearing, np.nan)
+        good &= np.isfinite(stream.range) | np.isfinite(bearings)
+        if (count := np.count_nonzero(good)) < MIN_SIGHTINGS:
+            raise InputError(
+                f"{log.name}: has {count} sightings of mapped landmarks within the reference, expected {MIN_SIGHTINGS} or more"
+            )
+        stamp = np.unique(stream.t[good], return_inverse=True)[1]
+        rows = np.flatnonzero(good)[stamp % max(1, round(count / MOST_SIGHTINGS)) == 0]
+        points = log.world.positions()[landmark[rows]]
+        return Sightings(log, stream.t[rows], points, stream.range[rows], bearings[rows], np.ones((len(rows), 2)))
 
     def parameters(self, parts: Sequence[Sightings], settings: BearingRangeSettings) -> list[Parameter]:
-        """The constants of the sensor."""
-        return parameters_of(parts, settings)
+        """The constants, with priors about the rig's values; only the range scale without reference headings."""
+        has_range = any(np.isfinite(part.ranges).any() for part in parts)
+        has_bearing = any(np.isfinite(part.bearings).any() for part in parts)
+        has_heading = all(part.log.reference is not None and part.log.reference.has_heading for part in parts)
+        candidates = (
+            (has_heading, "x", 0.2, -10.0, 10.0),
+            (has_heading, "y", 0.2, -10.0, 10.0),
+            (has_bearing, "bearing_bias", 0.1, -np.pi, np.pi),
+            (has_range, "range_scale", 0.1, 0.2, 5.0),
+            (settings.range_kind == "depth", "depth_axis", 0.1, -np.pi, np.pi),
+            (has_heading, "time_offset", 0.1, -MAX_OFFSET, MAX_OFFSET),
+        )
+        return [Parameter(name, getattr(settings, name), *scale) for use, name, *scale in candidates if use]
 
     def with_noise(
         self, parts: Sequence[Sightings], settings: BearingRangeSettings
     ) -> tuple[Sequence[Sightings], BearingRangeSettings]:
-        """The settings with the scatter of the sightings."""
-        return with_scatter(parts, settings)
+        """The sightings with their probabilities not to be gross, and the settings with the scatter of the others as noise."""
+        errors = np.concatenate([part.errors(settings) for part in parts])
+        ranges = np.nan_to_num(np.concatenate([part.ranges for part in parts]))
+        sigmas, sound = dict[str, float](), np.ones(errors.shape)
+        if np.isfinite(errors[:, 0]).any():
+            (constant, relative), sound[:, 0] = separated(errors[:, 0], ranges)
+            sigmas |= {"range_sigma": constant, "range_sigma_relative": relative if relative > 1e-3 else 0.0}
+        if np.isfinite(errors[:, 1]).any():
+            (sigmas["bearing_sigma"], _), sound[:, 1] = separated(errors[:, 1], 0.0 * ranges)
+        ends = np.cumsum([len(part.t) for part in parts])[:-1]
+        weighted = [replace(part, sound=rows) for part, rows in zip(parts, np.split(sound, ends), strict=True)]
+        return weighted, settings.model_copy(update=_bounded(sigmas))
 
     def estimated(
         self, parts: Sequence[Sightings], settings: BearingRangeSettings
     ) -> tuple[Sequence[Sightings], BearingRangeSettings, Posterior | None]:
-        """Those for the kind of ranges, distance or depth, that has the smaller scatter."""
-        found = super().estimated(parts, settings)
-        if not any(np.any(np.isfinite(one.ranges) & np.isfinite(one.bearings)) for one in parts):
-            return found
+        """The data and settings of the kind of ranges, distance or depth, that has the smaller scatter."""
+        given = super().estimated(parts, settings)
+        if not any(np.any(np.isfinite(part.ranges) & np.isfinite(part.bearings)) for part in parts):
+            return given
         kind = "distance" if settings.range_kind == "depth" else "depth"
-        other = super().estimated(parts, settings.model_copy(update={"range_kind": kind}))
-        new, old = (spread(np.concatenate([p.errors(one[1]) for p in parts]))[0] for one in (other, found))
-        return other if new < BETTER_KIND * old else found
+        changed = super().estimated(parts, settings.model_copy(update={"range_kind": kind}))
+        new, old = (robust_sigma(np.concatenate([p.errors(fit[1]) for p in parts]))[0] for fit in (changed, given))
+        return changed if new < BETTER_KIND * old else given
 
     def finished(
-        self, _logs: Sequence[Log], parts: Sequence[Sightings], rig: Rig, learnt: SensorKnowledge
+        self, _logs: Sequence[Log], parts: Sequence[Sightings], rig: Rig, knowledge: SensorKnowledge
     ) -> SensorKnowledge:
         """The result with the scatter widened for errors that are correlated."""
         scatter = rig.bearing_range
         share = pose_share(parts, scatter)
         wider = _bounded({name: share**-0.5 * getattr(scatter, name) for name in SIGMAS})
         return replace(
-            learnt,
+            knowledge,
             sections={self.section: scatter.model_copy(update=wider)},
+            figures={"noise_factor": share**-0.5},
             details=SensorFit(parts, scatter, share),
         )
 
-    def document(self, found: SensorKnowledge, _rig: Rig) -> dict[str, Any]:
-        """The factor on the noise."""
-        return {"noise_factor": None if found.details is None else found.details.share**-0.5}
-
-    def report(self, found: SensorKnowledge, rig: Rig) -> dict[str, Sequence[Part]]:
-        """The scatter and the noise in the rig, and the residuals of the sightings."""
-        if found.details is None:
-            return {}
-        fit: SensorFit = found.details
-        rows: list[tuple[str, ...]] = [
-            (f"{n} [{unit}]", number(getattr(fit.scatter, n)), number(getattr(rig.bearing_range, n)))
-            for n, unit in SIGMAS.items()
-        ]
-        text = (
-            f"Errors of sightings are correlated: {1.0 / fit.share:.1f} sightings contain as much information on the pose as an "
-            "independent one. Estimators assume independence, so that the noise in the rig is larger than the scatter."
-        )
-        return {
-            "Noise": [(("noise of the sightings", "scatter", "in the rig"), rows), text],
-            "Residuals of the sightings": [sightings_figure(fit.seen, fit.scatter)],
-        }
+    def residuals(self, knowledge: SensorKnowledge) -> list[Residuals]:
+        """The errors of ranges and bearings."""
+        if knowledge.details is None:
+            return []
+        fit = knowledge.details
+        units, model, out = {"range": "m", "bearing": "rad"}, fit.scatter.model(), []
+        for part in fit.sightings:
+            sigmas = bearing_range.sigmas(model, part.ranges)
+            out.append(Residuals(part.log.name, units, part.t, part.ranges, part.errors(fit.scatter), sigmas))
+        return out
 
 
 CALIBRATOR = LandmarkCalibrator()
 
 
-def pose_share(seen: Sequence[Sightings], settings: BearingRangeSettings) -> float:
+def pose_share(parts: Sequence[Sightings], settings: BearingRangeSettings) -> float:
     """The share of independent information on the pose in the sightings: see :func:`independent_share`."""
 
-    def scored(one: Sightings) -> LikelihoodTerms:
-        dimensions = [Parameter(name, 0.0, 1.0) for name in ("x", "y", "heading")]
-        evidence = least_squares(lambda moved: one.residuals(settings, moved), dimensions, blocks([one.t], WINDOW))
-        return evidence(np.zeros(3))
+    def residuals(moved: Array) -> Array:
+        return np.concatenate([part.residuals(settings, moved) for part in parts])
 
-    found = [scored(one) for one in seen]
-    return independent_share(
-        np.concatenate([one.scores for one in found]), np.sum([one.information for one in found], axis=0)
-    )
-
-
-def sightings_figure(seen: Sequence[Sightings], settings: BearingRangeSettings) -> Picture:
-    """Residuals of range and bearing: their distribution, over range, and over time."""
-    errors = [one.errors(settings) for one in seen]
-    rows = [(0, "range", "m"), (1, "bearing", "rad")]
-    rows = [row for row in rows if any(np.isfinite(e[:, row[0]]).any() for e in errors)]
-    figure, axes = grid(len(rows), 3, 4.0 * len(rows))
-    for panels, (column, what, unit) in zip(axes, rows, strict=True):
-        typical = np.concatenate([bearing_range.sigmas(settings.model(), one.ranges)[:, column] for one in seen])
-        limit = _VIEW * float(np.median(typical))
-        edges = np.linspace(-limit, limit, 61)
-        for i, (one, error) in enumerate(zip(seen, errors, strict=True)):
-            values = np.clip(error[:, column], -limit, limit)
-            dots = slice(None, None, max(1, len(values) // _SHOWN))
-            style = {"color": COLOURS[i % len(COLOURS)], "label": one.log.name}
-            panels[0].hist(values[np.isfinite(values)], edges, density=True, histtype="step", linewidth=1.5, **style)
-            panels[1].plot(one.ranges[dots], values[dots], ".", markersize=2, **style)
-            panels[2].plot(one.t[dots], values[dots], ".", markersize=2, **style)
-        density = np.mean(np.exp(-0.5 * (edges[:, None] / typical) ** 2) / (typical * np.sqrt(2.0 * np.pi)), axis=1)
-        panels[0].plot(edges, density, color="0.3", linestyle="--", label="fitted scatter")
-        far = np.nanmax(np.concatenate([one.ranges for one in seen]))
-        distance = np.linspace(0.0, far, 50) if np.isfinite(far) else np.zeros(0)
-        scatter = bearing_range.sigmas(settings.model(), distance)[:, column]
-        for sign in (-2.0, 2.0):
-            panels[1].plot(distance, sign * scatter, color="0.3", linestyle="--", label="2 sigma of the scatter")
-        panels[0].set(xlabel=f"{what} residual [{unit}]", ylabel=f"density [1/{unit}]")
-        panels[1].set(xlabel="measured range [m]", ylabel=f"{what} residual [{unit}]")
-        panels[2].set(xlabel="time [s]", ylabel=f"{what} residual [{unit}]")
-    legend(figure, axes.flat, markers=3.0)
-    return png(figure)
+    dimensions = [Parameter(name, 0.0, 1.0) for name in ("x", "y", "heading")]
+    terms = least_squares(residuals, dimensions, blocks([part.t for part in parts], WINDOW))(np.zeros(3))
+    return independent_share(terms.scores, terms.information)

@@ -1,55 +1,209 @@
-"""The calibrator of wheel odometry, from the motion of the reference over short windows."""
+"""Calibration of wheel odometry, from the motion of the reference over segments of a log: constants, and growth of the errors.
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+The covariance of relative motion is linear in the variances of :class:`factors.odometry.model.Growth`, so the noise is a sum of
+non-negative variance components (Searle, Casella, McCulloch, "Variance Components", 1992, chapter 6). Windows of several
+lengths separate growing errors from the constant ones of the reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize
 
-from factorgraph_loc.drawing.figures import COLOURS, grid, legend, png
-from factorgraph_loc.drawing.pages import Part, Picture, Rows
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.fitting.posterior import Parameter
+from factorgraph_loc.fitting.posterior import Parameter, robust_sigma
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, SensorKnowledge, upper_bounds
-from factorgraph_loc.sensors.motion import odometry_model
-from factorgraph_loc.sensors.odometry import calibration as odometry
-from factorgraph_loc.sensors.odometry.calibration import (
-    BLACKOUT,
-    LENGTHS,
-    NoiseFit,
-    Windows,
-    cut,
-    fit_noise,
-    odometry_of,
-)
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, Residuals, SensorKnowledge, upper_bounds
+from factorgraph_loc.sensors.motion import integrated, odometry_model, odometry_of, overlap
+from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,
     OdometryNoise,
     OdometrySettings,
     OdometryUncertainty,
 )
-from factorgraph_loc.sensors.smoothed import Traced
-from factorgraph_loc.text import number
-from factors.odometry.model import OdometryModel
+from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, Traced
+from factors import chi_squared, se2
+from factors.motion import ChainState
+from factors.odometry.model import (
+    MINIMUM_HEADING_VARIANCE,
+    MINIMUM_POSITION_VARIANCE,
+    Growth,
+    OdometryModel,
+    relative_motion,
+)
 from factors.se2 import Array
 
+LEAD = 1.0  # s of complete odometry that a window needs at its beginning, because of the lag
+WINDOW = 2.0  # s; length of a window that constants are estimated from
+# error of the reference over a window: m, m, rad; lower bound of the residuals' standard deviations
+REFERENCE_SIGMAS = np.array((0.005, 0.005, 0.003))
+MOVING = np.array((0.05, 0.1))  # m/s, rad/s above which the robot moves in a window
 MIN_WINDOWS = 15
+LENGTHS = (1.0, 3.0, 10.0)  # s
+BLACKOUT = 30.0  # s
+MIN_BLACKOUTS = 10
 MOST_OUTLIERS = 0.05  # share of the windows
-KINDS = {VelocityStream: "velocities", IncrementStream: "increments"}
-_VIEW = 5.0  # robust standard deviations; larger residuals are drawn at the edge
+ERRORS = {"along": "m", "lateral": "m", "heading": "rad"}
+FITS = 3  # each without the outliers of the one before
+GATE = chi_squared.quantile(0.9999, 3)  # squared error above which a window is an outlier
+_SMALLEST = 1e-8  # variance per unit below which a component is zero
+# Lower bounds for wheels, by error and driver. A reference that depends on the odometry gives lower values.
+FLOOR = np.array(((0.01, 0.0, 0.0), (0.005, 0.0, 0.0), (0.003, 0.005, 0.0)))
 
 
 @dataclass(frozen=True)
-class WheelsFit:
-    """The ``windows`` of 2 s, and the ``noise`` of the odometry ``model``."""
+class Windows:
+    """M segments of a log: ``begin`` and ``end`` (M,) [s], and ``motion`` (M, 3) of the reference over them. ``sigmas`` (M, 3) of
+    the residuals."""
 
-    windows: Sequence[Windows]
-    model: OdometryModel
-    noise: NoiseFit
+    log: Log
+    begin: Array
+    end: Array
+    motion: Array
+    sigmas: Array = field(default_factory=lambda: np.ones(3))
+
+    @property
+    def t(self) -> Array:
+        return self.begin
+
+    def states(self, model: OdometryModel) -> tuple[Array, Array]:
+        """States of the odometry (M, 8) at both ends."""
+        chain = integrated(self.log, model)
+        return chain.states(self.begin), chain.states(self.end)
+
+    def errors(self, model: OdometryModel) -> Array:
+        """Motion of the reference relative to the odometry (M, 3): a body-frame perturbation at the end, [m, m, rad]."""
+        start, end = self.states(model)
+        odometry = se2.between(start[:, 1:4], end[:, 1:4])
+        return se2.log(se2.between(odometry, self.motion))
+
+    def residuals(self, settings: OdometrySettings) -> Array:
+        """The errors (M, 3) in standard deviations."""
+        return self.errors(self.model(settings)) / self.sigmas
+
+    def model(self, settings: OdometrySettings) -> OdometryModel:
+        """The model with these settings."""
+        return odometry_model(self.log.rig.model_copy(update={"odometry": settings}))
+
+    def covariances(self, model: OdometryModel) -> Array:
+        """The model's covariances (M, 3, 3) of the residuals."""
+        start, end = self.states(model)
+        pairs = zip(start.tolist(), end.tolist(), strict=True)
+        covariances = [relative_motion(model, ChainState(*a), ChainState(*b)).covariance for a, b in pairs]
+        return np.array(covariances).reshape(-1, 3, 3)
+
+
+def cut(log: Log, length: float) -> Windows:
+    """Consecutive windows of ``length`` seconds with reference poses at both ends and without odometry gaps."""
+    assert log.reference is not None
+    first, last = overlap(log)
+    edges = np.arange(first + LEAD, last, length)
+    begin, end = edges[:-1], edges[1:]
+    poses = log.reference.at(edges, max_gap=REFERENCE_GAP)
+    motion = se2.between(poses[:-1], poses[1:])
+    chain = integrated(log, odometry_model(log.rig))
+    gap = chain.states(end)[:, 6] - chain.states(begin - LEAD)[:, 6]
+    good = np.isfinite(motion[:, 0]) & (gap < 1e-6)
+    return Windows(log, begin[good], end[good], motion[good])
+
+
+@dataclass(frozen=True)
+class NoiseFit:
+    """``growth`` by error; ``outliers``: share of windows outside the gate; ``widened``: factor already included in the growth,
+    because errors of wheels are correlated and grow faster than a random walk; ``floored``: errors raised to the lower bound."""
+
+    growth: Mapping[str, Growth]
+    outliers: float
+    widened: float
+    floored: tuple[str, ...]
+
+
+def with_noise(model: OdometryModel, sigmas: Array) -> OdometryModel:
+    """The model with ``sigmas`` (3, 3) of longitudinal, lateral and heading errors, by distance, rotation and time."""
+    along, lateral, heading = (Growth(*row) for row in sigmas.tolist())
+    return replace(model, along=along, lateral=lateral, heading=heading)
+
+
+def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
+    """Fit the noise of the odometry ``model`` to the residuals of windows of several lengths, without outliers.
+
+    The noise is widened so that the median error over half a minute, the length of a blackout, is correct.
+    """
+    windows = [cut(log, length) for log in logs for length in LENGTHS]
+    bases = np.concatenate([_bases(part, model) for part in windows])
+    residuals = np.concatenate([part.errors(model) for part in windows])
+    lengths = np.concatenate([part.end - part.begin for part in windows])
+    weights = lengths / lengths.mean()
+    size = np.median(np.abs(residuals), axis=0) ** 2 / np.median(lengths)
+    variances = np.concatenate([np.repeat(size, 3), (1e-6, 1e-6)])
+    for _ in range(FITS):
+        inside = _squared(bases, residuals, variances)[0] < GATE
+        variances = _maximise(bases[inside], residuals[inside], weights[inside], variances)
+    outliers = float(np.mean(_squared(bases, residuals, variances)[0] >= GATE))
+    sigmas = np.sqrt(np.where(variances[:9] > _SMALLEST, variances[:9], 0.0)).reshape(3, 3)
+    floored = tuple(error for error, row, floor in zip(ERRORS, sigmas, FLOOR, strict=True) if np.all(row <= floor))
+    sigmas = np.maximum(sigmas, FLOOR)
+    widened = _widening(logs, with_noise(model, sigmas))
+    growth = {error: Growth(*row) for error, row in zip(ERRORS, (widened * sigmas).tolist(), strict=True)}
+    return NoiseFit(growth, outliers, widened, floored)
+
+
+def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
+    """Ratio of the errors over a blackout to those of the model; at least 1, and 1 if there are too few windows."""
+    windows = [cut(log, BLACKOUT) for log in logs]
+    residuals = np.concatenate([part.errors(model) for part in windows])
+    if len(residuals) < MIN_BLACKOUTS:
+        return 1.0
+    covariances = np.concatenate([part.covariances(model) for part in windows])
+    squared = np.einsum("mi,mi->m", residuals, np.linalg.solve(covariances, residuals[..., None])[..., 0])
+    return max(1.0, float(np.sqrt(np.median(squared) / chi_squared.quantile(0.5, 3))))
+
+
+def _bases(windows: Windows, model: OdometryModel) -> Array:
+    """Covariances (M, 11, 3, 3) for unit variances: three drivers of each error, then position and heading of the reference."""
+    start, end = windows.states(model)
+    drivers = np.abs(end - start)[:, [4, 5, 0]]  # distance, rotation, time in motion
+    drivers[:, 2] -= end[:, 7] - start[:, 7]
+    moved = drivers[:, 2] > 0.0
+    floor = np.diag((MINIMUM_POSITION_VARIANCE, MINIMUM_POSITION_VARIANCE, MINIMUM_HEADING_VARIANCE))
+    known = replace(model, unknown_distance=0.0, unknown_rotation=0.0)
+    out = np.zeros((len(start), 11, 3, 3))
+    for i in range(3):
+        by_time = np.zeros((3, 3))
+        by_time[i, 2] = 1.0
+        unit = windows.covariances(with_noise(known, by_time)) - floor
+        unit[moved] /= drivers[moved, 2, None, None]
+        unit[~moved] = 0.0
+        out[:, 3 * i : 3 * i + 3] = drivers[:, :, None, None] * unit[:, None]
+    out[:, 9] = 2.0 * np.diag((1.0, 1.0, 0.0))
+    out[:, 10] = 2.0 * np.diag((0.0, 0.0, 1.0))
+    return out
+
+
+def _squared(bases: Array, residuals: Array, variances: Array) -> tuple[Array, Array]:
+    """Squared Mahalanobis distances (M,) and log-determinants (M,)."""
+    floor = np.diag((MINIMUM_POSITION_VARIANCE, MINIMUM_POSITION_VARIANCE, MINIMUM_HEADING_VARIANCE))
+    covariance = np.tensordot(bases, variances, (1, 0)) + floor
+    solved = np.linalg.solve(covariance, residuals[..., None])[..., 0]
+    return np.sum(residuals * solved, axis=1), np.linalg.slogdet(covariance)[1]
+
+
+def _maximise(bases: Array, residuals: Array, weights: Array, start: Array) -> Array:
+    """Variances (11,) that maximise the Gaussian likelihood; optimised as logarithms."""
+
+    def cost(logarithms: Array) -> float:
+        squared, log_determinant = _squared(bases, residuals, np.exp(logarithms))
+        return float(weights @ (squared + log_determinant) / len(weights))
+
+    bounds = [(np.log(1e-14), np.log(25.0))] * len(start)
+    result = minimize(cost, np.log(np.maximum(start, 1e-10)), method="L-BFGS-B", bounds=bounds)
+    return np.asarray(np.exp(result.x))
 
 
 class OdometryCalibrator(ConstantsCalibrator):
@@ -57,14 +211,6 @@ class OdometryCalibrator(ConstantsCalibrator):
 
     section, channel, senses = "odometry", "odometry", False
     uncertain = upper_bounds(OdometryUncertainty)
-
-    def check_alike(self, first: Log, log: Log) -> None:
-        """InputError if one log reports velocities and the other increments."""
-        ours, theirs = (KINDS[type(odometry_of(one))] for one in (log, first))
-        if ours != theirs:
-            raise InputError(
-                f"{log.name}: its odometry has {ours}, that of {first.name} {theirs}; expected logs of one robot type"
-            )
 
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
@@ -76,131 +222,101 @@ class OdometryCalibrator(ConstantsCalibrator):
 
     def part(self, log: Log) -> Windows:
         """Windows of the log; InputError if there are too few."""
-        found = cut(log, odometry.WINDOW)
-        if len(found.begin) < MIN_WINDOWS:
+        windows = cut(log, WINDOW)
+        if len(windows.begin) < MIN_WINDOWS:
             raise InputError(
-                f"{log.name}: odometry and reference overlap in {len(found.begin)} windows of {odometry.WINDOW:g} s, expected "
+                f"{log.name}: odometry and reference overlap in {len(windows.begin)} windows of {WINDOW:g} s, expected "
                 f"{MIN_WINDOWS} or more"
             )
-        return found
+        return windows
 
     def parameters(self, parts: Sequence[Windows], settings: OdometrySettings) -> list[Parameter]:
-        """The constants, of velocities also their delay, lag and slowdown."""
-        return odometry.parameters_of(parts[0], settings)
+        """The constants; velocities also have delay, lag and slowdown. Wheels that report turns have hardly any bias by time."""
+        commanded = isinstance(odometry_of(parts[0].log), VelocityStream)
+        by_speed, by_turn = (0.005, 0.002) if commanded else (0.0005, 0.0005)  # m/s, rad/s
+        priors = {
+            "scale_distance": (0.05, 0.2, 5.0),
+            "scale_rotation": (0.05, 0.2, 5.0),
+            "speed_bias": (by_speed, -1.0, 1.0),
+            "heading_rate_bias": (by_turn, -1.0, 1.0),
+            "heading_drift": (0.03, -1.0, 1.0),
+            "direction": (0.1, -np.pi, np.pi),
+        }
+        if commanded:
+            priors |= {"delay": (0.1, 0.0, 2.0), "lag": (0.1, 0.0, 5.0), "turn_slowdown": (0.05, 0.0, 5.0)}
+        return [Parameter(name, getattr(settings, name), *prior) for name, prior in priors.items()]
 
     def with_noise(
         self, parts: Sequence[Windows], settings: OdometrySettings
     ) -> tuple[Sequence[Windows], OdometrySettings]:
-        """The windows with the scatter of their errors."""
-        return odometry.with_scatter(parts, settings), settings
+        """The windows with robust standard deviations of their errors, apart for motion and rest. Weights are equal in motion:
+        those of the noise model would favour windows with little motion."""
+        errors, moves = [], []
+        for part in parts:
+            start, end = part.states(part.model(settings))
+            moves.append(np.any((end - start)[:, 4:6] > MOVING * (end - start)[:, :1], axis=1))
+            errors.append(part.errors(part.model(settings)))
+        every, moving = np.concatenate(errors), np.concatenate(moves)
+        scatter = [robust_sigma(every[rows]) if rows.any() else np.zeros(3) for rows in (~moving, moving)]
+        sigmas = np.maximum(scatter, REFERENCE_SIGMAS)
+        weighted = [replace(part, sigmas=sigmas[rows.astype(int)]) for part, rows in zip(parts, moves, strict=True)]
+        return weighted, settings
 
     def finished(
-        self, logs: Sequence[Log], parts: Sequence[Windows], rig: Rig, learnt: SensorKnowledge
+        self, logs: Sequence[Log], parts: Sequence[Windows], rig: Rig, knowledge: SensorKnowledge
     ) -> SensorKnowledge:
         """The result with the noise that remains."""
         noise = fit_noise(logs, odometry_model(rig))
-        growth = {
-            error: GrowthSettings.bounded(per_distance=g.per_distance, per_rotation=g.per_rotation, per_time=g.per_time)
-            for error, g in noise.growth.items()
-        }
+        growth = {error: GrowthSettings.bounded(**asdict(g)) for error, g in noise.growth.items()}
         settings = rig.odometry.model_copy(update={"noise": OdometryNoise(**growth)})
-        details = WheelsFit(parts, odometry_model(rig.model_copy(update={"odometry": settings})), noise)
-        return replace(learnt, sections={self.section: settings}, details=details)
-
-    def doubts(self, found: SensorKnowledge) -> list[str]:
-        """Warnings about outliers and implausibly low noise."""
-        doubts = []
-        noise = None if found.details is None else found.details.noise
-        if noise is not None and noise.outliers > MOST_OUTLIERS:
-            doubts.append(
-                f"{100.0 * noise.outliers:.0f} % of the odometry windows are outliers: check for slip, collisions, and gaps in "
-                "the reference."
-            )
-        if noise is not None and noise.floored:
-            doubts.append(
-                f"The fitted noise of the odometry ({', '.join(noise.floored)}) is lower than wheels can achieve and was raised: "
-                "the reference is probably not independent of the odometry."
-            )
-        return doubts
-
-    def document(self, found: SensorKnowledge, rig: Rig) -> dict[str, Any]:
-        """The share of outliers, and the factor by which the noise was widened."""
-        noise = None if found.details is None else found.details.noise
-        return {
-            "odometry_outliers": None if noise is None else noise.outliers,
-            "odometry_widened": None if noise is None else noise.widened,
-            "wheels": {name: calibrated for name, _, calibrated in _wheels(rig)} or None,
-        }
-
-    def report(self, found: SensorKnowledge, rig: Rig) -> dict[str, Sequence[Part]]:
-        """The growth of each error, and plots of the residuals of the windows."""
-        if found.details is None:
-            return {}
-        noise: NoiseFit = found.details.noise
-        rows = [
-            (error, *(number(v) for v in (g.per_distance, g.per_rotation, g.per_time)))
-            for error, g in noise.growth.items()
-        ]
-        header = ("error of the odometry [m, m, rad]", "per sqrt(m)", "per sqrt(rad)", "per sqrt(s)")
-        text = (
-            f"{100.0 * noise.outliers:.1f} % of the windows were outliers. The odometry's noise was multiplied by "
-            f"{noise.widened:.2f}, so that it is valid for half a minute without landmarks."
+        rig = rig.model_copy(update={self.section: settings})
+        return replace(
+            knowledge,
+            sections={self.section: settings},
+            notes=_warnings(noise),
+            figures={
+                "outliers": noise.outliers,
+                "noise_factor": noise.widened,
+                **_wheels(settings),
+                "noise": [{"error": error} | asdict(g) for error, g in noise.growth.items()],
+            },
+            details=[replace(part, log=replace(part.log, rig=rig)) for part in parts],
         )
-        figure = odometry_figure(found.details.windows, found.details.model)
-        return {"Noise": [(header, rows), *_wheels_table(rig), text], "Residuals of the odometry": [figure]}
+
+    def residuals(self, knowledge: SensorKnowledge) -> list[Residuals]:
+        """The errors of the odometry over the windows."""
+        out = []
+        for windows in knowledge.details or ():
+            model = odometry_model(windows.log.rig)
+            start, end = windows.states(model)
+            sigmas = np.sqrt(np.diagonal(windows.covariances(model), axis1=1, axis2=2))
+            distance = end[:, 4] - start[:, 4]
+            out.append(Residuals(windows.log.name, ERRORS, windows.t, distance, windows.errors(model), sigmas))
+        return out
 
 
-def _wheels(rig: Rig) -> list[tuple[str, float, float]]:
-    """Name, value in the rig and calibrated value [m] of what is known of the wheels."""
-    settings = rig.of(OdometrySettings)
+def _warnings(noise: NoiseFit) -> list[str]:
+    """Warnings about outliers and implausibly low noise."""
+    notes = []
+    if noise.outliers > MOST_OUTLIERS:
+        notes.append(
+            f"{100.0 * noise.outliers:.0f} % of the odometry windows are outliers: check for slip, collisions, and gaps in "
+            "the reference."
+        )
+    if noise.floored:
+        notes.append(
+            f"The fitted noise of the odometry ({', '.join(noise.floored)}) is lower than wheels can achieve and was raised: "
+            "the reference is probably not independent of the odometry."
+        )
+    return notes
+
+
+def _wheels(settings: OdometrySettings) -> dict[str, float]:
+    """The calibrated radius and track [m] of the wheels, if the rig has them."""
     if (drive := settings.wheels) is None:
-        return []
+        return {}
     radius, track = drive.corrected(settings.scale_distance, settings.scale_rotation)
-    known = [] if drive.radius is None or radius is None else [("radius", drive.radius, radius)]
-    return [*known, ("track", drive.track, track)]
-
-
-def _wheels_table(rig: Rig) -> list[Rows]:
-    """Radius and track of the wheels, if the rig has them."""
-    rows: list[tuple[str, ...]] = [(f"{name} [m]", number(given), number(found)) for name, given, found in _wheels(rig)]
-    return [(("wheels", "in the rig", "with its scales"), rows)] if rows else []
+    return ({} if radius is None else {"radius": radius}) | {"track": track}
 
 
 CALIBRATOR = OdometryCalibrator()
-
-
-def odometry_figure(windows: Sequence[Windows], model: OdometryModel) -> Picture:
-    """Residuals over windows: in time, over distance, and their growth with the length of the window."""
-    figure, axes = grid(3, 3, 12.0)
-    residuals = [one.errors(model) for one in windows]
-    lengths = (*LENGTHS, BLACKOUT)
-    growth = [_growth([cut(one.log, length) for one in windows], model) for length in lengths]
-    for row, (panels, (what, unit)) in enumerate(
-        zip(axes, (("along", "m"), ("lateral", "m"), ("heading", "rad")), strict=True)
-    ):
-        for i, (one, residual) in enumerate(zip(windows, residuals, strict=True)):
-            start, end = one.states(model)
-            limit = max(_VIEW * 1.4826 * float(np.median(np.abs(residual[:, row]))), 1e-3)
-            values = np.clip(residual[:, row], -limit, limit)
-            style = {"color": COLOURS[i % len(COLOURS)], "label": one.log.name}
-            panels[0].plot(one.begin, values, ".", markersize=3, **style)
-            panels[1].plot((end - start)[:, 4], values, ".", markersize=3, **style)
-        panels[2].plot(
-            lengths, [g[0][row] for g in growth], "o-", color=COLOURS[0], label="residuals, root mean square"
-        )
-        panels[2].plot(lengths, [g[1][row] for g in growth], "s--", color="0.3", label="noise in the rig")
-        panels[2].set(xscale="log", yscale="log")
-        panels[0].set(xlabel="time [s]", ylabel=f"{what} [{unit}] in 2 s")
-        panels[1].set(xlabel="distance [m] in 2 s", ylabel=f"{what} [{unit}] in 2 s")
-        panels[2].set(xlabel="length of the window [s]", ylabel=f"{what} [{unit}]")
-    legend(figure, axes.flat, markers=3.0)
-    return png(figure)
-
-
-def _growth(windows: Sequence[Windows], model: OdometryModel) -> tuple[Array, Array]:
-    """Root mean squares (3,) of the residuals and of the model's prediction for them."""
-    squares = np.concatenate([one.errors(model) for one in windows]) ** 2
-    stated = np.concatenate([np.diagonal(one.covariances(model), axis1=1, axis2=2) for one in windows])
-    if not len(squares):
-        return np.full(3, np.nan), np.full(3, np.nan)
-    return np.sqrt(np.mean(squares, axis=0)), np.sqrt(np.mean(stated, axis=0))

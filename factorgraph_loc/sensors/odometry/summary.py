@@ -12,8 +12,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import TICK_GAP
 from factorgraph_loc.sensors import interfaces
 from factorgraph_loc.sensors.interfaces import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP, Paragraph, Summary
-from factorgraph_loc.sensors.motion import odometry_model
-from factorgraph_loc.sensors.odometry.calibration import integrated
+from factorgraph_loc.sensors.motion import integrated, odometry_model
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
 from factors import se2
 from factors.se2 import Array

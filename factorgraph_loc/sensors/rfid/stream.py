@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.errors import bad_field
+from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import values
 from factorgraph_loc.files.columns import (
     ANGLE,
@@ -25,9 +25,14 @@ from factorgraph_loc.files.columns import (
     named,
     number,
 )
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Measurement, Stream
 from factorgraph_loc.text import listed, plain
-from factors.se2 import Array
+from factors.rfid.signals import PhaseReads
+from factors.se2 import Array, Integers
+
+MAX_GAP = 0.1  # s; longest gap of a reference that is interpolated
+PHASE_WINDOW = 2.0  # s
 
 ANTENNA = named("antenna", "the name of an antenna")
 RFID = Table(
@@ -207,3 +212,32 @@ def check(m: RfidScan, where: str) -> dict[str, Any]:
         column.name: values.within(where, column, getattr(m, column.name), (len(tags),)) for column in READS.columns
     }
     return {"tags": tags, "antennas": antennas, "antenna": antenna, **told}
+
+
+def along_reference(
+    log: Log, tags: Mapping[str, int], antennas: Mapping[str, int]
+) -> tuple[RfidStream, Integers, Array, Array, Integers, Integers]:
+    """The reads of known tags by known antennas within the reference: the stream, R row indices, times (R,) [s], poses (R, 3) of
+    the robot, and indices (R,) of antennas and tags. InputError if the log has no reference or no reads."""
+    if log.reference is None:
+        raise InputError(f"{log.name}: has no reference trajectory, expected one for calibration")
+    stream = log.streams.get("rfid")
+    if not isinstance(stream, RfidStream):
+        raise InputError(f"{log.name}: has no RFID reads, expected a log with reads")
+    t = stream.t - stream.age + log.rig.time_offset("rfid")
+    tag = np.array([tags.get(name, -1) for name in stream.epc], dtype=np.int64)
+    antenna = np.array([antennas.get(name, -1) for name in stream.antenna], dtype=np.int64)
+    poses = log.reference.at(t, max_gap=MAX_GAP)
+    rows = np.flatnonzero((tag >= 0) & (antenna >= 0) & np.isfinite(poses[:, 0]))
+    return stream, rows, t[rows], poses[rows], antenna[rows], tag[rows]
+
+
+def phase_reads(
+    log: Log, tags: Mapping[str, int], antennas: Mapping[str, int], window: float = PHASE_WINDOW, first_window: int = 0
+) -> PhaseReads:
+    """The reads with a phase along the reference, relative to the world's origin, in windows of ``window`` seconds, numbered
+    from ``first_window``. ``tags`` and ``antennas``: indices by name. Raises InputError like :func:`along_reference`."""
+    stream, rows, t, poses, antenna, tag = along_reference(log, tags, antennas)
+    windows = first_window + np.floor((t - t.min(initial=np.inf)) / window).astype(np.int64)
+    reads = PhaseReads(poses, antenna, tag, stream.phase[rows], stream.frequency[rows], windows)
+    return reads.chosen(np.isfinite(reads.phase) & np.isfinite(reads.frequency))

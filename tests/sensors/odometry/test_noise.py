@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.sensors.odometry.calibration import cut, fit_noise, integrated
+from factorgraph_loc.sensors.motion import integrated
+from factorgraph_loc.sensors.odometry.calibrator import cut, fit_noise
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import OdometrySettings
 from factors.odometry.chain import OdometryChain

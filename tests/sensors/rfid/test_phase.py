@@ -104,10 +104,10 @@ def test_survey_and_lever_arm_are_found(fit: PhaseFit) -> None:
     shift = se2.transform_from(SURVEY.transform(), point) - point
     found = (fit.survey.x, fit.survey.y, fit.survey.heading, *fit.lever_arm)
     error = np.abs(np.array(found) - (*shift, SURVEY.heading, *LEVER_ARM))
-    assert np.all(fit.spread[[0, 1, 3, 4]] < 0.01)
-    assert fit.spread[2] < 0.005
-    assert np.all(error < 5.0 * fit.spread + 0.002)
-    assert fit.after > fit.before + 0.02
+    assert np.all(fit.sigmas[[0, 1, 3, 4]] < 0.01)
+    assert fit.sigmas[2] < 0.005
+    assert np.all(error < 5.0 * fit.sigmas + 0.002)
+    assert fit.agreement > fit.initial_agreement + 0.02
 
 
 def test_nothing_is_found_where_nothing_is_wrong(log: Log) -> None:
@@ -120,8 +120,8 @@ def test_nothing_is_found_where_nothing_is_wrong(log: Log) -> None:
         }
     )
     fit = fit_phase([log], rfid, SURVEY)
-    assert np.all(np.abs(fit.lever_arm) < 5.0 * fit.spread[3:] + 0.002)
-    assert fit.after - fit.before < 0.002
+    assert np.all(np.abs(fit.lever_arm) < 5.0 * fit.sigmas[3:] + 0.002)
+    assert fit.agreement - fit.initial_agreement < 0.002
 
 
 def test_without_reference_or_reads_it_says_what_is_missing(log: Log) -> None:
@@ -149,7 +149,7 @@ def test_logs_are_focused_together(log: Log, fit: PhaseFit) -> None:
     """The same log twice says the same, to the accuracy of the search: windows of different logs are never mixed."""
     twice = fit_phase([log, without_signals(log), log], SETTINGS)
     assert twice.reads == 2 * fit.reads
-    assert twice.after == pytest.approx(fit.after, abs=1e-5)
+    assert twice.agreement == pytest.approx(fit.agreement, abs=1e-5)
 
 
 def test_rssi_is_found() -> None:

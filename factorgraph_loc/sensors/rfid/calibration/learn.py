@@ -1,37 +1,36 @@
 """RFID settings learnt along trajectories: survey, mounting, detection models, tempering, strength and phase.
 
-Along references all of these are learnt. Along trajectories that the smoother found, the likelihood of the reads is averaged over
-the poses that it thinks possible (:func:`~factorgraph_loc.sensors.smoothed.possible_poses`), and models keep their kind: a beam is
-fitted in all its parameters, a logistic model in all its coefficients, and a grid in its range and rate.
+Along references all of these are learnt. Along smoothed trajectories the likelihood of the reads is averaged over possible poses
+(:func:`~factorgraph_loc.sensors.smoothed.possible_poses`). Models keep their kind: a beam is fitted in all its parameters, a
+logistic model in all its coefficients, and a grid in its range and rate. The smoother estimates yaw and clock of the antennas.
 """
 
 import hashlib
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import file_name
-from factorgraph_loc.fitting.posterior import FittedConstant, Parameter, blocks, by_block, independent_share
+from factorgraph_loc.fitting.posterior import FittedConstant, by_block, independent_share
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import SensorKnowledge
-from factorgraph_loc.sensors.rfid.calibration.fields import CrossValidation, Kind, choose, fit
+from factorgraph_loc.sensors.rfid.calibration.fields import Kind, choose, fit
 from factorgraph_loc.sensors.rfid.calibration.pairs import (
-    BLOCKS,
     Floor,
     TagPairs,
     modelled,
     nearby,
     pairs_of,
-    seen,
     terms,
 )
-from factorgraph_loc.sensors.rfid.calibration.parametric import Placing, family_of, fit_model, place
+from factorgraph_loc.sensors.rfid.calibration.parametric import STEP, SURVEY, family_of, fit_model, place
 from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit, fit_phase
-from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, distinct, rounds_of
+from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, cells, rounds_of
 from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi
 from factorgraph_loc.sensors.rfid.settings import (
     BeamSettings,
@@ -44,11 +43,17 @@ from factorgraph_loc.sensors.rfid.settings import (
     SurveySettings,
     write_grid,
 )
-from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, Traced, pooled, possible_poses
+from factorgraph_loc.sensors.smoothed import (
+    REFERENCE_GAP,
+    Traced,
+    corrections_of,
+    pooled,
+    possible_poses,
+    recordings,
+)
 from factorgraph_loc.text import quoted
 from factors import se2
-from factors.rfid.model import FEATURES, BeamModel, DetectionModel, GridModel, LogisticModel, logits
+from factors.rfid.model import FEATURES, BeamModel, DetectionModel, GridModel, LogisticModel
 from factors.rfid.parameters import OF_MODEL
 from factors.se2 import Array
 
@@ -58,24 +63,20 @@ WINDOW = 10.0  # s; reads in different windows are independent
 MIN_READS = 100.0  # weighted reads that a model is learnt from
 COEFFICIENT = "coefficient of "
 VAGUE = 0.5  # relative standard error of a parameter that is not determined
-BURSTS = 1.3  # rounds that are worth one; less is no reason to change the tempering
+BURSTS = 1.3  # smaller numbers of rounds per independent one do not change the tempering
 
 
 @dataclass(frozen=True)
 class RfidFit:
-    """The result along references.
+    """The detection models along references.
 
-    ``models``, and ``which`` of them each antenna has; their ``kind``, and the ``trials`` of others; ``phase``: the focus, if logs
-    have phases; ``share`` of reads that are worth independent ones; ``pairs``: the data.
+    ``models``, and ``which`` of them each of the ``antennas`` has; their ``kind``; ``pairs``: the data.
     """
 
     models: tuple[DetectionModel, ...]
     which: tuple[int, ...]
     antennas: tuple[str, ...]
     kind: Kind
-    trials: tuple[CrossValidation, ...]
-    phase: PhaseFit | None
-    share: float
     pairs: TagPairs
 
 
@@ -85,43 +86,45 @@ def learn_rfid(logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = N
     Logs with the same reads count once. With a ``kind``, only models of that kind are fitted. InputError if a log has too few
     rounds.
     """
-    numbers = distinct(logs)
-    logs = [log for i, log in enumerate(logs) if numbers.index(numbers[i]) == i]
+    logs = [log for i, log in enumerate(logs) if recordings(logs)[i] == i]
     settings = rig.of(RfidSettings)
     floor = floor_of(settings)
     rounds = [rounds_of(log, settings) for log in logs]
-    facing = any(np.any(np.isfinite(one.tags.facing)) for one in rounds)
+    facing = any(np.any(np.isfinite(log.tags.facing)) for log in rounds)
     survey = _about_the_middle(rounds, rig.survey)
-    phase = _focus([log for log in logs if log.world == logs[0].world and _has_phases(log)], settings, survey)
-    told = () if phase is None else _focused(phase, survey)
-    placing = place(rounds, settings, survey, floor, told, with_facing=facing)
-    settings, survey = placing.settings, placing.survey
+    phase = _focus([log for log in logs if log.world == logs[0].world], settings, survey)
+    focus = {} if phase is None else _priors_of(phase, survey)
+    settings, survey, posterior = place(rounds, settings, survey, floor, focus, with_facing=facing)
+    places = zip(posterior.parameters, posterior.values.tolist(), posterior.errors.tolist(), strict=True)
     pairs, names = pairs_of(rounds, settings, survey), tuple(settings.all_antennas())
-    trials: tuple[CrossValidation, ...] = ()
+    scores = dict[Kind, float]()
     if kind is None:
-        kind, trials = choose(pairs, floor, len(names), facing=facing)
+        kind, scores = choose(pairs, floor, len(names), facing=facing)
     models, which = fit(pairs, kind, floor, len(names))
     settings = _with_models(settings, models, which, grids, floor)
-    settings = _with_signals(logs, settings, survey, focused=bool(told))
-    apart = [rounds_of(log, settings, merged=False) for log in logs]
-    together, _ = bursts(pairs, modelled(models, which, pairs), floor)
-    share = min(pose_share(apart, settings, survey, models, which, floor), 1.0 / together)
+    settings = _with_signals(logs, settings, survey, focused=phase is not None)
+    single = [rounds_of(log, settings, merged=False) for log in logs]
+    excess, _ = bursts(pairs, modelled(models, which, pairs), floor)
+    share = min(pose_share(single, settings, survey, models, which, floor), 1.0 / excess)
+    rows = [{"model": tried.label(), "held_out_nll": nll, "best": tried == kind} for tried, nll in scores.items()]
+    figures = {"independent_share": share, "models": rows}
+    if phase is not None:
+        figures |= {"initial_phase_agreement": phase.initial_agreement, "phase_agreement": phase.agreement}
     return SensorKnowledge(
         {"rfid": settings.model_copy(update={"tempering": share}), "survey": survey},
-        _place_constants(placing),
-        details=RfidFit(models, which, names, kind, trials, phase, share, pairs),
-        correlations=placing.found.correlations(),
+        [FittedConstant("rfid", p.name, 0.0, value, error, p.sigma) for p, value, error in places],
+        figures=figures,
+        details=RfidFit(models, which, names, kind, pairs),
+        correlations=posterior.correlations(),
     )
 
 
 def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) -> SensorKnowledge:
-    """The detection models of ``rig``, their priors and the tempering, from smoothed logs; ``first``: the rig before all turns,
-    about whose models the priors are."""
-    settings, started = rig.of(RfidSettings), first.of(RfidSettings)
-    floor = floor_of(started)
-    pairs = pairs_of([_possible(one, settings) for one in traced], settings, rig.survey)
-    if len(traced) == 1:
-        pairs = replace(pairs, fold=2 * pairs.fold // BLOCKS)  # the halves of a single log
+    """The detection models of ``rig``, their priors, the tempering, and yaw and clock of the antennas, from smoothed logs;
+    ``first``: the rig before all turns, about whose values the priors are."""
+    settings, initial = rig.of(RfidSettings), first.of(RfidSettings)
+    floor = floor_of(initial)
+    pairs = pairs_of([_possible(trace, settings) for trace in traced], settings, rig.survey)
     names, of_antenna = list(settings.models), [a.model for a in settings.all_antennas().values()]
     models, constants, notes = dict(settings.models), list[FittedConstant](), list[str]()
     for name, labels in settings.parameter_names().items():
@@ -130,94 +133,115 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
             notes.append(
                 f"The antennas of model {quoted(name)} read {part.hits.sum():.0f} tags, expected {MIN_READS:.0f}: it stays."
             )
-        elif (found := _refitted(part, started.models[name].model(), name, floor)) is None:
+        elif (fitted := _refitted(part, initial.models[name].model(), name, floor)) is None:
             notes.append(f"The logs hardly determine the model {quoted(name)} of the antennas: it stays.")
         else:
-            constants += found[1]
-            models[name] = written(found[0], name, grids).model_copy(update={"prior": _prior(traced, labels)})
-    fitted = [models[name].model() for name in names]
-    together, error = bursts(pairs, modelled(fitted, [names.index(model) for model in of_antenna], pairs), floor)
-    before = started.tempering
-    tempering = 1.0 / together if together > BURSTS and together * before > 1.0 else before
-    constants.append(FittedConstant("rfid", "tempering", before, tempering, max(error / together**2, 1e-4)))
+            constants += fitted[1]
+            models[name] = written(fitted[0], name, grids).model_copy(update={"prior": _prior(traced, labels)})
+    fits = [models[name].model() for name in names]
+    excess, error = bursts(pairs, modelled(fits, [names.index(model) for model in of_antenna], pairs), floor)
+    known = initial.tempering
+    tempering = 1.0 / excess if excess > BURSTS and excess * known > 1.0 else known
+    constants.append(FittedConstant("rfid", "tempering", known, tempering, max(error / excess**2, 1e-4)))
+    settings, mounting = _mounted(traced, settings, initial)
     changes = {"models": models, "false_read": floor.false_read, "miss": floor.miss, "tempering": tempering}
-    changes["uncertainty"] = RfidUncertainty(**started.uncertainties())  # nothing was learnt of mounting and clock
-    return SensorKnowledge({"rfid": settings.model_copy(update=changes)}, constants, notes)
+    changes["uncertainty"] = RfidUncertainty(**initial.uncertainties())  # not that of the narrower priors of the models
+    return SensorKnowledge({"rfid": settings.model_copy(update=changes)}, [*constants, *mounting], notes)
+
+
+def _mounted(
+    traced: Sequence[Traced], settings: RfidSettings, initial: RfidSettings
+) -> tuple[RfidSettings, list[FittedConstant]]:
+    """The settings with yaw of the antennas and time offset as the smoother estimated them, if logs determine them, and these
+    constants."""
+    known, antennas, constants = initial.uncertainties(), dict(settings.all_antennas()), list[FittedConstant]()
+    common = corrections_of("rfid.yaw", traced)
+    for name, antenna in antennas.items():
+        own = corrections_of(f"rfid.antennas.{name}.yaw", traced) or [(0.0, 0.0)] * len(common)
+        yaws = [(a + b, math.hypot(s, t)) for (a, s), (b, t) in zip(common, own, strict=False)]
+        prior = math.hypot(known["yaw"], known["antenna_yaw"] * (len(antennas) > 1))
+        start = initial.all_antennas()[name].yaw
+        if constant := _mean(f"antennas.{name}.yaw", yaws, start, antenna.yaw, prior):
+            constants.append(constant)
+            antennas[name] = antenna.model_copy(update={"yaw": round(float(se2.wrap_scalar(constant.fitted)), 5)})
+    offset = settings.time_offset
+    clock = corrections_of("rfid.time_offset", traced)
+    if constant := _mean("time_offset", clock, initial.time_offset, offset, known["time_offset"]):
+        constants.append(constant)
+        offset = constant.fitted
+    return settings.model_copy(update={"antennas": antennas, "preset": None, "time_offset": offset}), constants
+
+
+def _mean(
+    name: str, corrections: Sequence[tuple[float, float]], initial: float, value: float, prior: float
+) -> FittedConstant | None:
+    """A constant that is the same in all logs, from the corrections of its ``value``; the initial one if it is not determined."""
+    if not corrections:
+        return None
+    each, errors = np.array(corrections).T
+    error = max(float(np.sqrt(np.mean(errors**2))), float(np.std(each))) / math.sqrt(len(each))
+    constant = FittedConstant("rfid", name, initial, value + float(each.mean()), error, prior, tuple(value + each))
+    return constant if constant.is_determined else replace(constant, fitted=initial)
 
 
 def _refitted(
-    pairs: TagPairs, before: DetectionModel, name: str, floor: Floor
+    pairs: TagPairs, initial: DetectionModel, name: str, floor: Floor
 ) -> tuple[DetectionModel, list[FittedConstant]] | None:
-    """A model of the kind of ``before`` and its parameters, each also for single logs; None if a beam is not determined."""
-    family = family_of(before, pairs)
-    model, found = fit_model(pairs, family, floor)
-    values, unit = family.shown(found.values)
-    errors = unit * found.errors
-    if isinstance(before, BeamModel) and np.any(errors > VAGUE * np.abs(values)):
+    """A model of the kind of ``initial`` and its parameters; None if a beam is not determined."""
+    family = family_of(initial, pairs)
+    model, posterior = fit_model(pairs, family, floor)
+    if isinstance(initial, BeamModel) and np.any(posterior.errors > VAGUE * np.abs(posterior.values)):
         return None
-    logs = [fit_model(pairs.part(pairs.fold == i), family, floor)[1] for i in np.unique(pairs.fold)]
-    each = np.array([family.shown(one.values)[0] for one in logs])
-    known = family.shown(np.array([p.mean for p in family.parameters]))[0]
-    if isinstance(before, LogisticModel):
-        of_feature = dict(zip(FEATURES, before.coefficients, strict=True))
-        known = np.array([of_feature[p.name.removeprefix(COEFFICIENT)] for p in family.parameters])
-    rows = zip(family.parameters, known.tolist(), values.tolist(), errors.tolist(), each.T.tolist(), strict=True)
-    return model, [
-        FittedConstant("rfid", f"models.{name}.{p.name}", old, new, error, per_log=tuple(own))
-        for p, old, new, error, own in rows
-    ]
+    known = [p.mean for p in family.parameters]
+    if isinstance(initial, LogisticModel):
+        of_feature = dict(zip(FEATURES, initial.coefficients, strict=True))
+        known = [of_feature[p.name.removeprefix(COEFFICIENT)] for p in family.parameters]
+    rows = zip(family.parameters, known, posterior.values.tolist(), posterior.errors.tolist(), strict=True)
+    return model, [FittedConstant("rfid", f"models.{name}.{p.name}", *figures) for p, *figures in rows]
 
 
 def _prior(traced: Sequence[Traced], labels: Sequence[str]) -> PriorSettings:
     """The scatter between logs of the range and rate that the smoother estimated, by their ``labels``."""
-    spreads = {}
+    scatters = {}
     for kind, label in zip(OF_MODEL, labels, strict=True):
-        told = [one.constants[f"rfid.{label}"] for one in traced if one.constants and f"rfid.{label}" in one.constants]
-        if len(told) == len(traced):
-            spreads[kind] = min(pooled(told, getattr(CALIBRATED, kind)).spread, 1.0)
-    return CALIBRATED.model_copy(update=spreads)
+        if corrections := corrections_of(f"rfid.{label}", traced):
+            scatters[kind] = min(pooled(corrections, getattr(CALIBRATED, kind)).scatter, 1.0)
+    return CALIBRATED.model_copy(update=scatters)
 
 
-def _possible(one: Traced, settings: RfidSettings) -> Rounds:
-    """The rounds of a smoothed log, without doubted tags, at poses that scatter as the smoother thinks possible."""
-    found = rounds_of(one.log, settings)
-    kept = np.array([name not in one.doubted for name in found.names])
+def _possible(trace: Traced, settings: RfidSettings) -> Rounds:
+    """The rounds of a smoothed log, without doubted tags, at poses drawn from the smoothed distribution."""
+    rounds = rounds_of(trace.log, settings)
+    kept = np.array([name not in trace.doubted for name in rounds.names])
     if kept.sum() < 2:
         raise InputError(
-            f"{one.log.name}: {kept.sum()} of the {len(kept)} tags that were read are believed to be where the map has them, "
-            "expected 2 or more to learn from without a reference"
+            f"{trace.log.name}: {kept.sum()} of the {len(kept)} tags that were read are not doubted, expected 2 or more to "
+            "learn from without a reference"
         )
-    assert one.log.reference is not None
+    assert trace.log.reference is not None
     return replace(
-        found,
-        poses=possible_poses(one.log.reference, found.t, REFERENCE_GAP),
-        hits=found.hits[:, kept],
-        tags=replace(found.tags, points=found.tags.points[kept], facing=found.tags.facing[kept]),
-        names=tuple(name for name, keep in zip(found.names, kept, strict=True) if keep),
+        rounds,
+        poses=possible_poses(trace.log.reference, rounds.t, REFERENCE_GAP),
+        hits=rounds.hits[:, kept],
+        tags=replace(rounds.tags, points=rounds.tags.points[kept], facing=rounds.tags.facing[kept]),
+        names=tuple(name for name, keep in zip(rounds.names, kept, strict=True) if keep),
     )
 
 
-def _place_constants(placing: Placing) -> list[FittedConstant]:
-    """The changes of survey and mounting."""
-    found = zip(placing.found.parameters, placing.found.values, placing.found.errors, strict=True)
-    return [FittedConstant("rfid", p.name, 0.0, float(value), float(error), p.sigma) for p, value, error in found]
-
-
 def bursts(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
-    """How many rounds are worth an independent one, at least 1, and its standard error: by the scatter of each tag's reads by each
-    antenna in blocks of time. ``logit`` (M,): of the model.
+    """The number of rounds with the information of an independent one, at least 1, and its standard error: by the scatter of each
+    tag's reads by each antenna in blocks of time. ``logit`` (M,): of the model.
 
-    Unlike the gradient by the pose, this scatter hardly depends on trajectories that were found by the same reads. It is a ratio
-    of variances (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5), with the error of a ratio over blocks.
+    Unlike the gradient by the pose, this scatter hardly depends on trajectories that were estimated from the same reads. It is a
+    ratio of variances (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5).
     """
     p = floor.probability(logit)
-    key = (pairs.block * (pairs.tag.max() + 1) + pairs.tag) * (pairs.antenna.max() + 1) + pairs.antenna
-    _, first, cell = np.unique(key, return_index=True, return_inverse=True)
+    first, cell = cells(np.column_stack((pairs.block, pairs.tag, pairs.antenna)), (1.0, 1.0, 1.0))
     excess, variance = np.bincount(cell, pairs.hits - pairs.count * p), np.bincount(cell, pairs.count * p * (1.0 - p))
-    block = pairs.block[first]
-    observed, expected = np.bincount(block, excess**2), np.bincount(block, variance)
-    ratio = float(observed.sum() / max(float(expected.sum()), 1e-9))
-    error = float(np.sqrt(np.sum((observed - ratio * expected) ** 2)) / max(float(expected.sum()), 1e-9))
+    observed, expected = by_block(np.column_stack((excess**2, variance)), pairs.block[first]).T
+    total = max(float(expected.sum()), 1e-9)
+    ratio = float(observed.sum()) / total
+    error = float(np.sqrt(np.sum((observed - ratio * expected) ** 2))) / total
     return max(1.0, ratio), error
 
 
@@ -230,46 +254,32 @@ def pose_share(
     floor: Floor,
 ) -> float:
     """The share of independent information on the pose in the reads of unmerged rounds."""
-    scores, information = [], np.zeros((3, 3))
-    for log in logs:
-        chosen = nearby(log, settings, survey)
-        view, row = seen(log, settings, survey, chosen), chosen // len(log.names)
-        logit, gradient = np.empty(len(chosen)), np.empty((len(chosen), 4))
-        mine = np.asarray(which)[log.antenna[row]]
-        for i, model in enumerate(models):
-            logit[mine == i], gradient[mine == i] = logits(model, view.points[mine == i], view.facing[mine == i])
-        by_x, by_y, by_yaw = view.jacobian(gradient, np.zeros(2)).T[3:]
-        turned = by_yaw - view.mounted[:, 1] * by_x + view.mounted[:, 0] * by_y
-        jacobian = np.column_stack((by_x, by_y, turned))
-        found = terms(logit, log.hits.ravel()[chosen], log.count[row], floor)
-        scores.append(by_block(found.gradient[:, None] * jacobian, blocks([log.t], WINDOW)[row]))
-        information += jacobian.T @ (found.information[:, None] * jacobian)
-    return independent_share(np.concatenate(scores), information)
+    within = [nearby(log, settings, survey) for log in logs]
+    pairs = pairs_of(logs, settings, survey, within, WINDOW)
+    logit, columns = modelled(models, which, pairs), []
+    for step in STEP * np.eye(3):
+        stepped = [replace(log, poses=se2.compose(log.poses, step)) for log in logs]
+        columns.append((modelled(models, which, pairs_of(stepped, settings, survey, within)) - logit) / STEP)
+    jacobian = np.column_stack(columns)
+    likelihood = terms(logit, pairs.hits, pairs.count, floor)
+    information = jacobian.T @ (likelihood.information[:, None] * jacobian)
+    return independent_share(by_block(likelihood.gradient[:, None] * jacobian, pairs.block), information)
 
 
 def _focus(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:
     """The focus by phases; None if there are too few phases near their tags, or they do not agree better than before."""
     try:
-        found = fit_phase(logs, settings, survey) if logs else None
+        phase = fit_phase(logs, settings, survey)
     except InputError:
         return None
-    return found if found is not None and found.after > found.before and np.all(np.isfinite(found.spread)) else None
+    return phase if phase.agreement > phase.initial_agreement and np.isfinite(phase.sigmas).all() else None
 
 
-def _focused(phase: PhaseFit, survey: SurveySettings) -> tuple[Parameter, ...]:
+def _priors_of(phase: PhaseFit, survey: SurveySettings) -> dict[str, tuple[float, float]]:
     """The priors of survey and lever arm that the phases give."""
-    pivot = np.array((phase.survey.about_x, phase.survey.about_y))
-    before = (*(se2.transform_from(survey.transform(), pivot) - pivot).tolist(), survey.heading)
-    after = (phase.survey.x, phase.survey.y, phase.survey.heading)
-    names = ("survey.x", "survey.y", "survey.heading", "antennas.x", "antennas.y")
-    changes = (*np.subtract(after, before).tolist(), *phase.lever_arm)
-    return tuple(Parameter(n, m, s) for n, m, s in zip(names, changes, phase.spread.tolist(), strict=True))
-
-
-def _has_phases(log: Log) -> bool:
-    stream = log.streams["rfid"]
-    assert isinstance(stream, RfidStream)
-    return bool(np.any(np.isfinite(stream.phase)))
+    shift = (phase.survey.x - survey.x, phase.survey.y - survey.y, phase.survey.heading - survey.heading)
+    names = (*SURVEY, "antennas.x", "antennas.y")
+    return dict(zip(names, zip((*shift, *phase.lever_arm), phase.sigmas.tolist(), strict=True), strict=True))
 
 
 def floor_of(settings: RfidSettings) -> Floor:
@@ -282,7 +292,7 @@ def _about_the_middle(rounds: Sequence[Rounds], survey: SurveySettings) -> Surve
     """The survey with its rotation about the centre of the tags, if uncorrected, to separate shift and rotation."""
     if survey != SurveySettings():
         return survey
-    places = {name: point for one in rounds for name, point in zip(one.names, one.tags.points[:, :2], strict=True)}
+    places = {name: point for log in rounds for name, point in zip(log.names, log.tags.points[:, :2], strict=True)}
     x, y = np.mean(list(places.values()), axis=0).round(2).tolist()
     return SurveySettings.bounded(about_x=x, about_y=y)
 
@@ -291,11 +301,9 @@ def _with_models(
     settings: RfidSettings, models: Sequence[DetectionModel], which: Sequence[int], grids: Path, floor: Floor
 ) -> RfidSettings:
     antennas = dict(settings.all_antennas())
-    # a model of a single antenna has the antenna's name
     names = [DEFAULT] * len(models)
-    if len(models) > 1:
+    if len(models) > 1:  # a model of a single antenna has the antenna's name
         names = [next((a for a, w in zip(antennas, which, strict=True) if w == i), DEFAULT) for i in range(len(models))]
-    models_of = {name: written(model, name, grids) for name, model in zip(names, models, strict=True)}
     antennas = {
         a: s.model_copy(update={"x": round(s.x, 4), "y": round(s.y, 4), "yaw": round(s.yaw, 5), "model": names[w]})
         for (a, s), w in zip(antennas.items(), which, strict=True)
@@ -304,8 +312,8 @@ def _with_models(
         update={
             "antennas": antennas,
             "preset": None,
-            "models": models_of,
-            "uncertainty": RfidUncertainty(),  # as well as the models
+            "models": {name: written(model, name, grids) for name, model in zip(names, models, strict=True)},
+            "uncertainty": RfidUncertainty(),  # in proportion to the priors of the models
             "false_read": floor.false_read,
             "miss": floor.miss,
         }
@@ -320,11 +328,10 @@ def _with_signals(
     changes: dict[str, object] = {}
     try:
         strength = fit_rssi(logs, settings, survey)
-    except InputError:  # too few reads have a strength
-        pass
-    else:
         tempering = strength.tempering if settings.rssi is None else settings.rssi.tempering
         changes["rssi"] = strength.model_copy(update={"tempering": tempering})
+    except InputError:  # too few reads have a strength
+        pass
     if focused and settings.phase is None:
         changes["phase"] = PhaseSettings()
     return settings.model_copy(update=changes)
@@ -333,19 +340,10 @@ def _with_signals(
 def written(model: DetectionModel, name: str, grids: Path) -> BeamSettings | LogisticSettings | GridSettings:
     """The settings of a learnt model; a grid is written to a file with the prefix ``grids``."""
     if isinstance(model, BeamModel):
-        return BeamSettings.bounded(
-            p0=round(model.p0, 4),
-            r_max=round(model.r_max, 3),
-            s_r=round(model.s_r, 3),
-            sigma_phi=round(model.sigma_phi, 3),
-            behind=round(model.behind, 3),
-            prior=CALIBRATED,
-        )
+        values = {field: round(value, 4) for field, value in asdict(model).items()}
+        return BeamSettings.bounded(**values, prior=CALIBRATED)
     if isinstance(model, LogisticModel):
-        b = [round(value, 4) for value in model.coefficients]
-        return LogisticSettings(
-            coefficients=(b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7], b[8], b[9], b[10]), prior=CALIBRATED
-        )
+        return LogisticSettings(coefficients=tuple(round(b, 4) for b in model.coefficients), prior=CALIBRATED)
     assert isinstance(model, GridModel)
     file = f"{grids.name}.{_safe(name)}.npz"
     write_grid(model, grids.with_name(file))

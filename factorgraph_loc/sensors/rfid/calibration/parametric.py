@@ -1,12 +1,13 @@
 """Survey, mounting and detection model of RFID as one problem of maximal posterior density.
 
 The likelihood of reads and misses has a floor (:func:`~factorgraph_loc.sensors.rfid.calibration.pairs.terms`). The logit of a
-detection model is differentiated numerically by its parameters. Its derivatives by position and facing of the tags give those by
-the survey's transform and by the antennas' mounting.
+detection model is differentiated numerically by its parameters, and positions and facing of the tags by the survey's transform and
+the antennas' mounting.
 """
 
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -18,8 +19,15 @@ from factorgraph_loc.fitting.posterior import (
     by_block,
     maximise,
 )
-from factorgraph_loc.sensors.rfid.calibration.pairs import REACH, Floor, TagPairs, nearby, pairs_of, seen, terms
-from factorgraph_loc.sensors.rfid.calibration.rounds import Integers, Rounds
+from factorgraph_loc.sensors.rfid.calibration.pairs import (
+    REACH,
+    Floor,
+    TagPairs,
+    nearby,
+    pairs_of,
+    terms,
+)
+from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings, SurveySettings
 from factors import se2
 from factors.rfid.model import FEATURES, NEAR, BeamModel, DetectionModel, GridModel, LogisticModel, logits
@@ -31,35 +39,29 @@ EDGE = 5.0  # pseudo-rounds without reads at the maximum range, so that extrapol
 VAGUE = 1e3  # standard deviation of the prior of a constant without any
 STEP = 1e-4  # of numerical derivatives
 MOST_PAIRS = 60000  # per log, for survey and mounting
-BEAM = {  # bounds of the logit of p0, and of logarithms
-    "p0": (-3.0, 7.0),
-    "r_max": (np.log(0.3), np.log(2.0 * REACH)),
-    "s_r": (np.log(0.05), np.log(5.0)),
-    "sigma_phi": (np.log(0.1), np.log(9.0)),
-}
-SURVEY = {"x": 0.1, "y": 0.1, "heading": 0.05}  # m, rad; standard deviations of the priors
-MOUNTING = {"x": 0.05, "y": 0.05, "yaw": 0.15}  # of what all antennas have in common
-APART = 0.7  # times these: what each antenna has besides
-ALL = "antennas"
+BEAM = {"p0": (0.05, 0.999), "r_max": (0.3, 2.0 * REACH), "s_r": (0.05, 5.0), "sigma_phi": (0.1, 9.0)}  # bounds
+SURVEY = {"survey.x": 0.1, "survey.y": 0.1, "survey.heading": 0.05}  # m, rad; standard deviations of the priors
+COMMON = {"antennas.x": 0.05, "antennas.y": 0.05, "antennas.yaw": 0.15}  # of changes that all antennas have in common
+APART = 0.7  # times these: changes of each antenna
+NO_FOCUS: Mapping[str, tuple[float, float]] = {}
 
 
 @dataclass(frozen=True)
 class Family:
-    """Detection models: ``built`` of values (P,) of ``parameters``. ``shown``: values for tables, and their derivatives by the
-    parameters. ``design``: of a linear logit, its derivatives (M, P) at points (M, 3) and facings (M,)."""
+    """Detection models: ``built`` of values (P,) of ``parameters``. ``design``: of a linear logit, its derivatives (M, P) at
+    points (M, 3) and facings (M,)."""
 
     parameters: tuple[Parameter, ...]
     built: Callable[[Array], DetectionModel]
-    shown: Callable[[Array], tuple[Array, Array]]
     design: Callable[[Array, Array], Array] | None = None
 
     def jacobian(self, values: Array, points: Array, facing: Array) -> Array:
         """Derivatives (M, P) of the logits of tags at ``points`` (M, 3)."""
         if self.design is not None:
             return self.design(points, facing)
-        here = logits(self.built(values), points, facing)[0]
+        start = logits(self.built(values), points, facing)[0]
         steps = STEP * np.eye(len(values))
-        moved = [logits(self.built(values + step), points, facing)[0] - here for step in steps]
+        moved = [logits(self.built(values + step), points, facing)[0] - start for step in steps]
         return np.column_stack(moved) / STEP
 
 
@@ -84,32 +86,16 @@ def logistic(pairs: TagPairs, *, with_facing: bool) -> Family:
 
     sigmas = [1.0 / scale[i] if i else VAGUE for i in used]
     parameters = [Parameter(f"coefficient of {FEATURES[i]}", 0.0, float(s)) for i, s in zip(used, sigmas, strict=True)]
-    return Family(
-        tuple(parameters),
-        built,
-        lambda values: (values, np.ones(len(values))),
-        lambda points, facing: features(points, facing)[:, used],
-    )
+    return Family(tuple(parameters), built, lambda points, facing: features(points, facing)[:, used])
 
 
 def beam(start: BeamModel) -> Family:
     """Beams about ``start``, with its share of reads from behind."""
-
-    def built(values: Array) -> BeamModel:
-        r_max, s_r, sigma_phi = np.exp(values[1:]).tolist()
-        return BeamModel(float(1.0 / (1.0 + np.exp(-values[0]))), r_max, s_r, sigma_phi, start.behind)
-
-    def shown(values: Array) -> tuple[Array, Array]:
-        p0, *others = 1.0 / (1.0 + np.exp(-values[0])), *np.exp(values[1:])
-        return np.array((p0, *others)), np.array((p0 * (1.0 - p0), *others))
-
-    p0 = min(max(start.p0, 1e-3), 1.0 - 1e-3)
-    means = (_logit(p0), *np.log((start.r_max, start.s_r, start.sigma_phi)).tolist())
-    return Family(
-        tuple(Parameter(n, min(max(m, a), b), 2.0, a, b) for (n, (a, b)), m in zip(BEAM.items(), means, strict=True)),
-        built,
-        shown,
-    )
+    parameters = []
+    for name, (low, high) in BEAM.items():
+        mean = min(max(getattr(start, name), low), high)
+        parameters.append(Parameter(name, mean, 2.0 * mean, low, high))
+    return Family(tuple(parameters), lambda values: replace(start, **dict(zip(BEAM, values.tolist(), strict=True))))
 
 
 def scaled(start: GridModel) -> Family:
@@ -123,7 +109,7 @@ def scaled(start: GridModel) -> Family:
         return replace(start, logits=np.log(p / (1.0 - p)), **cells)
 
     parameters = tuple(Parameter(name, 0.0, 0.5, -2.0, 2.0) for name in OF_MODEL)
-    return Family(parameters, built, lambda values: (values, np.ones(2)))
+    return Family(parameters, built)
 
 
 def family_of(model: DetectionModel, pairs: TagPairs) -> Family:
@@ -143,29 +129,36 @@ def fit_model(pairs: TagPairs, family: Family, floor: Floor) -> tuple[DetectionM
         jacobian = family.jacobian(values, data.points, data.facing) if design is None else design
         return _evidence(logit, jacobian, data, floor)
 
-    found = maximise(family.parameters, at)
-    return family.built(found.values), found
+    posterior = maximise(family.parameters, at)
+    return family.built(posterior.values), posterior
 
 
-@dataclass(frozen=True)
-class Placing:
-    """``settings`` and ``survey`` with the changes whose posterior is ``found``: of the survey, and of each antenna."""
+def places_of(
+    settings: RfidSettings, focus: Mapping[str, tuple[float, float]] = NO_FOCUS
+) -> tuple[tuple[Parameter, ...], Array]:
+    """The changes of the survey and of each antenna, and the covariance of their priors: antennas have a change in common, and one
+    of their own if there are several. ``focus``: mean and standard deviation of changes of the survey and in common, from phases.
+    """
+    priors = {name: (0.0, sigma) for name, sigma in (SURVEY | COMMON).items()} | dict(focus)
+    antennas = settings.all_antennas()
+    own = {name: APART * sigma * (len(antennas) > 1) for name, sigma in COMMON.items()}
+    parameters = [Parameter(name, *priors[name]) for name in SURVEY]
+    for antenna in antennas:
+        for name, sigma in own.items():
+            mean, common = priors[name]
+            parameters.append(Parameter(name.replace(".", f".{antenna}."), mean, math.hypot(common, sigma)))
+    covariance = np.diag([p.sigma**2 for p in parameters])
+    kinds = [kind_of(p)[0] for p in parameters]
+    for i, k in itertools.permutations(range(len(SURVEY), len(kinds)), 2):
+        covariance[i, k] = priors[kinds[i]][1] ** 2 * (kinds[i] == kinds[k])
+    return tuple(parameters), covariance
 
-    settings: RfidSettings
-    survey: SurveySettings
-    found: Posterior
 
-
-def places_of(settings: RfidSettings, better: Sequence[Parameter] = ()) -> tuple[Parameter, ...]:
-    """The changes of survey and mounting: of all antennas, and of each if there are several. ``better``: priors that replace the
-    usual ones."""
-    places = [Parameter(f"survey.{name}", 0.0, sigma) for name, sigma in SURVEY.items()]
-    places += [Parameter(f"{ALL}.{name}", 0.0, sigma) for name, sigma in MOUNTING.items()]
-    names = list(settings.all_antennas())
-    for antenna in names if len(names) > 1 else ():
-        places += [Parameter(f"{antenna}.{name}", 0.0, APART * sigma) for name, sigma in MOUNTING.items()]
-    replaced = {p.name: p for p in better}
-    return tuple(replaced.get(p.name, p) for p in places)
+def kind_of(place: Parameter) -> tuple[str, str]:
+    """The kind of a change of :func:`places_of`, a name in SURVEY or COMMON, and its antenna, or ""."""
+    what, _, rest = place.name.partition(".")
+    antenna, _, name = rest.rpartition(".")
+    return f"{what}.{name}", antenna
 
 
 def place(
@@ -173,51 +166,40 @@ def place(
     settings: RfidSettings,
     survey: SurveySettings,
     floor: Floor,
-    better: Sequence[Parameter] = (),
+    focus: Mapping[str, tuple[float, float]] = NO_FOCUS,
     *,
     with_facing: bool,
-) -> Placing:
-    """Survey and mounting of maximal posterior density, together with a logistic model of all antennas."""
+) -> tuple[RfidSettings, SurveySettings, Posterior]:
+    """Survey and mounting of maximal posterior density, together with a logistic model of all antennas: the changed settings, and
+    the posterior of the changes."""
     count = max(len(nearby(log, settings, survey)) for log in logs)
     logs = [log.part(np.arange(len(log.t)) % (1 + count // MOST_PAIRS) == 0) for log in logs]
-    places = places_of(settings, better)
+    places, prior = places_of(settings, focus)
+    kinds, names, number = [kind_of(p) for p in places], list(settings.all_antennas()), len(places)
     within = [nearby(log, settings, survey) for log in logs]
     pairs = pairs_of(logs, settings, survey, within)
     family = logistic(pairs, with_facing=with_facing)
     begin = fit_model(pairs, family, floor)[1]
 
     def at(values: Array) -> LikelihoodTerms:
-        changes, model = values[: len(places)], values[len(places) :]
-        there = moved(settings, survey, places, changes)
-        data = _edged(pairs_of(logs, *there, within))
-        logit, gradient = logits(family.built(model), data.points, data.facing)
-        by_places = np.zeros((len(logit), len(places)))
-        by_places[: len(pairs.hits)] = _by_places(logs, *there, within, places, gradient[: len(pairs.hits)])
-        jacobian = np.hstack((by_places, family.jacobian(model, data.points, data.facing)))
+        model, changed = family.built(values[number:]), moved(settings, survey, places, values[:number])
+        data = _edged(pairs_of(logs, *changed, within))
+        logit, columns = logits(model, data.points, data.facing)[0], np.zeros((len(data.points), number))
+        for kind in SURVEY | COMMON:
+            steps = STEP * np.array([name == kind for name, _ in kinds])
+            step = _edged(pairs_of(logs, *moved(*changed, places, steps), within))
+            change = (logits(model, step.points, step.facing)[0] - logit) / STEP
+            for i in np.flatnonzero(steps):
+                antenna = kinds[i][1]
+                columns[:, i] = change * (data.antenna == names.index(antenna)) if antenna else change
+        jacobian = np.hstack((columns, family.jacobian(values[number:], data.points, data.facing)))
         return _evidence(logit, jacobian, data, floor)
 
-    found = maximise((*places, *family.parameters), at, begin.as_dict())
-    return Placing(*moved(settings, survey, places, found.values[: len(places)]), _of_antennas(found, places, settings))
-
-
-def _of_antennas(found: Posterior, places: Sequence[Parameter], settings: RfidSettings) -> Posterior:
-    """The posterior of the survey, and of each antenna with what all have in common."""
-    names = [p.name for p in places]
-    rows = [[names.index(f"survey.{name}")] for name in SURVEY]
-    rows += [
-        [names.index(f"{what}.{name}") for what in (ALL, antenna) if f"{what}.{name}" in names]
-        for antenna in settings.all_antennas()
-        for name in MOUNTING
-    ]
-    total = np.zeros((len(rows), len(found.values)))
-    for i, columns in enumerate(rows):
-        total[i, columns] = 1.0
-    labels = [f"survey.{name}" for name in SURVEY]
-    labels += [f"antennas.{antenna}.{name}" for antenna in settings.all_antennas() for name in MOUNTING]
-    before = [p.sigma for p in places_of(settings)]
-    sigmas = [math.hypot(*(before[column] for column in columns)) for columns in rows]
-    parameters = tuple(Parameter(label, 0.0, sigma) for label, sigma in zip(labels, sigmas, strict=True))
-    return Posterior(parameters, total @ found.values, total @ found.covariance @ total.T, found.share)
+    covariance = np.diag([p.sigma**2 for p in (*places, *family.parameters)])
+    covariance[:number, :number] = prior
+    posterior = maximise((*places, *family.parameters), at, begin.as_dict(), covariance)
+    changes, matrix = posterior.values[:number], posterior.covariance[:number, :number]
+    return *moved(settings, survey, places, changes), Posterior(places, changes, matrix, posterior.share)
 
 
 def moved(
@@ -225,53 +207,25 @@ def moved(
 ) -> tuple[RfidSettings, SurveySettings]:
     """The rig's antennas and survey with ``changes`` (P,) of places."""
     antennas = dict(settings.all_antennas())
-    for parameter, change in zip(places, changes.tolist(), strict=True):
-        what, _, name = parameter.name.rpartition(".")
-        if what == "survey":
-            survey = survey.model_copy(update={name: _added(name, getattr(survey, name), change)})
-            continue
-        for antenna in antennas if what == ALL else [what]:
-            old: AntennaSettings = antennas[antenna]
-            antennas[antenna] = old.model_copy(update={name: _added(name, getattr(old, name), change)})
+    for place, change in zip(places, changes.tolist(), strict=True):
+        antenna, name = kind_of(place)[1], place.name.rpartition(".")[2]
+        old: SurveySettings | AntennaSettings = antennas[antenna] if antenna else survey
+        value = getattr(old, name) + change
+        new = old.model_copy(update={name: se2.wrap_scalar(value) if name in ("heading", "yaw") else value})
+        if isinstance(new, SurveySettings):
+            survey = new
+        else:
+            antennas[antenna] = new
     # a preset has no positions that could be changed
     return settings.model_copy(update={"antennas": antennas, "preset": None}), survey
 
 
-def _added(name: str, value: float, change: float) -> float:
-    return float(se2.wrap_scalar(value + change)) if name in ("heading", "yaw") else value + change
-
-
-def _by_places(
-    logs: Sequence[Rounds],
-    settings: RfidSettings,
-    survey: SurveySettings,
-    within: Sequence[Integers],
-    places: Sequence[Parameter],
-    gradient: Array,
-) -> Array:
-    """Derivatives (M, P) of logits by places, from their ``gradient`` (M, 4) by points and facing."""
-    pivot = np.array((survey.about_x + survey.x, survey.about_y + survey.y))
-    names = list(settings.all_antennas())
-    out, first = [], 0
-    for log, chosen in zip(logs, within, strict=True):
-        derivatives = seen(log, settings, survey, chosen).jacobian(gradient[first : first + len(chosen)], pivot)
-        first += len(chosen)
-        antenna = log.antenna[chosen // len(log.names)]
-        columns = []
-        for parameter in places:
-            what, _, name = parameter.name.rpartition(".")
-            column = derivatives[:, list(SURVEY).index(name) if what == "survey" else 3 + list(MOUNTING).index(name)]
-            columns.append(column * (antenna == names.index(what)) if what in names else column)
-        out.append(np.column_stack(columns))
-    return np.concatenate(out)
-
-
 def _evidence(logit: Array, jacobian: Array, pairs: TagPairs, floor: Floor) -> LikelihoodTerms:
     """The likelihood of reads. Those of a tag are correlated: some tags are stronger than others."""
-    found = terms(logit, pairs.hits, pairs.count, floor)
-    information = jacobian.T @ (found.information[:, None] * jacobian)
-    scores = by_block(found.gradient[:, None] * jacobian, pairs.tag)
-    return LikelihoodTerms(float(np.sum(found.nll)), scores, information)
+    likelihood = terms(logit, pairs.hits, pairs.count, floor)
+    information = jacobian.T @ (likelihood.information[:, None] * jacobian)
+    scores = by_block(likelihood.gradient[:, None] * jacobian, pairs.tag)
+    return LikelihoodTerms(float(np.sum(likelihood.nll)), scores, information)
 
 
 def _edged(pairs: TagPairs) -> TagPairs:
@@ -283,7 +237,3 @@ def _edged(pairs: TagPairs) -> TagPairs:
     added = TagPairs(edge, facing, none, none + EDGE / len(edge), zero, zero, zero, zero)
     columns = [f.name for f in fields(TagPairs)]
     return TagPairs(**{name: np.concatenate((getattr(pairs, name), getattr(added, name))) for name in columns})
-
-
-def _logit(p: float) -> float:
-    return float(np.log(p / (1.0 - p)))

@@ -9,61 +9,56 @@ to a window defocus slowly.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
-from factorgraph_loc.sensors.rfid.stream import RfidStream
+from factorgraph_loc.sensors.rfid.stream import phase_reads
 from factorgraph_loc.text import listed
 from factors import se2
 from factors.rfid.detection import TagArray
 from factors.rfid.signals import PhaseLikelihood, PhaseModel, PhaseReads
 from factors.se2 import Array
 
-Rows = NDArray[np.int64]
-
-WINDOW = 2.0  # s
-MAX_GAP = 0.1  # s; longest interpolated gap of the reference
 ENOUGH_READS = 1000
 SHIFTS = (-0.3, -0.15, 0.0, 0.15, 0.3)  # m; coarse search
 HEADINGS = (-0.05, -0.025, 0.0, 0.025, 0.05)  # rad
 THINNING = 6  # of the windows, in the coarse search
-BLOCKS = 8  # of windows, for the jackknife
+BLOCKS = 8  # of windows; one is left out in each part of the jackknife
 
 
 @dataclass(frozen=True)
 class PhaseFit:
-    """``survey``: transform of the survey; ``lever_arm`` (2,): correction of x and y [m] of every antenna; ``spread`` (5,):
-    standard deviations of the survey's x, y [m] and heading [rad] and of the lever arm's x, y [m]; ``before`` and ``after``:
-    agreement of the phases, as mean resultant lengths (0 to 1); ``reads``: number of reads used.
+    """``survey``: transform of the survey; ``lever_arm`` (2,): correction of x and y [m] of every antenna; ``sigmas`` (5,):
+    standard deviations of the survey's x, y [m] and heading [rad] and of the lever arm's x, y [m]; ``agreement`` of the phases as
+    mean resultant length (0 to 1), and with the initial values; ``reads``: number of reads used.
 
-    The gain in untempered log-likelihood per read is kappa times ``after - before``.
+    The gain in untempered log-likelihood per read is kappa times the growth of the agreement.
     """
 
     survey: SurveySettings
     lever_arm: tuple[float, float]
-    spread: Array
-    before: float
-    after: float
+    sigmas: Array
+    initial_agreement: float
+    agreement: float
     reads: int
 
 
 def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | None = None) -> PhaseFit:
     """Estimate survey and lever arm by focusing the phases of all ``logs``, in one world; ``survey``: initial value.
 
-    The survey is rotated about the centre of the tags. The spread is the jackknife's over blocks of time, which is robust to
-    correlated reads. InputError if a log has no reference, or there are too few reads with a phase near their tags.
+    Standard deviations are those of the jackknife over blocks of time, which is robust to correlated reads. InputError if a log
+    has no reference, or there are too few reads with a phase near their tags.
     """
     start = survey or SurveySettings()
-    focus = _Focus.of(logs, rfid)
-    origin = np.array((*se2.transform_from(start.transform(), focus.pivot) - focus.pivot, start.heading, 0.0, 0.0))
+    focus = _Focus.of(logs, rfid, start)
+    origin = np.array((start.x, start.y, start.heading, 0.0, 0.0))
     coarse = focus.near(origin)
     if coarse.count < ENOUGH_READS:
         names = listed(log.name for log in logs)
@@ -71,11 +66,11 @@ def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | 
         raise InputError(f"{names}: hold {coarse.count} reads with a phase, {expected}")
     # select again, because other reads are near their tags after the coarse search
     fine = focus.near(coarse.climb(coarse.coarse(origin)))
-    found = fine.climb(coarse.coarse(origin))
-    parts = np.array([fine.without(block).climb(found) for block in range(BLOCKS)])
-    spread = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((parts - parts.mean(axis=0)) ** 2, axis=0))
-    lever_arm = (float(found[3]), float(found[4]))
-    return PhaseFit(fine.survey(found), lever_arm, spread, fine.agreement(origin), fine.agreement(found), fine.count)
+    state = fine.climb(coarse.coarse(origin))
+    parts = np.array([fine.without(block).climb(state) for block in range(BLOCKS)])
+    sigmas = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((parts - parts.mean(axis=0)) ** 2, axis=0))
+    lever_arm = (float(state[3]), float(state[4]))
+    return PhaseFit(fine.survey(state), lever_arm, sigmas, fine.agreement(origin), fine.agreement(state), fine.count)
 
 
 @dataclass(frozen=True)
@@ -85,10 +80,10 @@ class _Focus:
     reads: PhaseReads
     model: PhaseModel
     tags: TagArray  # as surveyed
-    pivot: Array
+    initial: SurveySettings
 
     @classmethod
-    def of(cls, logs: Sequence[Log], rfid: RfidSettings) -> _Focus:
+    def of(cls, logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> _Focus:
         tags = tag_map(logs[0].world, SurveySettings())
         names = {name: i for i, name in enumerate(rfid.all_antennas())}
         parts: list[PhaseReads] = []
@@ -98,15 +93,14 @@ class _Focus:
             first_window = 1 + int(parts[-1].windows.max(initial=first_window))
         reads = PhaseReads(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PhaseReads)))
         model = PhaseModel(rfid.model().antennas, kappa=1.0, tempering=1.0)
-        return cls(reads, model, tags.tags, tags.tags.points[:, :2].mean(axis=0))
+        return cls(reads, model, tags.tags, survey)
 
     @property
     def count(self) -> int:
         return len(self.reads.tags)
 
     def survey(self, state: Array) -> SurveySettings:
-        x, y, heading, px, py = map(float, (*state[:3], *self.pivot))
-        return SurveySettings.bounded(x=x, y=y, heading=heading, about_x=px, about_y=py)
+        return self.initial.model_copy(update=dict(zip(("x", "y", "heading"), state[:3].tolist(), strict=True)))
 
     def near(self, state: Array) -> _Focus:
         """The reads that are near their tags, in windows with enough of them."""
@@ -138,39 +132,10 @@ class _Focus:
         return np.asarray(result.x * unit)
 
     def _pose(self, state: Array) -> Array:
-        """The pose of the world in the survey's frame, in which tags have their surveyed positions."""
+        """The pose of the world in the survey's frame."""
         return se2.inverse(self.survey(state).transform())
 
     def _likelihood(self, state: Array) -> PhaseLikelihood:
         x, y = map(float, state[3:])
         antennas = tuple(replace(a, x=a.x + x, y=a.y + y) for a in self.model.antennas)
         return PhaseLikelihood(replace(self.model, antennas=antennas), self.tags)
-
-
-def along_reference(
-    log: Log, tags: Mapping[str, int], antennas: Mapping[str, int]
-) -> tuple[RfidStream, Rows, Array, Array, Rows, Rows]:
-    """The reads of known tags by known antennas within the reference: the stream, R row indices, times (R,) [s], poses (R, 3) of
-    the robot, and indices (R,) of antennas and tags. InputError if the log has no reference or no reads."""
-    if log.reference is None:
-        raise InputError(f"{log.name}: has no reference trajectory, expected one for calibration")
-    stream = log.streams.get("rfid")
-    if not isinstance(stream, RfidStream):
-        raise InputError(f"{log.name}: has no RFID reads, expected a log with reads")
-    t = stream.t - stream.age + log.rig.time_offset("rfid")
-    tag = np.array([tags.get(name, -1) for name in stream.epc], dtype=np.int64)
-    antenna = np.array([antennas.get(name, -1) for name in stream.antenna], dtype=np.int64)
-    poses = log.reference.at(t, max_gap=MAX_GAP)
-    rows = np.flatnonzero((tag >= 0) & (antenna >= 0) & np.isfinite(poses[:, 0]))
-    return stream, rows, t[rows], poses[rows], antenna[rows], tag[rows]
-
-
-def phase_reads(
-    log: Log, tags: Mapping[str, int], antennas: Mapping[str, int], window: float = WINDOW, first_window: int = 0
-) -> PhaseReads:
-    """The reads with a phase along the reference, relative to the world's origin, in windows of ``window`` seconds, numbered
-    from ``first_window``. ``tags`` and ``antennas``: indices by name. Raises InputError like :func:`along_reference`."""
-    stream, rows, t, poses, antenna, tag = along_reference(log, tags, antennas)
-    windows = first_window + np.floor((t - t.min(initial=np.inf)) / window).astype(np.int64)
-    reads = PhaseReads(poses, antenna, tag, stream.phase[rows], stream.frequency[rows], windows)
-    return reads.chosen(np.isfinite(reads.phase) & np.isfinite(reads.frequency))

@@ -5,23 +5,21 @@ Rounds of an antenna at nearly the same pose are merged into k reads of n rounds
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.fitting.posterior import by_block
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
-from factors import se2
 from factors.rfid.detection import TagArray
 from factors.se2 import Array
 
-NEAR = 0.05  # m; closer rounds of an antenna are merged
-TURNED = 0.05  # rad
+CELL = (0.05, 0.05, 0.05, 1.0)  # m, m, rad, antennas; rounds in one cell are merged
 MOST_ROUNDS = 20.0  # weight limit per pose; otherwise a robot at rest would outweigh its whole drive
 MIN_ROUNDS = 100
 
@@ -33,8 +31,7 @@ class Rounds:
     """K poses with antenna rounds, and T tags of the map that were read at least once in the log.
 
     ``t`` (K,) [s] and ``poses`` (K, 3) of the robot; ``antenna`` (K,): index in the rig; ``count`` (K,): weighted number of
-    inventory rounds; ``hits`` (K, T): number of rounds that read each tag. ``tags``: as surveyed; ``names``: T EPCs. ``silent``:
-    tags of the map that were never read.
+    inventory rounds; ``hits`` (K, T): number of rounds that read each tag. ``tags``: as surveyed; ``names``: T EPCs.
     """
 
     log: str
@@ -45,18 +42,11 @@ class Rounds:
     hits: Array
     tags: TagArray
     names: tuple[str, ...]
-    silent: tuple[str, ...]
 
-    def part(self, keep: NDArray[np.bool_]) -> Rounds:
+    def part(self, keep: NDArray[np.bool_] | Integers) -> Rounds:
         """The selected poses."""
-        return replace(
-            self,
-            t=self.t[keep],
-            poses=self.poses[keep],
-            antenna=self.antenna[keep],
-            count=self.count[keep],
-            hits=self.hits[keep],
-        )
+        columns = ("t", "poses", "antenna", "count", "hits")
+        return replace(self, **{name: getattr(self, name)[keep] for name in columns})
 
 
 def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Rounds:
@@ -74,8 +64,8 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
     t = stream.t[first] + log.rig.time_offset("rfid") - _middle(stream.age, inverse, read, len(first))
     antennas = {name: i for i, name in enumerate(settings.all_antennas())}
     antenna = np.array([antennas.get(stream.antenna[i], -1) for i in first], dtype=np.int64)
-    seen = {epc for epc in stream.epc if epc in log.world.tags}
-    names = tuple(name for name in log.world.tags if name in seen)
+    epcs = set(stream.epc)
+    names = tuple(name for name in log.world.tags if name in epcs)
     index = {name: i for i, name in enumerate(names)}
     hits = np.zeros((len(first), len(names)))
     columns = np.array([index.get(epc, -1) for epc in stream.epc], dtype=np.int64)
@@ -83,45 +73,19 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
     hits[inverse[known], columns[known]] = 1.0
     order = np.argsort(t, kind="stable")
     poses = log.reference.at(t[order], max_gap=REFERENCE_GAP)
-    order = order[np.isfinite(poses[:, 0]) & (antenna[order] >= 0)]
+    good = np.isfinite(poses[:, 0]) & (antenna[order] >= 0)
+    order, poses = order[good], poses[good]
     if len(order) < MIN_ROUNDS or len(names) < 2:
         raise InputError(
-            f"{log.name}: has {len(order)} inventory rounds of the rig's antennas within the reference, in which "
+            f"{log.name}: has {len(order)} inventory rounds of the rig's antennas within the reference, where "
             f"{len(names)} tags of the map were read, expected {MIN_ROUNDS} rounds and 2 tags or more"
         )
     tags = [log.world.tags[name] for name in names]
-    found = Rounds(
-        log.name,
-        t[order],
-        log.reference.at(t[order], max_gap=REFERENCE_GAP),
-        antenna[order],
-        np.ones(len(order)),
-        hits[order],
-        TagArray(
-            np.array([(tag.x, tag.y, tag.z) for tag in tags]),
-            np.array([np.nan if tag.facing is None else tag.facing for tag in tags]),
-        ),
-        names,
-        tuple(name for name in log.world.tags if name not in seen),
-    )
-    return _together(found) if merged else found
-
-
-def distinct(logs: Sequence[Log]) -> list[int]:
-    """An identifier of each log's reads, equal for logs with the same reads but other odometry."""
-    streams: list[RfidStream] = []
-    out = []
-    for log in logs:
-        stream = log.streams["rfid"]
-        assert isinstance(stream, RfidStream)
-        same = (
-            i for i, one in enumerate(streams) if np.array_equal(one.t, stream.t) and list(one.epc) == list(stream.epc)
-        )
-        number = next(same, len(streams))
-        if number == len(streams):
-            streams.append(stream)
-        out.append(number)
-    return out
+    points = np.array([(tag.x, tag.y, tag.z) for tag in tags])
+    facing = np.array([np.nan if tag.facing is None else tag.facing for tag in tags])
+    count = np.ones(len(order))
+    rounds = Rounds(log.name, t[order], poses, antenna[order], count, hits[order], TagArray(points, facing), names)
+    return _merged(rounds) if merged else rounds
 
 
 def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) -> Array:
@@ -136,31 +100,20 @@ def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) 
     return middle
 
 
-def _together(rounds: Rounds) -> Rounds:
-    group = np.zeros(len(rounds.t), dtype=np.int64)
-    begun: dict[int, tuple[int, Array]] = {}
-    count = 0
-    for i, (antenna, pose) in enumerate(zip(rounds.antenna.tolist(), rounds.poses, strict=True)):
-        number, start = begun.get(antenna, (-1, pose))
-        away = np.hypot(pose[0] - start[0], pose[1] - start[1]) > NEAR
-        if number < 0 or away or abs(se2.wrap_scalar(float(pose[2] - start[2]))) > TURNED:
-            number, start = count, pose
-            begun[antenna] = number, start
-            count += 1
-        group[i] = number
-    size = np.bincount(group, minlength=count).astype(float)
-    hits = np.zeros((count, rounds.hits.shape[1]))
-    np.add.at(hits, group, rounds.hits)
-    # the poses of a group are close together, so its middle represents all
-    order = np.argsort(group, kind="stable")
-    starts = np.concatenate(([0], np.cumsum(size.astype(np.int64))[:-1]))
-    middle = order[starts + size.astype(np.int64) // 2]
+def cells(coordinates: Array, sizes: tuple[float, ...]) -> tuple[Integers, Integers]:
+    """For rows of ``coordinates`` (M, D) in cells of ``sizes`` (D,): the first row in each cell, and the cell of each row."""
+    keys = np.floor(coordinates / sizes).astype(np.int64)
+    keys -= keys.min(axis=0)
+    flat = np.ravel_multi_index(tuple(keys.T), tuple(keys.max(axis=0) + 1))
+    _, first, cell = np.unique(flat, return_index=True, return_inverse=True)
+    return first, cell
+
+
+def _merged(rounds: Rounds) -> Rounds:
+    """One round at the mean pose for all of an antenna in a cell of poses."""
+    first, cell = cells(np.column_stack((rounds.poses, rounds.antenna)), CELL)
+    size = np.bincount(cell).astype(float)
     weight = np.minimum(1.0, MOST_ROUNDS / size)
-    return replace(
-        rounds,
-        t=rounds.t[middle],
-        poses=rounds.poses[middle],
-        antenna=rounds.antenna[middle],
-        count=weight * size,
-        hits=weight[:, None] * hits,
-    )
+    poses, hits = by_block(rounds.poses, cell) / size[:, None], weight[:, None] * by_block(rounds.hits, cell)
+    part = replace(rounds.part(first), poses=poses, hits=hits, count=weight * size)
+    return part.part(np.argsort(part.t, kind="stable"))

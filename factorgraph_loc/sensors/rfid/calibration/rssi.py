@@ -5,13 +5,13 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.special import gammaln
+from scipy.stats import t as student
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.rfid.calibration.phase import along_reference
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, RssiSettings, SurveySettings
+from factorgraph_loc.sensors.rfid.stream import along_reference
 from factorgraph_loc.text import listed
 from factors.rfid.signals import FEATURES, RssiReads, features
 from factors.se2 import Array
@@ -27,27 +27,22 @@ def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) ->
 
     Signals below the reader's sensitivity are missing, so the path loss is flatter than in free space.
     """
-    x, y = _table(logs, rfid, survey)
-    if len(y) < ENOUGH_READS:
-        names = listed(log.name for log in logs)
-        raise InputError(f"{names}: hold {len(y)} reads with an RSSI, expected at least {ENOUGH_READS}")
-    coefficients, sigma, dof = _fit(x, y)
-    return RssiSettings.bounded(coefficients=tuple(coefficients.tolist()), sigma=sigma, dof=dof)
-
-
-def _table(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> tuple[Array, Array]:
-    """Features (R, 6) and RSSI (R,) of the reads of all logs."""
     names = {name: i for i, name in enumerate(rfid.all_antennas())}
     tables: list[Array] = []
     values: list[Array] = []
     for log in logs:
         tags = tag_map(log.world, survey)
         stream, rows, _, poses, antenna, tag = along_reference(log, tags.index, names)
-        heard = np.isfinite(stream.rssi[rows])
-        reads = RssiReads(poses[heard], antenna[heard], tag[heard], stream.rssi[rows][heard])
+        good = np.isfinite(stream.rssi[rows])
+        reads = RssiReads(poses[good], antenna[good], tag[good], stream.rssi[rows][good])
         tables.append(features(rfid.model().antennas, tags.tags, np.zeros(3), reads))
         values.append(reads.rssi)
-    return np.concatenate(tables).reshape(-1, len(FEATURES)), np.concatenate(values)
+    if (count := sum(map(len, values))) < ENOUGH_READS:
+        raise InputError(
+            f"{listed(log.name for log in logs)}: hold {count} reads with an RSSI, expected at least {ENOUGH_READS}"
+        )
+    coefficients, sigma, dof = _fit(np.concatenate(tables).reshape(-1, len(FEATURES)), np.concatenate(values))
+    return RssiSettings.bounded(coefficients=tuple(coefficients.tolist()), sigma=sigma, dof=dof)
 
 
 def _fit(x: Array, y: Array) -> tuple[Array, float, float]:
@@ -59,18 +54,10 @@ def _fit(x: Array, y: Array) -> tuple[Array, float, float]:
         coefficients: Array = np.linalg.lstsq(x * root[:, None], y * root, rcond=None)[0].astype(float)
         residuals = y - x @ coefficients
         sigma = math.sqrt(np.mean(weights * residuals**2))
-        dof = _dof(residuals, sigma)
+
+        def cost(v: float, ratios: Array = residuals / sigma) -> float:
+            return -float(np.mean(student.logpdf(ratios, math.exp(v))))
+
+        dof = math.exp(minimize_scalar(cost, bounds=np.log(DOF), method="bounded").x)
         weights = (dof + 1.0) / (dof + (residuals / sigma) ** 2)
     return coefficients, sigma, dof
-
-
-def _dof(residuals: Array, sigma: float) -> float:
-    """Maximum-likelihood degrees of freedom."""
-    found = minimize_scalar(lambda v: _nll(residuals, sigma, math.exp(v)), bounds=np.log(DOF), method="bounded")
-    return math.exp(found.x)
-
-
-def _nll(residuals: Array, sigma: float, dof: float) -> float:
-    """Mean negative log density of the Student distribution."""
-    scale = gammaln(dof / 2.0) - gammaln((dof + 1.0) / 2.0) + 0.5 * math.log(dof * math.pi) + math.log(sigma)
-    return float(scale + 0.5 * (dof + 1.0) * np.mean(np.log1p((residuals / sigma) ** 2 / dof)))
