@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.stats import t as student
+from scipy.special import gammaln
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
@@ -28,8 +28,7 @@ def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) ->
     Signals below the reader's sensitivity are missing, so the path loss is flatter than in free space.
     """
     names = {name: i for i, name in enumerate(rfid.all_antennas())}
-    tables: list[Array] = []
-    values: list[Array] = []
+    tables, values = list[Array](), list[Array]()
     for log in logs:
         tags = tag_map(log.world, survey)
         stream, rows, _, poses, antenna, tag = along_reference(log, tags.index, names)
@@ -47,8 +46,7 @@ def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) ->
 
 def _fit(x: Array, y: Array) -> tuple[Array, float, float]:
     """Coefficients, scale and degrees of freedom, by conditional maximisation (Liu, Rubin, Stat. Sinica 5, 1995)."""
-    dof = 5.0
-    weights = np.ones(len(y))
+    dof, weights = 5.0, np.ones(len(y))
     for _ in range(ITERATIONS):
         root = np.sqrt(weights)
         coefficients: Array = np.linalg.lstsq(x * root[:, None], y * root, rcond=None)[0].astype(float)
@@ -56,7 +54,9 @@ def _fit(x: Array, y: Array) -> tuple[Array, float, float]:
         sigma = math.sqrt(np.mean(weights * residuals**2))
 
         def cost(v: float, ratios: Array = residuals / sigma) -> float:
-            return -float(np.mean(student.logpdf(ratios, math.exp(v))))
+            dof = math.exp(v)  # mean negative log density of the Student distribution
+            scale = gammaln(dof / 2.0) - gammaln((dof + 1.0) / 2.0) + 0.5 * math.log(dof * math.pi)
+            return float(scale + 0.5 * (dof + 1.0) * np.mean(np.log1p(ratios**2 / dof)))
 
         dof = math.exp(minimize_scalar(cost, bounds=np.log(DOF), method="bounded").x)
         weights = (dof + 1.0) / (dof + (residuals / sigma) ** 2)
