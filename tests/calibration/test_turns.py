@@ -45,8 +45,12 @@ def blind(offices):
 
 @pytest.fixture(scope="module")
 def found(blind, tmp_path_factory):
-    """From a rig whose antennas reach 20 % too far, and read too little."""
+    """From a rig whose antennas reach 20 % too far, and read too little; one is turned by 0.1 rad, and the clock is 0.06 s late."""
     rig = with_beam(blind[0], r_max=5.4, p0=0.7)
+    antennas = dict(rig.rfid.all_antennas())
+    antennas["3"] = antennas["3"].model_copy(update={"yaw": antennas["3"].yaw + 0.1})
+    changes = {"antennas": antennas, "preset": None, "time_offset": 0.06}
+    rig = rig.model_copy(update={"rfid": rig.rfid.model_copy(update=changes)})
     grids = tmp_path_factory.mktemp("grids") / "cart"
     return calibrate(blind, outcome, rig, grids=grids)
 
@@ -60,6 +64,15 @@ def test_the_antennas_are_learnt_without_a_reference(found):
         assert getattr(beam, name) == pytest.approx(true, abs=4.0 * errors[name] + 1e-3), name
         assert errors[name] < 0.06 * true, name
     assert found.knowledge.turns[-1] < 0.3 < found.knowledge.turns[0]
+
+
+def test_yaw_and_clock_of_antennas_are_learnt_without_a_reference(found, blind):
+    known = {name: antenna.yaw for name, antenna in blind[0].rig.rfid.all_antennas().items()}
+    for name, antenna in found.rig.rfid.antennas.items():
+        assert antenna.yaw == pytest.approx(known[name], abs=0.05), name
+    (clock,) = (c for c in found.knowledge.constants if c.name == "time_offset")
+    assert clock.is_determined
+    assert found.rig.rfid.time_offset == pytest.approx(0.0, abs=4.0 * clock.error)
 
 
 def test_independent_reads_keep_their_tempering(found):

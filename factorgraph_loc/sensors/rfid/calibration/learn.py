@@ -161,11 +161,11 @@ def _mounted(
         yaws = [(a + b, math.hypot(s, t)) for (a, s), (b, t) in zip(common, own, strict=False)]
         prior = math.hypot(known["yaw"], known["antenna_yaw"] * (len(antennas) > 1))
         start = initial.all_antennas()[name].yaw
-        if constant := _mean(f"antennas.{name}.yaw", yaws, start, antenna.yaw, prior):
+        current = start + se2.wrap_scalar(antenna.yaw - start)
+        if constant := _mean(f"antennas.{name}.yaw", yaws, start, current, prior):
             constants.append(constant)
-            antennas[name] = antenna.model_copy(update={"yaw": round(float(se2.wrap_scalar(constant.fitted)), 5)})
-    offset = settings.time_offset
-    clock = corrections_of("rfid.time_offset", traced)
+            antennas[name] = antenna.model_copy(update={"yaw": round(se2.wrap_scalar(constant.fitted), 5)})
+    offset, clock = settings.time_offset, corrections_of("rfid.time_offset", traced)
     if constant := _mean("time_offset", clock, initial.time_offset, offset, known["time_offset"]):
         constants.append(constant)
         offset = constant.fitted
