@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
@@ -56,9 +56,23 @@ def fgloc() -> Fgloc:
     return call
 
 
+@pytest.fixture
+def refused(fgloc: Fgloc) -> Callable[..., str]:
+    """``refused("info", path)``: what a command that refuses what it is given says, in one line and nothing else."""
+
+    def call(*args: object) -> str:
+        result = fgloc(*args)
+        assert (result.exit_code, result.stdout) == (2, ""), result.output
+        (line,) = result.stderr.splitlines()
+        assert line.startswith("error: ")
+        return line
+
+    return call
+
+
 @pytest.fixture(scope="session")
 def fgloc_once() -> Fgloc:
-    """The same for fixtures that several tests share, without pictures."""
+    """``fgloc`` for fixtures that several tests share, without pictures."""
 
     def call(*args: object) -> Result:
         with pytest.MonkeyPatch.context() as patch:
@@ -96,13 +110,19 @@ def gallery(tmp_path_factory):
 
 
 @pytest.fixture
-def gallery_on_disk(gallery, tmp_path, monkeypatch):
-    """``gallery_on_disk(**changes)``: the path of the log of the gallery with other fields."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def written(tmp_path):
+    """``written(log, **changes)``: the folder of a log with other fields."""
 
-    def write(**changes):
+    def write(log, **changes):
         folder = tmp_path / f"log{len(list(tmp_path.glob('log*')))}"
-        write_native(dataclasses.replace(gallery, **changes), folder)
+        write_native(dataclasses.replace(log, **changes), folder)
         return folder
 
     return write
+
+
+@pytest.fixture
+def gallery_on_disk(gallery, written, tmp_path, monkeypatch):
+    """``gallery_on_disk(**changes)``: the path of the log of the gallery with other fields."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return partial(written, gallery)

@@ -1,26 +1,12 @@
 """``fgloc active``: a table, files, JSON, and errors of one line."""
 
 import polars as pl
-import pytest
 
 SMALL = ("--set", "world.width=8", "--set", "world.plan=hall", "--set", "world.depth=6", "--set", "world.tags=12")
 FEW = ("--set", "particles=300", "--set", "policy.samples=16")
 
 
-@pytest.mark.in_full
-def test_runs_have_processes_of_their_own(fgloc, tmp_path):
-    out = tmp_path / "out"
-    done = fgloc("active", "office", "--policy", "random", "--seeds", "0:2", *SMALL, *FEW, "--max-metres", 1, "-o", out)
-    assert done.exit_code == 0, done.stderr
-    assert str(out) in done.stdout
-    rows = pl.read_parquet(out / "results.parquet")
-    assert rows.select("policy", "seed", "status").rows() == [("random", 0, "ok"), ("random", 1, "ok")]
-    again = fgloc("active", "office", "--seeds", "0:2", "-o", out)
-    assert again.exit_code == 2
-    assert "holds results already" in again.stderr
-
-
-def test_policies_are_compared(fgloc, tmp_path):
+def test_policies_are_compared(fgloc, refused, tmp_path):
     out = tmp_path / "out"
     few = (*SMALL[:-1], "world.tags=4", "--max-metres", 3)
     done = fgloc("active", "office", "--policy", "information,random", "--seeds", "0:2", *few, *FEW, "-o", out)
@@ -31,6 +17,7 @@ def test_policies_are_compared(fgloc, tmp_path):
     assert sorted(rows.select("policy", "seed").rows()) == [(p, s) for p in ("information", "random") for s in (0, 1)]
     assert (rows["metres"] <= 3.3).all()  # a step of a way more
     assert (out / "plots" / "comparison.png").exists()
+    assert "holds results already" in refused("active", "office", "--seeds", "0:2", "-o", out)
 
 
 def test_a_robot_that_finds_nothing_gives_up(fgloc, tmp_path):

@@ -29,11 +29,9 @@ def test_every_setting_of_an_estimator_is_told(fgloc, name):
     assert all(one["meaning"] in printed.stdout for one in found["settings"])
 
 
-def test_a_bad_name_is_told_with_the_nearest(fgloc):
-    done = fgloc("estimators", "smother")
-    assert done.exit_code == 2
-    assert done.stderr == "error: no estimator is called 'smother': did you mean smoother?\n"
-    assert "known: batch, dead_reckoning, ekf" in fgloc("estimators", "zzz").stderr
+def test_a_bad_name_is_told_with_the_nearest(refused):
+    assert "did you mean smoother?" in refused("estimators", "smother")
+    assert "known: batch, dead_reckoning, ekf" in refused("estimators", "zzz")
 
 
 def test_the_list_of_sensors_has_their_channels(fgloc):

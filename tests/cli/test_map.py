@@ -1,13 +1,12 @@
 """`fgloc map`, from the arguments to the files, on a small simulated log."""
 
 import json
-from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.io.native.world_file import read_world
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.rig import Rig
@@ -45,14 +44,9 @@ def circling():
 
 
 @pytest.fixture
-def on_disk(circling, tmp_path):
+def on_disk(circling, written):
     """``on_disk(**changes)``: the path of the log with other fields."""
-
-    def write(**changes):
-        write_native(replace(circling, **changes), tmp_path / "log")
-        return tmp_path / "log"
-
-    return write
+    return partial(written, circling)
 
 
 def test_a_map_with_swapped_landmarks_is_corrected_and_can_be_used(fgloc, on_disk, tmp_path):
@@ -63,9 +57,7 @@ def test_a_map_with_swapped_landmarks_is_corrected_and_can_be_used(fgloc, on_dis
     assert result.exit_code == 0, result.output
     lines = result.stdout.splitlines()
     assert any(line.startswith("2 ") and line.endswith("swapped with 5") for line in map(str.rstrip, lines))
-    summary = "7 landmarks are in the new map: 5 agreeing with the given one, 2 wrong in the given map (2, 5)"
-    assert summary in lines
-    assert str(out) in lines[-1]
+    assert any("2 wrong in the given map (2, 5)" in line for line in lines)
     made = read_world(out)
     np.testing.assert_allclose(made.positions(), PLACES, atol=0.15)
     assert all(landmark.covariance for landmark in made.landmarks.values())
@@ -106,19 +98,11 @@ def test_a_map_is_extended(fgloc, on_disk, tmp_path):
         (["-o", "OUT/none/a.world.toml"], "there is no folder"),
         (["-o", "OUT/a.world.toml", "-e", "particle_filter"], "expected one that estimates landmarks"),
         (["-o", "OUT/a.world.toml", "--set", "batch.landmarks=known"], "--set is batch.landmarks"),
-        (["-o", "OUT/there.world.toml"], "exists already; choose another name or give --overwrite"),
+        (["-o", "OUT/there.world.toml"], "exists already"),
+        (["-o", "OUT/a.world.toml"], "from a range alone a landmark cannot be located"),
     ],
 )
-def test_bad_options_are_one_line(fgloc, short_log, tmp_path, options, message):
+def test_what_cannot_be_mapped_is_one_line(refused, short_log, tmp_path, options, message):
     (tmp_path / "there.world.toml").write_text("")
-    result = fgloc("map", short_log, *(option.replace("OUT", str(tmp_path)) for option in options))
-    assert result.exit_code == 2
-    assert message in result.stderr
-    assert result.stderr.count("\n") == 1
-
-
-def test_beacons_cannot_be_mapped(fgloc, short_log, tmp_path):
-    result = fgloc("map", short_log, "-o", tmp_path / "a.world.toml")
-    assert result.exit_code == 2
-    assert "no sighting has a bearing; from a range alone a landmark cannot be located" in result.stderr
+    assert message in refused("map", short_log, *(option.replace("OUT", str(tmp_path)) for option in options))
     assert not list(tmp_path.glob("a.*"))

@@ -59,17 +59,14 @@ def test_eight_antennas_stand_as_on_the_robot_of_the_paper(fgloc, tmp_path):
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        ((), "--out is missing, expected the file to write, such as robot.rig.toml"),
-        (("--odometry", "tracks"), "--odometry is 'tracks', expected one of differential, omnidirectional, none"),
-        (("--camera", "640"), "--camera is '640', expected a size such as 640x480, or none"),
-        (("--camera", "8x480", "-o", "a.toml"), "the new rig: camera.width is 8: input should be greater"),
-        (("--odometry", "none", "-o", "a.toml"), "the new rig has no sensors, expected odometry"),
+        ((), "--out is missing"),
+        (("--odometry", "tracks"), "--odometry is 'tracks', expected one of differential"),
+        (("--camera", "640"), "--camera is '640', expected a size"),
+        (("--camera", "8x480", "-o", "a.toml"), "camera.width is 8"),
+        (("--odometry", "none", "-o", "a.toml"), "the new rig has no sensors"),
     ],
 )
-def test_wrong_options_are_one_line(fgloc, tmp_path, monkeypatch, options, why):
+def test_wrong_options_are_one_line(refused, tmp_path, monkeypatch, options, why):
     monkeypatch.chdir(tmp_path)
-    done = fgloc("rigs", "new", *options)
-    assert done.exit_code == 2
-    assert done.stderr.startswith(f"error: {why}")
-    assert done.stderr.count("\n") == 1
+    assert why in refused("rigs", "new", *options)
     assert not list(tmp_path.iterdir())

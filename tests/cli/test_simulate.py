@@ -59,19 +59,10 @@ def test_images_are_written_with_the_log(fgloc, tmp_path):
     ("arguments", "message"),
     [
         (("office", "--image-rate", 5), "expected --images with them"),
-        (("ofice",), "did you mean office?"),
         (("office", "--set", "world.tgas=3"), "unknown key world.tgas: did you mean tags?"),
-        (("office", "--set", "a.b=x", "--set", "a.b.c=3"), "--set: no key a.b.c, as a.b is 'x'"),
-        (
-            ("office", "--set", "drive.clearance=2.0", "--set", "world.plan=hall", "--set", "world.depth=3"),
-            "no place that",
-        ),
         (("office", "--recorded", "nowhere"), "nowhere: is neither a file"),
     ],
 )
-def test_what_is_wrong_is_told_in_one_line(fgloc, tmp_path, arguments, message):
-    done = fgloc("simulate", *arguments, "-o", tmp_path / "log")
-    assert done.exit_code == 2
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
+def test_what_is_wrong_is_told_in_one_line(refused, tmp_path, arguments, message):
+    assert message in refused("simulate", *arguments, "-o", tmp_path / "log")
     assert not (tmp_path / "log").exists()
