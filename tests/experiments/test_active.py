@@ -61,14 +61,9 @@ def test_each_policy_runs_on_each_seed(calls, tmp_path):
     assert told[0] == (0, 14)
     assert told[-1] == (14, 14)
     found = {(row["policy"], row["seed"]): row for row in results.rows}
-    one = found["random", 1]
-    assert (one["metres"], one["localized"], one["steps"], one["planning_ms"], one["planning_ms_max"]) == (
-        16.0,
-        False,
-        3,
-        12.0,
-        30.0,
-    )
+    assert found["random", 1].items() >= {
+        *(("metres", 16.0), ("localized", False), ("steps", 3), ("planning_ms", 12.0), ("planning_ms_max", 30.0)),
+    }
     assert found["information", 2]["planning_ms"] is None  # nothing had to be chosen
 
 
@@ -76,17 +71,10 @@ def test_each_policy_runs_on_each_seed(calls, tmp_path):
 def test_files_of_an_experiment(tmp_path):
     out = tmp_path / "out"
     results = active.active(OFFICE, out, policies=("information", "random"), seeds=range(3))
-    assert sorted(
-        str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and "store" not in path.parts
-    ) == [
-        "config.toml",
-        "differences.csv",
-        "plots/comparison.png",
-        "plots/office-active_mcl-information-seed0.png",
-        "plots/office-active_mcl-random-seed0.png",
-        "results.csv",
-        "results.parquet",
-        "table.md",
+    assert sorted(path.name for path in (out / "plots").iterdir()) == [
+        "comparison.png",
+        "office-active_mcl-information-seed0.png",
+        "office-active_mcl-random-seed0.png",
     ]
     assert pl.read_parquet(out / "results.parquet").to_dicts() == results.rows
     (difference,) = pl.read_csv(out / "differences.csv").to_dicts()
@@ -134,16 +122,16 @@ def test_what_was_interrupted_goes_on(calls, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("policies", "estimators", "message"),
+    ("names", "message"),
     [
-        (("informtion",), ("active_mcl",), "did you mean information"),
-        (("random",), ("ekf",), "unknown estimator 'ekf'"),
-        (("random", "random"), ("active_mcl",), "random is given twice"),
-        ((), ("active_mcl",), "no policy is given"),
+        ({"policies": ("informtion",)}, "did you mean information"),
+        ({"policies": ("random",), "estimators": ("ekf",)}, "unknown estimator 'ekf'"),
+        ({"policies": ("random", "random")}, "random is given twice"),
+        ({"policies": ()}, "no policy is given"),
     ],
 )
-def test_names_are_checked_before_anything_runs(calls, tmp_path, policies, estimators, message):
+def test_names_are_checked_before_anything_runs(calls, tmp_path, names, message):
     with pytest.raises(InputError, match=message):
-        active.active(OFFICE, tmp_path / "out", policies=policies, estimators=estimators)
+        active.active(OFFICE, tmp_path / "out", **names)
     assert not calls
     assert not (tmp_path / "out").exists()

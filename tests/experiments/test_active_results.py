@@ -18,24 +18,10 @@ from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
 
 def row(policy, seed, metres, *, world="hall", localized=True, **changes):
     """A run; ``changes`` of its other figures."""
-    return {
-        "world": world,
-        "policy": policy,
-        "estimator": "active_mcl",
-        "seed": seed,
-        "status": "ok",
-        "reason": None,
-        "localized": localized,
-        "metres": metres,
-        "seconds": 2.0 * metres,
-        "error_position": 0.1,
-        "error_heading": math.radians(5.0),
-        "claimed_wrong": False,
-        "steps": 3,
-        "planning_ms": 20.0,
-        "planning_ms_max": 50.0,
-        **changes,
-    }
+    named = {"world": world, "policy": policy, "estimator": "active_mcl", "seed": seed, "status": "ok", "reason": None}
+    ends = {"localized": localized, "metres": metres, "seconds": 2.0 * metres, "claimed_wrong": False}
+    errors = {"error_position": 0.1, "error_heading": math.radians(5.0)}
+    return {**named, **ends, **errors, "steps": 3, "planning_ms": 20.0, "planning_ms_max": 50.0, **changes}
 
 
 def crashed(policy, seed):

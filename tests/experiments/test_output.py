@@ -18,23 +18,8 @@ from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.belief import LearntPoint
 
 COLUMNS = [
-    "kind",
-    "t_ns",
-    "x",
-    "y",
-    "heading",
-    "cov_xx",
-    "cov_xy",
-    "cov_xh",
-    "cov_yy",
-    "cov_yh",
-    "cov_hh",
-    "error_position",
-    "error_heading",
-    "nees",
-    "update_ms",
-    "status",
-    "doubts_model",
+    *("kind", "t_ns", "x", "y", "heading", "cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh"),
+    *("error_position", "error_heading", "nees", "update_ms", "status", "doubts_model"),
 ]
 
 

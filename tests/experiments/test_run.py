@@ -181,26 +181,22 @@ def test_the_reference_prior_is_not_before_the_odometry(log):
     assert resolve_prior(replace(log, streams={"odometry": later}), "reference")[0].t == pytest.approx(0.45)
 
 
-@pytest.mark.parametrize("prior", ["here", "1", "1,nan", "1,2,nan", "0,0,90", "1,2,0,0"])
+@pytest.mark.parametrize("prior", ["here", "1", "1,nan", "0,0,90", "1,2,0,0"])
 def test_priors_that_are_none(log, prior):
     with pytest.raises(InputError, match=f"prior is '{prior}', expected"):
         resolve_prior(log, prior)
 
 
-def test_missing_priors(log):
-    with pytest.raises(InputError, match="states no start"):
-        run(log, RunConfig("fake", prior="log"))
-    with pytest.raises(InputError, match="has no reference"):
-        run(replace(log, reference=None), RunConfig("fake", prior="reference"))
-    message = "fake cannot start from an unknown pose .*, expected a prior reference, log or X,Y,HEADING"
-    with pytest.raises(InputError, match=message):
-        run(log, RunConfig("fake", prior="unknown"))
+@pytest.mark.parametrize(
+    ("prior", "why"), [("log", "no start"), ("reference", "no reference"), ("unknown", "an unknown pose")]
+)
+def test_missing_priors(log, prior, why):
+    with pytest.raises(InputError, match=why):
+        run(replace(log, reference=None), RunConfig("fake", prior=prior))
 
 
 def test_a_start_without_a_heading_where_it_can_be_found(log, fake, monkeypatch):
-    with pytest.raises(
-        InputError, match=r"^fake cannot find an unknown heading on straight .* expected a prior X,Y,HEADING$"
-    ):
+    with pytest.raises(InputError, match="cannot find an unknown heading"):
         run(log, RunConfig("fake", prior="1,2"))
     monkeypatch.setattr(fake, "supports_unknown_heading", True, raising=False)
     run(log, RunConfig("fake", prior="1,2"))

@@ -62,10 +62,9 @@ def test_an_estimator_is_given_all_tags_whatever_the_log_reads_later(reading, fa
 def test_tags_that_are_believed_dead_are_named(reading):
     found = Diagnostics(doubted={"dead_tags": {"b": 0.7, "c": 0.999}})
     use = use_of(reading, ALL, "smoother", settings_of("smoother", {}))
-    assert list(doubts(use, found, Learnt())) == [
-        "straight: 2 of 3 tags of the map are believed dead, as they were not read from where they should have been: "
-        "c (> 99 %), b (70 %)",
-    ]
+    (told,) = doubts(use, found, Learnt())
+    assert told.startswith("straight: 2 of 3 tags of the map are believed dead")
+    assert told.endswith("c (> 99 %), b (70 %)")
     assert list(doubts(use, Diagnostics(), Learnt())) == []
 
 
