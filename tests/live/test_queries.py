@@ -106,7 +106,7 @@ def unchanged(log, case):
     expected = answers(expected)
 
     @given(asked=questions)
-    @settings(max_examples=8, deadline=None)
+    @settings(max_examples=5, deadline=None)
     def check(asked):
         localizer, rows = started(log, case)
         for i, m in enumerate(rows):

@@ -101,18 +101,12 @@ def test_measurements_have_the_corrected_stamp(log):
     assert [m.t for m in found.measurements(("camera",))][:2] == pytest.approx([0.5, 0.7])
 
 
-def test_the_second_time_nothing_is_computed(log, computed):
+def test_the_second_time_nothing_is_computed_nor_of_another_log_with_the_same_images(log, computed, tmp_path):
     first, _ = frames(log)
     assert len(computed) == 10
     computed.clear()
     second, _ = frames(log)
-    assert computed == []
     assert all(same(a, b) for a, b in zip(first, second, strict=True))
-
-
-def test_part_of_a_log_and_another_log_with_the_same_images(log, computed, tmp_path):
-    frames(log)
-    computed.clear()
     copies = [tmp_path / f"copy{k}.png" for k in range(3)]
     for copy, file in zip(copies, log.streams["camera"].file, strict=False):
         copy.write_bytes(file.read_bytes())
@@ -120,7 +114,7 @@ def test_part_of_a_log_and_another_log_with_the_same_images(log, computed, tmp_p
     assert computed == []
 
 
-def test_other_settings_and_other_images_are_computed(log, computed):
+def test_other_settings_other_images_and_other_code_compute_again(log, computed, monkeypatch):
     frames(log)
     computed.clear()
     frames(log, FrontendSettings(feature="orb", count=101))
@@ -130,10 +124,6 @@ def test_other_settings_and_other_images_are_computed(log, computed):
     cv2.imwrite(str(file), cv2.imread(str(file))[::-1])
     frames(log)
     assert computed == ["4.png"]
-
-
-def test_changed_code_is_computed_again(log, computed, monkeypatch):
-    frames(log)
     computed.clear()
     monkeypatch.setattr(frontend, "code_version", lambda _: "changed")
     frames(log)
@@ -186,9 +176,6 @@ def test_a_log_without_images_stays_as_it_is(log):
     assert with_features(without, ORB) == (without, ())
     found, _ = with_features(log, ORB)
     assert with_features(found, ORB)[0] is found
-
-
-def test_no_images():
     assert frames(log_of([])) == ([], ())
 
 

@@ -57,8 +57,6 @@ def test_a_range_that_is_too_long_is_found():
     result, found = outcome(told(log, r_max=1.2 * model.r_max), estimator)
     assert found["causal.position_rmse"] < 1.25 * best["causal.position_rmse"]
     assert found["causal.anees"] < 6.0
-    _, misled = outcome(told(log, EXACT, r_max=1.2 * model.r_max), estimator)
-    assert misled["causal.position_rmse"] > 1.3 * best["causal.position_rmse"]
     value, sigma = result.learnt.values["rfid.range_scale"]
     # the edge of the reads keeps its width, which is not in proportion
     assert value == pytest.approx(-np.log(1.2), abs=0.03)
@@ -102,8 +100,6 @@ def test_antennas_that_are_turned_and_a_late_clock_are_found():
 def test_what_is_known_exactly_is_not_learnt():
     result, _ = exact("smoother")
     assert not [name for name in result.learnt.values if name.startswith("rfid")]
-    result = run(office(), RunConfig("smoother", {"self_calibration": False}))
-    assert not result.learnt.values
 
 
 def test_nothing_is_said_of_antennas_that_are_as_the_rig_says():
