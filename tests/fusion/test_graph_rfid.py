@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,30 +24,11 @@ def office(faults: Mapping[str, Any] | None = None, seed: int = 1, **changes: An
     return simulate(preset("office", settings), seed)
 
 
-@cache
-def plain() -> tuple[Log, RunResult]:
-    log = office()
-    return log, run(log, RunConfig("smoother"))
-
-
 def errors(log: Log, result: RunResult) -> np.ndarray:
     """Position errors (N,) [m] of the causal estimates."""
     assert log.reference is not None
     difference = result.poses - log.reference.at(result.t, max_gap=0.2)
     return np.hypot(difference[:, 0], difference[:, 1])
-
-
-def test_a_silence_of_all_tags_is_no_place() -> None:
-    """For 40 s nothing is read: the robot goes on by odometry, says so, and is back soon after."""
-    log = office({"silence": {"time": 25.0, "duration": 40.0}})
-    result = run(log, RunConfig("smoother"))
-    figures = score(result, log)
-    assert figures["causal.anees"] < 12.0
-    assert any("no tag is read" in what for _, what in result.diagnostics.events)
-    status = np.array(result.status)
-    assert np.all(status[(result.t > 30.0) & (result.t < 64.0)] == "ambiguous")
-    assert np.all(status[result.t > 72.0] == "localized")
-    assert errors(log, result)[result.t > 72.0].max() < 0.5
 
 
 def test_landmarks_of_a_track_that_was_lost_are_forgotten() -> None:
@@ -89,7 +69,7 @@ def test_nothing_known_is_read() -> None:
 
 
 def test_without_a_map_it_is_told_that_reads_are_of_no_use() -> None:
-    log, _ = plain()
+    log = office()
     unmapped = replace(log, world=log.world.model_copy(update={"tags": {}}))
     result = run(unmapped, RunConfig("ekf"))
     assert any("reads are of no use without a map" in warning for warning in result.warnings)

@@ -10,7 +10,6 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.log import cut
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation import simulate as simulate_office
 
@@ -98,10 +97,6 @@ def test_rows_that_neither_filter_uses_are_counted_once(office):
 def test_an_unknown_start_needs_tags(office):
     assert made(office, BOTH).supports_unknown_start
     assert not made(office, SIGHT).supports_unknown_start
-    config = RunConfig("switching", {"particles": 2000}, sensors=BOTH, prior="unknown", seed=1)
-    result = run(cut(office, 0.0, 30.0), config)
-    assert result.status[-1] == "localized"
-    assert np.hypot(*(result.poses[-1] - office.reference.at(result.t[-1:])[0])[:2]) < 0.5
 
 
 def test_what_one_filter_takes_back_the_other_keeps(office):
