@@ -6,15 +6,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from picture import SMALL
 
 from factorgraph_loc import ImageStream, Log, PointMap, Rig, SightingStream, Trajectory, VelocityStream, World
 from factorgraph_loc.evaluation.inspect import inspect
-from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.summary import mounting_problems
+from factorgraph_loc.vision.settings import FrontendSettings
 
-CAMERA = CameraSettings(
-    width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5, frontend={"feature": "orb", "count": 30}
-)
+CAMERA = SMALL.model_copy(update={"frontend": FrontendSettings(feature="orb", count=30)})
 
 
 @pytest.fixture

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from landmark_world import with_sightings
+from picture import SMALL
 
 from factorgraph_loc import CameraFrame, FeatureStream, InputError, PointMap, Rig, SightingStream, Trajectory, World
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED, score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.sensors.camera.settings import CameraSettings
 
 NO_POINTS = "straight: the map has no points that a camera could find: give --world"
 STAMPS = np.array([0.3, 0.7])
@@ -29,8 +29,7 @@ def blank(log):
         "camera": FeatureStream(STAMPS, frames),
         "sightings": SightingStream(STAMPS, ["x", "x"], np.full(2, 50.0), np.full(2, 60.0)),
     }
-    camera = CameraSettings(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
-    rig = Rig(sensors=("odometry", "camera"), bearing_range=log.rig.bearing_range, camera=camera)
+    rig = Rig(sensors=("odometry", "camera"), bearing_range=log.rig.bearing_range, camera=SMALL)
     return replace(log, rig=rig, world=World(), streams=streams)
 
 

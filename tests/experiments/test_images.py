@@ -2,21 +2,18 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
+from picture import SMALL, moved_over
 
 from factorgraph_loc import ImageStream, InputError, PointMap, SightingStream, compare
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.sensors.camera import frontend
-from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.use import frontend_of
 from factorgraph_loc.vision.settings import FrontendSettings
 
-CAMERA = CameraSettings(
-    width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5, frontend={"feature": "orb", "count": 30}
-)
+CAMERA = SMALL.model_copy(update={"frontend": FrontendSettings(feature="orb", count=30)})
 
 
 @pytest.fixture(autouse=True)
@@ -27,11 +24,7 @@ def _cache(tmp_path, monkeypatch):
 @pytest.fixture
 def seeing(log, tmp_path):
     """The short log with a camera and eight images, the first of them 0.1 s after its begin."""
-    rng = np.random.default_rng(1)
-    picture = cv2.GaussianBlur(rng.integers(0, 256, (120, 200), dtype=np.uint8), (0, 0), 1.5)
-    files = [tmp_path / f"{k}.png" for k in range(8)]
-    for k, file in enumerate(files):
-        cv2.imwrite(str(file), picture[:, 4 * k : 4 * k + 160])
+    files = moved_over(tmp_path, 8)
     rig = log.rig.model_copy(update={"camera": CAMERA, "sensors": ("odometry", "camera")})
     return replace(log, rig=rig, streams=dict(log.streams) | {"camera": ImageStream(0.1 + 0.2 * np.arange(8), files)})
 

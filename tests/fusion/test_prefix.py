@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
+from picture import SMALL, moved_over
 from short_logs import frames, late, office, plaza, room, with_gyro
 
 from factorgraph_loc import ImageStream, InputError, PointMap, World
@@ -12,7 +12,7 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import ESTIMATORS
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.measurement import selected
-from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.vision.settings import FrontendSettings
 
 READS = ("odometry", "rfid")
 FEW = {"particles": 150, "min_particles": 100, "smooth": False}
@@ -110,19 +110,12 @@ def test_nor_with_other_settings(name, kind, settings):
 
 @pytest.mark.parametrize("name", ["smoother", "monoslam"])
 def test_nor_do_features_that_are_found_in_images(name, tmp_path):
-    rng = np.random.default_rng(1)
-    picture = cv2.GaussianBlur(rng.integers(0, 256, (120, 240), dtype=np.uint8), (0, 0), 1.5)
-    files = [tmp_path / f"{k}.png" for k in range(12)]
-    for k, file in enumerate(files):
-        cv2.imwrite(str(file), picture[:, 4 * k : 4 * k + 160])
-    settings = CameraSettings(
-        width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5, frontend={"feature": "orb", "count": 60}
-    )
+    settings = SMALL.model_copy(update={"frontend": FrontendSettings(feature="orb", count=60)})
     log = room()
     rig = log.rig.model_copy(update={"camera": settings, "sensors": ("odometry", "camera")})
     streams = {
         "odometry": cut(log, 0.0, 2.6).streams["odometry"],
-        "camera": ImageStream(0.13 + 0.2 * np.arange(12), files),
+        "camera": ImageStream(0.13 + 0.2 * np.arange(12), moved_over(tmp_path, 12)),
     }
     log = replace(log, rig=rig, streams=streams, world=World(points=PointMap.of((), np.empty((0, 3)))))
     config = RunConfig(name, SETTINGS[name] | {"landmarks": "unknown"}, prior="0,0,0")

@@ -38,21 +38,18 @@ def test_what_is_stored_is_small_and_belongs_to_a_case():
     assert sum(path.stat().st_size for path in RESULTS.iterdir()) < MOST_BYTES
 
 
-@pytest.mark.parametrize(
-    ("sensor", "changes"),
-    [
-        ("odometry", {"scale_distance": 1.01}),
-        ("bearing_range", {"range_sigma": 0.101}),
-        ("bearing_range", {"bearing_sigma": 0.0303}),
-    ],
-)
 @pytest.mark.parametrize("name", ["ekf", "particle_filter", "smoother", "batch"])
-def test_a_change_of_a_model_by_a_hundredth_is_seen(name, sensor, changes):
+def test_a_change_of_a_model_by_a_hundredth_is_seen(name):
     log, config = logs.landmarks(), RunConfig(name, {"particles": 300} if name == "particle_filter" else {})
-    found = differences(record_run(log, config), record_run(with_rig(log, sensor, **changes), config))
-    seen = {difference.quantity: difference.size for difference in found}
-    for quantity in ("final.poses", "final.covariances"):
-        assert seen[quantity] > 30.0 * TOLERANCE
+    right = record_run(log, config)
+    for sensor, key, value in (
+        ("odometry", "scale_distance", 1.01),
+        ("bearing_range", "range_sigma", 0.101),
+        ("bearing_range", "bearing_sigma", 0.0303),
+    ):
+        found = differences(right, record_run(with_rig(log, sensor, **{key: value}), config))
+        seen = {difference.quantity: difference.size for difference in found}
+        assert min(seen["final.poses"], seen["final.covariances"]) > 30.0 * TOLERANCE, key
 
 
 def test_records_are_read_as_they_were_written(tmp_path):

@@ -13,7 +13,7 @@ from factorgraph_loc.slam import loop_closure
 from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints
 from factors import se2
 from factors.graph import point_key, pose_key
-from tests.slam.test_slam_points import rmse, with_features
+from tests.slam.test_slam_points import rmse
 
 MODEL = camera_world.CAMERA.model()
 POSES = np.array([(0.0, 0.1 * i, 0.05 * i) for i in range(5)])
@@ -107,7 +107,7 @@ def test_no_image_twice_a_second():
 
 def laps(points, seconds=48.0):
     """Two rounds in a room; no track lasts for more than ten seconds."""
-    return with_features(camera_world.simulate(3, seconds), 10.0, points=points, every=0.6)
+    return camera_world.with_tracks(camera_world.simulate(3, seconds), 10.0, points=points, every=0.6)
 
 
 def both(log, monkeypatch):

@@ -7,31 +7,23 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from factorgraph_loc import FeatureStream, World
+from factorgraph_loc import World
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.output import map_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.mapping.point_maps import chosen
 from factorgraph_loc.model.log import cut
 
-SECONDS, EVERY = 24.0, 0.4  # s
+SECONDS = 24.0
 SEEDS = range(21, 24)
 UNKNOWN = RunConfig("smoother", {"landmarks": "unknown"})
 
 
 def filmed(seed, speeds):
     """A drive through the room with features that are followed for four seconds, and no map."""
-    log = camera_world.simulate(seed, SECONDS, speeds=speeds)
-    rng, points = np.random.default_rng(seed), camera_world.with_views(camera_world.room())
-    times = np.arange(0.3, SECONDS, EVERY)
-    frames = []
-    for k, (t, pose) in enumerate(zip(times.tolist(), log.reference.at(times), strict=True)):
-        found, shown = camera_world.frame(points, pose, t, rng, clutter=60)
-        tracks = np.where(shown < 0, 10**6 + 1000 * k + np.arange(len(shown)), shown + 1000 * int(t / 4.0))
-        frames.append(replace(found, tracks=tracks))
-    rig = log.rig.model_copy(update={"sensors": ("odometry", "camera")})
-    streams = {"odometry": log.streams["odometry"], "camera": FeatureStream(times, frames)}
-    return replace(log, rig=rig, world=World(), streams=streams)
+    return camera_world.with_tracks(
+        camera_world.simulate(seed, SECONDS, speeds=speeds), 4.0, seed, begin=0.3, every=0.4
+    )
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 import factorgraph_loc as fgloc
-from factorgraph_loc import FeatureStream, SightingStream, Trajectory, VelocityStream, World
+from factorgraph_loc import FeatureStream, SightingStream, Trajectory, VelocityStream
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.graph.solver import FullHistory
@@ -134,23 +134,8 @@ def test_a_robot_at_rest_or_turning_on_the_spot(name, turn):
     assert result.learnt.points is None or np.all(np.isfinite(result.learnt.points.covariances))
 
 
-def with_features(log, lifetime, seed=5, points=None, every=0.3):
-    """The log with features ``every`` so many seconds in place of named points; tracks last for ``lifetime`` seconds."""
-    rng = np.random.default_rng(seed)
-    points = camera_world.with_views(camera_world.room()) if points is None else points
-    times = np.arange(0.13, log.reference.t[-1], every)
-    frames = []
-    for k, (t, pose) in enumerate(zip(times.tolist(), log.reference.at(times), strict=True)):
-        found, shown = camera_world.frame(points, pose, t, rng, clutter=60)
-        tracks = np.where(shown < 0, 10**6 + 1000 * k + np.arange(len(shown)), shown + 1000 * int(t / lifetime))
-        frames.append(replace(found, tracks=tracks))
-    streams = {"odometry": log.streams["odometry"], "camera": FeatureStream(times, frames)}
-    rig = log.rig.model_copy(update={"sensors": ("odometry", "camera")})
-    return replace(log, rig=rig, streams=streams, world=World())
-
-
 def test_points_whose_tracks_end_are_found_again(log):
-    result = run(with_features(log, 4.0), CONFIGS["smoother"])
+    result = run(camera_world.with_tracks(log, 4.0), CONFIGS["smoother"])
     points, true = result.learnt.points, camera_world.room()
     assert rmse(result, log) < 0.25
     assert points.feature == "colour"
@@ -163,7 +148,7 @@ def test_points_whose_tracks_end_are_found_again(log):
 
 def test_a_track_that_comes_back_meets_the_one_that_took_its_place(log):
     # two tracks of each point take turns; now and then both are in one image
-    film = with_features(log, 4.0)
+    film = camera_world.with_tracks(log, 4.0)
     frames = list(film.streams["camera"].frame)
     for k, frame in enumerate(frames):
         old = frame.tracks < 10**6
@@ -184,7 +169,7 @@ def test_a_track_that_comes_back_meets_the_one_that_took_its_place(log):
 
 def test_few_features_that_cannot_confirm_each_other_are_not_believed():
     """For 6 s three tracks are left, which slip: the robot goes on by its wheels, as with nothing to see."""
-    film = with_features(camera_world.simulate(1, 11.0), 100.0)
+    film = camera_world.with_tracks(camera_world.simulate(1, 11.0), 100.0)
     ends = []
     for left in (3, 0):
         frames = []

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from picture import SMALL
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.sensors.camera.frontend import LiveFrontend
-from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.settings import FrontendSettings
 
-CAMERA = CameraSettings(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5).model()
+CAMERA = SMALL.model()
 
 
 @pytest.mark.parametrize("feature", ["orb", "sift"])
