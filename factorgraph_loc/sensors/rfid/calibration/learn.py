@@ -28,7 +28,7 @@ from factorgraph_loc.sensors.rfid.calibration.pairs import (
     pairs_of,
     terms,
 )
-from factorgraph_loc.sensors.rfid.calibration.parametric import STEP, SURVEY, family_of, fit_model, place
+from factorgraph_loc.sensors.rfid.calibration.parametric import STEP, SURVEY, family_of, fit_model, place, places_of
 from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit, fit_phase
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, cells, rounds_of
 from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi
@@ -95,7 +95,7 @@ def learn_rfid(logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = N
     phase = _focus([log for log in logs if log.world == logs[0].world], settings, survey)
     focus = {} if phase is None else _priors_of(phase, survey)
     settings, survey, posterior = place(rounds, settings, survey, floor, focus, with_facing=facing)
-    places = zip(posterior.parameters, posterior.values.tolist(), posterior.errors.tolist(), strict=True)
+    places = zip(places_of(settings)[0], posterior.values.tolist(), posterior.errors.tolist(), strict=True)
     pairs, names = pairs_of(rounds, settings, survey), tuple(settings.all_antennas())
     scores = dict[Kind, float]()
     if kind is None:
