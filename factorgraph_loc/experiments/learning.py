@@ -1,6 +1,6 @@
 """A run whose final trajectory has a rig that was learnt from the log itself.
 
-What was learnt comes from the whole log, so that no causal estimate may use it: those are of the run with the rig as it was given.
+The learnt rig depends on the whole log. Causal estimates therefore use the given rig.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def run_and_learn(log: Log, config: RunConfig, progress: Callable[[float], None]
     """Run an estimator on a log, learn the rig from the log by turns with the smoother, and compute the final trajectory with it.
 
     ``progress`` is called with the fraction done. The effective configuration of the result has the ``learnt_rig`` too. Raises
-    InputError if the log does not tell enough, and what :func:`~factorgraph_loc.experiments.run.run` does.
+    InputError if the log has too little information, and the errors of :func:`~factorgraph_loc.experiments.run.run`.
     """
     report = progress or (lambda _share: None)
     runs = TURNS + 2

@@ -1,4 +1,4 @@
-"""What is learnt of a robot whose constants are known."""
+"""Calibration of a simulated robot with known constants."""
 
 from dataclasses import replace
 
@@ -37,10 +37,10 @@ def test_the_constants_are_found(knowledge, name, truth):
 
     Gross ranges are more often too long than too short, which may move a constant by half a thousandth besides.
     """
-    (found,) = (c for c in knowledge.constants if c.name == name)
-    assert found.is_determined
-    assert found.fitted == pytest.approx(truth, abs=4.0 * found.error + 5e-4)
-    assert found.error < 0.1 * abs(truth - found.initial)
+    (result,) = (c for c in knowledge.constants if c.name == name)
+    assert result.is_determined
+    assert result.fitted == pytest.approx(truth, abs=4.0 * result.error + 5e-4)
+    assert result.error < 0.1 * abs(truth - result.initial)
 
 
 def test_the_scatter_is_found_without_the_outliers(knowledge):
@@ -54,30 +54,34 @@ def test_white_errors_are_worth_independent_ones(knowledge, simulate):
     """Errors of a landmark that last for 3 s, as of a Gauss-Markov process, are not."""
     assert knowledge.sensors["landmarks"].details.share > 0.6
     log = simulate(seconds=240.0, range_sigma=1e-6)
-    seen, rng = log.streams["bearing_range"], np.random.default_rng(3)
-    errors = np.zeros(len(seen.t))
-    for name in set(seen.landmark):
-        rows = np.flatnonzero(np.array(seen.landmark) == name)
-        value, before = rng.standard_normal(), seen.t[rows[0]]
+    sightings, rng = log.streams["bearing_range"], np.random.default_rng(3)
+    errors = np.zeros(len(sightings.t))
+    for name in set(sightings.landmark):
+        rows = np.flatnonzero(np.array(sightings.landmark) == name)
+        value, last = rng.standard_normal(), sightings.t[rows[0]]
         for row in rows.tolist():
-            kept = np.exp((before - seen.t[row]) / 3.0)
-            value, before = kept * value + np.sqrt(1.0 - kept**2) * rng.standard_normal(), seen.t[row]
+            kept = np.exp((last - sightings.t[row]) / 3.0)
+            value, last = kept * value + np.sqrt(1.0 - kept**2) * rng.standard_normal(), sightings.t[row]
             errors[row] = 0.1 * value
-    one = replace(
-        log, streams={"odometry": log.streams["odometry"], "bearing_range": replace(seen, range=seen.range + errors)}
+    with_errors = replace(
+        log,
+        streams={
+            "odometry": log.streams["odometry"],
+            "bearing_range": replace(sightings, range=sightings.range + errors),
+        },
     )
-    assert learn(one).sensors["landmarks"].details.share < 0.3
+    assert learn(with_errors).sensors["landmarks"].details.share < 0.3
 
 
 def test_constants_that_the_robot_does_not_have_are_within_chance(simulate):
-    found = constants(simulate(seconds=200.0, scale_distance=0.95))
-    assert found["scale_distance"].fitted == pytest.approx(0.95, abs=0.005)
-    assert all(abs(c.fitted - c.initial) < 4.0 * c.error for c in found.values() if c.name != "scale_distance")
+    result = constants(simulate(seconds=200.0, scale_distance=0.95))
+    assert result["scale_distance"].fitted == pytest.approx(0.95, abs=0.005)
+    assert all(abs(c.fitted - c.initial) < 4.0 * c.error for c in result.values() if c.name != "scale_distance")
 
 
 def test_late_commands_have_a_delay(simulate):
-    found = constants(simulate(seconds=200.0, delay=0.2))
-    assert found["delay"].fitted + found["lag"].fitted == pytest.approx(0.2, abs=0.02)
+    result = constants(simulate(seconds=200.0, delay=0.2))
+    assert result["delay"].fitted + result["lag"].fitted == pytest.approx(0.2, abs=0.02)
 
 
 def test_increments_have_neither_delay_nor_lag(simulate):
@@ -85,21 +89,21 @@ def test_increments_have_neither_delay_nor_lag(simulate):
     odometry = log.streams["odometry"]
     twists = np.column_stack((odometry.v, 0.0 * odometry.v, odometry.w)) * 0.05
     motion = se2.exp(np.vstack((np.zeros(3), twists[:-1])))
-    found = constants(replace(log, streams={**log.streams, "odometry": IncrementStream(odometry.t, *motion.T)}))
-    assert not {"delay", "lag"} & set(found)
-    assert found["scale_rotation"].fitted == pytest.approx(1.04, abs=4.0 * found["scale_rotation"].error)
+    result = constants(replace(log, streams={**log.streams, "odometry": IncrementStream(odometry.t, *motion.T)}))
+    assert not {"delay", "lag"} & set(result)
+    assert result["scale_rotation"].fitted == pytest.approx(1.04, abs=4.0 * result["scale_rotation"].error)
 
 
 def test_gross_ranges_do_not_widen_the_noise(simulate):
-    """A quarter is 5 m too long: the scale is that of the others, and so is the scatter."""
+    """A quarter is 5 m too long: scale and scatter are those of the others."""
     log = simulate(seconds=120.0)
-    seen, rng = log.streams["bearing_range"], np.random.default_rng(1)
-    long = np.where(rng.random(len(seen.t)) < 0.25, rng.exponential(5.0, len(seen.t)), 0.0)
-    streams = {**log.streams, "bearing_range": replace(seen, range=seen.range + long)}
-    found = learn(replace(log, streams=streams))
-    (scale,) = (c for c in found.constants if c.name == "range_scale")
+    sightings, rng = log.streams["bearing_range"], np.random.default_rng(1)
+    long = np.where(rng.random(len(sightings.t)) < 0.25, rng.exponential(5.0, len(sightings.t)), 0.0)
+    streams = {**log.streams, "bearing_range": replace(sightings, range=sightings.range + long)}
+    result = learn(replace(log, streams=streams))
+    (scale,) = (c for c in result.constants if c.name == "range_scale")
     assert scale.fitted == pytest.approx(1.0, abs=4.0 * scale.error + 1e-3)
-    assert found.sensors["landmarks"].details.scatter.range_sigma < 0.06
+    assert result.sensors["landmarks"].details.scatter.range_sigma < 0.06
 
 
 @pytest.mark.parametrize(("depth", "kind"), [(True, "depth"), (False, "distance")])
@@ -129,18 +133,18 @@ def test_without_headings_and_bearings_only_the_range_scale_is_learnt(simulate, 
 
 
 def test_logs_that_do_not_go_together_are_refused(simulate, headless):
-    log, other = simulate(seconds=30.0), simulate(seed=2, seconds=30.0)
+    log, second = simulate(seconds=30.0), simulate(seed=2, seconds=30.0)
     with pytest.raises(InputError, match=r"simulated-2: has no reference"):
-        check([log, replace(other, reference=None)])
+        check([log, replace(second, reference=None)])
     with pytest.raises(InputError, match=r"simulated-2: has no bearing_range"):
-        check([log, replace(other, streams={"odometry": other.streams["odometry"]})])
+        check([log, replace(second, streams={"odometry": second.streams["odometry"]})])
     with pytest.raises(InputError, match=r"only one has headings"):
-        check([log, headless(other)])
+        check([log, headless(second)])
     with pytest.raises(InputError, match=r"given twice"):
         check([log, log])
-    odometry = other.streams["odometry"]
+    odometry = second.streams["odometry"]
     increments = IncrementStream(odometry.t, odometry.v, odometry.v, odometry.w)
     with pytest.raises(InputError, match=r"simulated-2: its odometry is of another kind than that of simulated-1"):
-        check([log, replace(other, streams={**other.streams, "odometry": increments})])
+        check([log, replace(second, streams={**second.streams, "odometry": increments})])
     with pytest.raises(InputError, match=r"simulated-1: odometry and reference overlap in 14 windows"):
         learn(log)

@@ -40,17 +40,17 @@ def calibrated(logs, folder, factor, anees=3.0):
 
 
 def test_each_log_is_tried_with_a_rig_from_the_others(logs, tmp_path):
-    found, runs = calibrated(logs, tmp_path, 0.5)
-    assert not found.refused
-    assert found.rig == found.knowledge.rig != logs[0].rig
-    assert growth(found.trials) == pytest.approx(0.5)
-    assert [(t.log, t.estimator) for t in found.trials] == [
+    calibration, runs = calibrated(logs, tmp_path, 0.5)
+    assert not calibration.refused
+    assert calibration.rig == calibration.knowledge.rig != logs[0].rig
+    assert growth(calibration.trials) == pytest.approx(0.5)
+    assert [(t.log, t.estimator) for t in calibration.trials] == [
         (log.name, estimator) for log in logs for estimator in ("ekf", "smoother")
     ]
     learnt = {name: rig for name, _, rig in runs if rig != logs[0].rig}
-    assert found.rig not in learnt.values()
+    assert calibration.rig not in learnt.values()
     assert learnt["reads-1"] != learnt["reads-2"]
-    assert any("moved tags tag3" in doubt for doubt in found.doubts)
+    assert any("moved tags tag3" in doubt for doubt in calibration.doubts)
 
 
 @pytest.mark.parametrize(
@@ -58,16 +58,16 @@ def test_each_log_is_tried_with_a_rig_from_the_others(logs, tmp_path):
     [(1.01, 3.0, False), (1.05, 3.0, True), (0.95, 3.8, False), (0.95, 7.0, True), (0.7, 7.0, False)],
 )
 def test_a_rig_with_larger_or_less_consistent_errors_is_refused(logs, tmp_path, factor, anees, refused):
-    found, _ = calibrated(logs, tmp_path, factor, anees)
-    assert bool(found.refused) == refused
-    assert found.rig == (found.input_rig if refused else found.knowledge.rig)
-    assert any("input rig is kept" in doubt for doubt in found.doubts) == refused
-    assert ("input rig is kept" in report.summary(found)[-1]) == refused
+    calibration, _ = calibrated(logs, tmp_path, factor, anees)
+    assert bool(calibration.refused) == refused
+    assert calibration.rig == (calibration.input_rig if refused else calibration.knowledge.rig)
+    assert any("input rig is kept" in doubt for doubt in calibration.doubts) == refused
+    assert ("input rig is kept" in report.summary(calibration)[-1]) == refused
 
 
 def test_logs_with_the_same_reads_are_one_recording(logs, tmp_path):
     """Its halves are held out, as those of a single log."""
     again = replace(logs[0], name="again")
     assert len(set(recordings([logs[0], again, logs[1]]))) == 2
-    found, _ = calibrated([logs[0], again], tmp_path, 0.5)
-    assert [t.log for t in found.trials if t.estimator == "ekf"] == ["reads-1", "again"] * 2
+    calibration, _ = calibrated([logs[0], again], tmp_path, 0.5)
+    assert [t.log for t in calibration.trials if t.estimator == "ekf"] == ["reads-1", "again"] * 2

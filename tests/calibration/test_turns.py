@@ -44,7 +44,7 @@ def blind(offices):
 
 
 @pytest.fixture(scope="module")
-def found(blind, tmp_path_factory):
+def learnt(blind, tmp_path_factory):
     """From a rig whose antennas reach 20 % too far, and read too little; one is turned by 0.1 rad, and the clock is 0.06 s late."""
     rig = with_beam(blind[0], r_max=5.4, p0=0.7)
     antennas = dict(rig.rfid.all_antennas())
@@ -55,42 +55,42 @@ def found(blind, tmp_path_factory):
     return calibrate(blind, outcome, rig, grids=grids)
 
 
-def test_the_antennas_are_learnt_without_a_reference(found):
+def test_the_antennas_are_learnt_without_a_reference(learnt):
     """Each within four standard errors of what made the reads, and these are small."""
-    beam = found.rig.rfid.models["default"]
+    beam = learnt.rig.rfid.models["default"]
     assert isinstance(beam, BeamSettings)
-    errors = {c.name.rpartition(".")[2]: c.error for c in found.knowledge.constants if c.sensor == "rfid"}
+    errors = {c.name.rpartition(".")[2]: c.error for c in learnt.knowledge.constants if c.sensor == "rfid"}
     for name, true in {"p0": 0.9, "r_max": 4.5, "s_r": 0.3, "sigma_phi": 0.698}.items():
         assert getattr(beam, name) == pytest.approx(true, abs=4.0 * errors[name] + 1e-3), name
         assert errors[name] < 0.06 * true, name
-    assert found.knowledge.turns[-1] < 0.3 < found.knowledge.turns[0]
+    assert learnt.knowledge.turns[-1] < 0.3 < learnt.knowledge.turns[0]
 
 
-def test_yaw_and_clock_of_antennas_are_learnt_without_a_reference(found, blind):
+def test_yaw_and_clock_of_antennas_are_learnt_without_a_reference(learnt, blind):
     known = {name: antenna.yaw for name, antenna in blind[0].rig.rfid.all_antennas().items()}
-    for name, antenna in found.rig.rfid.antennas.items():
+    for name, antenna in learnt.rig.rfid.antennas.items():
         assert antenna.yaw == pytest.approx(known[name], abs=0.05), name
-    (clock,) = (c for c in found.knowledge.constants if c.name == "time_offset")
+    (clock,) = (c for c in learnt.knowledge.constants if c.name == "time_offset")
     assert clock.is_determined
-    assert found.rig.rfid.time_offset == pytest.approx(0.0, abs=4.0 * clock.error)
+    assert learnt.rig.rfid.time_offset == pytest.approx(0.0, abs=4.0 * clock.error)
 
 
-def test_independent_reads_keep_their_tempering(found):
-    (tempering,) = (c for c in found.knowledge.constants if c.name == "tempering")
+def test_independent_reads_keep_their_tempering(learnt):
+    (tempering,) = (c for c in learnt.knowledge.constants if c.name == "tempering")
     assert tempering.fitted == 1.0
-    assert found.rig.rfid.tempering == 1.0
+    assert learnt.rig.rfid.tempering == 1.0
 
 
 def test_bursts_lower_the_tempering(tmp_path):
-    """Fades of five seconds, of which a rig without them knows nothing."""
+    """Fades of five seconds that the rig does not model."""
     faults = {"fading": {"duration": 5.0, "share": 0.4}}
     log = simulate(preset("office", {"drive": {"duration": 90.0}, "faults": faults}), 3)
     turns = learn_by_turns([log], log.rig, smoothed, tmp_path / "cart")
     assert 0.12 < turns.rig.rfid.tempering < 0.5
 
 
-def test_priors_come_from_the_scatter_between_logs(found):
-    prior = found.rig.rfid.models["default"].prior
+def test_priors_come_from_the_scatter_between_logs(learnt):
+    prior = learnt.rig.rfid.models["default"].prior
     assert 0.005 < prior.range_scale < 0.03
     assert 0.02 < prior.read_rate < 0.2
 
@@ -127,9 +127,9 @@ def test_the_final_trajectory_alone_is_of_what_was_learnt(offices):
     for name in ("t", "poses", "covariances"):
         assert np.array_equal(getattr(plain, name), getattr(learning.result, name))
     assert plain.status == learning.result.status
-    before, after = score(plain, log), score(learning.result, log)
-    assert after["causal.position_rmse"] == before["causal.position_rmse"]
-    assert after["final.position_rmse"] < 0.9 * before["final.position_rmse"]
+    given, improved = score(plain, log), score(learning.result, log)
+    assert improved["causal.position_rmse"] == given["causal.position_rmse"]
+    assert improved["final.position_rmse"] < 0.9 * given["final.position_rmse"]
     assert learning.result.config["learnt_rig"]["rfid"]["models"]["default"]["r_max"] == pytest.approx(4.5, abs=0.1)
     assert learning.result.config["rig"]["rfid"]["models"]["default"]["r_max"] == 5.4
 
@@ -138,9 +138,9 @@ def test_the_reference_is_not_used(offices, tmp_path):
     """Learnt is the same with a reference that lies elsewhere."""
     log = cut(offices[0], 0.0, 40.0)
     shifted = replace(log.reference, poses=log.reference.poses + 1.0)
-    pair = [replace(log, reference=one) for one in (None, shifted)]
-    found = [learn_by_turns([one], one.rig, smoothed, tmp_path / "cart").rig for one in pair]
-    assert found[0] == found[1]
+    pair = [replace(log, reference=reference) for reference in (None, shifted)]
+    learnt = [learn_by_turns([each], each.rig, smoothed, tmp_path / "cart").rig for each in pair]
+    assert learnt[0] == learnt[1]
 
 
 def test_what_does_not_tell_enough_is_named(offices, blind, tmp_path):

@@ -1,4 +1,4 @@
-"""Wheels that are calibrated against a reference without another sensor, and what that says of their radius and track."""
+"""Calibration of wheels against a reference without another sensor: radius and track."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ def file(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def calibrated(simulate, file):
-    """What is learnt of two drives with wheels alone: 6 % larger than the rig says, 4 % further apart."""
+    """From two drives with wheels that are 6 % larger and 4 % further apart than in the rig."""
     logs = []
     for seed in (1, 2):
         log = simulate(seed=seed, seconds=120.0, scale_distance=1.06, scale_rotation=1.06 / 1.04)
@@ -31,9 +31,9 @@ def calibrated(simulate, file):
 
 
 def test_radius_and_track_are_found(calibrated):
-    found = report.document(calibrated)["figures"]["odometry"]
-    assert found["radius"] == pytest.approx(1.06 * RADIUS, rel=0.01)
-    assert found["track"] == pytest.approx(1.04 * TRACK, rel=0.015)
+    wheels = report.document(calibrated)["figures"]["odometry"]
+    assert wheels["radius"] == pytest.approx(1.06 * RADIUS, rel=0.01)
+    assert wheels["track"] == pytest.approx(1.04 * TRACK, rel=0.015)
     assert calibrated.rig.odometry.wheels == DifferentialDrive(radius=RADIUS, track=TRACK)
     assert "radius" in report.page(calibrated)
 

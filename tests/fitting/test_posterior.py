@@ -31,18 +31,28 @@ def test_outliers_move_the_fit_by_little():
 def test_standard_deviations_are_those_of_repetitions():
     """The ratio over 200 repetitions has a standard error of 5 %: 20 % are four."""
     runs = [fitted(LINE, *line(seed, 2.0, 0.5, count=100)) for seed in range(200)]
-    spread = np.std([run.values for run in runs], axis=0)
-    np.testing.assert_allclose(np.mean([run.errors for run in runs], axis=0), spread, rtol=0.2)
+    scatter = np.std([run.values for run in runs], axis=0)
+    np.testing.assert_allclose(np.mean([run.errors for run in runs], axis=0), scatter, rtol=0.2)
+
+
+def test_priors_may_be_correlated():
+    """A parameter without data follows another one as the prior says."""
+    whitened, blocks = line(1, 2.0, 0.0)
+    pair = [LINE[0], replace(LINE[0], name="unseen", mean=3.0, sigma=2.0)]
+    covariance = np.array(((LINE[0].sigma ** 2, 0.5), (0.5, 4.0)))
+    likelihood = least_squares(lambda values: whitened(values[:1]), pair, blocks)
+    slope, unseen = maximise(pair, likelihood, covariance=covariance).values
+    assert unseen - 3.0 == pytest.approx(0.5 / LINE[0].sigma ** 2 * (slope - LINE[0].mean), rel=1e-3)
 
 
 def test_parameters_that_do_the_same_move_together():
     """Their sum is known, each by its prior only; without data a parameter keeps the prior."""
     whitened, blocks = line(1, 2.0, 0.0)
     twins = [LINE[0], replace(LINE[0], name="twin", sigma=2.0), replace(LINE[0], name="unseen", mean=3.0)]
-    found = fitted(twins, lambda values: whitened(values[:1] + values[1:2]), blocks)
-    np.testing.assert_allclose(found.values, (0.4, 1.6, 3.0), atol=0.02)
-    assert found.errors[2] == pytest.approx(1.0)
-    ((first, second, correlation),) = found.correlations()
+    twin_fit = fitted(twins, lambda values: whitened(values[:1] + values[1:2]), blocks)
+    np.testing.assert_allclose(twin_fit.values, (0.4, 1.6, 3.0), atol=0.02)
+    assert twin_fit.errors[2] == pytest.approx(1.0)
+    ((first, second, correlation),) = twin_fit.correlations()
     assert (first, second) == ("slope", "twin")
     assert correlation < -0.99
 
