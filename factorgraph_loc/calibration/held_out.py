@@ -123,15 +123,11 @@ def _error(trials: Sequence[Trial], rig: str, kind: str) -> float:
     return pooled(trials, rig, f"{kind}.position_rmse")
 
 
-def _effective_error(trials: Sequence[Trial], rig: str, kind: str) -> float:
-    """The position error of consistent estimates with the same logarithmic score.
-
-    The score of a Gaussian estimate (Gneiting and Raftery, "Strictly proper scoring rules, prediction, and estimation", JASA 102,
-    2007, section 4) is worst by the divergence of Kullback and Leibler if the covariance is wrong by the factor ``ANEES / D``.
-    """
+def _anees_factor(trials: Sequence[Trial], rig: str, kind: str) -> float:
+    """The factor between ANEES and its ideal, the number of dimensions, in whichever direction."""
     dimensions = 3.0 if math.isfinite(pooled(trials, rig, f"{kind}.heading_rmse")) else 2.0
     factor = max(pooled(trials, rig, f"{kind}.anees") / dimensions, 1e-9)
-    return _error(trials, rig, kind) * math.exp(0.5 * (factor - 1.0 - math.log(factor)))
+    return max(factor, 1.0 / factor)
 
 
 def refusal(trials: Sequence[Trial]) -> str:
@@ -144,9 +140,10 @@ def refusal(trials: Sequence[Trial]) -> str:
     for log in dict.fromkeys(t.log for t in trials):
         if (own := growth([t for t in trials if t.log == log])) > WORST:
             return f"errors on {log}, held out, are {own:.2f} times those with the input rig"
-    if (effective := _ratio(trials, _effective_error)) > WORSE:
+    # ANEES is a ratio of squares: standard deviations may be worse by WORST, unless errors are smaller by that
+    if (away := _ratio(trials, _anees_factor)) > WORST**2 and pooled_growth > 1.0 / WORST:
         ratio = f"{pooled_growth:.2f} times those with the input rig"
-        return f"errors on held-out logs are {ratio}, but ANEES is so far from its ideal that they count {effective:.2f} times"
+        return f"errors on held-out logs are {ratio}, but ANEES is {away:.2f} times as far from its ideal"
     return ""
 
 
