@@ -90,7 +90,7 @@ def one_line(message: str) -> str:
 
 
 def plain_lines(text: str) -> str:
-    """A text of several lines in which non-printable characters other than line ends are escaped, for files that people print."""
+    """A text of several lines with non-printable characters escaped, except for line ends, for files that people print."""
     return "\n".join(plain(line, None) for line in text.split("\n"))
 
 

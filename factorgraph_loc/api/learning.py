@@ -45,7 +45,7 @@ def calibrate(
 
 def report_beside(out: Path, *, overwrite: bool) -> Path:
     """The path of the report of a rig; InputError if the rig's name is invalid or the file exists."""
-    return output.beside(out, RIG, ".report.html", overwrite=overwrite)
+    return output.with_ending(out, RIG, ".report.html", overwrite=overwrite)
 
 
 def build_map(
@@ -71,7 +71,7 @@ def build_map(
     For the arguments see :class:`~factorgraph_loc.experiments.maps.MapOptions`; for ``stages``, which shows the progress, see
     :func:`~factorgraph_loc.experiments.maps.make_map`.
     """
-    maps.picture_beside(Path(out), overwrite=overwrite)
+    maps.plot_path(Path(out), overwrite=overwrite)
     options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead, points or {})
     made = maps.make_map(read_log(log, rig=rig, world=world), options, stages)
     made.write(Path(out), overwrite=overwrite)

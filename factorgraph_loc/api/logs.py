@@ -24,7 +24,7 @@ from factorgraph_loc.simulation import simulate as make_log
 
 
 def datasets(data_root: str | Path | None = None) -> list[Dataset]:
-    """The logs that are known by name; ``present`` tells whether their files exist."""
+    """The logs with a name; ``present``: whether their files exist."""
     return describe(data_root)
 
 

@@ -118,7 +118,7 @@ def map_(
     from factorgraph_loc.api import learning
     from factorgraph_loc.experiments import maps
 
-    picture = maps.picture_beside(out, overwrite=options.overwrite)  # before the log is read
+    picture = maps.plot_path(out, overwrite=options.overwrite)  # before the log is read
     loaded = source.load_one(log)
     settings = parse_settings(set_ or (), [options.estimator], [maps.POINTS])
     made = learning.build_map(

@@ -56,7 +56,7 @@ def run(
     learn: Annotated[
         bool,
         typer.Option(
-            "--learn", help="Learn the rig from the log itself, without its reference, for the final trajectory."
+            "--learn", help="Learn the rig from the log, without the reference. Only the final trajectory uses the learnt rig."
         ),
     ] = False,
     json: Json = False,
@@ -96,7 +96,7 @@ def run(
     if outcome.learnt:
         from factorgraph_loc.calibration.report import constants_table
 
-        show.line("learnt from the log, for the final trajectory alone:")
+        show.line("learnt from the log; only the final trajectory uses these:")
         show.table(*constants_table(outcome.learnt))
     _print_events(result)
     _print_effort(scores)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 WARNINGS = 20  # number of warnings printed
-NARROW, PADDING = 18, 2  # characters of a column that is wrapped, at least, and beside each column
+NARROW, PADDING = 18, 2  # characters: minimum width of a wrapped column, padding of each column
 
 
 def line(text: str = "") -> None:

@@ -28,7 +28,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 CORNERS = 32  # of the polygon of an ellipse
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
 _CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
-_STYLES = ("-", "--", ":", "-.")  # a second cue beside colour
+_STYLES = ("-", "--", ":", "-.")  # tell curves apart without colour
 _WIDTH, _DPI = 16.0, 100
 _TITLE, _LINES = 80, 3  # maximum length of a line of text, and number of lines
 _LABEL, _LEGEND, _SIGN = 60, 190, 13  # maximum length of a label, and of a line of the legend with its signs
@@ -56,7 +56,7 @@ def grid(rows: int, columns: int, height: float, title: str = "", *, shared: boo
 
 
 def dress(axes: Iterable[Axes]) -> None:
-    """Apply the common look to ``axes``: a pale grid behind the data, and readable font sizes."""
+    """Apply the common style to ``axes``: a pale grid behind the data, and readable font sizes."""
     for axis in axes:
         axis.grid(color="0.9")
         axis.set_axisbelow(True)
@@ -97,8 +97,10 @@ def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:
 
 @contextmanager
 def drawing(figure: Figure) -> Iterator[None]:
-    """Context for drawing a figure: a ``$`` in a name is shown as it is, long lines are shortened, and warnings about missing
-    glyphs or about labels that leave no room are suppressed.
+    """Context for drawing a figure.
+
+    A ``$`` in a name is printed, not read as mathematics. Long lines are shortened. Warnings about missing glyphs, and about
+    labels that leave no room, are suppressed.
     """
     named = [text for axis in figure.axes for text in (axis.title, axis.xaxis.label, axis.yaxis.label, *axis.texts)]
     for text in (*figure.texts, *named, *(text for legend in figure.legends for text in legend.get_texts())):

@@ -8,8 +8,8 @@ Test: Wilcoxon, "Individual comparisons by ranking methods", Biometrics Bulletin
 zeros and ties in the Wilcoxon signed rank procedures", JASA 54(287), 1959. Effect: matched-pairs rank-biserial correlation,
 Kerby, "The simple difference formula", Comprehensive Psychology 3, 2014. Many comparisons: Holm, "A simple sequentially rejective
 multiple test procedure", Scandinavian Journal of Statistics 6(2), 1979. Band of the NEES: Bar-Shalom, Li, Kirubarajan,
-"Estimation with Applications to Tracking and Navigation", 2001, section 5.4, for the effective number of independent values
-(Geyer, "Practical Markov chain Monte Carlo", Statistical Science 7(4), 1992, section 3.3).
+"Estimation with Applications to Tracking and Navigation", 2001, section 5.4. Its number of independent values: Geyer,
+"Practical Markov chain Monte Carlo", Statistical Science 7(4), 1992, section 3.3.
 """
 
 import math
@@ -29,7 +29,7 @@ from factors import chi_squared
 from factors.se2 import Array
 
 SIGNIFICANT = 1.0 - CONFIDENCE
-_EXACT = 60  # pairs up to which the distribution is computed exactly
+_EXACT = 60  # largest number of pairs with an exact distribution
 
 # columns of a difference, with their types, as there may be no rows
 DIFFERENCES: dict[str, type] = {
@@ -228,7 +228,7 @@ def independent_count(values: Array) -> float:
 
 
 def mean_nees_band(counts: Sequence[float], dof: float) -> tuple[float, float]:
-    """The 95 % band of the mean over logs of their mean NEES per degree of freedom, for a consistent estimator.
+    """The 95 % band of a consistent estimator: mean over logs of the mean NEES per degree of freedom.
 
     ``counts``: effective number of independent values of each log. The mean over logs is approximated by a chi-square
     distribution with matched variance.

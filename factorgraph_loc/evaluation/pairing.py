@@ -1,5 +1,6 @@
-"""What all scores of trajectories share: pairing of estimates and reference poses, at the reference's own stamps, at most ten per
-second; alignment in the plane; the pieces over which relative errors are taken; and statistics of errors.
+"""Common steps of all scores of trajectories: pairing with the reference, alignment in the plane, pieces, statistics of errors.
+
+Estimates are paired with the reference at its own stamps, at most ten per second. Pieces are intervals of relative errors.
 
 The estimate is interpolated, the reference never is: it is defined at its stamps only, and a gap contains no stamp. Estimates are
 on a grid of 10 Hz, so a scored pose is interpolated between two that are less than 0.1 s away; the later of them may use a
@@ -30,8 +31,8 @@ RATE = 10.0  # Hz, of poses that are scored
 TOLERANCE = 1e-3  # s, of stamps
 _PAUSE = 1.0  # s between neighbours of a reference that is never a gap
 _USUAL = 3.0  # times the median interval that is never a gap
-PIECE_TOLERANCE = 0.1  # by which the length of one of all pairs may differ, as a share of it
-DELTA = 1.0  # m, and s, over which relative errors are taken
+PIECE_TOLERANCE = 0.1  # maximum relative difference of a length, for all pairs of poses
+DELTA = 1.0  # m, and s: interval of relative errors
 CONFIDENCE = 0.95  # of intervals
 HOW = ("rmse", "mean", "median", "p95", "max", "min", "std")
 
@@ -132,8 +133,11 @@ def summarize(values: Array) -> dict[str, float | None]:
 
 
 def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
-    """Pieces, one after the other, as indices of first and last pose, for the ``steps`` (N - 1,) between N poses that are numbered
-    from ``first``: each ends at the first pose at which the steps since its beginning sum up to ``length`` or more."""
+    """Successive pieces as indices of their first and last pose.
+
+    ``steps`` (N - 1,): between N poses, numbered from ``first``. A piece ends at the first pose where its steps sum up to
+    ``length`` or more.
+    """
     pieces: list[tuple[int, int]] = []
     begin, covered = first, 0.0
     for i, step in enumerate(steps.tolist(), start=first + 1):

@@ -139,7 +139,7 @@ def _of_medians(
     with np.errstate(invalid="ignore", divide="ignore"):
         figures = compare(np.median(first[cases], axis=1), np.median(second[cases], axis=1))
     tail = (1.0 - CONFIDENCE) / 2.0
-    # a draw in which both medians are infinite extends the interval to both sides
+    # a draw with two infinite medians extends the interval to both sides
     unknown = np.isnan(figures[1:])
     low = quantile(np.where(unknown, lowest, figures[1:]), tail)
     high = quantile(np.where(unknown, math.inf, figures[1:]), 1.0 - tail)

@@ -126,8 +126,8 @@ def active(
     and for each policy and estimator a plot of the run of the first seed. A failed run is a row with its reason; the others
     continue. The same call resumes an interrupted experiment. ``progress`` is called with the number of runs done and of all.
 
-    Raises InputError, before anything runs, for an unknown or repeated policy or estimator, or an ``out`` that contains results
-    without ``overwrite``; and if all runs are refused for their input.
+    Raises InputError before anything runs if a policy or an estimator is unknown or repeated, or if ``out`` contains results
+    without ``overwrite``. It also raises InputError if the input of all runs is rejected.
     """
     simulation, settings = _settings(world, changes or {})
     seeds, out = list(seeds), Path(out)

@@ -28,7 +28,7 @@ from factorgraph_loc.sensors.camera.use import PreparedLog
 from factorgraph_loc.text import listed
 from factors.se2 import Array
 
-NEW = 1000  # objects after which they are searched; tens of thousands at once would take as long as many updates
+NEW = 1000  # new objects between searches for garbage; a search of tens of thousands takes as long as many updates
 
 
 @dataclass
@@ -115,7 +115,7 @@ class CausalRun:
         return takewhile(lambda m: m.t <= self.end, steps)
 
     def _reach(self, t: float) -> None:
-        """What comes before a measurement at ``t``: the start, and ticks."""
+        """Process the start and the ticks that precede a measurement at ``t``."""
         if not self._initialized and t > self._start:
             self._initialize()
         for tick in self.ticks.before(t):
@@ -174,9 +174,11 @@ def span_of(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
 
 @contextmanager
 def only_new_searched() -> Iterator[None]:
-    """A context in which objects that were there before, and those that have outlived two searches, are not searched for garbage:
-    those of the loaded modules and of a long run are so many that each time takes a tenth of a second. Nothing changes where a
-    program has told Python so for itself (``gc.freeze``)."""
+    """A context without garbage collection of older objects: those created earlier, and those that two searches kept.
+
+    A search through the many objects of the loaded modules and of a long run takes a tenth of a second. Nothing changes if the
+    program has called ``gc.freeze``.
+    """
     if gc.get_freeze_count():
         yield
         return

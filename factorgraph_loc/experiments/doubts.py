@@ -36,7 +36,7 @@ def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[str, ...
 
 
 def in_bent_map(log: Log, frame: MapFrame, final: Trajectory) -> tuple[str, ...]:
-    """What a map that was made without a reference may be wrong by itself, where the robot was."""
+    """A warning about the common error, along the trajectory, of a map that was made without a reference."""
     if frame.error is None or not len(final):
         return ()
     worst = np.linalg.eigvalsh(frame.error(final.poses)[:, :2, :2])[:, -1]

@@ -100,7 +100,7 @@ def execute(runs: Sequence[Planned], folder: Path, executor: Executor, *, again:
     """Make ``runs``, store their results or failures in the store below ``folder`` unless they exist, and yield their outcomes.
 
     ``again``: repeat stored failures. A run that another process has claimed is waited for. When the generator is closed, the
-    executor ends at once, and unfinished runs are not stored. Raises StoreError if the store cannot be written.
+    executor ends without delay, and unfinished runs are not stored. Raises StoreError if the store cannot be written.
     """
     store, queue = Store(folder), _Queue(runs)
     claims: dict[str, ExitStack] = {}

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 STATES = ("ok", "failed", "missing", "damaged")
-PACE = 20.0  # assumed ratio of log time to computing time, for an unknown estimator
+PACE = 20.0  # assumed ratio of log time to computing time of an unknown estimator
 
 
 @dataclass(frozen=True)

@@ -60,9 +60,12 @@ def _seeds(value: Any) -> Any:
 
 
 class LogEntry(FileModel):
-    """Logs: ``log``, a name listed by ``fgloc datasets``, a path relative to the file's folder, or a glob over either, with
-    ``reader``, its ``options``, and files ``rig`` and ``world`` replacing the log's own; or ``simulate``, a preset or a TOML
-    file, with changed ``settings`` and ``seeds``, for a log each."""
+    """Stored logs (``log``) or simulated ones (``simulate``).
+
+    ``log``: a name listed by ``fgloc datasets``, a path relative to the file's folder, or a glob over either. Its keys are
+    ``reader``, its ``options``, and files ``rig`` and ``world`` in place of the log's own. ``simulate``: a preset or a TOML file
+    with changed ``settings``; each of its ``seeds`` makes a log.
+    """
 
     log: PathName | None = None
     reader: Name | None = None

@@ -1,4 +1,4 @@
-"""A run whose final trajectory has a rig that was learnt from the log itself.
+"""A run with a final trajectory for a rig that is learnt from the log.
 
 The learnt rig depends on the whole log. Causal estimates therefore use the given rig.
 """

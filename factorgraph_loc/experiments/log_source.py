@@ -1,4 +1,4 @@
-"""Sources of an experiment's logs, as plain data from which other processes can load them.
+"""Sources of an experiment's logs, as plain data that other processes use to load them.
 
 Nothing numerical is imported until a log is loaded, so that an experiment with stored results starts quickly."""
 
@@ -118,7 +118,7 @@ class RecordedSource:
         return dict(named) | dict(self._data())
 
     def identity(self) -> dict[str, Any]:
-        """What determines the log besides the content of its files."""
+        """The values that, with the content of the files, determine the log."""
         path = Path(self.log)
         name = path.stem if path.is_file() else path.name
         return {"log": name, "number": self.number, "reader": self.reader, "options": json.loads(self.options)}
@@ -184,7 +184,7 @@ class SimulatedSource:
         return dict(_of_toml(self.preset)) if self.preset.endswith(".toml") else {}
 
     def identity(self) -> dict[str, Any]:
-        """What determines the log besides the content of its files."""
+        """The values that, with the content of the files, determine the log."""
         return {"simulated": Path(self.preset).name, "settings": json.loads(self.settings), "seed": self.seed}
 
 
@@ -254,7 +254,7 @@ def _of_folder(folder: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _of_toml(path: str | None) -> Iterator[tuple[str, Path]]:
-    """A file of settings, and recursively the files beside it that it names."""
+    """A file of settings and, recursively, the files of its folder that it names."""
     if path is None:
         return
     folder = Path(path).parent

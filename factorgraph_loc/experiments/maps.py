@@ -13,7 +13,7 @@ import numpy as np
 
 from factorgraph_loc.drawing.figures import save
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.output import beside
+from factorgraph_loc.experiments.output import with_ending
 from factorgraph_loc.experiments.preparation import first_odometry, resolve_prior
 from factorgraph_loc.experiments.run import run
 from factorgraph_loc.files.models import parse_model, replacing
@@ -104,16 +104,16 @@ class MadeMap:
     draw: Callable[[], Figure]
 
     def write(self, out: Path, *, overwrite: bool = False) -> None:
-        """Write the map, and its plot beside it. Raises InputError as :func:`picture_beside`, or if they cannot be written."""
-        picture = picture_beside(out, overwrite=overwrite)
+        """Write the map and its plot. Raises InputError as :func:`plot_path`, or if they cannot be written."""
+        picture = plot_path(out, overwrite=overwrite)
         with writing(out), replacing(picture) as temporary:  # write both or none
             save(self.draw(), temporary)
             write_world(self.world, out)
 
 
-def picture_beside(out: Path, *, overwrite: bool) -> Path:
-    """The path of the plot beside a map. Raises InputError for a wrong name of the map, or if a file exists already."""
-    return beside(out, SUFFIX, ".map.png", overwrite=overwrite)
+def plot_path(out: Path, *, overwrite: bool) -> Path:
+    """The path of the plot of a map. Raises InputError for a wrong name of the map, or if a file exists already."""
+    return with_ending(out, SUFFIX, ".map.png", overwrite=overwrite)
 
 
 def make_map(log: Log, options: MapOptions | None = None, stages: Stages = silent) -> MadeMap:
@@ -125,14 +125,14 @@ def make_map(log: Log, options: MapOptions | None = None, stages: Stages = silen
     options = options or MapOptions()
     if options.drop_dead:
         return _without_dead(log, options, stages)
-    what = _what(log, options)
+    what = _mapped_kind(log, options)
     if what == "points":
         return _of_points(log, options, stages)
     return _of_tags(log, options, stages) if what == "tags" else _of_landmarks(log, options, stages)
 
 
-def _what(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points"]:
-    """What is mapped. Raises InputError for options of another kind of map."""
+def _mapped_kind(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points"]:
+    """The kind of map. Raises InputError for options of another kind."""
     of_landmarks = bool(options.settings) or options.estimator != MAP_ESTIMATORS[0]
     of_tags = options.tag_height is not None
     of_others = of_landmarks or of_tags

@@ -64,7 +64,7 @@ def write_run(
     yy) [m^2] in the world frame. ``events.csv``: ``t_ns`` (absolute), ``t`` [s from the log's start] and the event.
     ``innovations.parquet``: ``sensor``, ``t_ns`` (absolute), the normalised innovation squared ``nis`` and its degrees of freedom
     ``dof``, of each update.
-    ``map.world.toml``, with its points beside it: the map with the points that were found, if any were; see :func:`map_of`.
+    ``map.world.toml`` and the file of its points: the map with the learnt points, if there are any; see :func:`map_of`.
 
     Everything is written to a temporary folder first; other files in ``out`` are not changed. Raises InputError if ``out``
     contains results and ``overwrite`` is off.
@@ -129,7 +129,10 @@ def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: 
 
 
 def map_of(result: RunResult, log: Log) -> World | None:
-    """The log's map with the points that a run found in place of its own, or beside them if these were used; None without any."""
+    """The log's map with the points that a run learnt; None without any.
+
+    They replace the points of the map, or are added to these if the run used them.
+    """
     points, known = result.learnt.points, log.world.points
     if points is None or not len(points):
         return None
@@ -140,9 +143,11 @@ def map_of(result: RunResult, log: Log) -> World | None:
     return log.world.model_copy(update={"name": f"{log.name}-map", "points": points})
 
 
-def beside(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
-    """The path with another ``ending`` beside ``out``, whose name ends in ``suffix``. Raises InputError if it does not, if its
-    folder is missing, or if either file exists already."""
+def with_ending(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
+    """The path ``out`` with its ``suffix`` replaced by ``ending``.
+
+    Raises InputError if the name of ``out`` has another suffix, if its folder is missing, or if either file exists already.
+    """
     name = out.name.removesuffix(suffix)
     if name in ("", out.name):
         raise InputError(f"--out is {quoted(str(out))}, expected a name that ends in {suffix}")
@@ -246,7 +251,7 @@ def _slowest_update(result: RunResult) -> Array:
 def run_files(result: RunResult, log: Log, started: float, align: Alignment = "none") -> dict[str, bytes]:
     """The files of a run by name: see :func:`~factorgraph_loc.experiments.output.write_run`; ``update_ms`` is empty.
 
-    ``started``: the value of ``perf_counter`` at the start, for the total time.
+    ``started``: the value of ``perf_counter`` at the start, to compute the total time.
     """
     scores = score(result, log, align)
     timings = {name: value for name, value in scores.items() if name.startswith(TIMING)}

@@ -90,10 +90,11 @@ def plan(
     """All runs of an experiment with paths relative to ``folder``; cached facts are stored below ``cache``. ``given``: logs in
     place of those that the experiment names.
 
-    Estimators are run once for values of a sweep that do not apply to them, deterministic ones with the first seed only. Raises
-    InputError, before anything runs, for an unreadable log, two logs of one name, invalid settings or prior, or a sensor that no
-    log has; and before any log is read, TooManyRunsError for more than ``most`` runs, InputError for simulated logs that are
-    longer than :data:`MOST_SECONDS` together, or have more observations than :data:`MOST_LOOKS`.
+    Estimators are run once for values of a sweep that do not apply to them, deterministic ones with the first seed only.
+
+    Before any log is read, raises TooManyRunsError for more than ``most`` runs. Simulated logs with a total length above
+    :data:`MOST_SECONDS`, or with more observations than :data:`MOST_LOOKS`, raise InputError. Before anything runs, raises
+    InputError for an unreadable log, two logs of one name, invalid settings or prior, or a sensor that no log has.
     """
     digests, facts = FileDigests(cache / "digests.json"), Facts(cache / "facts.json")
     experiment = _placed(experiment, folder, data_root)

@@ -1,5 +1,4 @@
-"""What comes before a run: its start, from the user, the log, or the reference; its sensors, and what their packages prepare before
-an estimator runs."""
+"""Preparation of a run: its start (of the user, the log or the reference), its sensors, and the preparation by their packages."""
 
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress

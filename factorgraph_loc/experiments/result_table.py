@@ -50,7 +50,7 @@ def load_results(path: str | Path) -> pl.DataFrame:
     try:
         return read_parquet(file)
     except InputError as error:
-        raise InputError(f"{error}; `fgloc experiment run` writes it anew") from error
+        raise InputError(f"{error}; `fgloc experiment run` writes it again") from error
 
 
 def _row(run: PlannedRun, stored: dict[str, Any]) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def run(
     processed before the estimator is initialized, because its velocity is held; other measurements older than the prior are
     counted as ignored. With an unknown start the ticks begin at the first measurement, and the final trajectory begins at the
     first belief and may be empty. A log with neither start nor reference, and without a map that its sensors observe, begins at
-    (0, 0, 0). ``progress`` is called with the fraction done, of which feature extraction, if needed, is the first half. ``watch``
+    (0, 0, 0). ``progress`` is called with the fraction done; if features are extracted, this is the first half. ``watch``
     is called with the time and the estimator after each tick, to inspect its belief.
 
     Raises InputError if the configuration does not fit the log, RunFailedError if the estimator fails or returns a pose that is

@@ -1,8 +1,9 @@
 """Store of run results on disk: a folder per key, which is complete or missing.
 
-A run's files are written beside the store's folders, synced, and moved into place by one rename. Its ``manifest.json`` contains
-the sha256 of each file except for timings. Whoever computes a run holds a lock on a file named by its key; the system releases it
-when the process ends in any way, so that no claim outlives its owner."""
+A run's files are written to a temporary folder, synced, and moved into place by one rename. Its ``manifest.json`` contains the
+sha256 of each file except for timings. The process that computes a run has a lock on a file named by the key. The system releases
+this lock when the process ends in any way, so that no claim outlives its owner.
+"""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from factors.se2 import Array
 TIMELINE = "log_time"
 WORLD, CAMERA = "/world", "/camera"  # the latter without a robot pose
 FRUSTUM = 0.4  # m from the camera to its image
-BATCH = 16  # images sent at once
+BATCH = 16  # images per message
 NEAREST = 300  # map points drawn into an image
 
 

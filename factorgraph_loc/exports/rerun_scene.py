@@ -57,7 +57,7 @@ def show(log: Log, runs: Sequence[StoredRun], bind: str = LOOPBACK) -> None:
     Raises InputError as :func:`write_rrd` does, without a display, and if the viewer does not start.
     """
     if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
-        raise InputError("there is no display to open the viewer on, expected --rrd FILE, for a viewer elsewhere")
+        raise InputError("there is no display to open the viewer on, expected --rrd FILE to view it elsewhere")
     recording = rr.RecordingStream("fgloc")
     with open_viewer(bind) as url:
         recording.connect_grpc(url, default_blueprint=_blueprint(log, runs))
@@ -171,7 +171,7 @@ def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
 
 
 def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
-    """Layout of the viewer: the plan from above; beside it camera, errors and events, where there are any."""
+    """Layout of the viewer: the plan from above and, if present, camera, errors and events at its side."""
     past = rrb.VisibleTimeRanges(
         timeline=TIMELINE, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
     )

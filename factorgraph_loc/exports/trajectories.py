@@ -34,7 +34,7 @@ from factors.se2 import Array
 
 KITTI = ".kitti"
 TIMES_SUFFIX = ".times.txt"
-LEAST = 1e-12  # m^2 or rad^2: least variance of an edge, for a finite information
+LEAST = 1e-12  # m^2 or rad^2: least variance of an edge, to keep its information finite
 
 
 def matrices(trajectory: Trajectory | Trajectory3) -> Array:
@@ -57,7 +57,7 @@ def write_trajectory(trajectory: Trajectory | Trajectory3, path: str | Path, t0_
 
 
 def write_kitti(trajectory: Trajectory | Trajectory3, path: Path) -> Path:
-    """Write poses in KITTI format, and their stamps [s from the log's start] to ``NAME.times.txt`` beside it; return that path.
+    """Write poses in KITTI format, and their stamps [s from the log's start] to ``NAME.times.txt``; return the latter's path.
 
     Poses are of the robot's frame (x forward, z up), not of a camera, and not relative to the first one.
     """

@@ -94,7 +94,7 @@ def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
 def read_bytes(path: Path, limit: int) -> bytes:
     """The content of a regular file of at most ``limit`` bytes; InputError as in :func:`opened`."""
     with opened(path, limit) as file:
-        parts, count, step = [], 0, os.fstat(file.fileno()).st_size + 1  # read the expected size at once
+        parts, count, step = [], 0, os.fstat(file.fileno()).st_size + 1  # read the expected size in one step
         try:
             while count <= limit and (part := file.read(step)):
                 parts.append(part)
@@ -143,8 +143,8 @@ def limit_memory() -> None:
 def limited_memory(source: object, size: int) -> Iterator[None]:
     """End a command with one line if this block, which reads ``source`` of ``size`` bytes, takes more than :data:`MEMORY`.
 
-    A few kilobytes may unpack to gigabytes, and polars does not tell how much before. A limit set for the operating system would
-    be no help, as compiled parsers abort without a message where memory is refused.
+    A few kilobytes may unpack to gigabytes, and polars does not report the size in advance. A limit of the operating system is no
+    alternative: compiled parsers abort without a message if memory is refused.
     """
     if not _limited.is_set():
         yield

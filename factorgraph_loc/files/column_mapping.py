@@ -20,7 +20,7 @@ JSON_SUFFIXES = (".jsonl", ".ndjson", ".json")
 COMMENT = ("#", "//")
 
 EpcCase = Literal["as written", "upper", "lower"]
-Alternatives = tuple[str, ...]  # columns of which one must be there
+Alternatives = tuple[str, ...]  # columns; one of them is required
 Value = bool | int | str
 
 
@@ -32,7 +32,7 @@ class ReadNames(FileModel):
     antennas: dict[str, str] = Field(default_factory=dict)
     """names in the rig of those of the reads"""
     epc_case: EpcCase = "as written"
-    """letter case in which EPCs are compared with the map"""
+    """letter case of EPCs when they are compared with the map"""
 
 
 class ColumnMapping(FileModel):
@@ -174,7 +174,7 @@ class TableFolder:
 
 
 def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
-    """EPCs in the letter case in which log and map are compared."""
+    """EPCs in the letter case of the comparison with the map."""
     if case == "as written":
         return list(epcs)
     return [epc.upper() if case == "upper" else epc.lower() for epc in epcs]

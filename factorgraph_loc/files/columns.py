@@ -61,9 +61,12 @@ def symmetric(upper: Sequence[Array]) -> Array:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table. ``units``: factors by name; the first unit is ours, in which the inclusive bounds ``low`` and ``high``
-    are. ``may_lack``: whether a cell may be empty. ``doc``: its meaning. ``field``: name in the stream, if it is not ``name``.
-    ``left_out_below``: smaller values are treated as empty cells, with a warning; streams and measurements have none."""
+    """A column of a table.
+
+    ``units``: factors by name; the first unit is that of streams, and of the inclusive bounds ``low`` and ``high``.
+    ``may_lack``: whether a cell may be empty. ``doc``: its meaning. ``field``: name in the stream, if it is not ``name``.
+    ``left_out_below``: smaller values are treated as empty cells, with a warning; streams and measurements have none.
+    """
 
     name: str
     kind: Literal["stamp", "number", "name", "whole", "file"]
@@ -104,8 +107,10 @@ class Column:
         return f"{what}{of} in {self.low:.6g} to {self.high:.6g}"
 
     def in_unit(self, unit: str | float, source: object = "") -> tuple[Column, float]:
-        """The column in one of its units, or in one with a given factor; and the factor. InputError, which names ``source``, for an
-        unknown unit."""
+        """The column in one of its units, or in a unit given by its factor; and the factor.
+
+        An unknown unit raises InputError, which names ``source``.
+        """
         factor = self.units.get(unit, 0.0) if isinstance(unit, str) else float(unit)
         if not LEAST_UNIT <= abs(factor) <= 1.0 / LEAST_UNIT:
             expected = f"one of {', '.join(self.units)}, or a number of them, at least {LEAST_UNIT:g}"
@@ -135,7 +140,7 @@ class Table:
     """A table of a sensor. ``rows_of_one_stamp``: whether these form one measurement, or one each.
 
     ``stream``: class of the stream, whose fields are the columns; "" if a function creates it. ``optional``: groups of optional
-    columns, of which the first available one is used; ``("rssi",), ()``: rssi or none.
+    columns; the first available group is used. ``("rssi",), ()``: rssi or none.
     """
 
     name: str

@@ -37,8 +37,10 @@ def pillow_image(file: BinaryIO, source: object) -> Iterator[Image.Image]:
 
 
 def image_size(content: bytes, source: object) -> tuple[int, int]:
-    """Width and height [px] from the header; InputError as in :func:`pillow_image`, and for a PNG with a chunk that is declared
-    longer than the file, for which OpenCV would allocate memory."""
+    """Width and height [px] from the header; InputError as in :func:`pillow_image`.
+
+    A PNG with a chunk longer than the file raises InputError too: OpenCV would allocate memory for the declared length.
+    """
     at = len(PNG) if content.startswith(PNG) else len(content)
     while at + 8 <= len(content):
         at += 12 + int.from_bytes(content[at : at + 4], "big")

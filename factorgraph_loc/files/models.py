@@ -253,9 +253,9 @@ def inside(root: Path, name: str, source: object, *others: Path, expected: str =
 
     All paths in files are resolved by this function.
 
-    A relative path is that of the first folder in which it exists. InputError if it leaves all of them (by dots, as an absolute
-    path or by a link), which says what is ``expected``, or if it is neither a regular file nor a folder; NoFileNameError if no file
-    can have that name.
+    A relative path belongs to the first folder where it exists. InputError if it leaves all of them (by dots, as an absolute path
+    or by a link), with what is ``expected``, or if it is neither a regular file nor a folder. NoFileNameError if no file can have
+    that name.
     """
     try:
         folders = [os.path.realpath(folder) for folder in (root, *others)]

@@ -1,4 +1,4 @@
-"""What models of settings say of themselves: keys, defaults, bounds, units and meanings.
+"""Descriptions of models of settings: keys, defaults, bounds, units and meanings.
 
 A field of a :class:`~factorgraph_loc.files.models.FileModel` has its bounds from ``Field``, its unit from a
 :class:`~factorgraph_loc.files.models.InUnit` in its annotation, and its meaning from the docstring below it.
@@ -90,12 +90,12 @@ def bound_text(value: float) -> str:
 
 
 def default_text(setting: Setting) -> str:
-    """The default of a setting as in TOML; ``required``, or a dash where nothing is set."""
+    """The default of a setting as in TOML; ``required``, or a dash for None."""
     return "required" if setting.required else _toml(setting.default)
 
 
 def values_text(setting: Setting) -> str:
-    """What a setting may be: ``0 to 5 s``, ``known, extended, unknown``, ``text``."""
+    """The valid values of a setting: ``0 to 5 s``, ``known, extended, unknown``, ``text``."""
     low, high = bound_text(setting.low), bound_text(setting.high)
     between = f"{low} to {high}" if low and high else f"{low} or more" if low else f"at most {high}" if high else ""
     bounded = f"{between} {setting.unit}".strip() or setting.kind

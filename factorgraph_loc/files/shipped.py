@@ -22,7 +22,7 @@ def readers() -> dict[str, Path]:
 
 
 def folder() -> Path:
-    """The folder of shipped files: in the installed package, or beside the package in a source checkout."""
+    """The folder of shipped files: inside the installed package, or next to the package in a source checkout."""
     package = Path(str(resources.files(__name__.partition(".")[0])))
     installed = package / "datasets"
     return installed if installed.is_dir() else package.parent / "datasets"

@@ -15,7 +15,7 @@ from factorgraph_loc.files.columns import SECONDS, Column
 from factors.se2 import Array
 
 NUMBER = (int, float, np.integer, np.floating)
-FEW = 30  # numbers, for which a loop is faster than NumPy
+FEW = 30  # at most so many numbers: a loop is faster than NumPy
 
 
 def seconds_of(where: str, value: object, name: str = "t") -> float:

@@ -1,4 +1,4 @@
-"""Motion between odometry poses or encoder counts, both of which may be reset during a log; radius and track of wheels."""
+"""Motion between odometry poses or encoder counts, which may be reset during a log; radius and track of wheels."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -20,7 +20,7 @@ SPEED, TURN, FASTER = 1.0, 2.0, 3.0
 NEAR, ZERO = 0.05, 1e-6  # m: from the origin after a reset of odometry; and tolerance of zeros
 HELD = 1.0  # s for which the previous motion is continued across a reset
 COUNTERS = (2**8, 2**16, 2**32)  # ranges of encoders that wrap to 0
-TURNS = ("left_angle", "left_rate")  # columns of a table that tell how wheels turn, for which their radius is needed
+TURNS = ("left_angle", "left_rate")  # columns with angles of wheels, which need a radius
 WHEELS = ("left", "left_speed", *TURNS)
 
 
@@ -30,11 +30,13 @@ class WheelSizes(FileModel):
     track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")] | None = None
     """distance between the wheels"""
     radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")] | None = None
-    """radius of the wheels, if they tell how they turn"""
+    """radius of the wheels, if their angles are given"""
 
     def sizes(self, source: object, what: str, *, turns: bool) -> tuple[float, float]:
-        """Metres per unit, and the track [m]. ``turns``: whether the wheels tell how they turn. InputError if a size is missing,
-        which ``what`` needs."""
+        """Metres per unit, and the track [m]. ``turns``: whether angles of wheels are given.
+
+        InputError if a size is missing that ``what`` needs.
+        """
         if self.track is None or (turns and self.radius is None):
             lacking = "track" if self.track is None else "radius"
             raise InputError(f"{source}: {what} needs {lacking} [m], here or in [odometry.wheels] of the rig")
@@ -141,7 +143,7 @@ def _tell(source: object, t_ns: Integers, anew: Integers, warnings: list[str]) -
 
 
 def with_wheels_of(rig: Rig | None, options: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The options of a reader with radius and track of the rig, where they tell of wheels and the rig knows these."""
+    """The options of a reader, with radius and track of the rig if they have wheels and the rig has these sizes."""
     drive = None if rig is None else rig.of(OdometrySettings).wheels
     odometry = options.get("odometry")
     if drive is None or not isinstance(odometry, Mapping):
@@ -155,7 +157,7 @@ def with_wheels_of(rig: Rig | None, options: Mapping[str, Any]) -> Mapping[str, 
 
 
 def with_wheels_in(rig: Rig, options: Mapping[str, Any]) -> Rig:
-    """The rig with the wheels that valid options tell of, if it has none."""
+    """The rig, with the wheels of the options if it has none and they are valid."""
     odometry = options.get("odometry")
     settings = rig.of(OdometrySettings)
     if settings.wheels is not None or not isinstance(odometry, Mapping):

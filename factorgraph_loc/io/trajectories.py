@@ -34,8 +34,8 @@ MESSAGES = "PoseStamped, PoseWithCovarianceStamped, Odometry, TransformStamped o
 def read_trajectory(source: str | Path) -> PosePath:
     """The trajectory that ``source`` names.
 
-    A file in TUM, KITTI or EuRoC format, which its first row tells; ``BAG:TOPIC`` or ``BAG:/tf:PARENT.CHILD``; the folder of a
-    run, whose final trajectory it is; or a log, whose reference it is. InputError describes what is invalid in one line.
+    A file in TUM, KITTI or EuRoC format, according to its first row; ``BAG:TOPIC`` or ``BAG:/tf:PARENT.CHILD``; the final
+    trajectory in the folder of a run; or the reference of a log. InputError describes the problem in one line.
     """
     path, text = Path(source), str(source)
     if (bag := _in_bag(text)) is not None:

@@ -170,7 +170,7 @@ class Localizer:
     def _begin_anew(self, estimator: Estimator | None, prior: PosePrior | None, guard: Guard) -> None:
         self._estimator = estimator
         self._guard = guard
-        self._failure: RunFailedError | None = None  # by which the estimator was lost
+        self._failure: RunFailedError | None = None  # of the estimator, which is unusable since
         self._prior = prior  # its time is NaN until the first measurement
         # ticks start at the prior's time, or at the first measurement
         self._ticks = None if prior is None or math.isnan(prior.t) else Ticks(prior.t)

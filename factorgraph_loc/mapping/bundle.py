@@ -30,8 +30,8 @@ FOCAL_SIGMA, ASPECT_SIGMA = 0.1, 0.005  # standard deviations of an unknown foca
 CENTRE_SIGMA = 0.01  # standard deviation of an unknown principal point, relative to the focal length
 LENS_SIGMA = (0.1, 0.1, 0.003, 0.003)  # standard deviations of an unknown distortion
 FIXED = 1e-5  # standard deviation of the known calibration constants
-SOMEWHERE = 1000.0  # m, standard deviation of a point before it was seen
-CHUNK = 500  # points whose covariances are computed at once
+SOMEWHERE = 1000.0  # m, prior standard deviation of a point
+CHUNK = 500  # points per computation of covariances
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ def robust_noise(model: CameraModel) -> Any:
 
 
 def _unknown_constants(model: CameraModel, *, lens: bool) -> Array:
-    """The covariance (9, 9) of (fx, fy, skew, cx, cy, k1, k2, p1, p2) if a data sheet is all that is known of them."""
+    """The covariance (9, 9) of (fx, fy, skew, cx, cy, k1, k2, p1, p2) if only a data sheet is available."""
     covariance = FIXED**2 * np.eye(9)
     focal = np.array((model.fx, model.fy))
     covariance[:2, :2] += FOCAL_SIGMA**2 * np.outer(focal, focal) + ASPECT_SIGMA**2 * np.diag(focal**2)

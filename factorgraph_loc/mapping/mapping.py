@@ -107,8 +107,9 @@ class LandmarkMap:
 
 @dataclass(frozen=True)
 class Alignment:
-    """``pose`` (3,) that moves points onto targets, its ``covariance`` (3, 3) of (x, y, angle), the number of inliers, and the
-    ``factor`` by which the points' covariances are to be multiplied.
+    """``pose`` (3,) that moves points onto targets, its ``covariance`` (3, 3) of (x, y, angle), and the number of inliers.
+
+    ``factor``: scale of the points' covariances.
     """
 
     pose: Array
@@ -125,7 +126,7 @@ def make_map(
 ) -> LandmarkMap:
     """Make a map of the ``learnt`` landmarks of a run on ``log``.
 
-    ``extend``: the run used the log's map and learnt what it lacks; its landmarks stay as they are. Otherwise the run used no
+    ``extend``: the run used the log's map and learnt what it lacks; its landmarks do not change. Otherwise the run used no
     map; if the log has one, the learnt landmarks are aligned with it (unless they are ``in_frame`` already) and its landmarks
     are judged. A given landmark is wrong if it lies more than ``TOLERANCE`` from the learnt one and the squared Mahalanobis
     distance exceeds ``GATE``; the covariance is the sum of the learnt landmark's, the alignment's and the survey's.

@@ -1,9 +1,9 @@
-"""Maps of points as wholes: the points of two drives in one map, and fewer points where there are many.
+"""Operations on whole maps of points: merging the maps of two drives, and thinning of dense maps.
 
-Two points are one if their positions agree within their covariances, if each looks more like the other than like any other
-candidate, and not less alike than views of one point do within the first map. Their errors may be common, such as those of one
-reference, so they are fused by covariance intersection with equal weights (Julier, Uhlmann, American Control Conference 1997),
-which is consistent for any correlation.
+Two points are one under three conditions. Their positions agree within their covariances. Each is the most similar candidate of
+the other. Their views differ no more than views of one point of the first map. Their errors may be correlated, such as those of
+one reference. They are therefore fused by covariance intersection with equal weights (Julier, Uhlmann, American Control
+Conference 1997), which is consistent for any correlation.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def _joined(first: PointMap, second: PointMap, added: Integers, owners: Integers
 
 
 def _common(first: PointMap, second: PointMap) -> Array | None:
-    """What the views of both maps know of their frames; a map that was made with a reference knows its own."""
+    """The common errors of the views of both maps; zero for a map that was made with a reference."""
     if first.common is None and second.common is None:
         return None
     nothing = [np.zeros((len(points.owners), 3, 3)) for points in (first, second)]
@@ -164,7 +164,7 @@ def _views(points: PointMap) -> list[Integers]:
 
 
 def _limit(points: PointMap, views: list[Integers]) -> float:
-    """How different views of one point are, of those that look most alike; 0 where no point has two."""
+    """A percentile, over points, of the distance between the most similar two views of one point; 0 without such points."""
     least = []
     for mine in [mine for mine in views if len(mine) > 1][:COMPARED]:
         apart = distance_matrix(points.descriptors[mine], points.descriptors[mine], binary=points.feature == "orb")

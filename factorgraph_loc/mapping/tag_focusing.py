@@ -41,7 +41,7 @@ def focused(
     """The ``learnt`` positions by tag, improved by the phases of the reads along the log's reference, or along the estimated
     ``keyframes``, which are interpolated.
 
-    Those of tags whose height is not known, or that have too few reads with a phase, stay as they are; all if the rig has no
+    Positions of tags with unknown height, or with too few reads with a phase, do not change; none does if the rig has no
     ``[rfid.phase]``.
     """
     rfid = log.rig.of(RfidSettings)

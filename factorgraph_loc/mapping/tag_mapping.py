@@ -72,7 +72,7 @@ def map_tags(
 
     ``poses``: those of the reference, or estimated together with the tags, starting from ``prior``, which defines the frame.
     Without a prior the first pose is the origin, and the facings of the log's map are not used. ``extend``: the tags of the
-    log's map are kept as they are and used to estimate the poses; otherwise they are only compared. ``height`` [m]: of tags
+    log's map do not change, and are used to estimate the poses; otherwise they are only compared. ``height`` [m]: of tags
     that the map lacks, by default the mean height of the antennas.
 
     Raises InputError if the log lacks what is needed, RunFailedError if no tag could be located.
@@ -178,7 +178,7 @@ def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
 def _world(
     log: Log, observations: TagLooks, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool
 ) -> World:
-    """The map as written: learnt tags in the frame of the rig's survey, kept tags as they were given."""
+    """The map for its file: learnt tags in the frame of the rig's survey, given tags unchanged."""
     survey: SurveySettings = log.rig.of(SurveySettings)
     transform = survey.transform()
     tags: dict[str, Tag] = {}

@@ -39,8 +39,8 @@ ITERATIONS = 30
 CONVERGED = 1e-3  # m
 LARGEST_STEP = 0.5  # m
 CURVATURE_STEP = 0.02  # m, of the numerical curvature
-CHUNK = 256  # candidates refined at once, to bound the memory
-LOOKS = 2000  # observations evaluated on the lattice at once, to bound the memory
+CHUNK = 256  # candidates per refinement, to bound the memory
+LOOKS = 2000  # observations per evaluation of the lattice, to bound the memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,8 +310,10 @@ def refine(
 def _refined(
     model: RfidModel, observations: TagReadCounts, heights: Array, facing: Array, places: Array
 ) -> tuple[Array, Array, Array]:
-    """Positions (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2), of C tags at once, each with its own
-    column of hits. The information is the observed curvature where it is positive definite, else the Fisher information."""
+    """Positions (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2) of C tags, each with a column of hits.
+
+    The information is the observed curvature if it is positive definite, else the Fisher information.
+    """
 
     def at(places: Array, which: Integers) -> tuple[Array, Array, Array]:
         tags = TagArray(np.column_stack((places, heights[which])), facing[which])

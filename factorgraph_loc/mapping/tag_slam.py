@@ -36,7 +36,7 @@ from factors.se2 import Array
 INTERVAL = 1.0  # s between keyframes
 STRETCH = 15  # keyframes per stretch
 WINDOW = 90  # latest keyframes along which new tags are searched
-MARGIN = 1.0  # m beyond the reach, outside of which missed reads of a tag are ignored
+MARGIN = 1.0  # m beyond the reach: farther away, missed reads of a tag are ignored
 ITERATIONS, FINAL_ITERATIONS = 4, 40
 ROUNDS = 3  # of searching all tags again at the end
 ELSEWHERE = 13.8  # 99.9 % of chi-square with two degrees of freedom

@@ -22,7 +22,7 @@ from factorgraph_loc.vision.images import Image, read_image
 from factors.se2 import Array
 
 _MAX_CONDITION = 1e12  # of the matrix in pixels: typical values for images of 1000 px are 1e4 to 1e7
-ZOOMS = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0)  # factors by which a photograph is reduced
+ZOOMS = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0)  # reduction factors of photographs
 ROTATIONS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # degrees
 MIN_WARPED = 128  # px per side: a quarter of it must still have features
 

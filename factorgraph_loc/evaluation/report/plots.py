@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _GREY = "0.6"
-_NAME = 40  # maximum length of a name beside an axis
+_NAME = 40  # maximum length of a name at an axis
 
 
 @dataclass(frozen=True)
 class _Row:
-    """The ``values`` of the logs of a variant, their ``mark`` (median or mean), and the ``band`` in which it is expected."""
+    """The ``values`` of the logs of a variant, their ``mark`` (median or mean), and the ``band`` expected of the mark."""
 
     name: str
     colour: str

@@ -1,4 +1,4 @@
-"""The background of trajectory plots: map and reference of a log, reduced in size for storage beside results."""
+"""The background of trajectory plots: map and reference of a log, reduced in size and stored with the results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which pose of an estimate belongs to which pose of the reference, and the alignment of the one with the other.
+"""Association of the poses of an estimate with those of the reference, and alignment of both.
 
 Least squares in space: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE
 Transactions on Pattern Analysis and Machine Intelligence, 1991, equations 38 to 43. In the plane:

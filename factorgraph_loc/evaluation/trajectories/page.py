@@ -42,13 +42,13 @@ FILES = ("errors.csv", "report.html", "score.json")  # the last one is written l
 
 
 def _trajectories(score: TrajectoryScore) -> Figure:
-    """Seen from above; beside it the heights, unless both are planar."""
+    """A plot from above and, unless both are planar, one of the heights."""
     flat = score.estimate.is_planar and score.reference.is_planar
     places = np.concatenate((score.estimate.positions, score.reference.positions))[:, :2]
     width, depth = np.maximum(np.ptp(places, axis=0), 1e-6)
     height = float(np.clip((14.0 if flat else 7.0) * depth / width + 1.5, 5.0, 10.0))
     figure, axes = grid(1, 1 if flat else 2, height, "trajectories, at the compared poses")
-    x, label = _over(score)
+    x, label = _abscissa(score)
     breaks = pauses(x) if score.seconds() is not None else np.empty(0, dtype=np.int64)  # NaN interrupts a line
     for path, style, name in (
         (score.reference, {"color": "0.75", "linewidth": 4.0}, REFERENCE),
@@ -75,7 +75,7 @@ def _errors(score: TrajectoryScore) -> Figure:
     known = {name: errors for name, errors in kinds.items() if errors is not None and len(errors.position)}
     units = {"position": "m"} if score.ape.rotation is None else {"position": "m", "rotation": "rad"}
     figure, axes = grid(len(units), len(known) + 1, 3.5 * len(units), "errors")
-    x, label = _over(score)
+    x, label = _abscissa(score)
     for row, (what, unit) in zip(axes, units.items(), strict=True):
         for axis, (name, errors) in zip(row, known.items(), strict=False):
             values = getattr(errors, what)
@@ -90,8 +90,8 @@ def _errors(score: TrajectoryScore) -> Figure:
     return figure
 
 
-def _over(score: TrajectoryScore) -> tuple[Array, str]:
-    """What the errors are plotted over: times (N,), or the numbers of the poses, and its label."""
+def _abscissa(score: TrajectoryScore) -> tuple[Array, str]:
+    """The abscissa (N,) of the errors and its label: times, or numbers of the poses."""
     t = score.seconds()
     return (np.arange(1.0, len(score.estimate) + 1), "number of the pose") if t is None else (t, "time [s]")
 
@@ -108,7 +108,7 @@ def errors_table(score: TrajectoryScore) -> Rows:
 
 
 def extents(score: TrajectoryScore) -> dict[str, str]:
-    """What was compared with what, how, and by which alignment, in words."""
+    """Descriptions of the estimate, the reference, their association and alignment."""
     rows = {}
     for name, path, poses, length in zip(
         ("estimate", "reference"), (score.estimate, score.reference), score.poses, score.lengths, strict=True
@@ -176,8 +176,11 @@ def write_score(score: TrajectoryScore, out: Path) -> None:
 
 
 def errors_of(score: TrajectoryScore) -> pl.DataFrame:
-    """The table of ``errors.csv``: for each pair the stamps [ns] of both, empty where there are none, the positions [m] of
-    both, the estimate's after its alignment, and the errors in position [m] and rotation [rad]."""
+    """The table of ``errors.csv``: a row for each pair of poses.
+
+    Columns: stamps [ns] of both (empty if missing), positions [m] of both (the estimate is aligned), errors in position [m] and
+    rotation [rad].
+    """
     rotation = score.ape.rotation
     columns = [
         pl.Series(name, [None] * len(path) if path.t_ns is None else path.t_ns, pl.Int64)

@@ -34,15 +34,17 @@ _MANY = 0.5  # share of poses that are paired, below which there is a warning
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """K errors: ``position`` (K,) [m], and ``rotation`` (K,) [rad], the angle of the rotation, or None where a trajectory has no
-    rotations. ``ends`` (K,): of each the index of its pose, for a relative error that of its last one."""
+    """K errors: ``position`` (K,) [m] and ``rotation`` (K,) [rad], an angle; None if a trajectory has no rotations.
+
+    ``ends`` (K,): index of the pose of an absolute error, of the last pose of a relative one.
+    """
 
     position: Array
     rotation: Array | None
     ends: Integers
 
     def figures(self, name: str) -> dict[str, float | None]:
-        """Statistics as ``NAME.position_rmse``, ...; None where there are no errors."""
+        """Statistics as ``NAME.position_rmse``, ...; None without errors."""
         figures: dict[str, float | None] = {}
         for what, values in (("position", self.position), ("rotation", self.rotation)):
             statistics = summarize(np.empty(0) if values is None else values)
@@ -54,10 +56,10 @@ class PoseErrors:
 class TrajectoryScore:
     """The errors of an estimate.
 
-    ``estimate``, aligned, and ``reference``: N poses each, as they were compared. ``transform``: from the frame of the estimate to
-    that of the reference. ``ape``: absolute errors (N,). ``rpe_per_m``, ``rpe_per_s``: relative errors over a metre of path and
-    over a second, None where rotations are missing, or stamps. ``lengths`` [m] and ``poses`` of the whole estimate and of the
-    whole reference. ``settings``: how they were compared. ``warnings``: one line for each doubt.
+    ``estimate`` (aligned), ``reference``: N associated poses each. ``transform``: from the frame of the estimate to that of the
+    reference. ``ape``: absolute errors (N,). ``rpe_per_m``, ``rpe_per_s``: relative errors over a metre of path and over a
+    second; None without rotations or stamps. ``lengths`` [m] and ``poses`` of the whole estimate and of the whole reference.
+    ``settings``: of association and alignment. ``warnings``: one line for each doubt.
     """
 
     estimate: PosePath
@@ -218,7 +220,7 @@ def _seconds(estimate: PosePath, truth: PosePath) -> Array | None:
 
 
 def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, align: Alignment) -> list[str]:
-    """What is likely not meant: heights that count though one of both has none, and a plane that is not the floor."""
+    """Warnings about likely mistakes: heights in a comparison with a planar trajectory, and a plane that is not the floor."""
     if align == "se2":
         rises = [(path.name, float(np.ptp(path.positions[:, 2]))) for path in (estimate, reference)]
         return [

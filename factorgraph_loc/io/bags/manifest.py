@@ -93,7 +93,7 @@ class Proposal:
     notes: list[str] = field(default_factory=list)
 
     def take(self, sensor: str, topics: Sequence[Topic], **settings: Any) -> None:
-        """Use the first of ``topics``, if there is one, for a sensor, and note the others."""
+        """Use the first of ``topics``, if any, for a sensor, and note the others."""
         if topics:
             self.options[sensor] = {"topic": topics[0].name, **settings}
             self.uses[topics[0].name] = sensor
@@ -102,8 +102,10 @@ class Proposal:
 
 
 def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
-    """Propose a manifest to be saved in ``folder``, if the bag is below that folder, else beside the bag. InputError if the bag
-    cannot be read."""
+    """Propose a manifest, to be saved in ``folder`` if the bag is below that folder, else in the folder of the bag.
+
+    InputError if the bag cannot be read.
+    """
     path, folder = Path(os.path.realpath(bag)), folder.resolve()
     root = folder if path.is_relative_to(folder) else path.parent
     with open_bag(path) as opened:
@@ -209,7 +211,7 @@ def _motion(out: Proposal, bag: Bag, topics: Sequence[Topic], tree: Tree) -> Non
 
 
 def _has_no_pose(bag: Bag, topic: Topic) -> bool:
-    """Whether the first message of odometry has a quaternion of zeros, as drivers leave it that tell velocities only."""
+    """Whether the first message of odometry has a quaternion of zeros: drivers without poses send velocities only."""
     first = next(bag.messages([topic.name]), None)
     if first is None:
         return False
@@ -315,7 +317,7 @@ def _rfid(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
 
 
 def _ranges(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
-    """The topic with a field for a distance and one beside it for the name of what is that far away."""
+    """Use the topic with a field of a distance and, next to it, one of the name of a landmark."""
     candidates = [(t, fields) for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))]
     if candidates and "bearing_range" not in out.options:
         topic, fields = candidates[0]

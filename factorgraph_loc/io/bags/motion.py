@@ -43,7 +43,7 @@ class WheelSettings(motions.WheelSizes):
     right_topic: str | None = None
     """topic of the right wheel, if each wheel has a topic"""
     unit: Literal["rad", "m"] = "rad"
-    """whether the wheels tell how they turn, or the way that they roll"""
+    """unit of the wheels' values: angles, or distances"""
 
 
 class JointRows:

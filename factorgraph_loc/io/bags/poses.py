@@ -44,7 +44,7 @@ class PoseTopic(TopicSettings, Turned):
     """A topic of poses, or of tf with two frames."""
 
     parent: str | None = None
-    """frame in which the poses are, for tf"""
+    """frame of the poses, for tf"""
     child: str | None = None
     """frame of the robot, for tf"""
 
@@ -295,7 +295,7 @@ class Tree:
 
 
 def tree_of(bag: Bag, notes: list[str]) -> Tree:
-    """The frames in the transforms of a bag. A topic that cannot be read is told of in ``notes``."""
+    """The frames in the transforms of a bag. A topic that cannot be read is reported in ``notes``."""
     parents: dict[str, str] = {}
     moving: set[str] = set()
     topic = ""

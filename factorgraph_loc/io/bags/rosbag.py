@@ -53,7 +53,7 @@ FRAMES, WITHIN = ":", "."  # /tf:PARENT.CHILD
 
 
 def camera_of(info: Info, frames: StaticFrames, notes: list[str]) -> CameraSettings:
-    """The camera of a ``CameraInfo``; it looks forward from the robot's origin if tf_static has no mounting."""
+    """The camera of a ``CameraInfo``. Without a mounting in tf_static it is at the robot's origin and points forward."""
     pose = frames.pose(info.frame)
     if pose is None:
         notes.append(f"tf_static has no mounting of {info.frame} on {frames.base}")
@@ -212,8 +212,11 @@ def _rig(
 
 
 def read_trajectory(path: Path, topic: str) -> PosePath:
-    """The poses of ``topic`` in the bag ``path``, at the stamps of headers where there are any: messages with poses or points, or
-    ``/tf:PARENT.CHILD``, the frame CHILD in the frame PARENT. InputError names the invalid message."""
+    """The poses of ``topic`` in the bag ``path``, at the stamps of headers or, without headers, of the bag.
+
+    The topic has messages with poses or points, or is ``/tf:PARENT.CHILD``: the frame CHILD in the frame PARENT. InputError
+    names the invalid message.
+    """
     name, _, frames = topic.partition(FRAMES)
     with open_bag(path) as bag:
         if not name:

@@ -214,7 +214,7 @@ class LandmarkTopic(TopicSettings, Turned):
 
 
 class Landmarks(RowsOfTopic):
-    """Collects ranges and bearings of a topic, or the positions from which they are computed."""
+    """Collects ranges and bearings of a topic, or computes them from positions."""
 
     def __init__(self, bag: Bag, options: LandmarkTopic, frames: StaticFrames) -> None:
         topic = bag.topic(options.topic)

@@ -148,7 +148,7 @@ def _getter(path: str) -> Callable[[Any], Any]:
 class TopicRows:
     """Collects N rows of numbers with timestamps, and the numbers of their messages, counted from 1 within the topic.
 
-    ``paths``: fields of which each message has one row; without them, rows are appended. NaN for what is no number.
+    ``paths``: fields; each message has one row of these. Without paths, rows are appended. NaN replaces what is not a number.
     """
 
     def __init__(self, source: str, width: int, paths: Sequence[str] = ()) -> None:

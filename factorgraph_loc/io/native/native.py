@@ -61,7 +61,7 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     tables = read_tables(path, warnings)
     if "odometry" not in tables:
         if not run_path.read_text(encoding="utf-8").strip():
-            raise InputError(f"{run_path}: is empty, expected a manifest, or odometry.csv beside it")
+            raise InputError(f"{run_path}: is empty, expected a manifest, or odometry.csv in its folder")
         raise InputError(f"{path}: has no odometry, which every estimator needs, expected rows in odometry.csv")
     rig = rig_of(run, run_path)
     require_span([(rows.path, rows.rows, rows.t_ns) for rows in tables.values()])
@@ -173,7 +173,7 @@ def require_new(folder: Path, *, overwrite: bool = False) -> None:
             f"{folder}: exists and is not an empty folder, expected a new one{_OR_LOG if overwrite else ''}"
         )
     if foreign := sorted(f.name for f in folder.iterdir() if f.suffix not in OF_LOGS and f.name != "camera"):
-        raise InputError(f"{folder}: holds {listed(foreign)} beside its log, which would be lost: expected a log alone")
+        raise InputError(f"{folder}: contains {listed(foreign)}, not part of its log, which would be lost: expected only a log")
 
 
 def write_files(log: Log, folder: Path, format: str) -> None:

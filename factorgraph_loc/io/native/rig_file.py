@@ -132,7 +132,7 @@ def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
 
 
 def _antennas(count: int) -> dict[str, dict[str, float]]:
-    """Antennas 1, 2, ... around the body, counter-clockwise from the front; two look to the left and to the right."""
+    """Antennas 1, 2, ... around the body, counter-clockwise from the front; two point to the left and to the right."""
     first = math.pi / 2.0 if count == 2 else 0.0
     directions = [se2.wrap_scalar(first + 2.0 * math.pi * i / count) for i in range(count)]
     return {

@@ -53,7 +53,7 @@ def reader(name: str) -> Reader:
 
 @dataclass(frozen=True)
 class _Source:
-    """What to read, and what to add to the reader's log; ``name``: None for the reader's name."""
+    """A reader, its input, and additions to its log; ``name``: None for the reader's name."""
 
     reader: str
     path: Path | None
@@ -184,15 +184,15 @@ def _name(path: Path) -> str:
 
 
 def _from_manifest(file: Path, data_root: str | Path | None, given: Collection[str]) -> _Source:
-    """What a manifest describes, without its ``rig`` and ``world`` if these are among those ``given`` in their place."""
+    """The source that a manifest describes, without its ``rig`` and ``world`` if these are among the ``given`` replacements."""
     manifest: Manifest = read_manifest(file)
     path = None
     if manifest.path is not None:
         path = named_path(file.parent, manifest.path, file, data_root)
         if not path.exists():
-            missing = file if file in manifests().values() else f"{file} (which has no {manifest.path} beside it)"
+            missing = file if file in manifests().values() else f"{file} (which has no {manifest.path} in its folder)"
             root = find_data_root(data_root, missing)
-            raise InputError(f"{file}: its data {manifest.path} does not exist, neither beside it nor below {root}")
+            raise InputError(f"{file}: its data {manifest.path} does not exist, neither in its folder nor below {root}")
     named = {what: name for what, name in (("rig", manifest.rig), ("world", manifest.world)) if what not in given}
     files = {
         what: named_path(file.parent, name, file, data_root, f"{EXPECTED}; or `--{what} FILE` in its place")

@@ -49,7 +49,7 @@ COLUMNS = {c.name: c for table in (VELOCITIES, INCREMENTS, WAYS, WHEEL_COLUMNS, 
 RATES = ("wx", "wy", "wz")
 FILE_NAME = named("file_name", "a name in the table of the sensor")
 MAP_NAME = named("name", "a name in the map")
-RATE = replace(IMU["w"], may_lack=True)  # about one of three axes, of which some may be missing
+RATE = replace(IMU["w"], may_lack=True)  # about one of three axes; some may be missing
 
 
 class PosesFile(TimedMapping, Turned):
@@ -68,10 +68,10 @@ class PosesFile(TimedMapping, Turned):
 
 
 class OdometryFile(PosesFile, motions.WheelSizes):
-    """``columns``: t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the row before); x, y, heading or a
-    quaternion (poses, of which only the relative motion is used); left, right (distances of the wheels), left_speed, right_speed
-    (their speeds), left_angle, right_angle (how far they turned), left_rate, right_rate (how fast they turn). ``radius`` and
-    ``track`` of the rig ([odometry.wheels]) come before those given here."""
+    """``columns``: t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the previous row); x, y, heading or a
+    quaternion (poses; only their relative motion is used); left, right (distances of the wheels), left_speed, right_speed
+    (their speeds), left_angle, right_angle (their angles), left_rate, right_rate (their angular rates). ``radius`` and
+    ``track`` of the rig ([odometry.wheels]) have precedence over these settings."""
 
 
 class ReferenceFile(PosesFile):

@@ -213,7 +213,7 @@ def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -
 
 
 def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: list[str]) -> TableRows:
-    """Add a second read, of which only the time is known, for each row that summarizes several."""
+    """Add a second read, with a time only, for each row that summarizes several."""
     if "last" not in mapped.columns:
         if "count" in mapped.columns and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):
             warnings.append(

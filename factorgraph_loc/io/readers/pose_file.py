@@ -54,8 +54,7 @@ def read_kitti(path: Path, times: Path) -> PosePath:
 
 
 def read_matrices(path: Path) -> Array:
-    """The poses (N, 3, 4), rotation and position, of a file in KITTI's format, as they are written. InputError names file and
-    row."""
+    """The poses (N, 3, 4), rotation and position, of a file in KITTI's format, unchanged. InputError names file and row."""
     cells = _read(path, MATRIX, " ")
     matrices = np.column_stack([cells.numbers(field, ENTRY) for field in MATRIX]).reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
