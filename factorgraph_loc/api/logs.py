@@ -125,6 +125,6 @@ def _write_with_images(
     """Render the images into a temporary folder first, so that the log is written completely or not at all."""
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with temporary_folder(folder) as beside:
+    with temporary_folder(folder) as rendered:
         workers = os.cpu_count() or 1
-        write_native(with_images(log, settings, seed, beside, workers=workers, tell=progress), folder)
+        write_native(with_images(log, settings, seed, rendered, workers=workers, progress=progress), folder)

@@ -1,5 +1,8 @@
-"""Shell completion of names and settings. Names must be fast, so no numerical libraries may be imported for them; settings are read
-from the classes that define them, whose import takes a second."""
+"""Shell completion of names and settings.
+
+Completion of names must be fast, and must not import numerical libraries. Settings are read from the classes that define them,
+with an import time of a second.
+"""
 
 from collections.abc import Callable, Iterable
 

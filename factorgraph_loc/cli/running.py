@@ -56,7 +56,8 @@ def run(
     learn: Annotated[
         bool,
         typer.Option(
-            "--learn", help="Learn the rig from the log, without the reference. Only the final trajectory uses the learnt rig."
+            "--learn",
+            help="Learn the rig from the log, without the reference. Only the final trajectory uses the learnt rig.",
         ),
     ] = False,
     json: Json = False,

@@ -94,8 +94,8 @@ def simulate(
     written = []
     for number in chosen:
         folder = out if seeds is None else out / file_name(f"{settings.name}-{number}")
-        with show.progress(folder.name, counted=True) as tell:
-            log = logs.simulate(settings, number, recorded=observations, images=images, out=folder, progress=tell)
+        with show.progress(folder.name, counted=True) as report:
+            log = logs.simulate(settings, number, recorded=observations, images=images, out=folder, progress=report)
         for warning in log.warnings:
             show.note(f"warning: {log.name}: {warning}")
         if not json:

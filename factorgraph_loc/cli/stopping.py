@@ -1,5 +1,6 @@
-"""How the command ends: by signals, temporary files are removed first; and with one line and an exit code when standard output or
-standard error are closed, full or cannot encode text."""
+"""Ends of the command: on a signal it removes temporary files first. If standard output or standard error are closed, full or
+cannot encode text, it ends with one line and an exit code.
+"""
 
 import io
 import os
@@ -41,8 +42,9 @@ def end(stop: KeyboardInterrupt) -> int:
 
 @contextmanager
 def unwrapped() -> Iterator[None]:
-    """Raise the :class:`Stop` that an exception was raised from in its place: compiled modules turn it into an ImportError where it
-    comes while they are loaded."""
+    """Raise the :class:`Stop` behind an exception in place of that: while compiled modules are loaded they turn it into an
+    ImportError.
+    """
     try:
         yield
     except Exception as error:

@@ -132,10 +132,9 @@ def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
 
 
 def running_mean(t: Array, values: Array, weights: Array) -> tuple[Array, Array]:
-    """Weighted running mean of ``values`` (sums of ``values`` over sums of ``weights``) within ``WINDOW`` seconds around each
-    ``t`` (N,), ascending; and the sums of weights.
+    """Weighted running mean of ``values`` around each ``t`` (N,), ascending, and the sums of weights.
 
-    NaN where a window has no weight.
+    The mean is the sum of ``values`` over that of ``weights`` within ``WINDOW`` seconds; NaN if a window has no weight.
     """
     first = np.searchsorted(t, t - WINDOW / 2.0, side="left")
     last = np.searchsorted(t, t + WINDOW / 2.0, side="right")

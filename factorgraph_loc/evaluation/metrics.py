@@ -1,9 +1,10 @@
 """Accuracy of a trajectory against the reference, and consistency of its covariances.
 
-There is no alignment, as the map's frame is known, unless it is asked for; for runs that estimated the map, aligned figures are
-added. Pairing of poses:
-:mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to
-Tracking and Navigation", 2001, section 5.4. Relative pose errors: :mod:`factorgraph_loc.evaluation.trajectories.score`.
+The map's frame is known, so trajectories are aligned only on request. For runs that estimated the map, aligned figures are added.
+
+Pairing of poses: :mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with
+Applications to Tracking and Navigation", 2001, section 5.4. Relative pose errors:
+:mod:`factorgraph_loc.evaluation.trajectories.score`.
 """
 
 from collections.abc import Mapping
@@ -102,8 +103,8 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
     ``timing.*`` always exist, as do ``warnings``, a list of texts.
 
     With ``align`` also ``scoring.align``, and ``causal.*`` and ``final.*`` of :data:`ALIGNED` [m, rad] after that alignment, at the
-    same stamps (see :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`): None without a reference, and where the
-    poses do not determine the alignment, which ``warnings`` then says.
+    same stamps (see :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`). They are None without a reference. They
+    are None, with a warning, if the poses do not determine the alignment.
     """
     causal = result.causal()
     final = result.final
@@ -235,8 +236,11 @@ def _constants(learnt: Learnt) -> dict[str, float]:
 
 
 def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
-    """Diagnostics as figures: NIS by sensor (median of NIS over its expected median, ideally 1; fraction above the 95 % bound),
-    residuals at the prediction (m, rad), numbers of unused measurements, and doubted elements of the map with their probability."""
+    """Diagnostics as figures.
+
+    NIS by sensor (median of NIS over its expected median, ideally 1; fraction above the 95 % bound), residuals at the prediction
+    (m, rad), numbers of unused measurements, and doubted elements of the map with their probability.
+    """
     figures: dict[str, Any] = {}
     for sensor, rows in sorted(diagnostics.nis.items()):
         if rows:

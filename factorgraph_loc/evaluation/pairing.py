@@ -2,13 +2,13 @@
 
 Estimates are paired with the reference at its own stamps, at most ten per second. Pieces are intervals of relative errors.
 
-The estimate is interpolated, the reference never is: it is defined at its stamps only, and a gap contains no stamp. Estimates are
-on a grid of 10 Hz, so a scored pose is interpolated between two that are less than 0.1 s away; the later of them may use a
+Estimates are interpolated. The reference is not: it is defined only at its stamps, and a gap contains no stamp. Estimates are on
+a grid of 10 Hz, so a scored pose is interpolated between two that are less than 0.1 s away. The later of these may use a
 measurement that had not arrived at the stamp.
 
-Poses are interpolated along the arc between neighbours. Covariances are averaged with the same weights: for errors ``a`` and
-``b`` of the neighbours, the covariance of ``(1 - f) a + f b`` is at most ``(1 - f) E[a a'] + f E[b b']``, for any correlation,
-and equal for identical errors.
+Poses are interpolated along the arc between neighbours. Covariances are averaged with the same weights. Let ``a`` and ``b`` be
+the errors of the neighbours. The covariance of ``(1 - f) a + f b`` is at most ``(1 - f) E[a a'] + f E[b b']``, for any
+correlation. Both are equal for identical errors.
 
 Alignment: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991, equations 40 to 42
 with scale 1. In the plane the rotation is one angle, and reflections cannot occur.
@@ -149,8 +149,10 @@ def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, i
 
 
 def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
-    """The same for pieces that may overlap: from each pose to that later one whose distance is nearest to ``length``, the first of
-    several, if it differs from that by at most :data:`PIECE_TOLERANCE` of it."""
+    """The same for pieces that may overlap: from each pose to the first later one with a distance nearest to ``length``.
+
+    Pieces that differ from ``length`` by more than :data:`PIECE_TOLERANCE` of it are omitted.
+    """
     covered = np.concatenate(([0.0], np.cumsum(steps))).tolist()
     pieces: list[tuple[int, int]] = []
     for i, start in enumerate(covered[:-1]):

@@ -23,8 +23,9 @@ ALIKE = 0.01  # relative difference of errors within which estimators are equall
 
 
 def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ...]]:
-    """The scores in each table that not all comparisons have, by its title: errors after an alignment, if the runs have one, and
-    relative errors, if they are asked for."""
+    """The optional scores of each table, by its title: errors after an alignment, if the runs have one, and requested relative
+    errors.
+    """
     tables: dict[str, tuple[str, ...]] = {}
     aligned = dict.fromkeys(row["scoring.align"] for row in rows if row.get("scoring.align"))
     if aligned:

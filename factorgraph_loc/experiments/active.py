@@ -116,8 +116,9 @@ def active(
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> ActiveResults:
-    """Drive simulated robots from an unknown start until they are localized: every policy with every estimator on every seed, in
-    ``jobs`` parallel processes (None: one per core).
+    """Drive simulated robots from an unknown start until they are localized: each policy with each estimator on each seed.
+
+    ``jobs``: number of parallel processes (None: one per core).
 
     ``world``: a preset of :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings. ``changes``: nested tables of
     settings of robot, policy or world, such as ``{"policy": {"horizon": 8}, "max_metres": 50}``.

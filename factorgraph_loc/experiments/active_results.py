@@ -95,11 +95,10 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """The first policy ``a`` compared with each other one ``b``, on common seeds, for each world and estimator.
+    """Comparison of the first policy ``a`` with each other one ``b``, on common seeds, for each world and estimator.
 
-    ``difference`` [m] of the medians, a minus b, with 95 % interval ``low`` to ``high``; their ``ratio``, a over b, with its
-    interval; the numbers of seeds ``failed_only_a`` and ``failed_only_b``, and ``p`` of McNemar's exact test for equal failure
-    rates.
+    ``difference`` [m] of the medians, a minus b, with 95 % interval ``low`` to ``high``. ``ratio`` of the medians, a over b, with
+    its interval. ``failed_only_a``, ``failed_only_b``: numbers of seeds. ``p``: of McNemar's exact test for equal failure rates.
     """
     results = []
     first, *further = policies(rows)

@@ -118,7 +118,7 @@ class CausalRun:
         """Process the start and the ticks that precede a measurement at ``t``."""
         if not self._initialized and t > self._start:
             self._initialize()
-        for tick in self.ticks.before(t):
+        for tick in self.ticks.advance(t):
             self._tick(tick)
 
     def _move(self, m: Measurement) -> None:
@@ -131,7 +131,7 @@ class CausalRun:
         while first < len(times):
             self._reach(times[first])
             last = max(first + 1, bisect.bisect_right(times, self.ticks.due))
-            self.ticks.before(times[last - 1])  # none, but it has come that far
+            self.ticks.advance(times[last - 1])  # no ticks, but the time of the last measurement
             self.guard.process(self.estimator, m.part(first, last))
             first = last
 

@@ -48,9 +48,9 @@ class _Made:
 class Cluster(Executor):
     """Computes runs on the cluster of the ``scheduler`` (its address).
 
-    The time of a run is limited here, its memory by the cluster's own limit. The context raises InputError if ``distributed`` is
-    not installed, the scheduler does not answer, it has no workers, or a worker has other code or other libraries; RunFailedError
-    if the scheduler disappears.
+    The executor limits the time of a run, the cluster its memory. The context raises InputError if ``distributed`` is not
+    installed, the scheduler does not answer, it has no workers, or a worker has other code or other libraries. It raises
+    RunFailedError if the scheduler disappears.
     """
 
     def __init__(self, scheduler: str, limits: Limits) -> None:

@@ -1,5 +1,8 @@
-"""Keys of runs, digests of all that a result depends on (log, configuration, code, libraries); and cached facts about
-logs and estimators for planning, as obtaining them requires numerical libraries or reading the log."""
+"""Keys of runs, and cached facts about logs and estimators for planning.
+
+A key is a digest of everything that a result depends on: log, configuration, code, libraries. Facts are cached because computing
+them imports numerical libraries or reads the log.
+"""
 
 from __future__ import annotations
 
@@ -80,8 +83,10 @@ def code_version() -> str:
 
 
 def digest_of_code(root: Path) -> str:
-    """The digest of the source files that runs use, of the packages in the folder ``root``: all of ``factors``, and the parts
-    :data:`COUNTED` of ``factorgraph_loc``. The shipped descriptions of readers count, too."""
+    """The digest of the source files of runs, of the packages in the folder ``root``.
+
+    They are all of ``factors``, the parts :data:`COUNTED` of ``factorgraph_loc``, and the shipped descriptions of readers.
+    """
     total = hashlib.sha256()
     for package in (root / PACKAGE, root / "factors"):
         for file in sorted(package.rglob("*")):
@@ -240,7 +245,7 @@ class Facts:
             self._known.logs[digest], self._new = [_facts(log) for log in source.load_all()], True
         return self._known.logs[digest]
 
-    def knows(self, digest: str) -> bool:
+    def has_facts(self, digest: str) -> bool:
         """Whether the logs of that digest are cached."""
         return digest in self._known.logs
 

@@ -215,28 +215,28 @@ class GivenSource:
 LogSource = RecordedSource | SimulatedSource | GivenSource
 
 
-def recorded_sources(name: str, folder: Path, **others: Any) -> list[RecordedSource]:
+def recorded_sources(name: str, folder: Path, **options: Any) -> list[RecordedSource]:
     """The sources that ``name`` stands for: a known name, a path relative to ``folder``, or a glob over either.
 
-    ``others``: fields of the sources. Raises InputError if there is none, or if a path leaves ``folder`` and the data folder.
+    ``options``: fields of the sources. Raises InputError if there is none, or if a path leaves ``folder`` and the data folder.
     """
     known = manifests()
     if name in known:
-        return [RecordedSource(name, **others)]
-    data_root = others.get("data_root")
+        return [RecordedSource(name, **options)]
+    data_root = options.get("data_root")
     if not is_pattern(name):
         # for anything else the reader raises the error, with the nearest name
         path = named_path(folder, name, "logs", data_root)
-        return [RecordedSource(str(path) if kind(path) or kind(Path(name)) else name, **others)]
+        return [RecordedSource(str(path) if kind(path) or kind(Path(name)) else name, **options)]
     names = [candidate for candidate in known if fnmatchcase(candidate, name)]
     named_path(folder, _fixed_part(name), "logs", data_root)
     paths = [named_path(folder, str(path.absolute()), "logs", data_root) for path in matching(name, folder, "logs")]
-    names += [str(path) for path in paths if others.get("reader") or _is_log(path)]
+    names += [str(path) for path in paths if options.get("reader") or _is_log(path)]
     if not names:
         raise InputError(
             f"no log matches {quoted(name)}: neither a name that `fgloc datasets` lists, nor a path from {folder}"
         )
-    return [RecordedSource(candidate, **others) for candidate in names]
+    return [RecordedSource(candidate, **options) for candidate in names]
 
 
 def _is_log(path: Path) -> bool:

@@ -194,23 +194,23 @@ def _of_landmarks(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
 
 
 def _of_tags(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
-    along_reference = _along_reference(options, has_reference=log.reference is not None)
+    uses_reference = _uses_reference(options, has_reference=log.reference is not None)
     height = options.tag_height
     if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
         raise InputError(f"--tag-height is {height:g}, expected metres, {HEIGHTS[0]:g} to {HEIGHTS[1]:g}")
     if options.extend and not log.world.tags:
         raise InputError(f"{log.name}: has no map of tags that could be extended; leave --extend out")
-    prior, frame = (None, OF_REFERENCE) if along_reference else _start_of_tags(log, options)
+    prior, frame = (None, OF_REFERENCE) if uses_reference else _start_of_tags(log, options)
     with stages("tags") as report:
         made = tag_mapping.map_tags(
             log,
-            "reference" if along_reference else "odometry",
+            "reference" if uses_reference else "odometry",
             prior,
             extend=options.extend,
             height=height,
             progress=lambda share: report(share, 1.0),
         )
-    if options.extend or (not along_reference and made.made.judged):
+    if options.extend or (not uses_reference and made.made.judged):
         frame = "that of the given map"
     return MadeMap(made.world, frame, made, log.warnings, partial(map_figure.tag_figure, log.name, made))
 
@@ -261,7 +261,7 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     return MadeMap(world, OF_REFERENCE, details, (*log.warnings, *doubts), draw)
 
 
-def _along_reference(options: MapOptions, *, has_reference: bool) -> bool:
+def _uses_reference(options: MapOptions, *, has_reference: bool) -> bool:
     """Whether the robot's poses are those of the reference; ``has_reference``: whether a usable one exists."""
     if options.poses not in (None, "reference", "odometry"):
         raise InputError(f"--poses is {quoted(options.poses)}, expected reference or odometry")

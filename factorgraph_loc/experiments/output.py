@@ -1,7 +1,7 @@
-"""The files of one run: trajectories, estimates, learnt values, events, scores, and the configuration; those that a store
-keeps; and the tables of several runs.
+"""Files of a run: trajectories, estimates, learnt values, events, scores, configuration. Files kept by a store. Tables of several
+runs.
 
-Times aside, all files of a run are reproducible to the byte.
+Except for times, all files of a run are reproducible to the byte.
 """
 
 import shutil

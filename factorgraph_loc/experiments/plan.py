@@ -175,7 +175,7 @@ def _check_simulated(experiment: Experiment, digests: FileDigests, facts: Facts)
         for entry in experiment.logs:
             if entry.simulate is not None:
                 sources = _simulated(entry, point)
-                new = sum(not facts.knows(digests.of_source(source)) for source in sources)
+                new = sum(not facts.has_facts(digests.of_source(source)) for source in sources)
                 size = sources[0].size() if new else (0.0, 0.0)
                 seconds, observations = seconds + new * size[0], observations + new * size[1]
                 if seconds > MOST_SECONDS or observations > MOST_LOOKS:
@@ -197,7 +197,7 @@ def _runs(
 ) -> Iterator[PlannedRun]:
     settings = _settings(entry, point)
     estimator = facts.estimator(entry.name, settings)
-    if _only_final(experiment, settings, estimator.effective):
+    if _needs_only_final(experiment, settings, estimator.effective):
         settings |= {"final_only": True}
         estimator = facts.estimator(entry.name, settings)
     for sensors in experiment.sensors:
@@ -224,8 +224,8 @@ def _runs(
             )
 
 
-def _only_final(experiment: Experiment, settings: Mapping[str, Any], effective: Mapping[str, Any]) -> bool:
-    """Whether runs need no causal estimates, as the report shows none and no times, and the estimator can do without them."""
+def _needs_only_final(experiment: Experiment, settings: Mapping[str, Any], effective: Mapping[str, Any]) -> bool:
+    """Whether runs need no causal estimates: the report shows none and no times, and the estimator does not require them."""
     if "final_only" not in effective or "final_only" in settings:
         return False
     shown = all(metric.startswith("final.") for metric in experiment.report.metrics)

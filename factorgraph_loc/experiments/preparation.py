@@ -27,8 +27,8 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
     """The Gaussian prior of the start of a run, and the name of its source.
 
     ``prior``: ``reference`` (the first reference pose at or after the first odometry, 0.02 m and 0.01 rad), ``log`` (the start
-    stated by the log), ``X,Y,HEADING`` [m, m, rad] (at the first odometry, 0.05 m and 0.05 rad), ``X,Y`` with unknown heading,
-    ``unknown``, or None: the log's start, else the reference, else unknown. An unknown start is returned as None. For a reference
+    stated by the log), ``X,Y,HEADING`` [m, m, rad] (at the first odometry, 0.05 m and 0.05 rad), ``X,Y`` with unknown heading, or
+    ``unknown``. None: the log's start, else the reference, else unknown. An unknown start is returned as None. For a reference
     without headings, the heading is unknown too.
 
     Raises InputError if the log lacks what is requested, or ``prior`` is none of these.

@@ -60,9 +60,8 @@ def run(
     (0, 0, 0). ``progress`` is called with the fraction done; if features are extracted, this is the first half. ``watch``
     is called with the time and the estimator after each tick, to inspect its belief.
 
-    Raises InputError if the configuration does not fit the log, RunFailedError if the estimator fails or returns a pose that is
-    not finite or a covariance that is not positive definite, with the time and the measurement; see
-    :mod:`factorgraph_loc.fusion.guarded`.
+    Raises InputError if the configuration does not fit the log. Raises RunFailedError, with the time and the measurement, if the
+    estimator fails, or if a pose is not finite or a covariance not positive definite; see :mod:`factorgraph_loc.fusion.guarded`.
     """
     use = _use(log, config)
     stated = resolve_prior(log, config.prior)

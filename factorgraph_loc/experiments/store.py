@@ -120,8 +120,11 @@ class Store:
         return self.folder / key[:2] / key
 
     def state(self, key: str, *, thorough: bool = False) -> State:
-        """The state of a run's results. Trajectories of the right size that are older than their manifest are not checked
-        further; other files, and all if ``thorough``, are compared with their checksums."""
+        """The state of a run's results.
+
+        A trajectory of the right size that is older than its manifest is not checked further. Other files, and all if
+        ``thorough``, are compared with their checksums.
+        """
         folder = self.path(key)
         try:
             manifest = self._manifest(key)

@@ -25,17 +25,17 @@ PATIENCE = 30.0  # s for the viewer to start
 
 @contextmanager
 def open_viewer(bind: str) -> Iterator[str]:
-    """The URL of a viewer for :meth:`rerun.RecordingStream.connect_grpc`: of one that is open, or of a new one that listens on the
-    address ``bind`` and stays open after this process has ended.
+    """The URL of an open or a new viewer for :meth:`rerun.RecordingStream.connect_grpc`.
 
-    InputError if ``bind`` is no IP address, or the viewer does not start or is closed before the end of the block.
+    A new viewer listens on the address ``bind`` and stays open after the end of this process. InputError if ``bind`` is no IP
+    address, or if the viewer does not start or is closed before the end of the block.
     """
     host = _reachable(bind)
     url = f"rerun+http://{f'[{host}]' if ':' in host else host}:{PORT}/proxy"
     with tempfile.TemporaryFile() as printed:
-        process = None if _listens(host) else _start(bind, printed)
+        process = None if _is_listening(host) else _start(bind, printed)
         latest = time.monotonic() + PATIENCE
-        while process is not None and not _listens(host):
+        while process is not None and not _is_listening(host):
             if process.poll() is not None or time.monotonic() > latest:
                 raise InputError(
                     f"the viewer did not start{_reason(printed)}; --rrd FILE writes a file that `rerun FILE` opens"
@@ -60,7 +60,7 @@ def _reachable(bind: str) -> str:
     return str(address)
 
 
-def _listens(host: str) -> bool:
+def _is_listening(host: str) -> bool:
     try:
         socket.create_connection((host, PORT), timeout=1.0).close()
     except OSError:

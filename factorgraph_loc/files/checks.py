@@ -68,8 +68,9 @@ def arrivals(
 def last_in_order(
     source: object, rows: Integers, t_ns: Integers, warnings: list[str], names: Sequence[str] | None = None
 ) -> Integers:
-    """Indices (M,) of the rows to keep, in order of arrival: the last one of equal timestamps (N,), or of each of the ``names`` of
-    landmarks at a timestamp."""
+    """Indices (M,) of the rows to keep, in order of arrival: the last row of equal timestamps (N,), and of equal ``names`` if
+    given.
+    """
     arrivals(source, rows, t_ns, warnings)
     keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)
     last = {key: i for i, key in enumerate(keys)}

@@ -105,8 +105,11 @@ def read_text(path: Path, limit: int = bounded.DATA) -> str:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file; InputError if it cannot be read, is not TOML, is nested deeper than :data:`DEEPEST`, or has more
-    than :data:`MOST_ENTRIES` values, a date, or an integer of more than 64 bits."""
+    """The content of a TOML file.
+
+    InputError if it cannot be read, is not TOML, is nested deeper than :data:`DEEPEST`, or has more than :data:`MOST_ENTRIES`
+    values, a date, or an integer of more than 64 bits.
+    """
     return parse_toml(read_text(path, bounded.SETTINGS), path)
 
 
@@ -123,8 +126,10 @@ def parse_toml(text: str, source: object) -> dict[str, Any]:
 
 
 def check_content(content: dict[str, Any], source: object) -> None:
-    """InputError for content that is nested too deeply, has too many values, or has a date, an integer of more than 64 bits, text
-    that is not UTF-8, or a value that is not from TOML."""
+    """Raise InputError if content is nested too deeply or has too many values or invalid ones.
+
+    Invalid are dates, integers of more than 64 bits, text that is not UTF-8, and values that are not from TOML.
+    """
     for key, value in _leaves(content, source):
         if isinstance(value, int) and abs(value) >= 2**63:
             raise InputError(f"{plain(source)}: {plain(key)} is a whole number of more than 64 bits")
@@ -253,9 +258,9 @@ def inside(root: Path, name: str, source: object, *others: Path, expected: str =
 
     All paths in files are resolved by this function.
 
-    A relative path belongs to the first folder where it exists. InputError if it leaves all of them (by dots, as an absolute path
-    or by a link), with what is ``expected``, or if it is neither a regular file nor a folder. NoFileNameError if no file can have
-    that name.
+    A relative path belongs to the first folder where it exists. InputError, with what is ``expected``, if it leaves all folders (by
+    dots, as an absolute path or by a link). InputError also if it is neither a regular file nor a folder. NoFileNameError if no
+    file can have that name.
     """
     try:
         folders = [os.path.realpath(folder) for folder in (root, *others)]

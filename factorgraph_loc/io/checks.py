@@ -46,8 +46,9 @@ def _require(where: str, column: Column, t: Array, values: Array) -> None:
 
 
 def require_one_span(log: Log) -> None:
-    """InputError at a timestamp of a log, or of its start, that is more than :data:`~factorgraph_loc.files.columns.MAX_SPAN` from
-    the others, because the clocks of sensors disagree."""
+    """InputError if a timestamp of a log, or its start, is more than :data:`~factorgraph_loc.files.columns.MAX_SPAN` from the
+    others: the clocks of sensors disagree.
+    """
     filled = {name: stream.t for name, stream in log.streams.items() if len(stream.t)}
     if not filled:
         return

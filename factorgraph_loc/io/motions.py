@@ -93,7 +93,9 @@ def between_wheels(
 
 
 def velocities_of_wheels(speeds: Array, track: float) -> Array:
-    """Speed and turn rate (N, 2) of a differential drive from the speeds (N, 2) of its left and right wheel; or so for ways."""
+    """Speed and turn rate (N, 2) of a differential drive from the speeds (N, 2) of its left and right wheel. Distances give
+    distances.
+    """
     left, right = speeds.T
     return np.column_stack(((left + right) / 2.0, (right - left) / track))
 

@@ -1,7 +1,7 @@
-"""Trajectories by name, from whatever holds one (files of poses, topics of bags, results of runs, references of logs); as those of
-evo (https://github.com/MichaelGrupp/evo) and as ROS messages, and back.
+"""Trajectories by name, from files of poses, topics of bags, results of runs, or references of logs.
 
-Neither library is needed for anything else: they are imported where they are used.
+Conversion to and from those of evo (https://github.com/MichaelGrupp/evo) and ROS messages. Both libraries are imported only by
+these functions.
 """
 
 from collections.abc import Iterable

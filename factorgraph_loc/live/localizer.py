@@ -221,7 +221,7 @@ class Localizer:
                 with self._guard.telling("the start", m.t):
                     estimator.initialize(self._frame.prior(self._prior))
         # as in a run of a log: a tick follows all measurements up to its time
-        for t in self._ticks.before(m.t):
+        for t in self._ticks.advance(m.t):
             self._guard.process(estimator, Tick(t))
         if not m.is_motion and not self._is_under_way(m.t):
             estimator.diagnostics.ignore("before the start")

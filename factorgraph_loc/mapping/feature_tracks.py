@@ -58,8 +58,9 @@ def overlapping_pairs(cameras: Cameras) -> list[tuple[int, int]]:
 def near_epipolar_lines(
     model: CameraModel, cameras: Cameras, i: int, j: int, first: Array, second: Array, gate: float
 ) -> Truths:
-    """Which pairs (N, M) of pixels ``first`` (N, 2) of frame i and ``second`` (M, 2) of frame j are consistent with one point:
-    at most ``gate`` pixels from each other's epipolar line.
+    """Whether pairs (N, M) of pixels ``first`` (N, 2) of frame i and ``second`` (M, 2) of frame j may show one point.
+
+    Each must be at most ``gate`` pixels from the epipolar line of the other.
     """
     rotation = cameras.rotations[j].T @ cameras.rotations[i]
     shift = cameras.rotations[j].T @ (cameras.positions[i] - cameras.positions[j])

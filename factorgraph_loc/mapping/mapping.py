@@ -1,14 +1,14 @@
 """Maps of identified landmarks from the landmarks that a run estimated, and comparison with a given map.
 
-A run without a map has a frame of its own. Its landmarks are aligned with those of a given map by one rotation and translation,
-robustly, as some given landmarks may be wrong: by sample consensus over pairs of landmarks (Fischler and Bolles, "Random sample
-consensus", 1981) with the truncated cost of Torr and Zisserman ("MLESAC", 2000), scaled by the least median of squares
-(Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987, chapter 5), then by weighted least squares on the
-inliers, which are selected again after each iteration.
+A run without a map has a frame of its own. Its landmarks are aligned with those of a given map by one rotation and translation.
+The alignment is robust, as some given landmarks may be wrong. It starts with sample consensus over pairs of landmarks (Fischler
+and Bolles, "Random sample consensus", 1981). The cost is truncated (Torr and Zisserman, "MLESAC", 2000) and scaled by the least
+median of squares (Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987, chapter 5). Weighted least squares on
+the inliers follow; inliers are selected again after each iteration.
 
-The covariances of the run include the drift between its start and the landmarks, which is common to all landmarks and removed
-by the alignment; they are therefore scaled by the variance of unit weight of the inliers (Koch, "Parameter Estimation and
-Hypothesis Testing in Linear Models", 1999).
+The covariances of the run include the drift between its start and the landmarks. It is common to all landmarks and removed by
+the alignment. The covariances are therefore scaled by the variance of unit weight of the inliers (Koch, "Parameter Estimation
+and Hypothesis Testing in Linear Models", 1999).
 """
 
 from collections import Counter
@@ -127,9 +127,9 @@ def make_map(
     """Make a map of the ``learnt`` landmarks of a run on ``log``.
 
     ``extend``: the run used the log's map and learnt what it lacks; its landmarks do not change. Otherwise the run used no
-    map; if the log has one, the learnt landmarks are aligned with it (unless they are ``in_frame`` already) and its landmarks
-    are judged. A given landmark is wrong if it lies more than ``TOLERANCE`` from the learnt one and the squared Mahalanobis
-    distance exceeds ``GATE``; the covariance is the sum of the learnt landmark's, the alignment's and the survey's.
+    map. If the log has one, the learnt landmarks are aligned with it (unless they are ``in_frame`` already) and its landmarks
+    are judged. A given landmark is wrong if it is more than ``TOLERANCE`` from the learnt one and the squared Mahalanobis
+    distance exceeds ``GATE``. Its covariance is the sum of those of the learnt landmark, the alignment and the survey.
 
     Raises RunFailedError if nothing was learnt.
     """

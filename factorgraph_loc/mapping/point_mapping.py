@@ -1,8 +1,8 @@
 """Maps of 3-D points from images with known camera poses.
 
-Keyframes are chosen, features are matched near epipolar lines and chained into tracks, tracks with enough parallax are
-triangulated, and points and cameras are adjusted together. Points with enough observations and small enough covariances are
-kept, with descriptors from a few directions.
+Keyframes are chosen. Features are matched near epipolar lines and chained into tracks. Tracks with enough parallax are
+triangulated, and points and cameras are adjusted together. Points with enough observations and small enough covariances are kept,
+with descriptors from a few directions.
 """
 
 from __future__ import annotations
@@ -230,8 +230,9 @@ def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Arr
 
 
 def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int) -> Integers:
-    """Observations (V,), at most ``views`` of each point: the one nearest to their mean, then repeatedly the one that differs
-    most, in direction or log distance, from those chosen.
+    """Observations (V,), at most ``views`` of each point.
+
+    The first is nearest to their mean. The next ones differ most, in direction or log distance, from the chosen ones.
     """
     chosen: list[int] = []
     order = np.argsort(tracks.track, kind="stable")

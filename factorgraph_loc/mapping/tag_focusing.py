@@ -1,10 +1,10 @@
 """Positions of tags to centimetres, from the phases of reads along known poses.
 
-The phases of one tag, antenna and channel within a window agree only at the tag's position, after the phase of the path is
-subtracted (:mod:`factors.rfid.signals`), as in a synthetic aperture (holography: Miesen, Kirsch, Vossiek, IEEE RFID 2011). Unknown
-phase offsets and frequency hopping cancel within a window, so that only the poses of one window must be exact, relative to each
-other, to a fraction of the wavelength. The prior is the position that follows from reads and misses. The likelihood has side lobes:
-it is evaluated on a lattice first, then refined by Fisher scoring.
+The phase of the path is subtracted from the phases of one tag, antenna and channel within a window (:mod:`factors.rfid.signals`).
+The results agree only at the tag's position, as in a synthetic aperture (holography: Miesen, Kirsch, Vossiek, IEEE RFID 2011).
+Unknown phase offsets and frequency hopping cancel within a window. Therefore only the relative poses of one window must be exact
+to a fraction of the wavelength. The prior is the position from reads and misses. The likelihood has side lobes: it is evaluated on
+a lattice first, then refined by Fisher scoring.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Search for the position of a tag, given known robot poses: all modes of the likelihood, not only the best one.
 
 The likelihood of all antenna observations is evaluated on a lattice, and its best positions are refined by Fisher scoring.
-After a straight pass a tag on the left of the robot may be as likely as one on the right: there are then two modes with weights
+After a straight pass a tag on the left of the robot may be as likely as one on the right. Then there are two modes, with weights
 from Laplace's method under a uniform prior.
 
 An unknown facing that matters to the model is tried in :data:`DIRECTIONS`, then between the best of them.
@@ -310,7 +310,7 @@ def refine(
 def _refined(
     model: RfidModel, observations: TagReadCounts, heights: Array, facing: Array, places: Array
 ) -> tuple[Array, Array, Array]:
-    """Positions (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2) of C tags, each with a column of hits.
+    """Positions (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2) of C tags, a column of hits each.
 
     The information is the observed curvature if it is positive definite, else the Fisher information.
     """

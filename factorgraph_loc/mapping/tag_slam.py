@@ -1,9 +1,9 @@
 """Joint estimation of tag positions and robot trajectory from odometry and reads.
 
-The trajectory grows in stretches, to bound the drift of the odometry: all poses so far are optimised with the mapped tags
-(:class:`factors.rfid.factor.RfidTagFactor`), then the remaining tags are searched
-(:mod:`factorgraph_loc.mapping.tag_search`) and added to the map once a single position explains their reads. At the end all
-tags are searched again along the whole trajectory, and the problem is solved again if one has moved.
+The trajectory grows in stretches, to bound the drift of the odometry. After each stretch all poses so far are optimised with the
+mapped tags (:class:`factors.rfid.factor.RfidTagFactor`). Then the remaining tags are searched
+(:mod:`factorgraph_loc.mapping.tag_search`); those with a single position that explains their reads are added to the map. At the
+end all tags are searched again along the whole trajectory, and the problem is solved again if one has moved.
 """
 
 from collections.abc import Callable
@@ -199,8 +199,9 @@ class _Problem:
 
 
 def _keyframes(begin: float, end: float, stamps: Array) -> Array:
-    """Times [s] at intervals of ``INTERVAL`` from ``begin`` to ``end``, without those inside of long gaps between ``stamps``,
-    and with one before the first stamp after a gap.
+    """Times [s] at intervals of ``INTERVAL`` from ``begin`` to ``end``, without those inside of long gaps between ``stamps``.
+
+    The time of the first stamp after a gap is preceded by one of these.
     """
     measured = np.unique(np.concatenate(((begin, end), stamps[(stamps > begin) & (stamps < end)])))
     gaps = np.flatnonzero(np.diff(measured) > TICK_GAP)

@@ -87,8 +87,10 @@ class Triangulated:
 
 
 def reproject(model: CameraModel, cameras: Cameras, points: Array, tracks: Tracks) -> tuple[Array, Array, Array, Array]:
-    """For each of N observations: error (N, 2) [px], predicted minus measured, its Jacobians with respect to the camera (N, 2,
-    6), as in :func:`factors.camera.model.linearize_in_space`, and to the point (N, 2, 3), and the depth (N,) [m].
+    """Errors of N observations (N, 2) [px], predicted minus measured, their Jacobians, and the depths (N,) [m].
+
+    The Jacobians are with respect to the camera (N, 2, 6), as in :func:`factors.camera.model.linearize_in_space`, and to the
+    point (N, 2, 3).
     """
     rotations = cameras.rotations[tracks.frame]
     local = np.einsum("nj,njk->nk", points[tracks.track] - cameras.positions[tracks.frame], rotations)

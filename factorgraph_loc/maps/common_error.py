@@ -1,8 +1,9 @@
-"""What all points of a map near a place are wrong by together, where the drive that made it had no reference.
+"""The common error of all points of a map near a place, if the map was made without a reference.
 
-Such a map is bent as the drive's trajectory was. Whoever is localized in it is off by as much, however many points tell where: that
-does not average out as the points' own errors do. So it is not part of an image's noise, but comes on top of the covariance in the
-frame of the map: it is that of the drive's pose where the points were seen, moved to where the robot is as a rigid body.
+Such a map is bent as the drive's trajectory was. A robot that is localized in it has the same error, with any number of points:
+it does not average out, unlike the points' own errors. It is therefore not part of an image's noise, but is added to the
+covariance in the frame of the map. It is the error of the drive's pose at the observation of the points, moved to the robot as a
+rigid body.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ LEAST = 0.01  # m: standard deviation of what a point has for itself
 
 @dataclass(frozen=True, eq=False)
 class CommonError:
-    """``covariances`` (K, 3, 3) of (x, y, heading) about ``places`` (K, 2) [m], from which points were seen in ``directions`` (K,
-    2), unit vectors."""
+    """``covariances`` (K, 3, 3) of (x, y, heading) about ``places`` (K, 2) [m] of the camera.
+
+    ``directions`` (K, 2): unit vectors from the camera to the points.
+    """
 
     places: Array
     directions: Array
@@ -39,8 +42,10 @@ class CommonError:
         return cls(places, _unit(directions), points.common[first])
 
     def at(self, poses: Array, looking: float = 0.0) -> Array:
-        """The covariances (N, 3, 3) at ``poses`` (N, 3) of a robot whose camera looks in the direction ``looking`` [rad] of its own
-        frame: those of the nearest places from which the same was seen."""
+        """The covariances (N, 3, 3) at ``poses`` (N, 3) of a robot: those of the nearest places with a similar view.
+
+        ``looking`` [rad]: direction of the camera in the robot frame.
+        """
         ahead = poses[:, 2] + looking
         cosine = np.column_stack((np.cos(ahead), np.sin(ahead))) @ self.directions.T
         away = np.linalg.norm(poses[:, None, :2] - self.places, axis=2)
@@ -49,14 +54,14 @@ class CommonError:
 
 
 def carried(covariances: Array, arms: Array) -> Array:
-    """``covariances`` (N, 3, 3) of a rigid body's (x, y, heading), about points that lie ``arms`` (N, 2) [m] from where it was."""
+    """``covariances`` (N, 3, 3) of a rigid body's (x, y, heading), moved to points at ``arms`` (N, 2) [m] from the old ones."""
     lever = np.repeat(np.eye(3)[None], len(arms), axis=0)
     lever[:, 0, 2], lever[:, 1, 2] = -arms[:, 1], arms[:, 0]
     return np.asarray(lever @ covariances @ lever.transpose(0, 2, 1))
 
 
 def without_common(points: PointMap) -> PointMap:
-    """The map with the covariances that its points have for themselves."""
+    """The map with covariances of its points without their common error."""
     if points.common is None:
         return points
     moved = carried(points.common, points.positions[points.owners, :2] - points.seen_from[:, :2])[:, :2, :2]

@@ -1,4 +1,4 @@
-"""Walls and lines of sight; space in which a robot can drive: free cells of a grid, distances to walls, and shortest paths."""
+"""Walls and lines of sight; drivable space: free cells of a grid, distances to walls, and shortest paths."""
 
 import math
 from collections.abc import Sequence
@@ -81,13 +81,13 @@ class FreeSpace:
         i, j = np.where(inside[:, None], places, 0).T
         return np.where(inside, self.index[i, j], -1)
 
-    def clear(self, a: Array, b: Array) -> bool:
+    def is_clear(self, a: Array, b: Array) -> bool:
         """Whether the straight line between two points crosses free cells only."""
-        return bool(_clear(self.index, self.origin, np.asarray(a, dtype=float), np.asarray(b, dtype=float)))
+        return bool(_is_clear(self.index, self.origin, np.asarray(a, dtype=float), np.asarray(b, dtype=float)))
 
 
 def free_space(world: Walled, clearance: float) -> FreeSpace:
-    """Return the space in which a robot keeps ``clearance`` [m] from all walls: its largest connected part.
+    """Return the largest connected space with ``clearance`` [m] from all walls.
 
     Raises InputError if the world has no walls, or no cell has that clearance.
     """
@@ -144,7 +144,7 @@ def straightened(space: FreeSpace, points: Array) -> Array:
         low, high = i + 1, len(points) - 1
         while low < high:
             middle = (low + high + 1) // 2
-            low, high = (middle, high) if space.clear(points[i], points[middle]) else (low, middle - 1)
+            low, high = (middle, high) if space.is_clear(points[i], points[middle]) else (low, middle - 1)
         corners.append(low)
         i = low
     return np.asarray(points[corners])
@@ -177,7 +177,7 @@ def _graph(index: NDArray[np.int64]) -> sparse.csr_matrix:
 
 
 @compiled
-def _clear(index: NDArray[np.int64], origin: Array, a: Array, b: Array) -> bool:
+def _is_clear(index: NDArray[np.int64], origin: Array, a: Array, b: Array) -> bool:
     dx, dy = b[0] - a[0], b[1] - a[1]
     count = max(2, math.ceil(math.hypot(dx, dy) / SPACING))
     step = 1.0 / (count - 1)

@@ -1,4 +1,4 @@
-"""Maps of 3-D points with image descriptors, stored as ``NAME.points.parquet`` beside a world file."""
+"""Maps of 3-D points with image descriptors, stored as ``NAME.points.parquet`` in the folder of a world file."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class PointMap:
     ``names``: P, unique; ``positions`` (P, 3) [m] in the world frame; ``covariances`` (P, 3, 3) [m^2]. ``feature``: the kind of
     the views' ``descriptors`` (V, D), empty where points are identified by name only (V = 0). ``owners`` (V,): the point of
     each view; ``seen_from`` (V, 3) [m]: the camera's position; ``sizes`` (V,) [px]: size of the feature in the image. ``common``
-    (V, 3, 3): of a map that was made without a reference, the covariance of (x, y, heading) of the frame there, about the camera:
-    the part of the points' errors that all points seen from there have in common; see :mod:`.common_error`.
+    (V, 3, 3): for a map that was made without a reference, the covariance of (x, y, heading) of the local frame, about the camera.
+    This is the common error of all points in a view; see :mod:`.common_error`.
     """
 
     names: tuple[str, ...]
@@ -224,8 +224,11 @@ def _descriptors(table: pl.DataFrame, rows: NDArray[np.int64], feature: str, pat
 
 
 def write_ply(points: PointMap, path: Path) -> None:
-    """Write a PLY file (G. Turk, "The PLY polygon file format", 1994), which viewers of point clouds read: positions, the standard
-    deviation in the worst direction [m] and the number of views."""
+    """Write a PLY file for viewers of point clouds: positions, the standard deviation in the worst direction [m] and the number
+    of views.
+
+    Format: G. Turk, "The PLY polygon file format", 1994.
+    """
     sigma = worst_sigma(points.covariances)
     views = np.bincount(points.owners, minlength=len(points))
     rows = zip(points.positions.tolist(), sigma.tolist(), views.tolist(), strict=True)

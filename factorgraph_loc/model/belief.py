@@ -45,8 +45,8 @@ class PosePrior:
 class PoseEstimate:
     """A causal estimate: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world frame.
 
-    ``status`` is about the pose. ``doubts_model`` tells whether measurements contradict the model of their sensor: the covariance
-    may be too small then.
+    ``status``: of the pose. ``doubts_model``: whether measurements contradict the model of their sensor; the covariance may be
+    too small then.
     """
 
     t: float

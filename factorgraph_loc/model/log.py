@@ -74,8 +74,10 @@ class Log:
         return (m for _, _, _, m in heapq.merge(*self._arrivals(self._in_order(sensors))))
 
     def steps(self, sensors: Sequence[str]) -> Iterator[Measurement]:
-        """The same, but that rows which arrive one after the other, each newer than the last, are one measurement where their
-        stream ``joins`` them: :class:`~factorgraph_loc.model.measurement.Rows`."""
+        """The same, but successive rows of a stream with ``joins`` are one measurement
+        (:class:`~factorgraph_loc.model.measurement.Rows`) if they arrive without others between and each is newer than the
+        previous one.
+        """
         order = self._in_order(sensors)
         joined = next((rank for rank, name in enumerate(order) if self.streams[name].joins), None)
         if joined is None:
@@ -93,7 +95,7 @@ class Log:
         yield from _pieces(rows, late, first, len(arrived))
 
     def _in_order(self, sensors: Sequence[str]) -> list[str]:
-        """The streams of ``sensors``, of which those that come first at equal times stand first."""
+        """The streams of ``sensors``, in the order of their measurements at equal times."""
         return sorted((s for s in self.streams if s in sensors), key=lambda s: (self.streams[s].rank, s))
 
     def _arrivals(
@@ -124,8 +126,8 @@ def _pieces(rows: Rows, late: Integers, first: int, last: int) -> Iterator[Rows]
 def cut(log: Log, start: float, end: float) -> Log:
     """The part of a log with timestamps in [start, end) seconds by each sensor's own clock, including the reference.
 
-    Timestamps and name do not change; a known start is dropped. A velocity from before ``start`` does not apply in the part, and
-    the first increment of odometry remains the motion since the row before it. InputError if no measurement is left.
+    Timestamps and name do not change; a known start is dropped. A velocity from before ``start`` does not apply in the part. The
+    first increment of odometry remains the motion since the previous row of the log. InputError if no measurement is left.
     """
 
     def inside(t: Array) -> NDArray[np.bool_]:

@@ -1,5 +1,7 @@
-"""The interface of measurements, frozen values with timestamps in seconds from the start of the log, in SI units; and the
-rows of one sensor of a log."""
+"""The interface of measurements, and the rows of one sensor of a log.
+
+Measurements are frozen values in SI units, with timestamps in seconds from the start of the log.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +17,16 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError
 from factors.se2 import Array
 
-GOING_BACK = 5.0  # s that an estimator goes back in time, at most, for one that is late
-FLOOR, TURN, SEEN = 0, 1, 2  # ranks of streams: motion on the floor, rotation alone, and what is exteroceptive
+GOING_BACK = 5.0  # s that an estimator goes back in time, at most, to process a late measurement
+FLOOR, TURN, EXTEROCEPTIVE = 0, 1, 2  # ranks of streams: motion on the floor, rotation only, exteroceptive measurements
 
 
 class Measurement(Protocol):
     """A measurement at ``t`` [s], the time of the event with the clock offset applied.
 
-    ``sensor``: its channel, as in a log and in ``--sensors``. ``modality``: the kind of sensor, by which estimators declare what
-    they use. ``source``: the name of the sensor, by default its modality. ``count``: number of detections. ``is_motion``: whether
-    it measures the robot's motion.
+    ``sensor``: its channel, as in a log and in ``--sensors``. ``modality``: the kind of sensor; estimators
+    declare the modalities that they use. ``source``: the name of the sensor, by default its modality. ``count``: number of
+    detections. ``is_motion``: whether it measures the robot's motion.
     """
 
     @property
@@ -60,8 +62,10 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Measurements of one ``kind`` that follow one another in time, as one: their ``times`` (N,) [s], and their ``values``, an
-    array (N,) of each field. As a measurement it has the time of the last."""
+    """Successive measurements of one ``kind`` as one, with the time of the last.
+
+    ``times`` (N,) [s]; ``values``: an array (N,) of each field.
+    """
 
     kind: type[Any]
     times: Array
@@ -106,7 +110,7 @@ class Stream:
     (:class:`~factorgraph_loc.model.measurement.Rows`).
     """
 
-    rank: ClassVar[int] = SEEN
+    rank: ClassVar[int] = EXTEROCEPTIVE
     joins: ClassVar[bool] = False
     kind: ClassVar[type[Any]]
     t: Array
@@ -140,7 +144,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class ScanStream(Stream):
-    """A stream in which the rows of one timestamp form one measurement, made of names (K,) and arrays (K,)."""
+    """A stream whose rows with one timestamp form one measurement of names (K,) and arrays (K,)."""
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         """One measurement per timestamp; ``offset`` [s] is added to the timestamps."""

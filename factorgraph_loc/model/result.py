@@ -57,9 +57,9 @@ class RunResult:
     """The result of one estimator on one log.
 
     ``config``: the effective configuration, enough to repeat the run. ``t`` (N,), ``poses`` (N, 3), ``covariances`` (N, 3, 3) in
-    the world frame and ``status`` (N) are the causal estimates at the ticks, ``doubts_model`` (N) tells
-    whether measurements contradicted the model of their sensor then; ``final`` is the estimate from the whole log.
-    ``reliability``: of the sensors' models on this log, by sensor.
+    the world frame, ``status`` (N): the causal estimates at the ticks. ``doubts_model`` (N): whether measurements contradicted
+    the model of their sensor. ``final``: the estimate from the whole log. ``reliability``: of the sensors' models on this log, by
+    sensor.
     """
 
     log: str

@@ -103,14 +103,14 @@ class Ticks:
         """When the next tick is."""
         return self._start + self._next / RATE
 
-    def before(self, t: float) -> Iterable[float]:
-        """The ticks before the next measurement, which is at ``t``."""
+    def advance(self, t: float) -> Iterable[float]:
+        """The ticks before ``t``, the time of the next measurement."""
         if self._newest <= t <= self._start + self._next / RATE and t <= self._newest + self._gap:
             self._newest = t
             return ()  # the usual case for odometry
-        return self._before(t)
+        return self._pass(t)
 
-    def _before(self, t: float) -> Iterator[float]:
+    def _pass(self, t: float) -> Iterator[float]:
         if t > self._newest + self._gap:
             yield from self.rest()
             self.skipped.append((self._newest, t))

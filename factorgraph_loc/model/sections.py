@@ -71,7 +71,7 @@ def registered() -> Mapping[str, HasSections]:
 
 
 def sections() -> dict[str, Section]:
-    """The sections of a rig by name in the order in which they are written; those without a channel come last."""
+    """The sections of a rig by name in the order of its file; those without a channel are last."""
     by_name = {name: section for sensor in registered().values() for name, section in sensor.settings.items()}
     used = set(sections_of_channels().values())
     return {name: by_name[name] for name in sorted(by_name, key=lambda name: name not in used)}

@@ -1,5 +1,7 @@
-"""What settings of sensors are made of: bounded numbers with their units, which reject wrong ones (degrees for radians, mm for m),
-constants that are estimated, and the base class."""
+"""Types of settings of sensors: bounded numbers with units, constants that are estimated, and the base class.
+
+The bounds reject values in a wrong unit (degrees for radians, mm for m).
+"""
 
 from __future__ import annotations
 
@@ -97,8 +99,10 @@ class SensorSettings(FileModel):
         return Estimated.of(self.constants, getattr(self, "uncertainty", None))
 
     def map_error(self, world: World) -> Callable[[Array], Array] | None:
-        """The error of a map that the sensor is localized in: covariances (N, 3, 3) of (x, y, heading) of its frame at poses (N,
-        3); None if the map is exact."""
+        """The error of the sensor's map: covariances (N, 3, 3) of (x, y, heading) of its frame at poses (N, 3).
+
+        None if the map is exact.
+        """
         return None
 
     def placed(self, folder: Path) -> Self:

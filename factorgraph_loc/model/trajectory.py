@@ -32,8 +32,11 @@ class Exchange:
 
     @classmethod
     def of(cls, path: PosePath, t0_ns: int = 0) -> Self:
-        """The poses of a path. InputError if it has no times, as in KITTI files, or they do not increase; for a trajectory on the
-        floor also if heights vary."""
+        """The poses of a path.
+
+        InputError if it has no times, as in KITTI files, or they do not increase. For a trajectory on the floor also if heights
+        vary.
+        """
         if path.t_ns is None:
             raise InputError(f"{path.name}: has poses without times, expected poses with times")
         require_times(path.name, path.t_ns)
@@ -162,10 +165,10 @@ class Trajectory(Exchange):
 
     @classmethod
     def from_polars(cls, table: pl.DataFrame) -> Self:
-        """A trajectory from the columns t [s], x, y [m], heading [rad], and those of covariances (cov_xx, cov_xy, cov_xh, cov_yy,
-        cov_yh, cov_hh) if there are any; others are ignored.
+        """A trajectory from the columns t [s], x, y [m], heading [rad], and optionally those of covariances; others are ignored.
 
-        InputError if a column is missing, or has values that are no numbers.
+        Columns of covariances: cov_xx, cov_xy, cov_xh, cov_yy, cov_yh, cov_hh. InputError if a column is missing, or has values
+        that are no numbers.
         """
         trajectory = super().from_polars(table)
         if not any(name in table.columns for name in COVARIANCES):
@@ -199,8 +202,11 @@ class Trajectory(Exchange):
 
 
 def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integers, Array, NDArray[np.bool_]]:
-    """Bracket times ``t`` (M,) in sorted ``stamps`` (N,), N > 0: the indices before and after, which are equal at a stamp, the
-    fraction between them, and whether a time is inside and not in a gap longer than ``max_gap``."""
+    """Bracket times ``t`` (M,) in sorted ``stamps`` (N,), N > 0.
+
+    Returns the indices of the previous and the next stamp, which are equal at a stamp; the fraction between them; and whether a
+    time is inside and not in a gap longer than ``max_gap``.
+    """
     t = np.asarray(t, dtype=float)
     last = np.clip(np.searchsorted(stamps, t, side="left"), 0, len(stamps) - 1)
     first = np.where(stamps[last] == t, last, np.maximum(last - 1, 0))

@@ -1,4 +1,4 @@
-"""Trajectories and poses in three dimensions, and what is seen of them from above."""
+"""Trajectories and poses in three dimensions, and their projections onto the plane."""
 
 from __future__ import annotations
 

@@ -108,20 +108,20 @@ def with_images(
     folder: Path,
     *,
     workers: int = 1,
-    tell: Callable[[float, float], None] = lambda _done, _total: None,
+    progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> Log:
     """Write images to ``folder`` for ``log``, simulated with the same settings and seed, and return the log with them.
 
-    ``workers``: number of processes for many images; ``tell``: called with the number of images done and of all. Raises InputError
-    as :func:`film` does.
+    ``workers``: number of processes for many images; ``progress``: called with the number of images done and of all. Raises
+    InputError as :func:`film` does.
     """
     assert log.reference is not None, "a simulated log has one"
     times = times_of(settings.images.rate, log.reference)
     count = len(times)
     if workers == 1 or count <= FEW:
-        _write(settings, seed, folder, range(count), lambda done: tell(done, count))
+        _write(settings, seed, folder, range(count), lambda done: progress(done, count))
     else:
-        _write_in_parallel(settings, seed, folder, count, workers, tell)
+        _write_in_parallel(settings, seed, folder, count, workers, progress)
     offset, names = log.rig.time_offset("camera"), [folder / _name(i) for i in range(count)]
     streams = {**log.streams, "camera": ImageStream(times - offset, names)}
     return replace(log, streams=streams, rig=with_sensors(log.rig, streams))
@@ -133,12 +133,14 @@ def _write_in_parallel(
     folder: Path,
     count: int,
     workers: int,
-    tell: Callable[[float, float], None],
+    progress: Callable[[float, float], None],
 ) -> None:
     """Each process makes the scene and every n-th image."""
     write = partial(_write, settings, seed, folder)
     parts = [range(i, count, workers) for i in range(workers)]
-    for _, outcome in run_each(write, parts, workers, beat=lambda: tell(sum(1 for _ in folder.glob("*.jpg")), count)):
+    for _, outcome in run_each(
+        write, parts, workers, beat=lambda: progress(sum(1 for _ in folder.glob("*.jpg")), count)
+    ):
         if isinstance(outcome, Exception):
             raise outcome
 
@@ -148,14 +150,14 @@ def _write(
     seed: int,
     folder: Path,
     indices: range,
-    tell: Callable[[float], None] = lambda _done: None,
+    progress: Callable[[float], None] = lambda _done: None,
 ) -> None:
     cv2.setNumThreads(1)
     images = film(settings, seed)
     for done, i in enumerate(indices):
         _, content = cv2.imencode(".jpg", images[i], JPEG)
         (folder / _name(i)).write_bytes(content.tobytes())
-        tell(done + 1)
+        progress(done + 1)
 
 
 def _name(i: int) -> str:

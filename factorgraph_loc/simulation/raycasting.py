@@ -19,7 +19,7 @@ from factors.se2 import Array
 BINS = 2048  # directions in the plan
 TAPS = 4  # maximum number of texture samples on an oblique surface
 STEEPEST = 1e3  # maximum slant
-SLACK = 1e-9  # m, by which adjacent faces overlap
+SLACK = 1e-9  # m, overlap of adjacent faces
 NEAREST = 1e-3  # m from a face's plane, within which the face is invisible
 
 # columns of a table of faces relative to a camera: unit normal, distance from the plane (negative behind it), unit vector
@@ -35,8 +35,8 @@ Place = tuple[
 
 
 class Surroundings(NamedTuple):
-    """The faces visible from ``origin`` (3,): a ``table`` (M, 13) of which ``items[starts[b] : starts[b + 1]]`` may be hit in
-    the direction b; ``size`` (5,): width, depth and height of the building, and the inverses of the first two.
+    """The faces visible from ``origin`` (3,): a ``table`` (M, 13); a ray in direction b may hit its rows
+    ``items[starts[b] : starts[b + 1]]``. ``size`` (5,): width, depth and height of the building, and the inverses of the first two.
     """
 
     origin: Array
@@ -124,7 +124,7 @@ def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: f
         if t < best:
             best, row = t, i
     if CEILING <= row < 0:
-        # a camera outside of the building may look past it
+        # a ray of a camera outside of the building may miss it
         x, y = (x0 + best * dx) * per_width, (y0 + best * dy) * per_depth
         if not (-SLACK <= x <= 1.0 + SLACK and -SLACK <= y <= 1.0 + SLACK):
             best, row = np.inf, NOTHING

@@ -67,7 +67,7 @@ class Renderer:
         return np.asarray(raycasting.develop(light, brightness, noise, NORMAL, read, shot))
 
     def hits(self, pixels: Array, position: Array, rotation: Array) -> Array:
-        """The world points (K, 3) shown by ``pixels`` (K, 2), NaN where there is none."""
+        """The world points (K, 3) shown by ``pixels`` (K, 2), NaN if there is none."""
         directions = reprojection.undistorted(self.model, np.asarray(pixels, dtype=float).reshape(-1, 2))
         rays = np.column_stack((directions, np.ones(len(directions)))) @ rotation.T
         distance = self._distances(position, rays)

@@ -66,7 +66,7 @@ def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Tex
     def drawn() -> Iterator[Canvas]:
         for i, size in enumerate(sizes):
             if i < w:
-                canvas = textures.wall(rng, *size, texel, windows=_outer(plan, faces[i]))
+                canvas = textures.wall(rng, *size, texel, windows=_is_outer(plan, faces[i]))
             elif i < w + b:
                 canvas = textures.furniture(rng, *size)
             else:
@@ -85,7 +85,7 @@ def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Tex
     return TexturedScene(faces, bottoms, tops, lids, plan.width, plan.depth, ROOM_HEIGHT, texels, layout, texel)
 
 
-def _outer(plan: Plan, face: Array) -> bool:
+def _is_outer(plan: Plan, face: Array) -> bool:
     """Whether a face is on the outline of the plan."""
     x1, y1, x2, y2 = face.tolist()
     return (x1 == x2 and x1 in {0.0, plan.width}) or (y1 == y2 and y1 in {0.0, plan.depth})

@@ -18,7 +18,7 @@ from factorgraph_loc.sensors.registry import functions, sensors
 from factorgraph_loc.text import quoted
 
 MOST_TAGS = 10_000
-MOST_LOOKS = 50_000_000  # maximum number of simulated observations of one kind, as all are in memory at once
+MOST_LOOKS = 50_000_000  # maximum number of simulated observations of one kind, which are all in memory
 Surface = Literal["wall", "shelf", "floor"]
 
 
@@ -124,7 +124,7 @@ class SimulationSettings(FileModel):
         """The number of simulated observations of tags, landmarks and points, summed over all objects of a kind. Raises
         ValueError if the settings are inconsistent.
         """
-        per_second = {what: often for _, looks in functions("looks") for what, often in looks(self).items()}
+        per_second = {what: often for _, rates in functions("looks") for what, often in rates(self).items()}
         return {what: self.drive.duration * often for what, often in per_second.items()}
 
 
@@ -173,10 +173,10 @@ RACKHAM_RIG: Mapping[str, Any] = {
     },
 }
 _OFFICE: Mapping[str, Any] = {"world": {"plan": "office", "tags": 40}, "rig": RACKHAM_RIG}
-# Fades that affect a fraction f of the time, with mean duration d, increase the variance of the number of reads in many rounds
-# at intervals dt by 1 + 2 rho / (1 - rho) f p / (1 - (1 - f) p), relative to independent rounds, with rho = exp(-dt / (d (1 -
-# f))) and the probability p of a read outside of fades: 1.9 at p = 0.5. The inverse is too conservative as a tempering, since
-# the robot moves. This tempering makes the smoother's causal ANEES 3: 3.0 over six runs of 300 s, 2.8 at 0.6.
+# Fades affect a fraction f of the time and have the mean duration d. p: probability of a read outside of fades. Relative to
+# independent rounds they increase the variance of the number of reads in many rounds at intervals dt by 1 + 2 rho / (1 - rho) f p
+# / (1 - (1 - f) p), with rho = exp(-dt / (d (1 - f))): 1.9 at p = 0.5. The inverse is too conservative as a tempering, since the
+# robot moves. This tempering makes the smoother's causal ANEES 3: 3.0 over six runs of 300 s, 2.8 at 0.6.
 _BURSTY: Mapping[str, Any] = {
     "faults": {"fading": {"duration": 2.0, "share": 0.2}},
     "rig": {"rfid": {"miss": 0.2, "tempering": 0.7}},

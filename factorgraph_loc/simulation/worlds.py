@@ -27,7 +27,7 @@ LOWEST_BOX = 1.4  # m: least height of furniture and shelves
 STANDOFF = 0.02  # m, of a tag or point from its surface
 POINT_HEIGHTS = (0.3, 2.2)  # m, range on walls
 IN_FRONT = 0.3  # m of free space needed before a tag
-CANDIDATES = 10  # candidate places for each tag, of which the farthest from the others is chosen
+CANDIDATES = 10  # candidate places for each tag; the farthest from the other tags is chosen
 
 
 @dataclass(frozen=True)
@@ -143,8 +143,8 @@ def _shelves(width: float, depth: float) -> tuple[Segment, ...]:
 def _corridors(width: float, depth: float, outline: tuple[Segment, ...], rng: np.random.Generator) -> Plan:
     """An H with a half-turn symmetry: a corridor along x and one across each of its ends; the rest are closed rooms.
 
-    A tag hangs in the middle, and one in an arm at each end, in opposite arms: coming from the middle the robot finds both on
-    its left or both on its right, which is random.
+    A tag is in the middle, and one in an arm at each end, in opposite arms. Seen from the middle, both are on the left or both on
+    the right, at random.
     """
     if width < 4.0 * HALL_WIDTH or depth < 3.0 * HALL_WIDTH:
         raise InputError(
@@ -205,9 +205,10 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
 
 
 def _distribute(plan: Plan, faces: Array, count: int, rng: np.random.Generator) -> Array:
-    """``count`` places (x, y, direction away from the surface) along ``faces`` (F, 4), by best-candidate sampling (Mitchell,
-    SIGGRAPH 1991): each is the farthest from the previous ones among :data:`CANDIDATES`, uniform per metre. None is behind
-    furniture.
+    """``count`` places (x, y, direction away from the surface) along ``faces`` (F, 4), none behind furniture.
+
+    Best-candidate sampling (Mitchell, SIGGRAPH 1991): each place is the farthest from the previous ones among
+    :data:`CANDIDATES`, which are uniform per metre.
     """
     out = np.empty((count, 3))
     length = np.hypot(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])

@@ -1,7 +1,7 @@
 """Visual odometry in a graph: relative-motion factors between the keyframes of consecutive images.
 
-They use only tracks that have no other use, so that no pixel counts twice: not those of map points, of points in the graph, or of
-points waiting to be triangulated.
+No pixel counts twice: the factors do not use tracks of map points, of points in the graph, or of points that wait for their
+triangulation.
 """
 
 import math

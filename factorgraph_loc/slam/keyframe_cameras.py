@@ -1,7 +1,7 @@
 """Camera poses of the keyframes of a graph, for points that are triangulated from them.
 
-The pose of a keyframe is that at the stamp of its image. If the time offset of the camera is estimated, the image was taken later:
-until then the robot moves on with the velocity that the odometry has at the stamp.
+The pose of a keyframe is that at the stamp of its image. If the time offset of the camera is estimated, the image was taken
+later. The robot then moves on with the odometry's velocity at the stamp.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ Waiting = Mapping[Hashable, Sequence[PointSighting]]
 
 
 class KeyframeCameras:
-    """The velocities (3,) of the robot at keyframes by their number (``twists``), none if the time offset of the camera is not
-    among the ``estimated`` constants; and which keyframes the points of the graph determine (``anchored``)."""
+    """``twists``: velocities (3,) of the robot at keyframes by their number, none if the time offset of the camera is not among
+    the ``estimated`` constants. ``anchored``: keyframes that points of the graph determine.
+    """
 
     def __init__(self, model: CameraModel, estimated: Estimated) -> None:
         self._model = model
@@ -77,10 +78,10 @@ class KeyframeCameras:
     def cameras(
         self, newest: Keyframe, pose: Array, names: Iterable[Hashable], waiting: Waiting, graph: GraphView
     ) -> dict[int, KeyframeCamera]:
-        """The camera poses of the keyframes that see the ``waiting`` points ``names``, by number, with the pixel errors they cause
-        in the ``newest`` one, which is at ``pose`` (3,).
+        """The camera poses, by number, of the keyframes that see the ``waiting`` points ``names``.
 
-        Relative poses come from points of the graph where these determine both keyframes, otherwise from odometry.
+        Each has the pixel errors that it causes in the ``newest`` keyframe, which is at ``pose`` (3,). Relative poses come from
+        points of the graph if these determine both keyframes, otherwise from odometry.
         """
         slacks = self._slacks(newest, graph)
         cameras = {newest.index: self._camera(pose, newest.index, slacks, graph)}

@@ -1,9 +1,8 @@
-"""Local bundle adjustment of the last keyframes and the points waiting there, where no points of the graph determine the
-rotation.
+"""Local bundle adjustment of the last keyframes and their waiting points, if no points of the graph determine the rotation.
 
-Odometry alone may be wrong by more pixels than the parallax to be triangulated, and far more where wheels slip. Points seen from
-several keyframes determine the rotation better, before anything is known of their distances. The result serves as a linearization
-point only: the sightings enter the graph unchanged.
+The error of the odometry may exceed the parallax of the points, and does so by far if wheels slip. Points seen from several
+keyframes determine the rotation better, even if their distances are unknown. The result is only a linearization point: the
+sightings enter the graph unchanged.
 """
 
 from collections.abc import Hashable, Mapping, Sequence
@@ -31,10 +30,11 @@ def bundled(
     poses: Sequence[Array],
     waiting: Mapping[Hashable, Sequence[PointSighting]],
 ) -> list[tuple[Array, Array]] | None:
-    """Adjusted poses (3,) and tilts (2,) of the last of consecutive ``keyframes``, as far as each shares points with the one
-    before; the first pose held, from the initial ``poses``.
+    """Adjusted poses (3,) and tilts (2,) of the last of consecutive ``keyframes``, while each shares points with the previous
+    one.
 
-    None with fewer than :data:`ENOUGH` points, or where most of what a keyframe sees does not fit.
+    The initial values are ``poses``; the first pose is fixed. None with fewer than :data:`ENOUGH` points, or if most sightings of
+    a keyframe do not fit.
     """
     often = _seen_often(keyframes[0].index, waiting)
     shared, sees = np.zeros(len(keyframes)), np.zeros(len(keyframes))
@@ -63,8 +63,9 @@ def bundled(
 def _adjusted(
     model: CameraModel, keyframes: Sequence[Keyframe], poses: Sequence[Array], often: Sequence[Sequence[PointSighting]]
 ) -> tuple[Sequence[Array], Array, Truths]:
-    """Adjusted poses (3,) and tilts (N, 2) of N keyframes, and which of the M sightings fit; no sighting fits where the points
-    cannot be determined."""
+    """Adjusted poses (3,) and tilts (N, 2) of N keyframes, and which of the M sightings fit: none if the points cannot be
+    determined.
+    """
     first = keyframes[0].index
     places = [camera_pose(model, pose) for pose in poses]
     points = []

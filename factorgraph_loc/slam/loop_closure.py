@@ -1,11 +1,11 @@
 """Loop closure without a map: recognition of points of the graph that were last seen long ago.
 
-About once a second an image is compared with those of these points that may be visible, without using a predicted pose
-(Associator.relocalized of :mod:`factorgraph_loc.vision.association`). The pose found must be on the floor. From there the points
-are matched again, and enough of the visible ones must be found, spread over the image. Since places in a building look alike,
-consecutive images must give poses that agree with each other by odometry, within the possible drift of the track. (Geometric
+About once a second an image is compared with the possibly visible ones of these points, without a predicted pose
+(Associator.relocalized of :mod:`factorgraph_loc.vision.association`). The resulting pose must be on the floor. The points are
+matched again from that pose, and enough of the visible ones must match, in all parts of the image. Places in a building look
+alike: therefore the poses of consecutive images must agree by odometry, within the possible drift of the track. Geometric
 verification and consistency over consecutive images: Cadena, Galvez-Lopez, Tardos, Neira, IEEE Transactions on Robotics 28(4),
-2012.)
+2012.
 """
 
 import math
@@ -53,7 +53,7 @@ class OldPoints:
 
 @dataclass(frozen=True)
 class Image:
-    """What was seen from a new ``keyframe`` at about ``guess``; ``travelled``: distance travelled [m]."""
+    """The image of a new ``keyframe`` at about ``guess``; ``travelled``: distance travelled [m]."""
 
     frame: CameraFrame
     keyframe: Keyframe
@@ -78,7 +78,7 @@ class LoopClosure:
         self._found: list[Revisit] = []  # consecutive ones that agree
         self._looked = -math.inf
 
-    def due(self, t: float) -> bool:
+    def is_due(self, t: float) -> bool:
         """Whether the image at time ``t`` is to be compared."""
         return t >= self._looked + INTERVAL
 
@@ -101,7 +101,7 @@ class LoopClosure:
 
 
 def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
-    """The result of one image by itself."""
+    """The result of one image, without the previous ones."""
     near = np.flatnonzero(_in_reach(model, lifted(model, *image.guess), old.points))
     recognised = None if len(near) < FEWEST else _recognised(model, image.frame, _newest(old, near, current))
     if recognised is None:
@@ -109,7 +109,7 @@ def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable
     pose, points, features = recognised
     rows = near[points]
     travelled = image.travelled - float(np.median(old.travelled[rows]))
-    if not _is_spread_out(model, image.frame.pixels[features]) or not _believed(image.guess, pose, travelled):
+    if not _is_spread_out(model, image.frame.pixels[features]) or not _is_plausible(image.guess, pose, travelled):
         return None
     return Revisit(image.keyframe, pose, rows, features)
 
@@ -144,7 +144,7 @@ def _on_floor(
     )
 
 
-def _believed(guess: Guess, pose: Array, travelled: float) -> bool:
+def _is_plausible(guess: Guess, pose: Array, travelled: float) -> bool:
     """Whether the track may have drifted from ``pose`` to ``guess`` over a distance ``travelled`` [m]."""
     off = se2.log(se2.between(guess[0], pose))
     drift = DRIFT + DRIFT_OF_WAY * travelled

@@ -1,13 +1,12 @@
-"""The EKF of the paper (Raoui, Bouyakhf, Devy, ICINCO 2011, section 5 and Algorithm 3), which is that of monoSLAM: Davison et
-al., 2007.
+"""The EKF of the paper (Raoui, Bouyakhf, Devy, ICINCO 2011, section 5 and Algorithm 3): that of monoSLAM, Davison et al., 2007.
 
-The state has 13 values: position r^W and orientation q^WR of the robot's frame R, its velocity v^W in the world frame and its
-turn rate w^R in its own frame. Points that are not in the map follow. The error state has 12 values, as an orientation has three
-degrees of freedom. The camera is mounted on R by the rig's extrinsics, so R replaces the paper's camera frame.
+The state has 13 values: position r^W and orientation q^WR of the robot's frame R, its velocity v^W in the world frame, and its
+turn rate w^R. Points that are not in the map follow. The error state has 12 values, as an orientation has three degrees of
+freedom. The camera is mounted on R by the rig's extrinsics, so R replaces the paper's camera frame.
 
-The robot has wheels: odometry replaces the constant-velocity prediction of x, y and heading; height, roll and pitch stay near
-those of a robot on the floor. Map points are searched where they are predicted (:mod:`.monoslam_search`); others enter the state
-by inverse depth (:mod:`.monoslam_map`). RFID is ignored.
+The robot has wheels: odometry replaces the constant-velocity prediction of x, y and heading. Height, roll and pitch stay near
+those of a robot on the floor. Map points are searched at their predicted pixels (:mod:`.monoslam_search`). Other points enter the
+state by inverse depth (:mod:`.monoslam_map`). RFID is ignored.
 """
 
 import math
@@ -84,7 +83,7 @@ class MonoslamSettings(FilterSettings):
     landmarks: MapUse = "known"
     """known takes the map's points and ignores others, extended estimates the others, unknown all: the default without a map"""
     self_calibration: bool = True
-    """whether the odometry's constants to which the rig gives an uncertainty are states"""
+    """whether constants of the odometry with an uncertainty in the rig are states"""
     max_points: Annotated[int, Field(ge=1, le=1000)] = 100
     """largest number of points in the state"""
     per_image: Annotated[int, Field(ge=1, le=1000)] = 20
@@ -112,9 +111,9 @@ class Monoslam(Filter):
         self._check = TurnCheck(turns, self._motion, self.diagnostics, NOTHING)
         self._mounting = np.zeros((6, 6)) if camera is None else of_mounting(camera)
         self._step: Step | None = None
-        self._anew = False
-        # without a map the start is unobservable: its uncertainty is kept out of the state, where it would shrink as the
-        # linearization point moves (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010)
+        self._relocalized = False
+        # without a map the start is unobservable. Its uncertainty is not in the state: it would shrink there as the linearization
+        # point moves (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010)
         self._origin: Origin | None = None
 
     def initialize(self, prior: PosePrior) -> None:
@@ -195,10 +194,10 @@ class Monoslam(Filter):
             return
         self._check.add(m)
         state, match = self._match(m, self._state, eye)
-        state, self._anew = self._relocated(m, state, eye, match)
-        if len(match.pixels) and not self._anew and not self._vague(state):
+        state, self._relocalized = self._relocated(m, state, eye, match)
+        if len(match.pixels) and not self._relocalized and not self._is_vague(state):
             state = self._corrected(m, state, eye, match)
-        if not self._anew and self._settings.landmarks != "known":
+        if not self._relocalized and self._settings.landmarks != "known":
             state = self._managed(m, state, eye, match)
         self._state = replace(state, image_odometry=self._odometry)
 
@@ -250,14 +249,14 @@ class Monoslam(Filter):
         Points in the state are dropped with the old pose.
         """
         lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0
-        camera = self._looker.relocated(m, eye) if lost >= LOST_AFTER or self._vague(state) else None
+        camera = self._looker.relocated(m, eye) if lost >= LOST_AFTER or self._is_vague(state) else None
         relocated = None if camera is None else self._standing(camera, eye, state)
         if relocated is None:
             return replace(state, lost=lost), False
         self.diagnostics.events.append((m.t, "camera: found its place in the map"))
         return relocated, True
 
-    def _vague(self, state: SlamState) -> bool:
+    def _is_vague(self, state: SlamState) -> bool:
         """Whether the pose in a known map is too uncertain for linearization."""
         return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > VAGUE**2)
 
@@ -306,5 +305,5 @@ class Monoslam(Filter):
         s = self._state
         # without a step, it is a second measurement at the same time
         step = self._step or standstill(self._records[-1].robot if self._records else s.robot)
-        self._step, anew, self._anew = None, self._anew, False
-        return UpdateRecord(self._t, step, s.robot, s.constants, s.covariance[: s.base, : s.base].copy(), anew)
+        self._step, relocalized, self._relocalized = None, self._relocalized, False
+        return UpdateRecord(self._t, step, s.robot, s.constants, s.covariance[: s.base, : s.base].copy(), relocalized)

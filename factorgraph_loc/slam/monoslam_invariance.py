@@ -3,8 +3,8 @@
 Robot and points may be moved, turned or, up to the lever arm of the camera, enlarged together, and no image changes. A filter
 whose error state is relative to the estimate gains information on these directions each time the estimate moves (Huang,
 Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010). An error that is one common motion and enlargement
-of everything keeps them (Barrau, Bonnabel, IEEE Transactions on Automatic Control 62(4), 2017, for the motion). Changing to it
-before an update and back after it is a linear map of the covariance, applied by :func:`carried`.
+of everything preserves these directions (motion: Barrau, Bonnabel, IEEE Transactions on Automatic Control 62(4), 2017). Changing
+to it before an update and back after it is a linear map of the covariance, applied by :func:`carried`.
 """
 
 import numpy as np
@@ -16,8 +16,10 @@ from factors.se2 import Array
 
 
 def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
-    """The covariance (12 + P + D, 12 + P + D) of ``posterior``, an update of ``prior``, if the invariant error keeps that of the
-    update. ``scale``: index of the constant that scales distances; None if there is none.
+    """The covariance (12 + P + D, 12 + P + D) of ``posterior``, an update of ``prior``, for an invariant error with the
+    covariance of the update.
+
+    ``scale``: index of the constant that scales distances, or None.
     """
     covariance = posterior.covariance
     own, ours = prior.robot, posterior.robot
@@ -36,7 +38,9 @@ def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
 
 
 def _by_turn(prior: SlamState, posterior: SlamState) -> Array:
-    """How the error (12 + P + D,) of one rotation (3,) of the world differs between two states; the turn itself is left out."""
+    """The difference between two states in the error (12 + P + D,) of one rotation (3,) of the world, without the rotation
+    itself.
+    """
     own, ours = prior.robot, posterior.robot
     change = np.zeros((len(posterior.covariance), 3))
     change[SHIFT] = ours.rotation.T @ cross(own.position - ours.position)

@@ -78,7 +78,7 @@ def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
     failed = {
         i
         for i, (p, start) in enumerate(zip(state.points, state.starts().tolist(), strict=True))
-        if (p.expected >= TRIED and p.matched < FOUND * p.expected) or (p.ray and _beyond(state, start + 5))
+        if (p.expected >= TRIED and p.matched < FOUND * p.expected) or (p.ray and _is_beyond_infinity(state, start + 5))
     }
     left = [i for i in range(len(state.points)) if i not in failed]
     spare = len(left) - most
@@ -86,7 +86,7 @@ def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
     return without(state, failed | dropped), len(failed)
 
 
-def _beyond(state: SlamState, place: int) -> bool:
+def _is_beyond_infinity(state: SlamState, place: int) -> bool:
     """Whether an inverse depth is significantly negative."""
     return bool(state.values[place] < -2.0 * np.sqrt(state.covariance[state.base + place, state.base + place]))
 

@@ -1,8 +1,8 @@
-"""Motion of the monoSLAM filter's robot between two times: odometry in x, y and heading, and a floor that holds the rest.
+"""Motion of the monoSLAM filter's robot between two times: odometry in x, y and heading; the floor bounds the other values.
 
 Davison, Reid, Molton, Stasse, "MonoSLAM: real-time single camera SLAM", IEEE Transactions on Pattern Analysis and Machine
-Intelligence 29(6), 2007. The error state has 12 values: rotation and translation (3,) of the pose in the robot's frame, as in
-``gtsam.Pose3``, the velocity (3,) in the world frame and the turn rate (3,) in the robot's frame.
+Intelligence 29(6), 2007. The error state has 12 values. The first six are rotation and translation (3,) of the pose in the
+robot's frame, as in ``gtsam.Pose3``. The velocity (3,) in the world frame and the turn rate (3,) in the robot's frame follow.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ PLANAR = [3, 4, 2]  # indices in the pose's error: x, y and heading of a level r
 UPRIGHT = [0, 1, 5]  # the components held by the floor: roll, pitch, height
 NO_VELOCITY = [8, 9, 10]  # their velocities
 SETTLING, UNEVEN = 1.0, 3.0  # s, time constant of the return to the floor; where its unevenness is learnt
-SHORTEST = 1e-3  # s, shortest interval from which a velocity is computed
+SHORTEST = 1e-3  # s, shortest interval for the computation of a velocity
 
 
 @dataclass(frozen=True)
 class RobotState:
-    """The 13 values: ``position`` (3,) [m] in the world, ``rotation`` (3, 3) of the robot in the world, in place of the
-    quaternion, ``velocity`` (3,) [m/s] in the world frame and ``rate`` (3,) [rad/s] in the robot's.
+    """The 13 values of a robot, with a rotation in place of the quaternion.
+
+    In the world frame: ``position`` (3,) [m], ``rotation`` (3, 3), ``velocity`` (3,) [m/s]. In the robot's: ``rate`` (3,) [rad/s].
     """
 
     position: Array
@@ -62,7 +63,7 @@ class Step:
     noise: Array
 
     def carried(self, covariance: Array) -> Array:
-        """The ``covariance`` (12 + P + D, 12 + P + D) of an error state, of which others are constant."""
+        """The predicted ``covariance`` (12 + P + D, 12 + P + D) of an error state with constants and points."""
         known = self.transition.shape[1]
         carried = self.transition @ covariance[:known]
         result = covariance.copy()
@@ -79,8 +80,9 @@ class Step:
 
 @dataclass(frozen=True)
 class Displacement:
-    """A motion: ``rotation`` (3, 3) and ``shift`` (3,) of the end in the frame of the start, with ``covariance`` (6, 6) of
-    a perturbation at the end, rotation first, and the derivative ``by_constants`` (6, P) of that perturbation by constants.
+    """A motion: ``rotation`` (3, 3) and ``shift`` (3,) of the end in the frame of the start.
+
+    ``covariance`` (6, 6): of a perturbation at the end, rotation first. ``by_constants`` (6, P): its derivative by constants.
     """
 
     rotation: Array
@@ -147,8 +149,10 @@ def planar(delta: Array, covariance: Array, by_constants: Array) -> Displacement
 
 
 def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float, settling: float) -> Step:
-    """A step of a robot on the floor: height, roll and pitch follow a stationary process about zero with these standard
-    deviations and the time constant ``settling`` [s], and have no velocity. For small tilts.
+    """A step of a robot on the floor, for small tilts.
+
+    Height, roll and pitch have no velocity. They follow a stationary process about zero with these standard deviations and the
+    time constant ``settling`` [s].
     """
     keep = math.exp(-dt / settling)
     robot = step.robot

@@ -16,7 +16,7 @@ from factors.se2 import Array
 @dataclass(frozen=True)
 class UpdateRecord:
     """``step``: from the previous record; ``covariance`` (12 + P, 12 + P): of ``robot`` and ``constants`` (P,) after the update.
-    ``anew``: the pose was found by relocalization, independent of the past.
+    ``relocalized``: the pose is independent of the past.
     """
 
     t: float
@@ -24,14 +24,14 @@ class UpdateRecord:
     robot: RobotState
     constants: Array
     covariance: Array
-    anew: bool = False
+    relocalized: bool = False
 
 
 def smoothed(records: Sequence[UpdateRecord]) -> list[UpdateRecord]:
     """The records, smoothed with all later ones. Velocity and turn rate have no later influence and are not smoothed."""
     results = list(records[-1:])
     for next_record, record in zip(records[:0:-1], records[-2::-1], strict=True):
-        results.append(record if next_record.anew else _smoothed(record, next_record, results[-1]))
+        results.append(record if next_record.relocalized else _smoothed(record, next_record, results[-1]))
     return results[::-1]
 
 
@@ -49,4 +49,4 @@ def _smoothed(record: UpdateRecord, next_record: UpdateRecord, later: UpdateReco
         record.covariance[block], *motion, error[kept], later.covariance[block]
     )
     robot, constants = record.robot.plus(change[:ROBOT]), record.constants + change[ROBOT:]
-    return replace(record, robot=robot, constants=constants, covariance=covariance, anew=False)
+    return replace(record, robot=robot, constants=constants, covariance=covariance, relocalized=False)

@@ -1,10 +1,10 @@
 """Active search: matching of an image's features to the points that the filter predicts.
 
 Davison et al., 2007 (see :mod:`~factorgraph_loc.slam.monoslam_motion`), section III.E: a point is searched in the 99 % ellipse of
-its innovation. Outliers are rejected by consensus: each match alone corrects the prediction, and the correction that most others
-agree with defines the inliers (Civera, Grasa, Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal of Field Robotics
-27(5), 2010). The corrected pixels follow from the innovation covariance, so that all matches are tried, not a random sample. Of
-the inliers, each must be inside the gate of what all others together tell.
+its innovation. Outliers are rejected by consensus: each single match corrects the prediction, and the correction with the most
+agreement of other matches defines the inliers (Civera, Grasa, Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal of
+Field Robotics 27(5), 2010). The corrected pixels follow from the innovation covariance, so that all matches are tried, not a
+random sample. Each inlier must be inside the gate of a prediction from all other inliers.
 """
 
 import numpy as np
@@ -38,14 +38,14 @@ def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
     i = np.arange(count)
     distances[i, i], covariances[i, i] = squared(residual, each), each
     inside = distances < GATE
-    # a match of a point that is hardly known explains everything, as it tells nothing
+    # a match of a very uncertain point has no information, and agrees with everything
     information = np.log(np.linalg.det(each)[:, None] / np.linalg.det(covariances))
     best = int(np.argmax(np.where(inside, GATE - distances + information, 0.0).sum(axis=0)))
     return _confirmed(residual, total, inside[:, best])
 
 
 def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
-    """Those of ``right`` (K,) that lie inside the gate of what all others of them tell; the worst is left out first."""
+    """The ``right`` matches (K,) inside the gate of a prediction from the other ones; the worst is removed first."""
     rows = np.flatnonzero(right)
     count = len(rows)
     values = (2 * rows[:, None] + np.arange(2)).ravel()
@@ -53,7 +53,7 @@ def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
     while count >= FEWEST:
         i = np.arange(count)
         own = np.linalg.inv(information.reshape(count, 2, count, 2)[i, :, i, :])
-        off = own @ (information @ pixels).reshape(count, 2, 1)  # from what the others tell
+        off = own @ (information @ pixels).reshape(count, 2, 1)  # from the prediction by the others
         distances = squared(off[..., 0], own)
         worst = int(np.argmax(distances))
         if distances[worst] < GATE:

@@ -1,4 +1,4 @@
-"""Data association of the monoSLAM filter: which pixels of an image belong to which points of the map or of the state."""
+"""Data association of the monoSLAM filter: matching of pixels of an image with points of the map or of the state."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -76,8 +76,9 @@ class FeatureMatcher:
     def unless_slipped(
         self, m: Pixels, state: SlamState, eye: Eye, added: Array, rarity: float
     ) -> tuple[SlamState, Match]:
-        """The state, less certain by ``added`` (3, 3) in x, y and heading if the pixels tell of wheels that slipped, and
-        :meth:`match`. ``rarity``: minus the logarithm of how probable that is."""
+        """The state and :meth:`match`. If the pixels show that wheels slipped, ``added`` (3, 3) is added to the covariance of x, y
+        and heading. ``rarity``: minus the logarithm of the probability of slip.
+        """
         slipped, diagnostics = state.widened(added), self._diagnostics
         added_before, noted = diagnostics.added, diagnostics.record()
         match = self.match(m, slipped, eye)
@@ -90,8 +91,9 @@ class FeatureMatcher:
         return state, self.match(m, state, eye)
 
     def new(self, m: Pixels, state: SlamState, eye: Eye, match: Match, tracks: frozenset[int]) -> list[int]:
-        """Rows of an image that may become points: unmatched features that were tracked from the previous image (``tracks``), or
-        names unknown to map and state, at a distance from matched and predicted pixels.
+        """Rows of an image that may become points, at a distance from matched and predicted pixels.
+
+        They are unmatched features with a track in the previous image (``tracks``), or names unknown to map and state.
         """
         if m.frame is None:
             known_names = {p.name for p in state.points}

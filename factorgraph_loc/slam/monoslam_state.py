@@ -118,20 +118,18 @@ def with_floor(prior: SlamState, posterior: SlamState, t: float) -> SlamState:
     """
     if prior.floor is None or prior.image_odometry is None or t <= prior.image_odometry.t:
         return replace(posterior, floor=prior.floor)
-    sigma, share = (
-        prior.floor.sigma,
-        -math.expm1(-2.0 * (t - prior.image_odometry.t) / UNEVEN),
-    )  # of its variance that is new
+    sigma = prior.floor.sigma
+    share = -math.expm1(-2.0 * (t - prior.image_odometry.t) / UNEVEN)  # of the variance of the tilt that is new
     was, now = (positive.inverse(s.covariance[:2, :2]) for s in (prior, posterior))
     gained, known = now - was, prior.covariance[:2, :2] - share * sigma**2 * np.eye(2)
-    weight = np.linalg.inv(np.eye(2) + gained @ known)  # what is told of the new part
+    weight = np.linalg.inv(np.eye(2) + gained @ known)  # of the evidence for the new part
     covariance = positive.inverse(share * weight @ gained + np.eye(2) / sigma**2)
     tilt = math.sqrt(share) * covariance @ weight @ now @ (tilt_of(posterior.robot) - tilt_of(prior.robot))
     return replace(posterior, floor=prior.floor.learnt(tilt, covariance, sigma)[0])
 
 
 def of_mounting(camera: CameraSettings) -> Array:
-    """The covariance (6, 6) of a pose if images tell that of the camera alone, of what is not known of the mounting."""
+    """The covariance (6, 6) of the robot's pose for an exact pose of the camera, from the uncertainty of the mounting."""
     u, lever = camera.uncertainty, np.eye(6)
     lever[SHIFT, TURN] = cross(camera.model().position)
     return (lever * np.square((u.roll, u.pitch, u.yaw, u.x, u.y, u.z))) @ lever.T
@@ -140,7 +138,7 @@ def of_mounting(camera: CameraSettings) -> Array:
 @dataclass(frozen=True)
 class Sights:
     """K predicted pixels: ``pixels`` (K, 2), ``depths`` (K,), and Jacobians with respect to the robot's pose (K, 2, 6) and the
-    point's own values (K, 2, 6), of which the first ``sizes`` (K,) are used; 0 for a map point, which is not in the state.
+    point's own values (K, 2, 6). ``sizes`` (K,): number of these values; 0 for a map point, which is not in the state.
     ``starts`` (K,): index of the point's values in the error state. ``noise`` (K, 2, 2) [px^2]: of pixel and map.
     """
 

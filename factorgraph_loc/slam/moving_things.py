@@ -1,11 +1,11 @@
-"""Tracks on things that move by themselves: a second motion in the image, next to the one that wheels tell.
+"""Tracks on moving things: a second motion in the image, in addition to that of the wheel odometry.
 
-A point that stands still is seen where the motion that the wheels tell moves it in the image, at some distance of the point.
-Images up to :data:`MAX_TIME` apart are compared, since a thing that moves agrees with the wheels now and then.
+The odometry predicts the pixel of a static point, up to the unknown distance of the point. Images up to :data:`MAX_TIME` apart
+are compared, since a moving thing agrees with the odometry now and then.
 
-Wheels seldom slip. Where they do, all that stands still moves in the image as if the robot had turned by another angle, and what
-seems to agree with the wheels agrees with that, too. If some tracks agree with the wheels alone, the others are of a thing that
-moves, however many they are.
+Wheels seldom slip. If they do, all static points move in the image as if the robot had turned by another angle. Tracks that seem
+to agree with the odometry then agree with that turn, too. If some tracks agree only with the odometry, the other tracks belong to
+a moving thing, even if they are the majority.
 """
 
 from collections.abc import Hashable, Mapping, Sequence, Set
@@ -40,11 +40,11 @@ class MovingThings:
         self._doubts = False
 
     def moving(self) -> Set[Hashable]:
-        """The tracks of the last images that move by themselves."""
+        """The tracks of the last images on moving things."""
         return self._moving
 
-    def trusts(self, name: Hashable) -> bool:
-        """Whether a track stands still; as long as something moves, it must have agreed with the wheels."""
+    def is_static(self, name: Hashable) -> bool:
+        """Whether a track is static. While something moves, such a track must have agreed with the odometry."""
         return name not in self._moving and (not self._doubts or name in self._steady)
 
     def learn(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: GraphView) -> None:
@@ -72,7 +72,7 @@ class MovingThings:
         new_pixels: Mapping[Hashable, Array],
         step: Increment,
     ) -> None:
-        """Learn from the ``common`` tracks of two images, and the ``step`` between these that wheels tell."""
+        """Learn from the ``common`` tracks of two images, and the ``step`` of the odometry between these."""
         if not common:
             return
         first, second = (np.array([by_name[name] for name in common]) for by_name in (old_pixels, new_pixels))
@@ -87,9 +87,10 @@ class MovingThings:
 
 
 def another(model: CameraModel, first: Array, second: Array, step: Increment, right: Truths) -> Truths:
-    """Which pairs of pixels (K, 2) fit the turn that explains most of those that do not fit the ``step`` that wheels tell.
+    """Whether pairs of pixels (K, 2) fit the turn that explains most of the pairs that do not fit the ``step`` of the odometry.
 
-    None does if most fit the step (``right``), or if no turn explains :data:`COMMON` of the others."""
+    None does if most fit the step (``right``), or if no turn explains :data:`COMMON` of the others.
+    """
     best, unexplained = right, ~right
     if 2 * np.count_nonzero(unexplained) >= len(right):
         for turn in TURNS.tolist():
@@ -105,8 +106,11 @@ def another(model: CameraModel, first: Array, second: Array, step: Increment, ri
 
 
 def fitting(model: CameraModel, first: Array, second: Array, step: Increment) -> Truths:
-    """Which pairs of pixels (K, 2) fit a ``step`` of the robot between them, at some distance: that at which the rays are nearest
-    to each other, or that which fits best to an error of the step (Gauss-Newton)."""
+    """Whether pairs of pixels (K, 2) fit a ``step`` of the robot between them, for some distance of the point.
+
+    Two distances are tried: that where the rays are nearest to each other, and the best one for an error of the step
+    (Gauss-Newton).
+    """
     pairs = RayPairs.of(model, first, second)
     camera, nearer = lifted(model, step.delta, step.covariance), nearness(pairs, step.delta)[0]
     squared = np.full(len(pairs), np.inf)

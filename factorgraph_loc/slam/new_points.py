@@ -1,7 +1,7 @@
 """Delayed initialization of points that the map lacks: sightings are collected until they determine the point.
 
-This needs sightings from :data:`FEWEST` keyframes with enough parallax for the errors of pixels and poses,
-rays that intersect in front of the camera, and small residuals. A sighting that contradicts the others is dropped.
+The sightings must come from :data:`FEWEST` keyframes with enough parallax for the errors of pixels and poses. Their rays must
+intersect in front of the camera, with small residuals. A sighting that contradicts the others is dropped.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class NewPoints:
                 if sighting.keyframe not in known:
                     known[sighting.keyframe] = places(sighting.keyframe)
             placed = [(s, place) for s in waiting if (place := known[s.keyframe]) is not None]
-            if len(placed) < FEWEST or not apart(self._model, *placed[0], *placed[-1]):
+            if len(placed) < FEWEST or not has_parallax(self._model, *placed[0], *placed[-1]):
                 continue
             result = agreed(self._model, [s for s, _ in placed], [p for _, p in placed])
             if result is not None:
@@ -129,7 +129,7 @@ class NewPoints:
         return determined
 
 
-def apart(
+def has_parallax(
     model: CameraModel,
     first: PointSighting,
     first_camera: KeyframeCamera,

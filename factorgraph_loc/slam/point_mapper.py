@@ -23,7 +23,7 @@ from factors.graph import Values, gather
 from factors.se2 import Array
 
 KEYFRAME_INTERVAL = 0.5  # s between images that become keyframes for points that are estimated
-LEAST_COMMON = 0.3  # share of an image's features that the last keyframe has: with less there is a new one at once
+LEAST_COMMON = 0.3  # least share of an image's features in the last keyframe; below it the image becomes a keyframe
 
 
 class PointMapper(Mapper):
@@ -51,9 +51,9 @@ class PointMapper(Mapper):
         # estimated points need keyframes of their own
         if self._unknown is None:
             return False
-        return m.t - self._taken >= self._interval or self._loses(m)
+        return m.t - self._taken >= self._interval or self._has_lost_features(m)
 
-    def _loses(self, m: Pixels) -> bool:
+    def _has_lost_features(self, m: Pixels) -> bool:
         """Whether an image has little in common with that of the last keyframe."""
         if m.frame is None or not self._tracks:
             return False

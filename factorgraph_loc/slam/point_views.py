@@ -1,8 +1,8 @@
-"""The views of each point of a graph: the last one, and some before it for a map.
+"""The views of each point of a graph: the last one, and earlier ones for a map.
 
-A point whose track was lost is matched by the descriptor of its last view: within the ellipse predicted from pose and point, the
-nearest descriptor is accepted if it is clearly nearer than the second
-(:func:`factorgraph_loc.vision.matching.match_guided`). Wrong matches are rejected later, by consensus with other points.
+A point with a lost track is matched by the descriptor of its last view. The nearest descriptor in the ellipse predicted from pose
+and point is accepted if it is clearly nearer than the second (:func:`factorgraph_loc.vision.matching.match_guided`). Wrong matches
+are rejected later, by consensus with other points.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,8 +30,9 @@ FARTHEST = 15.0  # m of its depth
 
 @dataclass(frozen=True, slots=True)
 class PointView:
-    """The feature's ``descriptor`` (D,) and ``size`` [px], the camera position ``seen_from`` (3,), and the distance travelled by
-    the robot until then, ``travelled`` [m]; the key of the ``keyframe``, and the ``guess`` of its pose.
+    """A view of a point: the feature's ``descriptor`` (D,) and ``size`` [px], and the camera position ``seen_from`` (3,).
+
+    ``travelled`` [m]: distance travelled by the robot until the view. ``keyframe``: its key; ``guess``: of its pose.
     """
 
     descriptor: NDArray[Any]
@@ -74,8 +75,9 @@ class PointViews:
     def refound(
         self, camera: CameraPose, points: Sequence[int], positions: Array, frame: CameraFrame, rows: Sequence[int]
     ) -> list[tuple[int, int]]:
-        """Pairs of a point, by its place in ``points`` (N,) with ``positions`` (N, 3), and of its match among the features ``rows``
-        of a frame taken from about ``camera``."""
+        """Pairs of a point, by its index in ``points`` (N,) with ``positions`` (N, 3), and its match in the ``rows`` of a frame
+        from about ``camera``.
+        """
         if not len(points) or not rows:
             return []
         model = self._model
@@ -107,8 +109,10 @@ class PointViews:
     def settled(
         self, points: PointMap, keys: Sequence[int], values: Mapping[int, Array], spreads: Mapping[int, Array]
     ) -> PointMap:
-        """The map of the points ``keys`` with all their views at the poses of their keyframes, which are among ``values``: their
-        body-frame covariances among ``spreads`` are those of the error that all points seen from there have in common."""
+        """The map of the points ``keys`` with all their views at the poses of their keyframes, which are among ``values``.
+
+        The body-frame covariances of these poses, among ``spreads``, are those of the common error of all points of a view.
+        """
         rows = [
             (i, view)
             for i, key in enumerate(keys)

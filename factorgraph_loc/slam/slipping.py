@@ -1,8 +1,7 @@
-"""Whether wheels slipped between two keyframes: points of the graph, all seen lately, say so together.
+"""Detection of slip of the wheels between two keyframes, from recently seen points of the graph.
 
-A factor between two poses that chose the likelier of two noises by itself (Olson, Agarwal, International Journal of Robotics
-Research 32(7), 2013) has many optima, and a graph of points falls into wrong ones. So this is decided once, before the keyframe
-comes in.
+A factor that chooses the likelier of two noises (Olson, Agarwal, International Journal of Robotics Research 32(7), 2013) has many
+optima, and a graph of points converges to wrong ones. The noise is therefore chosen once, before the keyframe enters the graph.
 """
 
 from collections.abc import Callable, Mapping
@@ -46,8 +45,10 @@ def unless_slipped(
 
 
 def moved_since(keyframes: Mapping[int, Keyframe], newest: Keyframe, t: float, most: int) -> Array | None:
-    """The covariance (3, 3) of the motion, slips included, to the ``newest`` of the ``keyframes`` from the last one at or before
-    ``t`` [s], or from ``most`` steps ago; None where the step to the newest is not known."""
+    """The covariance (3, 3), slip included, of the motion to the ``newest`` of the ``keyframes``; None if its step is unknown.
+
+    The motion starts at the last keyframe at or before ``t`` [s], or ``most`` steps ago.
+    """
     steps: list[Increment] = []
     while newest.t > t and newest.from_previous is not None and len(steps) < most:
         steps.append(newest.from_previous)
@@ -61,15 +62,14 @@ def moved_since(keyframes: Mapping[int, Keyframe], newest: Keyframe, t: float, m
 def _evidence(
     model: CameraModel, pose: Array, covariances: tuple[Array, Array], observed: tuple[Array, Array, Array, Array]
 ) -> float:
-    """By how much the second of two covariances (3, 3) of a predicted ``pose`` (3,) makes what is seen more probable than the
-    first: the difference of the logarithms."""
+    """The log-likelihood ratio of the image at ``pose`` (3,) for the second of two covariances (3, 3), relative to the first."""
     points, pixels, of_points, noise = observed
     agrees = agreeing(model, lifted(model, pose, covariances[1]), points, pixels, noise)
     if np.count_nonzero(agrees) < ENOUGH:
         return 0.0
     factor = ReprojectionFactor(model, points[agrees], pixels[agrees], point_covariances=of_points[agrees])
     update = image_update(factor, pose, covariances[1], ITERATIONS, SETTLED)
-    # what the image tells by itself
+    # information of the image only
     posterior = positive.inverse(update.covariance)
     gained = positive.inverse(positive.nearest(posterior - positive.inverse(covariances[1])))
     off, gained = gained @ posterior @ update.delta, gained + COMMON
@@ -77,7 +77,6 @@ def _evidence(
 
 
 def more_probable(off: Array, covariances: tuple[Array, Array]) -> float:
-    """By how much the second of two covariances (D, D) of an error ``off`` (D,) makes it more probable than the first: the
-    difference of the logarithms."""
+    """The log-likelihood ratio of an error ``off`` (D,) for the second of two covariances (D, D), relative to the first."""
     fits = [positive.squared(off, covariance) + np.linalg.slogdet(covariance)[1] for covariance in covariances]
     return 0.5 * float(fits[0] - fits[1])

@@ -50,8 +50,8 @@ REVISITED = 6  # features of points not seen for longer that are accepted togeth
 
 @dataclass
 class _Point:
-    """A point of the graph: when it was last seen, the information (3, 3) of its sightings for exact poses, and the number of
-    consecutive outliers.
+    """A point of the graph: the time of its last sighting, the information (3, 3) of its sightings for exact poses, and the
+    number of consecutive outliers.
     """
 
     key: int
@@ -172,8 +172,10 @@ class UnknownPoints:
         for i in fresh:
             self._new.add(sighted.names[i], sighted.sightings[i])
         self._new.forget(keyframe.index, movers.moving())
-        waiting = [n for i in fresh if self._new.count(n := sighted.names[i]) >= FEWEST_SIGHTINGS and movers.trusts(n)]
-        bundle = self._cameras.bundled(keyframe, guess[0], self._new.those(movers.trusts), self._floor.sigma, graph)
+        waiting = [
+            n for i in fresh if self._new.count(n := sighted.names[i]) >= FEWEST_SIGHTINGS and movers.is_static(n)
+        ]
+        bundle = self._cameras.bundled(keyframe, guess[0], self._new.those(movers.is_static), self._floor.sigma, graph)
         cameras, pose = bundle or (
             self._cameras.cameras(keyframe, guess[0], waiting, self._new.waiting(), graph),
             guess[0],
@@ -223,7 +225,7 @@ class UnknownPoints:
     def _revisited(self, image: _NewImage, guess: Guess, rows: Sequence[int], names: list[Hashable]) -> set[int]:
         """The ``rows`` of an image that certainly show points last seen long ago; ``names`` are updated to those of the points."""
         frame, t, graph = image.m.frame, image.keyframe.t, image.graph
-        if frame is None or not self._loops.due(image.m.t):
+        if frame is None or not self._loops.is_due(image.m.t):
             return set()
         old = [name for name, point in self._points.items() if t - point.last >= LOST and point.key in self._views]
         if not old:
@@ -320,11 +322,11 @@ class UnknownPoints:
     def _placed(
         self, image: _NewImage, points: list[_Point], pixels: Array, guess: Guess, known: Truths
     ) -> tuple[Guess, Array, float, Truths]:
-        """The pose corrected by points of the graph, the tilt (2,) of the robot that they tell with its prior standard deviation,
-        and which of them are inliers.
+        """The pose corrected by points of the graph, the tilt (2,) of the robot with its prior standard deviation, and whether each
+        point is an inlier.
 
-        Points not seen for long need to agree with each other, but not with the rest, as the track has drifted since. So few points
-        that they cannot confirm each other are used only if they have names: where the pose is uncertain a wrong one agrees, too.
+        Points not seen for long must agree with each other, but not with the rest, as the track has drifted since. A few points
+        cannot confirm each other, and are used only if they have names: a wrong one may agree with an uncertain pose.
         """
         model, keyframe, graph, named = image.model, image.keyframe, image.graph, image.m.names is not None
         sigma = self._floor.sigma

@@ -1,11 +1,12 @@
 """Matching of an image's features to the points of a map, with or without a predicted camera pose.
 
-With a prediction, a point is searched where it should be visible, if it was observed from a similar viewpoint before, which also
-excludes occluded points. The most similar feature in its gate is accepted if it passes the ratio test, and all matches must agree
-on one pose (:mod:`~factorgraph_loc.vision.consensus`). Without a prediction, the image is compared with a small map as a whole,
-with those keyframes of a large one that look most alike (:mod:`~factorgraph_loc.vision.relocalization`,
-:mod:`~factorgraph_loc.vision.places`). Ratio test: Lowe, IJCV 60, 2004, section 7.1, here among different points, as
+With a prediction, a point is searched at its predicted pixel, if it was once observed from a similar viewpoint; this excludes
+occluded points. The most similar feature in its gate is accepted if it passes the ratio test. All matches must agree on one pose
+(:mod:`~factorgraph_loc.vision.consensus`). Ratio test: Lowe, IJCV 60, 2004, section 7.1, but only among different points, as
 views of one point are similar.
+
+Without a prediction, the image is compared with a whole small map, or with the most similar keyframes of a large one
+(:mod:`~factorgraph_loc.vision.relocalization`, :mod:`~factorgraph_loc.vision.places`).
 """
 
 import math
@@ -39,11 +40,11 @@ GATE = float(chi_squared.quantile(0.99, 2))
 CELL = 20.0  # px, cells for sorting features
 # px, radius: added for errors of the prediction, and the largest gate
 SMALLEST_GATE, LARGEST_GATE = 3.0, 150.0
-MARGIN = 20.0  # px around the image in which a predicted point is still searched
+MARGIN = 20.0  # px around the image: predicted points there are searched
 SAME = 4.0  # px: closer points and features may be the same
 SAME_POINT = 0.15  # m: closer points may be the same
 CHANCE = 0.02  # fraction of pairs of different map points that are more similar than a match may be
-MANY = 5000  # views of a map, of which only those of the most similar keyframes are compared with an image
+MANY = 5000  # views of a map: with more, only the most similar keyframes are compared with an image
 # matches, and fraction of the visible points: fewer may be consistent with the prediction by chance. In an office unknown to the
 # map up to 2 % of the features are
 FEWEST, LEAST_SHARE = 3, 0.05
@@ -330,8 +331,9 @@ def bit_distances(
 def clear_pairs(
     pairs: Integers, costs: Array, predicted: Array, features: Array, ratio: float, apart: float
 ) -> Integers:
-    """Indices of the pairs that are mutually nearest and pass the ratio test: a cost below ``ratio`` times that of the best other
-    match at least ``apart`` pixels away."""
+    """Indices of the mutually nearest pairs that pass the ratio test: a cost below ``ratio`` times that of the best other match
+    at least ``apart`` pixels away.
+    """
     count, amount = len(predicted), len(features)
     of_point, of_feature = np.full(count, NOWHERE), np.full(amount, NOWHERE)
     for i in range(len(pairs)):
@@ -368,8 +370,8 @@ def clear_pairs(
 
 @compiled(error_model="numpy")
 def nearest_owners(distances: NDArray[Any], starts: Integers, few: int) -> tuple[Integers, NDArray[Any], Integers]:
-    """Of K owners of the columns of ``distances`` (N, M), those of owner k from ``starts`` (K + 1,) k on: the ``few`` nearest
-    to each row, nearest first, with their distances (N, few); and the row (K,) that is nearest to each."""
+    """The ``few`` owners nearest to each row of ``distances`` (N, M), nearest first, their distances (N, few), and the row (K,)
+    nearest to each owner. Columns of owner k are ``starts[k]`` to ``starts[k + 1]``, with ``starts`` (K + 1,)."""
     n, count = len(distances), len(starts) - 1
     owners, least = np.zeros((n, few), dtype=np.int64), np.full((n, few), np.inf, dtype=distances.dtype)
     rows, best = np.zeros(count, dtype=np.int64), np.full(count, np.inf, dtype=distances.dtype)

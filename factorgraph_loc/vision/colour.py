@@ -1,7 +1,8 @@
 """The Gaussian colour model: intensity and two opponent colours as linear combinations of red, green and blue.
 
-Geusebroek, van den Boomgaard, Smeulders, Geerts, "Color invariance", IEEE TPAMI 23(12), 2001, eq. 5: the response of a Gaussian
-receptive field to a spectrum and its first two derivatives, for RGB cameras."""
+It is the response, for RGB cameras, of a Gaussian receptive field to a spectrum and its first two derivatives (Geusebroek, van den
+Boomgaard, Smeulders, Geerts, "Color invariance", IEEE TPAMI 23(12), 2001, eq. 5).
+"""
 
 import cv2
 import numpy as np

@@ -18,8 +18,8 @@ from factorgraph_loc.vision.scale_space import ScaleSpace
 class Weights:
     """A linear map that weights the 35 values of a colour feature, learnt from points seen in two images.
 
-    ``map`` (35, 35) takes the values minus their ``mean`` (35,) to a space where the differences between two views of a point
-    have unit covariance: Euclidean distance there is the Mahalanobis distance of the values (within-class whitening, Fukunaga,
+    ``map`` (35, 35) multiplies the values minus their ``mean`` (35,). The results have unit covariance of the difference between
+    two views of a point: their Euclidean distance is the Mahalanobis distance of the values (within-class whitening, Fukunaga,
     "Introduction to Statistical Pattern Recognition", 1990, section 10.2).
     """
 

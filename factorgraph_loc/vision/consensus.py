@@ -1,9 +1,9 @@
 """Outlier rejection among the points seen in an image: they must agree on one camera pose near the predicted one.
 
-If all together are compatible with the prediction (joint compatibility: Neira, Tardos, IEEE Transactions on Robotics and
-Automation 17(6), 2001), all are accepted. Otherwise samples of three points correct the prediction by a Kalman update, and the
-correction with most inliers is used (after Civera, Grasa, Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal of Field
-Robotics 27(5), 2010). The prediction of a robot on a floor has a covariance of rank 5, and so has the correction.
+All points are accepted if they are jointly compatible with the prediction (Neira, Tardos, IEEE Transactions on Robotics and
+Automation 17(6), 2001). Otherwise samples of three points correct the prediction by a Kalman update, and the correction with most
+inliers is used. (Civera, Grasa, Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal of Field Robotics 27(5), 2010, use
+one point.) The prediction of a robot on a floor has a covariance of rank 5, and so has the correction.
 """
 
 from dataclasses import dataclass
@@ -45,22 +45,25 @@ class CameraPose:
     covariance: Array
 
 
-def compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> bool:
+def are_compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> bool:
     """Whether all ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise covariances ``covariances`` (K, 2, 2) [px^2], are jointly
     compatible with the prediction."""
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (points, pixels, covariances))
     try:
         joint = _joint(reprojection.lens_of(model), camera.position, camera.rotation, camera.covariance, *arrays)
-    except np.linalg.LinAlgError:  # an extreme covariance: each point is tested by itself
+    except np.linalg.LinAlgError:  # an extreme covariance: each point is tested separately
         return False
     return bool(joint < _largest(2 * len(points)))
 
 
 def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> Truths:
-    """The inliers among ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise covariances ``covariances`` (K, 2, 2) [px^2], for a
-    pose near the predicted ``camera``: all if :func:`compatible`, none with fewer than :data:`FEWEST`."""
+    """The inliers among ``points`` (K, 3) with a pose near the predicted ``camera``.
+
+    They were seen at ``pixels`` (K, 2) with noise covariances ``covariances`` (K, 2, 2) [px^2]. All are inliers if
+    :func:`are_compatible`, none with fewer than :data:`FEWEST`.
+    """
     count = len(points)
-    if compatible(model, camera, points, pixels, covariances):
+    if are_compatible(model, camera, points, pixels, covariances):
         return np.ones(count, dtype=bool)
     if count < FEWEST:
         return np.zeros(count, dtype=bool)
@@ -154,7 +157,7 @@ def _joint(
 def root_of(camera: CameraPose) -> Array:
     """A square root (6, 6) of the covariance, which may be singular."""
     values, vectors = np.linalg.eigh(camera.covariance)
-    # rounding errors must not decide in which directions a sample may move
+    # rounding errors must not change the directions of a sample
     return np.asarray(vectors * np.sqrt(np.where(values > ROUNDING * values[-1], values, 0.0)))
 
 

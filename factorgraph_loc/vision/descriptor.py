@@ -1,6 +1,6 @@
 """Descriptors of the colour features: the paper's 2 space, 21 scale, 5 orientation and 9 texture values.
 
-All are measured on E in a point's own frame and in units of its own scale, on a lattice of 24 x 24 samples, as one product with a
+They are computed on a lattice of 24 x 24 samples of E in a point's own frame and in units of its scale, as one product with a
 matrix of filters. The paper's neighbours are a cross of four places around the point, whose size depends on the scale. Algorithm
 1 and figure 2 of Raoui, Bouyakhf, Devy, ICINCO 2011; normalised Laplacian of Gaussian: Lindeberg, IJCV 30, 1998; Gabor wavelets:
 Daugman, J. Opt. Soc. Am. A 2(7), 1985."""
@@ -66,8 +66,11 @@ def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = Fa
 
 
 def values(record: NDArray[np.void]) -> Float:
-    """The 35 values (N, 35) of records (N,), each block dimensionless: responses and textures divided by their norm, for
-    invariance to contrast; scale in octaves; the sine of orientations, which is continuous where an angle wraps."""
+    """The 35 values (N, 35) of records (N,), each block dimensionless.
+
+    Responses and textures are divided by their norm, for invariance to contrast. Scale is in octaves. Orientations are given by
+    their sine, which is continuous where an angle wraps.
+    """
     responses = record["scale_responses"].reshape(-1, 20)
     texture = record["texture"].reshape(-1, 9)
     return np.hstack(

@@ -1,11 +1,11 @@
 """Detector of colour features: corners of colour at their characteristic scales, with a direction.
 
 Colour Harris: the second moment matrix of Harris and Stephens ("A combined corner and edge detector", 1988) summed over the
-channels of the Gaussian colour model, with a derivative and an integration scale (Mikolajczyk, Schmid, "Scale & affine invariant
-interest point detectors", IJCV 60, 2004, eq. 1); the scale of a corner maximises the normalised Laplacian of Gaussian (ibid.,
-section 2.1). Direction: the peak of a histogram of gradients (Lowe, "Distinctive image features", IJCV 60, 2004, section 5).
-Weaker corners near a stronger one of their scale are suppressed (Brown, Szeliski, Winder, "Multi-image matching using multi-scale
-oriented patches", CVPR 2005, section 2.1)."""
+channels of the Gaussian colour model. It has a derivative and an integration scale (Mikolajczyk, Schmid, "Scale & affine
+invariant interest point detectors", IJCV 60, 2004, eq. 1). The scale of a corner maximises the normalised Laplacian of Gaussian
+(ibid., section 2.1). Direction: the peak of a histogram of gradients (Lowe, "Distinctive image features", IJCV 60, 2004, section
+5). Weaker corners near a stronger one of their scale are suppressed (Brown, Szeliski, Winder, "Multi-image matching using
+multi-scale oriented patches", CVPR 2005, section 2.1)."""
 
 import cv2
 import numpy as np
@@ -48,8 +48,11 @@ _WEIGHTS: Float = np.exp(-(_grid[1:-1, 1:-1] ** 2).sum(axis=2) / (2.0 * ORIENTAT
 def detect(
     space: ScaleSpace, colours: list[Float], mask: Mask | None, count: int, *, everywhere: bool = False
 ) -> Keypoints:
-    """At most ``count`` points, by descending strength, of the image in ``space``, where ``mask`` (H, W) is not 0: the strongest,
-    or of all its parts ``everywhere``; ``colours``: its channels (H, W) besides E."""
+    """At most ``count`` points of the image in ``space``, by descending strength, where ``mask`` (H, W) is not 0.
+
+    They are the strongest ones or, with ``everywhere``, those of all parts of the image. ``colours``: channels (H, W) in addition
+    to E.
+    """
     corners = np.vstack(_corners(space, colours))
     if mask is not None:
         x, y = np.rint(corners[:, :2]).astype(np.int64).T

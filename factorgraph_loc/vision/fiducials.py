@@ -3,8 +3,8 @@ fiducial markers under occlusion", Pattern Recognition 2014; for AprilTags their
 
 Each corner of a marker is a named point at the intersection of lines fitted to the edges. Refinement at the corner itself
 (OpenCV's ``cornerSubPix``) is biased: blur moves a corner into the square, so that the marker appears smaller and farther away.
-Across an edge, blur is symmetric, so that the edge position follows from the mean grey level (Tabatabai, Mitchell, "Edge location
-to subpixel values in digital imagery", PAMI 1984, for moments).
+Blur across an edge is symmetric, so that the edge position follows from the mean grey level. (Tabatabai, Mitchell, "Edge location
+to subpixel values in digital imagery", PAMI 1984, use moments.)
 """
 
 from collections import Counter

@@ -31,7 +31,7 @@ class CameraFrame:
 
     @property
     def frame(self) -> "CameraFrame":
-        """The features, with empty arrays where there are none."""
+        """The features; empty arrays without features."""
         return self
 
     @property

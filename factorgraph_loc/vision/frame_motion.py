@@ -1,13 +1,13 @@
 """Motion of a planar robot between two images, from tracked features.
 
 Least squares of Sampson's error over the rotation and the direction of translation (:mod:`factors.camera.visual_odometry`), with
-Huber loss. Initial value: of the motions defined by pairs of matches, the one with most inliers (Fischler and Bolles, CACM 24(6),
-1981; two matches suffice in a plane: Ortin and Montiel, Robotica 19, 2001). The distance is unobservable: it stays as predicted,
-with zero information along it.
+Huber loss. Each pair of matches defines a motion; the one with most inliers is the initial value (Fischler and Bolles, CACM 24(6),
+1981; two matches suffice in a plane: Ortin and Montiel, Robotica 19, 2001). The distance is unobservable: it keeps its predicted
+value, with zero information.
 
-Where a rotation alone explains most matches, as for a robot at rest, the direction of translation is noise or that of a moving
-object. Then only the rotation is estimated, by least squares of the pixels, with the small displacement allowed by odometry as
-further unknowns.
+If a rotation without translation explains most matches, as for a robot at rest, the direction of translation is noise or that of
+a moving object. Then only the rotation is estimated, by least squares of the pixels. The small displacement allowed by odometry is
+estimated with it.
 
 The information is for Gaussian noise, to first order. For a translation that is short relative to the pixel noise, or if all
 points lie in one plane, its direction is biased; such motions are rejected.
@@ -79,10 +79,11 @@ def frame_motion(
 def turned(
     model: CameraModel, first: Array, second: Array, starts: Sequence[Array]
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """By how much the robot turned [rad] between two images with K features at the pixels ``first`` and ``second`` (K, 2), and the
-    relative error of the focal length, each with its standard deviation. ``starts`` (3,): motions, one of them near the true one.
+    """The turn of the robot [rad] between two images, and the relative error of the focal length, with standard deviations.
 
-    None with too few matches or too few inliers."""
+    ``first``, ``second`` (K, 2): pixels of K features. ``starts`` (3,): motions, one of them near the true one. None with too few
+    matches or too few inliers.
+    """
     if len(first) < MIN_MATCHES:
         return None
     pairs = RayPairs.of(model, first, second)

@@ -20,8 +20,9 @@ MIN_SIDE = 16  # px: smaller images have no features
 def as_image(array: object, source: object = "image") -> Image:
     """Convert ``array`` (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA to ``uint8``, (H, W) or (H, W, 3), C-contiguous.
 
-    ``uint16`` spans 0 to 65535 and floating point 0 to 1: both are scaled to 0 to 255. Alpha is dropped. Raises InputError,
-    naming ``source``, for an empty array, another shape or type, and values that are not finite or out of range."""
+    ``uint16`` spans 0 to 65535 and floating point 0 to 1: both are scaled to 0 to 255. Alpha is dropped. An
+    empty array, another shape or type, and values that are not finite or out of range raise InputError, which names ``source``.
+    """
     if not isinstance(array, np.ndarray):
         raise InputError(f"{source}: is {type(array).__name__}, expected an array of pixels")
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (1, 3, 4)):

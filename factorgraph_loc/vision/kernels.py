@@ -79,10 +79,10 @@ def refined_peaks(
 ) -> int:
     """Select and refine the ``pixels`` (N, 2) at local maxima of ``strength`` (H, W) that are also maxima over scale.
 
-    A pixel is selected if its strength is above ``threshold`` and the normalised Laplacian of the middle one of ``planes`` (3, H,
-    W), of ``variances`` (3,), is the largest of the three, there or at a neighbouring pixel. Written to ``peaks`` (N, 5): x and
-    y, from a paraboloid through the 3x3 strengths; scale offset from the middle plane, from a parabola; strength; absolute
-    Laplacian. Returns their number.
+    A pixel is selected under two conditions. Its strength is above ``threshold``. At the pixel or a neighbour, the middle one of
+    ``planes`` (3, H, W), with ``variances`` (3,), has the largest normalised Laplacian. Written to ``peaks`` (N, 5): x and y, from
+    a paraboloid through the 3x3 strengths; scale offset from the middle plane, from a parabola; strength; absolute Laplacian.
+    Returns their number.
     """
     count = 0
     for n in range(len(pixels)):

@@ -22,10 +22,10 @@ class Keypoints:
     """N points of an image, as arrays.
 
     ``points`` (N, 2) [px]: x right, y down, (0, 0) at the centre of the upper left pixel. ``sizes`` (N,) [px]: for SIFT and the
-    colour features twice the standard deviation of the Gaussian scale of a point, for ORB its patch; a fixed multiple of the
-    region described. ``angles`` (N,) [rad]: direction ``atan2(dy, dx)`` with y down, NaN if a point has none. ``responses`` (N,):
-    strength, comparable within one image and one extractor. ``levels`` (N,): scale level of a point; for OpenCV's features its
-    packed octave."""
+    colour features twice the standard deviation of the Gaussian scale of a point, for ORB its patch. It is proportional to the
+    size of the described region. ``angles`` (N,) [rad]: direction ``atan2(dy, dx)`` with y down, NaN if a point has none.
+    ``responses`` (N,): strength, comparable within one image and one extractor. ``levels`` (N,): scale level of a point; for
+    OpenCV's features its packed octave."""
 
     points: Array
     sizes: Array
@@ -90,8 +90,10 @@ PARTS = 12  # of an image that has features everywhere: with more the weakest wo
 
 
 def spread_out(pixels: Array, count: int, priority: Sequence[int] | None = None, cells: int | None = None) -> Integers:
-    """Indices of at most ``count`` of ``pixels`` (K, 2), ascending, taken in turn from about as many ``cells`` of a grid, ``count``
-    by default; in each cell by ``priority`` (K,), highest first, else in their order."""
+    """Ascending indices of at most ``count`` of ``pixels`` (K, 2), chosen in turn from about ``cells`` cells of a grid.
+
+    ``cells``: by default ``count``. ``priority`` (K,): highest first in each cell, by default the first pixels.
+    """
     if len(pixels) <= count:
         return np.arange(len(pixels))
     low, high = pixels.min(axis=0), pixels.max(axis=0)

@@ -4,8 +4,9 @@ Ratio test and mutual check: Lowe, "Distinctive image features from scale-invari
 paper accepts a match "if distance is less than 5 times the distance to the second closest", which always holds: ``paper_literal``
 does so; ``ratio=1 / PAPER_RATIO, mutual=False`` is the strict reading.
 
-Distances are computed from matrix products, whose rounding depends on the BLAS kernel. Distances below the resolution are 0, and
-a neighbour is accepted only if it is nearer than the second by more than that, so that matches do not depend on the processor."""
+Distances are computed from matrix products, whose rounding depends on the BLAS kernel. Matches must not depend on the processor.
+Distances below the resolution are therefore 0, and a neighbour must be nearer than the second by more than the resolution.
+"""
 
 import math
 from dataclasses import dataclass
@@ -46,12 +47,13 @@ def match(
     paper_literal: bool = False,
     allowed: Truths | None = None,
 ) -> Matches:
-    """For each of ``first`` (N, D) the nearest of ``second`` (M, D), if its distance is below ``ratio`` times that to the second
-    nearest, or there is no second. Ties are no matches.
+    """For each of ``first`` (N, D) the nearest of ``second`` (M, D), if it passes the ratio test. Ties are no matches.
 
-    ``binary``: Hamming distance, not Euclidean. ``mutual``: both must be nearest to each other. ``paper_literal``: the paper's
-    ratio of 5, without the mutual check. ``allowed`` (N, M): restricts the pairs. Raises InputError for incompatible or
-    non-finite descriptors, and for a ratio that is not positive."""
+    The distance must be below ``ratio`` times that to the second nearest, if there is one. ``binary``: Hamming distance, not
+    Euclidean. ``mutual``: both must be nearest to each other. ``paper_literal``: the paper's ratio of 5, without the mutual
+    check. ``allowed`` (N, M): restricts the pairs. Raises InputError for incompatible or non-finite descriptors, and for a ratio
+    that is not positive.
+    """
     if paper_literal:
         ratio, mutual = PAPER_RATIO, False
     if not ratio > 0.0:
@@ -64,10 +66,10 @@ def match(
     if distances.size == 0:
         return Matches(np.empty((0, 2), dtype=np.int64), np.empty(0))
     forward = nearest_neighbours(distances, resolution(first, binary=binary))
-    keep = np.isfinite(forward.best) & forward.alone & (forward.best < ratio * forward.second)
+    keep = np.isfinite(forward.best) & forward.is_unique & (forward.best < ratio * forward.second)
     if mutual:
         back = nearest_neighbours(distances.T, resolution(second, binary=binary))
-        keep &= (back.index[forward.index] == np.arange(len(keep))) & back.alone[forward.index]
+        keep &= (back.index[forward.index] == np.arange(len(keep))) & back.is_unique[forward.index]
     chosen = np.flatnonzero(keep)
     return Matches(np.stack([chosen, forward.index[chosen]], axis=1), forward.best[chosen].astype(float))
 
@@ -89,9 +91,11 @@ def match_guided(
 
 
 def gates(predicted: Array, covariances: Array, points: Array, probability: float = GATE) -> Truths:
-    """Which of ``points`` (M, 2) lie in the ellipses (N, M) of the given ``probability`` of Gaussians with means ``predicted``
-    (N, 2) and ``covariances`` (N, 2, 2). NaN predictions have empty gates. Raises InputError if a covariance is not positive
-    definite."""
+    """Whether ``points`` (M, 2) lie in the ellipses (N, M), of the given ``probability``, of Gaussians.
+
+    ``predicted`` (N, 2): means; ``covariances`` (N, 2, 2). NaN predictions have empty gates. Raises InputError if a covariance is
+    not positive definite.
+    """
     if not 0.0 < probability < 1.0:
         raise InputError(f"matching: probability of a gate is {probability}, expected between 0 and 1")
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
@@ -107,13 +111,15 @@ def gates(predicted: Array, covariances: Array, points: Array, probability: floa
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """``index`` (N,) of the nearest, its distance ``best`` (N,), that of the ``second`` nearest (N,), infinite where there is
-    none, and whether the nearest is ``alone`` (N,): nearer by more than the resolution of distances."""
+    """``index`` (N,) of the nearest, its distance ``best`` (N,), that of the ``second`` nearest (N,), infinite without one.
+
+    ``is_unique`` (N,): whether the nearest is nearer by more than the resolution of distances.
+    """
 
     index: Integers
     best: Float
     second: Float
-    alone: Truths
+    is_unique: Truths
 
 
 def nearest_neighbours(distances: Float, resolution: Float) -> Nearest:
@@ -128,9 +134,11 @@ def nearest_neighbours(distances: Float, resolution: Float) -> Nearest:
 
 
 def resolution(descriptors: Descriptors, *, binary: bool) -> Float:
-    """The squared distance (N,) of ``descriptors`` (N, D) that rounding alone may cause: 0 for bits; otherwise the bound of the
-    three products of D single-precision terms in :func:`distance_matrix` (Higham, Accuracy and Stability of Numerical Algorithms,
-    2002, section 3.1), for similar descriptors."""
+    """The largest squared distance (N,) of ``descriptors`` (N, D) due to rounding; 0 for bits.
+
+    It bounds the three products of D single-precision terms in :func:`distance_matrix` for similar descriptors (Higham, Accuracy
+    and Stability of Numerical Algorithms, 2002, section 3.1).
+    """
     if binary:
         return np.zeros(len(descriptors), dtype=np.float32)
     values = descriptors.astype(np.float32)

@@ -1,7 +1,7 @@
-"""The keyframes of a map by what they look like as a whole, to compare an image with those few that are most like it.
+"""Descriptions of the whole keyframes of a map, to compare an image only with the few most similar ones.
 
-A keyframe is described by how its descriptors differ from the words of a small vocabulary (VLAD: Jegou, Douze, Schmid, Perez, CVPR
-2010), each word normalised by itself (Arandjelovic, Zisserman, CVPR 2013).
+A keyframe is described by the differences between its descriptors and the words of a small vocabulary (VLAD: Jegou, Douze, Schmid,
+Perez, CVPR 2010). Each word is normalised separately (Arandjelovic, Zisserman, CVPR 2013).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class KeyframeLooks:
 
 
 def _values(descriptors: Descriptors) -> Array:
-    """As real numbers; bits of binary ones by themselves."""
+    """Descriptors as real numbers, with a number for each bit of binary ones."""
     if descriptors.dtype == np.uint8:
         descriptors = np.unpackbits(descriptors, axis=1)
     return np.asarray(descriptors, dtype=float)

@@ -1,7 +1,7 @@
 """Camera pose from matched map points without a prediction.
 
-Samples of three points give up to four poses each; the one with most inliers is kept (universal RANSAC: Raguram, Chum, Pollefeys,
-Matas, Frahm, PAMI 35(8), 2013, as in OpenCV) and refined with all inliers. For a robot on the floor only three values are
+Each sample of three points gives up to four poses; the pose with most inliers is kept and refined with all inliers. (Universal
+RANSAC: Raguram, Chum, Pollefeys, Matas, Frahm, PAMI 35(8), 2013, as in OpenCV.) For a robot on the floor only three values are
 refined, and a camera that would float or tilt is rejected.
 """
 

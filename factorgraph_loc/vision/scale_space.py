@@ -80,8 +80,11 @@ class ScaleSpace:
         return np.asarray(np.clip(nearest, 0, len(self._steps) - 1), dtype=np.int64)
 
     def patches(self, points: Array, sigmas: Array, angles: Array, offsets: Float) -> Float:
-        """Samples (N, M) of E around ``points`` (N, 2) [px], at scales ``sigmas`` (N,) [px] and ``offsets`` (M, 2) in units of
-        the scale, along axes rotated by ``angles`` (N,) [rad]. Beyond the border the nearest pixel counts."""
+        """Samples (N, M) of E around ``points`` (N, 2) [px] at scales ``sigmas`` (N,) [px].
+
+        ``offsets`` (M, 2): in units of the scale, along axes rotated by ``angles`` (N,) [rad]. Beyond the border the nearest pixel
+        counts.
+        """
         levels = self.levels(sigmas)
         steps = self._steps[levels]
         axis = (sigmas / steps)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)

@@ -1,8 +1,8 @@
 """Feature tracks over consecutive images.
 
-Matches between two images are mutual nearest neighbours that pass the ratio test, with bounded displacement, and must fit one
-essential matrix, found by USAC (Raguram et al., PAMI 35, 2013) as in OpenCV with a fixed seed. A fundamental matrix would often
-fit a moving object too. Features without a match are also compared with the last image but one.
+Matches between two images are mutual nearest neighbours that pass the ratio test and have a bounded displacement. They must fit
+one essential matrix, estimated by USAC (Raguram et al., PAMI 35, 2013) as in OpenCV with a fixed seed. A fundamental matrix would
+often fit a moving object too. Features without a match are also compared with the last image but one.
 """
 
 import math

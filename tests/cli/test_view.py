@@ -32,6 +32,6 @@ def test_a_file_for_the_viewer(fgloc, short_log, run_folder, tmp_path, with_run)
 
 def test_a_viewer_that_does_not_start(refused, short_log, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setattr(rerun_viewer, "_listens", lambda _: False)
+    monkeypatch.setattr(rerun_viewer, "_is_listening", lambda _: False)
     monkeypatch.setattr(rerun_viewer, "COMMAND", (sys.executable, "-c", "raise SystemExit(1)"))
     assert "the viewer did not start; --rrd FILE writes a file" in refused("view", short_log)

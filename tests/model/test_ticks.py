@@ -9,7 +9,7 @@ from factorgraph_loc.model.scoring import Ticks, check_tick_gap
 
 def fired(start, stamps, gap=60.0):
     ticks = Ticks(start, gap)
-    found = [tick for t in stamps for tick in ticks.before(t)]
+    found = [tick for t in stamps for tick in ticks.advance(t)]
     return [*found, *ticks.rest()], ticks
 
 

@@ -73,12 +73,12 @@ def test_features_that_match_show_the_same_point(made):
 
 def test_a_log_gets_its_images(tmp_path, made):
     settings = preset("office", {**SETTINGS, "rig": {"camera": {"time_offset": 0.05}}})
-    told = []
-    log = with_images(simulate(settings, 1), settings, 1, tmp_path, tell=lambda *done: told.append(done))
+    progress = []
+    log = with_images(simulate(settings, 1), settings, 1, tmp_path, progress=lambda *done: progress.append(done))
     stream = log.streams["camera"]
     assert log.rig.sensors == ("odometry", "rfid", "camera")
     np.testing.assert_allclose(stream.t, made.times - 0.05)
-    assert told[-1] == (20, 20)
+    assert progress[-1] == (20, 20)
     for i in (0, 19):
         read = cv2.imread(str(stream.file[i])).astype(float)
         assert np.abs(read - made[i]).mean() < 4.0  # what the file's compression takes

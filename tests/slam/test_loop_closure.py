@@ -40,7 +40,7 @@ def shown(film, poses=POSES, off=DRIFT, memory=None, sigmas=SIGMAS, way=10.0):
         estimates[pose_key(i)] = guess
         keyframe = Keyframe(i, float(i), None, None)
         image = Image(frame, keyframe, (guess, np.diag(sigmas**2)), way)
-        assert closure.due(keyframe.t)
+        assert closure.is_due(keyframe.t)
         said.append((closure.compare(MODEL, image, old, estimates.__getitem__), truth))
     return said
 
@@ -101,8 +101,8 @@ def test_no_image_twice_a_second():
     frame, _ = camera_world.frame(ROOM, POSES[0], 3.0, np.random.default_rng(1))
     nothing = OldPoints(ROOM, [point_key(i) for i in range(len(ROOM))], np.zeros(len(ROOM)))
     closure.compare(MODEL, Image(frame, keyframe, (AWAY, np.eye(3)), 0.0), nothing, {}.__getitem__)
-    assert not closure.due(3.5)
-    assert closure.due(4.0)
+    assert not closure.is_due(3.5)
+    assert closure.is_due(4.0)
 
 
 def laps(points, seconds=48.0):
@@ -114,7 +114,7 @@ def both(log, monkeypatch):
     """Errors [m] with loops closed, and without."""
     config = RunConfig("smoother", {"landmarks": "unknown"})
     closed = rmse(run(log, config), log)
-    monkeypatch.setattr(LoopClosure, "due", lambda *_: False)
+    monkeypatch.setattr(LoopClosure, "is_due", lambda *_: False)
     return closed, rmse(run(log, config), log)
 
 

@@ -9,7 +9,7 @@ import pytest
 from factorgraph_loc import CameraFrame, PointMap
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.association import Associator
-from factorgraph_loc.vision.consensus import CameraPose, agreeing, compatible
+from factorgraph_loc.vision.consensus import CameraPose, agreeing, are_compatible
 from factorgraph_loc.vision.relocalization import found_on_floor, located
 from factors import se2
 from factors.camera import model as reprojection
@@ -195,7 +195,7 @@ def test_all_that_agree_with_a_prediction_are_taken_together():
         points, pixels, _ = named(rng, 20, 0.0)
         covariance = spread(0.001, 0.003)
         camera = CameraPose(*predicted(rng, covariance), covariance)
-        kept += compatible(MODEL, camera, points, pixels, noise)
+        kept += are_compatible(MODEL, camera, points, pixels, noise)
     assert kept >= 190  # of 198 expected: below 1e-4 of false alarms
 
 

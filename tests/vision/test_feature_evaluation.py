@@ -99,7 +99,7 @@ def test_wrong_matches_cost_precision():
     swapped = np.arange(n)
     swapped[:6] = np.roll(swapped[:6], 1)
     (scores,) = evaluate(pair(), made(points, vectors, seen, vectors[swapped]))
-    assert scores.matched.precision == scores.matched.matching_score == pytest.approx(1.0 - 6.0 / n)
+    assert scores.matching.precision == scores.matching.matching_score == pytest.approx(1.0 - 6.0 / n)
 
 
 def test_matches_out_of_the_common_part_are_wrong():
@@ -115,8 +115,8 @@ def test_detectors_have_no_matching_scores():
     steps = []
     (scores,) = evaluate(sequence, feature("fast_hessian", 50), lambda: steps.append(1))
     assert len(steps) == 2
-    assert np.isnan(scores.matched.matching_score)
-    assert scores.found.repeatability == 1.0
+    assert np.isnan(scores.matching.matching_score)
+    assert scores.repeatability.repeatability == 1.0
     assert scores.milliseconds > 0.0
 
 
@@ -124,6 +124,6 @@ def test_detectors_have_no_matching_scores():
 def test_opencv_features_match_as_well_as_they_are_known_to(data_root, name, score, precision):
     (graf,) = find_sequences([data_root / "oxford_affine" / "graf"])
     two = Sequence(graf.name, graf.first, graf.others[:2], graf.homographies[:2], graf.change, graf.amounts[:2])
-    found = [scores.matched for scores in evaluate(two, Feature(name, extractor(name, 1000).detectAndCompute))]
+    found = [scores.matching for scores in evaluate(two, Feature(name, extractor(name, 1000).detectAndCompute))]
     assert np.mean([s.matching_score for s in found]) == pytest.approx(score, abs=0.1)
     assert np.mean([s.precision for s in found]) == pytest.approx(precision, abs=0.05)

@@ -1,7 +1,7 @@
-"""Detectors that the colour features are compared with, written for evaluation: compact, not fast, without descriptors.
+"""Detectors for comparison with the colour features, written for evaluation: compact, not fast, without descriptors.
 
 Harris-Laplace and Hessian-Laplace: Mikolajczyk, Schmid, "Scale & Affine Invariant Interest Point Detectors", IJCV 60, 2004,
-section 2 (the simplified detector: points are detected at each scale and kept where the Laplacian has its maximum over scales).
+section 2. This is the simplified detector: it keeps points of each scale where the Laplacian has its maximum over scales.
 Fast-Hessian: Bay, Tuytelaars, Van Gool, "SURF: Speeded Up Robust Features", ECCV 2006, section 3. All use the luminance.
 """
 

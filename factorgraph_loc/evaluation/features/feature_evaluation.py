@@ -70,13 +70,14 @@ class PairScores:
     amount: float
     features: int
     milliseconds: float
-    found: Repeatability
-    matched: MatchScores
+    repeatability: Repeatability
+    matching: MatchScores
 
     def row(self) -> dict[str, Any]:
         """The scores by name, as a row of a table."""
         content = asdict(self)
-        return {**content, **content.pop("found"), **content.pop("matched")}
+        scores = {**content.pop("repeatability"), **content.pop("matching")}
+        return {**content, **scores}
 
 
 def feature(name: str, count: int) -> Feature:
@@ -126,7 +127,7 @@ def mutual_matches(first: Descriptors, second: Descriptors) -> Matched:
     i = np.flatnonzero(back.index[forward.index] == np.arange(len(first)))
     j = forward.index[i]
     best, runner_up = (values[i].astype(float) for values in (forward.best, forward.second))
-    return i, j, np.divide(best, runner_up, out=np.ones(len(i)), where=forward.alone[i] & back.alone[j])
+    return i, j, np.divide(best, runner_up, out=np.ones(len(i)), where=forward.is_unique[i] & back.is_unique[j])
 
 
 def match_scores(

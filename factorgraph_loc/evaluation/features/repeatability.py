@@ -1,9 +1,9 @@
 """Repeatability of points between two images of a scene.
 
 A point stands for a disc, which the homography maps to an ellipse in the other image; two regions correspond if they overlap.
-Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005, section 4: repeatability is the number of one-to-one
-correspondences over the smaller number of regions in the common part of the scene. Both regions of a pair are scaled such that
-the one in the first image has a radius of 30 px; otherwise large regions would overlap however inaccurate they are.
+Repeatability is the number of one-to-one correspondences over the smaller number of regions in the common part of the scene
+(Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005, section 4). Both regions of a pair are scaled to a
+radius of 30 px in the first image; otherwise large regions would overlap even if they are inaccurate.
 
 The ``strict`` score compares regions in their own size: their position in units of the size, and a ratio of sizes near 1.
 """

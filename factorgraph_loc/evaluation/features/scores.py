@@ -86,8 +86,10 @@ def write_scores(scores: FeatureScores, out: Path) -> None:
 
 
 def summary(scores: FeatureScores, sequences: Several[str] | None = None) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of a table: for each feature the mean over the pairs of ``sequences`` (None: of all), for times the median;
-    a dash where a feature has no such score."""
+    """Header and rows of a table of features: means over the pairs of ``sequences`` (None: of all), but medians of times.
+
+    A dash stands for a score that the feature does not have.
+    """
     chosen = scores.sequences() if sequences is None else sequences
     lines = []
     for name in scores.names():

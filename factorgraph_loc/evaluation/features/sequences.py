@@ -1,5 +1,6 @@
-"""Images of one planar scene with known homographies: folders in the Oxford format, or one photograph with known warps; mapping of
-points and regions by a homography, and the zoom, rotation and tilt it contains.
+"""Images of one planar scene with known homographies: folders in the Oxford format, or one photograph with known warps.
+
+A homography maps points and regions, and contains a zoom, a rotation and a tilt.
 
 Folders: Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005: ``img1`` to ``imgN`` and the homographies
 ``H1to2p`` to ``H1toNp`` from the first image to each other one.
@@ -184,10 +185,9 @@ def read_sequence(folder: Path) -> Sequence:
 def warped(photograph: Image, source: Path) -> list[Sequence]:
     """A photograph reduced by :data:`ZOOMS`, and rotated by :data:`ROTATIONS`.
 
-    A reduced photograph (area averaging) is placed in the middle of the mirrored original: a camera farther away sees more of the
-    surroundings, so that the same number of points falls on less of the scene. Rotated images are cropped to the square without
-    border in any of them; the first image is the same square. Raises InputError, naming ``source``, if the photograph is too
-    small.
+    A reduced photograph (area averaging) is placed in the middle of the mirrored original: a more distant camera sees more of the
+    surroundings, so that fewer of its points are on the scene. Rotated images are cropped to the largest square without a border
+    in any of them; the first image is the same square. If the photograph is too small, raises InputError, which names ``source``.
     """
     height, width = photograph.shape[:2]
     if min(height, width) < MIN_WARPED:

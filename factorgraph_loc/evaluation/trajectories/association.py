@@ -39,11 +39,11 @@ def associate(
 ) -> Associated:
     """Pairs of poses of both, at least one.
 
-    By index if one of them has no stamps, which must then be of equal length. ``nearest``: each pose of the shorter one (of the
-    estimate, if they are of equal length) with that of the other whose stamp is nearest, if it is at most ``max_diff`` [s] away.
-    ``interpolate``: as runs are scored, see :mod:`factorgraph_loc.evaluation.pairing`; in the plane if one of both is planar.
+    By index if one trajectory has no stamps; both must then have equal lengths. ``nearest``: each pose of the shorter one (if
+    equal, of the estimate) with the pose of the other with the nearest stamp, at most ``max_diff`` [s] away. ``interpolate``: as
+    in scores of runs, see :mod:`factorgraph_loc.evaluation.pairing`; in the plane if one of both is planar.
 
-    InputError if there are none.
+    InputError without pairs.
     """
     if estimate.t_ns is None or reference.t_ns is None:
         if how != "nearest":

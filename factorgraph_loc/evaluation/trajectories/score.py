@@ -1,7 +1,8 @@
 """Absolute and relative errors of an estimated trajectory against a reference.
 
 Absolute (APE) and relative pose errors (RPE): Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012,
-section IV; relative ones over a metre of path too. With the association ``nearest`` the figures are those of the package evo.
+section IV. Relative errors are also computed over a metre of path. With the association ``nearest`` the figures are those of the
+package evo.
 """
 
 from __future__ import annotations

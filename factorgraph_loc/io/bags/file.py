@@ -2,8 +2,8 @@
 ``.db3``).
 
 Messages are read one by one; only the index and the current chunk of a bag are kept in memory. A bag is compressed by chunks
-(``.bag``, ``.mcap``), by messages, or as a whole file that is unpacked to disk (version 2); what is unpacked is limited, because
-a few bytes may expand to gigabytes.
+(``.bag``, ``.mcap``), by messages, or as a whole file that is unpacked to disk (version 2). The size of unpacked content is
+limited, because a few bytes may expand to gigabytes.
 """
 
 from __future__ import annotations

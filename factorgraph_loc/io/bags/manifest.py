@@ -93,7 +93,7 @@ class Proposal:
     notes: list[str] = field(default_factory=list)
 
     def take(self, sensor: str, topics: Sequence[Topic], **settings: Any) -> None:
-        """Use the first of ``topics``, if any, for a sensor, and note the others."""
+        """Use the first of ``topics`` for a sensor and note the rest; nothing without topics."""
         if topics:
             self.options[sensor] = {"topic": topics[0].name, **settings}
             self.uses[topics[0].name] = sensor

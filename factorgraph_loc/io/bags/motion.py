@@ -1,5 +1,6 @@
-"""Motion of the robot in a bag: poses or velocities of odometry, the gyro of an IMU, or the wheels of a differential drive, each a
-topic, or joints of one message.
+"""Motion of the robot in a bag: poses or velocities of odometry, the gyro of an IMU, or the wheels of a differential drive.
+
+Each wheel has a topic, or both wheels are joints of one message.
 """
 
 from __future__ import annotations

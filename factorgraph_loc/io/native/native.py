@@ -163,8 +163,10 @@ def write_native(
 
 
 def require_new(folder: Path, *, overwrite: bool = False) -> None:
-    """InputError if ``folder`` is not empty, or with ``overwrite`` if it holds anything but a log in the native format; removes
-    remains of earlier attempts to write it."""
+    """InputError if ``folder`` is not empty or, with ``overwrite``, contains anything but a log in the native format.
+
+    Removes remains of earlier attempts to write it.
+    """
     sweep(folder.parent)
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
@@ -173,7 +175,9 @@ def require_new(folder: Path, *, overwrite: bool = False) -> None:
             f"{folder}: exists and is not an empty folder, expected a new one{_OR_LOG if overwrite else ''}"
         )
     if foreign := sorted(f.name for f in folder.iterdir() if f.suffix not in OF_LOGS and f.name != "camera"):
-        raise InputError(f"{folder}: contains {listed(foreign)}, not part of its log, which would be lost: expected only a log")
+        raise InputError(
+            f"{folder}: contains {listed(foreign)}, not part of its log, which would be lost: expected only a log"
+        )
 
 
 def write_files(log: Log, folder: Path, format: str) -> None:

@@ -62,7 +62,7 @@ class PosesFile(TimedMapping, Turned):
     times: str | None = None
     """file of the times of a KITTI file"""
 
-    def in_format(self) -> bool:
+    def is_in_format(self) -> bool:
         """Whether the file is in the format of another program."""
         return self.format != "columns" or self.times is not None
 
@@ -272,7 +272,7 @@ def _rounds(folder: TableFolder, options: Options) -> ReadsByRound | None:
 def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Array]:
     """Timestamps (N,), and velocities (N, 2) or increments (N, 3). InputError names file and row."""
     path, warnings = folder.file(options.file), folder.warnings
-    if options.in_format():
+    if options.is_in_format():
         if options.track is not None or options.radius is not None:
             raise InputError(f"{path}: format {options.format} has no wheels, expected no track or radius")
         t_ns, poses = _in_format(folder, options)
@@ -307,7 +307,7 @@ def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Arr
 def _reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> Trajectory:
     """The reference in seconds after ``t0_ns``; InputError names file and row of an invalid value."""
     path, warnings = folder.file(options.file), folder.warnings
-    if options.in_format():
+    if options.is_in_format():
         t_ns, poses = _in_format(folder, options)
         return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=options.has_heading)
     mapped = folder.read(options, (*POSES, ("t", "x", "y")))

@@ -90,7 +90,7 @@ def presets() -> dict[str, dict[str, dict[str, str]]]:
 
 class RfidFile(TimedMapping, ReadNames):
     """``columns``: t (or the first of several reads), epc or epc_base64, antenna, rssi (with ``*``: a column per tag or antenna),
-    phase, frequency or channel, and, if a row summarizes several reads, ``last`` and ``count``."""
+    phase, frequency or channel. Rows that summarize several reads have ``last`` and ``count``, too."""
 
     columns: dict[str, str] = Field(default_factory=dict)
     """column of the file for each field, besides those of the preset"""

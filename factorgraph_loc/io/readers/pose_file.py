@@ -40,8 +40,8 @@ EXPECTED = "{tum}, {kitti}, or {euroc}".format(**FORMATS)
 def read_kitti(path: Path, times: Path) -> PosePath:
     """The poses of a KITTI odometry file, whose timestamps are the lines of ``times``.
 
-    The file's poses are those of a camera with z forward and y down, in the frame of the first one (Geiger, Lenz, Urtasun, "Are we
-    ready for autonomous driving?", CVPR 2012). They are converted to x forward and z up. InputError names file and row.
+    The poses are of a camera with z forward and y down, in the frame of the first one. They are converted to x forward and z up.
+    InputError names file and row. Format: Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012.
     """
     matrices = read_matrices(path)
     t_ns = read_times(times)
