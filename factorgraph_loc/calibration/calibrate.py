@@ -1,6 +1,7 @@
 """Calibration of a complete rig: learn it along references, test it on held-out logs, and keep the input rig if it is worse."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,16 +59,13 @@ def calibrate(
     folds = folds_of(logs)
     report(1, len(folds) + 1)
     trials: list[Trial] = []
-    short = False
     for i, (train, tests) in enumerate(folds):
-        try:
+        with suppress(InputError):  # too short
             prefix = None if grids is None else grids.with_name(f"{grids.name}.fold{i}")
             unseen = learn([Traced(log) for log in train], start, grids=prefix, like=knowledge).rig
             trials += trials_of(tests, start, unseen, run)
-        except InputError:  # too short
-            short = True
         report(i + 2, len(folds) + 1)
-    refused = refusal(trials) if trials else ("the logs are too short to hold out parts of them" if short else "")
+    refused = refusal(trials) if trials else "the logs are too short to hold out parts of them"
     doubts = [*knowledge.notes, *_doubted(trials)]
     if not has_heading(logs[0]):
         doubts.append("The reference has no headings: only the range scale is learnt.")

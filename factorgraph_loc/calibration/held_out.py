@@ -56,13 +56,15 @@ def folds_of(logs: Sequence[Log]) -> list[tuple[list[Log], list[Log]]]:
     """Logs to learn from, and held-out stretches, for each recording, or for each half of a single one."""
     parts = list(zip(recordings(logs), logs, strict=True))
     if len({number for number, _ in parts}) == 1:
-        parts = [(half, _share(log, half / 2, (half + 1) / 2)) for half in range(2) for log in logs]
+        halves = [(half, _share(log, half / 2, (half + 1) / 2)) for half in range(2) for log in logs]
+        parts = [(half, part) for half, part in halves if part is not None]
     return [
         (
             [log for part, log in parts if part != number],
             [stretch for part, log in parts if part == number for stretch in _stretches(log)],
         )
         for number in dict.fromkeys(number for number, _ in parts)
+        if any(part != number for part, _ in parts)
     ]
 
 
@@ -147,21 +149,24 @@ def refusal(trials: Sequence[Trial]) -> str:
     return ""
 
 
-def _share(log: Log, begin: float, end: float) -> Log:
-    """The part of a log between two fractions of the time that has both odometry and reference."""
+def _share(log: Log, begin: float, end: float) -> Log | None:
+    """The part of a log between two fractions of the time that has both odometry and reference; None if it has none of these."""
     first, last = overlap(log)
-    return cut(log, first + begin * (last - first), first + end * (last - first))
+    with suppress(InputError):  # no measurements there
+        part = cut(log, first + begin * (last - first), first + end * (last - first))
+        if part.reference is not None and len(odometry_of(part).t):
+            return part
+    return None
 
 
 def _stretches(log: Log) -> list[Log]:
-    """Stretches of a log, without those that lack reference or measurements."""
+    """Stretches of a log with enough poses of the reference."""
     first, last = overlap(log)
     edges = np.linspace(0.0, 1.0, min(MOST, max(1, round((last - first) / LONGEST))) + 1)
     out = []
     for begin, end in pairwise(edges.tolist()):
         margin = max(0.0, 0.5 * (end - begin - LONGEST / (last - first)))
-        with suppress(InputError):  # no measurements there
-            part = _share(log, begin + margin, end - margin)
-            if part.reference is not None and len(odometry_of(part).t) and len(part.reference) >= FEWEST_POSES:
-                out.append(part)
+        part = _share(log, begin + margin, end - margin)
+        if part is not None and part.reference is not None and len(part.reference) >= FEWEST_POSES:
+            out.append(part)
     return out
