@@ -97,8 +97,8 @@ def new(
 
 
 def _value(option: str, given: str | None, default: str, expected: str, parse: Callable[[str], T], asks: bool) -> T:
-    """The value of an option: what is given, else the answer to a question if it ``asks``, else the default. ``parse`` raises
-    KeyError or ValueError for what is not ``expected``."""
+    """The value of an option: the given one, else the answer to a question if it ``asks``, else the default. ``parse`` raises
+    KeyError or ValueError for an invalid value; ``expected`` describes valid ones."""
     while True:
         text = default if given is None else given
         if given is None and asks:

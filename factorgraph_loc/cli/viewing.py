@@ -53,7 +53,7 @@ def view(
 
 
 def shown(log: Log, runs: list[StoredRun]) -> dict[str, Any]:
-    """The content of what is shown or written, for ``--json``."""
+    """The content of the view or the written files, for ``--json``."""
     return {"log": log.name, "runs": {run.name: str(run.folder.path) for run in runs}}
 
 

@@ -159,7 +159,7 @@ def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, in
         next_index = bisect.bisect_left(covered, start + length, i + 1)
         near = [j for j in (next_index - 1, next_index) if i < j < len(covered)]
         best = min(near, key=lambda j: abs(covered[j] - start - length))
-        best = bisect.bisect_left(covered, covered[best], i + 1)  # the first of those that stand still
+        best = bisect.bisect_left(covered, covered[best], i + 1)  # the first pose of a stop
         if abs(covered[best] - start - length) <= PIECE_TOLERANCE * length:
             pieces.append((first + i, first + best))
     return pieces

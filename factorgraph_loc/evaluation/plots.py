@@ -112,7 +112,7 @@ def overview(log: Log, odometry: Trajectory | None) -> Figure:
 
 
 def reliability_diagram(log: Log, estimator: str, reliability: Mapping[str, Reliability]) -> Figure:
-    """Detections that were observed over those that were predicted, by group, with two-sigma bars about what is predicted."""
+    """Observed over predicted numbers of detections, by group, with two-sigma bars about the prediction."""
     figure, axes = grid(
         len(reliability), 1, 3.2 * len(reliability), f"{log.name}, {estimator}: observed over predicted detections"
     )

@@ -42,7 +42,7 @@ def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> 
     by_seed = (a, b)
     seeds = sorted(set(a) | set(b))
     both = [[s.get(seed, next(iter(s.values())) if len(s) == 1 else None) for s in by_seed] for seed in seeds]
-    if any(len(s) == 1 for s in by_seed):  # paired with each seed of the other, whatever its own seed
+    if any(len(s) == 1 for s in by_seed):  # paired with each seed of the other, not only with its own seed
         longer = max(by_seed, key=len)
         both = [pair for seed, pair in zip(seeds, both, strict=True) if seed in longer]
     complete = [pair for pair in both if None not in pair]

@@ -1,7 +1,7 @@
 """Execution of planned runs: each is claimed in the store, computed by an executor, and stored here under its claim.
 
 An executor computes in local processes (:mod:`~factorgraph_loc.experiments.pool`) or on a cluster
-(:mod:`~factorgraph_loc.experiments.cluster`). Only this process stores, so that nothing is stored twice, whatever other processes
+(:mod:`~factorgraph_loc.experiments.cluster`). Only this process stores, so that nothing is stored twice, even if other processes
 use the same store."""
 
 from __future__ import annotations

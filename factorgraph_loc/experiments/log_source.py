@@ -204,7 +204,7 @@ class GivenSource:
         return self.log
 
     def files(self) -> dict[str, Path]:
-        """No files: the digest stands for them."""
+        """No files: the digest replaces them."""
         return {}
 
     def identity(self) -> dict[str, Any]:

@@ -203,8 +203,9 @@ def _result(
 def _rehearse(
     config: RunConfig, setup: model_setup.Setup, settings: FileModel, log: Log, prior: PosePrior | None
 ) -> None:
-    """Let an estimator that is thrown away work on the first seconds with observations, so that compiled functions are loaded, or
-    compiled, before times are taken. Once in a process for each estimator and its sensors; an error comes again in the run itself.
+    """Run an estimator on the first seconds with observations, so that compiled functions are loaded before times are measured.
+
+    This is done once in a process for each estimator and its sensors. Errors are ignored, as the run repeats them.
     """
     kind = config.estimator, setup.sensors
     if kind in _REHEARSED:

@@ -137,11 +137,11 @@ class TableFolder:
         return inside(self.path, name, self.path)
 
     def read(self, mapping: ColumnMapping, shapes: Sequence[Collection[str]]) -> Cells:
-        """Read the table of a mapping as :func:`read_mapped`, and note what is left out of it."""
+        """Read the table of a mapping as :func:`read_mapped`, with :meth:`noted`."""
         return self.noted(read_mapped(self.file(mapping.file), mapping, shapes), mapping)
 
     def noted(self, cells: Cells, mapping: ColumnMapping) -> Cells:
-        """Note what the ``cells`` leave out of their file, and return them."""
+        """Record which content of their file the ``cells`` use, for warnings about the rest, and return the cells."""
         if cells.passed:
             self.warnings.append(f"{cells.path}: {cells.passed} objects that lack mapped columns are skipped")
         self._read.setdefault(cells.path, []).append((cells, mapping))

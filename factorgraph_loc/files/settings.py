@@ -136,7 +136,7 @@ def _is_model(kind: Any) -> bool:
 
 
 def _own(key: str, parts: list[_Part], setting: Setting) -> Iterator[Setting]:
-    """The setting of a key itself; for a table only if it says what it means."""
+    """The setting of a key itself; for a table only if it has a description."""
     own = [part for part in parts if not _is_model(part.type)]
     if not own:
         if setting.meaning:

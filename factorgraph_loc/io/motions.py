@@ -25,7 +25,7 @@ WHEELS = ("left", "left_speed", *TURNS)
 
 
 class WheelSizes(FileModel):
-    """The sizes of a differential drive. Those of the rig ([odometry.wheels]) come before those given here."""
+    """The sizes of a differential drive. Those of the rig ([odometry.wheels]) have precedence."""
 
     track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")] | None = None
     """distance between the wheels"""

@@ -51,7 +51,7 @@ class Localizer:
 
     Call :meth:`initialize` first, and again to restart; there is nothing to close. Timestamps are seconds of any clock that all
     sensors share; the time offsets of the rig are added here. A lock guards the estimator: a push waits while another measurement
-    is processed. The same measurements in the same order give the same results, whatever is queried in between.
+    is processed. The same measurements in the same order give the same results; queries in between change nothing.
 
     InputError if the settings, sensors or ``history`` are invalid.
     """

@@ -151,7 +151,7 @@ def merged(observations: TagReadCounts, distance: float, angle: float) -> TagRea
 def _lattice_search(
     model: RfidModel, observations: TagReadCounts, read: NDArray[np.bool_], heights: Array, facing: Array
 ) -> TagCandidates:
-    """The best candidates of each tag that is ``read`` (T,), on a lattice wherever the antennas reach."""
+    """The best candidates of each tag that is ``read`` (T,), on a lattice of all places within reach of an antenna."""
     cells = _cells(observations.offsets[:, :2], reach(model))
     uses_facing = any(m.uses_facing for m in model.models)
     free = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS) if uses_facing else np.array([np.nan])

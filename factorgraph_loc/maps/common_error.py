@@ -15,8 +15,8 @@ import numpy as np
 from factorgraph_loc.maps.points import PointMap
 from factors.se2 import Array
 
-ARM = 1.0  # m that a turn of 1 rad counts as, in what is near
-LEAST = 0.01  # m: standard deviation of what a point has for itself
+ARM = 1.0  # m: distance that is equivalent to a turn of 1 rad, to choose the nearest place
+LEAST = 0.01  # m: least standard deviation of a point without the common error
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,9 +95,9 @@ class PointMap:
         )
 
     def with_points(self, added: PointMap, source: object) -> PointMap:
-        """Return this map with the named points ``added`` added. Raises InputError if a name exists already."""
+        """Return this map with the named points ``added``. Raises InputError if a name exists already."""
         if double := [name for name in added.names if name in self.index]:
-            raise InputError(f"{source}: the point {double[0]} is there twice, expected unique names")
+            raise InputError(f"{source}: the point {double[0]} occurs twice, expected unique names")
         return replace(
             self,
             names=(*self.names, *added.names),

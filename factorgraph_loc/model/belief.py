@@ -1,4 +1,4 @@
-"""Priors of the start pose, pose estimates, beliefs, and what is learnt besides the poses."""
+"""Priors of the start pose, pose estimates, beliefs, and other estimates: constants of sensors, landmarks, points."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-# what was added by one call: the list or count that grew, its name, and the rows or by how much
+# an addition: the list or count, its name, and the added rows or number
 Addition = tuple[dict[str, Any], str, Any]
 
 

@@ -1,4 +1,4 @@
-"""Poses with absolute times, as files, bags and messages hold them."""
+"""Poses with absolute times, as in files, bags and messages."""
 
 from __future__ import annotations
 

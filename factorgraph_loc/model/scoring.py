@@ -59,7 +59,7 @@ def check_tick_gap(gap: float) -> None:
 
 
 def check_prior(prior: str | None) -> None:
-    """InputError for a text that is no start of a run, whatever its log."""
+    """InputError for a text that is no start of a run on any log."""
     if prior not in (None, "unknown", "log", "reference"):
         parse_position(prior)
 

@@ -1,4 +1,4 @@
-"""Planar trajectories with covariances, interpolation and the TUM text format; what they have in common with those in space."""
+"""Planar trajectories with covariances, interpolation, the TUM text format, and the base class of trajectories."""
 
 from __future__ import annotations
 

@@ -162,7 +162,7 @@ def expose(
     table, starts, items = around.table, around.starts, around.items
     origin, size = around.origin, around.size
     place = (origin[0], origin[1], origin[2], size[2], size[3], size[4])
-    for edges in range(2):  # one loop for both, as what is inlined takes seconds to compile
+    for edges in range(2):  # one loop for both, as inlined code takes seconds to compile
         for i in range(height):
             for j in range(width):
                 across, along, first = 0.0, 0.0, 4

@@ -23,7 +23,7 @@ Surface = Literal["wall", "shelf", "floor"]
 
 
 class WorldSettings(FileModel):
-    """A plan of rooms from the origin, and what is in it: either ``tags`` or ``density``."""
+    """A plan of rooms from the origin and its content, with either ``tags`` or ``density``."""
 
     plan: Literal["office", "hall", "warehouse", "corridors"] = "office"
     """hall: one empty room; corridors: an H with a half-turn symmetry and three hanging tags, which alone distinguish its ends"""

@@ -108,7 +108,7 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
     Streams: odometry, rfid, bearing_range if the world has landmarks, sightings if it has points, and those of sensors from
     other packages. The reference is the true trajectory. The stated start is the true pose plus an error drawn from its
     covariance (:data:`START_SIGMAS`). World, drive and sensors use independent random generators. With ``recorded``, the robot
-    carries the antennas of these recordings and reads what they read (:mod:`.recorded`). Raises InputError if there is no space
+    has the antennas of these recordings, and reads are drawn from these (:mod:`.recorded`). Raises InputError if there is no space
     for the tags or for the robot.
     """
     of_world = seed if settings.world_seed is None else settings.world_seed

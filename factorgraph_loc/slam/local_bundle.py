@@ -18,7 +18,7 @@ from factors.camera.model import CameraModel, camera_pose, lens_of
 from factors.se2 import Array
 
 DISTANCE = 3.0  # m: first guess of how far points are away
-FEW, ENOUGH = 5, 8  # points that a keyframe shares with the one before: a third of what it sees, within these bounds
+FEW, ENOUGH = 5, 8  # bounds of the number of points shared with the previous keyframe: a third of the points in view
 ITERATIONS = 30
 FITS, MOST = 3.0, 0.5  # standard deviations, and the share of a keyframe's sightings that must fit
 SLIPPED = 0.1  # rad: what points that move with the image for their nearness cannot explain

@@ -245,7 +245,7 @@ class Monoslam(Filter):
             self.diagnostics.add_residuals(f"camera.{name}", residual[:, i].tolist())
 
     def _relocated(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> tuple[SlamState, bool]:
-        """Relocalize in the whole map if several images had no matches, or if the pose is hardly known; whether that succeeded.
+        """Relocalize in the whole map if several images had no matches, or if the pose is very uncertain; whether that succeeded.
         Points in the state are dropped with the old pose.
         """
         lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0

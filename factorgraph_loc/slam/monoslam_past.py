@@ -36,7 +36,7 @@ def smoothed(records: Sequence[UpdateRecord]) -> list[UpdateRecord]:
 
 
 def _smoothed(record: UpdateRecord, next_record: UpdateRecord, later: UpdateRecord) -> UpdateRecord:
-    """The record ``record`` given ``later``, which is the smoothed ``next_record``."""
+    """The smoothed ``record``; ``later``: the smoothed ``next_record``."""
     total, known = len(record.covariance), next_record.step.transition.shape[1]
     transition = np.zeros((POSE, total))
     transition[:, :known] = next_record.step.transition[:POSE]

@@ -235,10 +235,10 @@ def _visible(eye: Eye, sights: Sights) -> tuple[Sights, Integers]:
 
 
 def _slip(match: Match, state: SlamState, eye: Eye, added: Array) -> float:
-    """By how much pixels are more probable if the pose is less certain by ``added`` (3, 3): the difference of the logarithms."""
+    """The log-likelihood ratio of pixels for a pose with the ``added`` covariance (3, 3), relative to one without it."""
     sights = eye.all(state, match.mapped, match.points, match.covariances)
     covariance = Innovation.of(sights, state.covariance).total(sights.noise)
-    # points of unknown depth all began at the same, so that they may be nearer or farther together, as after a slip
+    # all points of unknown depth have the same initial depth: their errors are common, as after a slip
     depths = np.minimum(sights.starts + inverse_depth.SIZE - 1, len(state.covariance) - 1)
     alike = (sights.by_point[:, :, -1] * np.sqrt(state.covariance[depths, depths])[:, None]).ravel()
     by_pose = sights.by_pose[:, :, PLANAR].reshape(-1, 3)

@@ -106,7 +106,7 @@ class NewPoints:
     def ready(
         self, names: Iterable[Hashable], places: Callable[[int], KeyframeCamera | None], most: int = 1000
     ) -> list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]]:
-        """Remove and return at ``most`` this many of the points ``names`` that are determined now, with the sightings used.
+        """Remove and return at most ``most`` determined points of ``names``, with the used sightings.
 
         ``places``: camera poses of keyframes, None for a keyframe that nothing can be added to.
         """
@@ -145,8 +145,9 @@ def has_parallax(
 def agreed(
     model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera]
 ) -> tuple[TriangulatedPoint, list[PointSighting]] | None:
-    """The point ``sightings`` from ``places``, and its consistent sightings; None if they do not determine it. Of contradicting
-    sightings the one without which the others agree best is removed.
+    """The point of ``sightings`` from ``places``, and its consistent sightings; None if they do not determine it.
+
+    Sightings that contradict the point are removed one by one, such that the remaining ones agree best.
     """
     sightings, places = list(sightings), list(places)
     point = _triangulate(model, sightings, places, MAX_SPREAD)
@@ -168,15 +169,16 @@ def agreed(
 
 
 def _fits(point: TriangulatedPoint, sightings: Sequence[PointSighting]) -> bool:
-    """Whether all that is ``sightings`` of a point is as far from it as noise may be."""
+    """Whether the errors of the ``sightings`` of a point may be noise."""
     return bool(point.squared.sum() < chi_squared.quantile(GATE, 2 * len(sightings) - 3))
 
 
 def triangulate(
     model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera], most: float = MAX_SPREAD
 ) -> TriangulatedPoint | None:
-    """Triangulate a point ``sightings`` M times from ``places``, minimising the squared residuals in the images, from the point
-    nearest to the rays.
+    """Triangulate the point of M ``sightings`` from ``places``: minimise the squared residuals in the images.
+
+    The initial value is the point nearest to the rays.
 
     None if the rays are nearly parallel, do not intersect in front of the camera, or do not determine the point to ``most``
     times its least depth.

@@ -393,7 +393,7 @@ class UnknownPoints:
         self._hang(image, image.keyframe, point.key, sighting)
 
     def _hang(self, image: _NewImage, keyframe: Keyframe, key: int, sighting: PointSighting) -> None:
-        """Add the factor of a point ``sighting`` from a keyframe."""
+        """Add the factor of a ``sighting`` of a point from a keyframe."""
         keys = (keyframe.key, *image.graph.shared, tilt_key(keyframe.index), key)
         twist = self._cameras.twists.get(keyframe.index)
         factor = PointFactor(self.model, self._lens, sighting.pixel, self.estimated.indices, twist)

@@ -60,5 +60,5 @@ def test_markers_are_points_beside_others(world, tmp_path):
 
 def test_a_marker_must_not_have_the_name_of_another_point(world, tmp_path):
     write_points(PointMap.of(["m/2"], np.zeros((1, 3))), tmp_path / "a.points.parquet")
-    with pytest.raises(InputError, match="m/2 is there twice"):
+    with pytest.raises(InputError, match="m/2 occurs twice"):
         world('points = "a.points.parquet"\n[markers]\nm = { x = 0, y = 0, z = 0, size = 1, facing = 0 }\n')

@@ -1,4 +1,4 @@
-"""Results of an experiment for its page: figures of runs, and what is read of their files: trajectories, errors, configurations."""
+"""Results of an experiment for its page: figures of runs, and the trajectories, errors and configurations in their files."""
 
 from __future__ import annotations
 

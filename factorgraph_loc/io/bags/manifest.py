@@ -62,7 +62,7 @@ BESIDE = {
 
 @dataclass(frozen=True)
 class TopicUse:
-    """A topic of a bag. ``rate``: messages per second, None for fewer than two; ``use``: what it is taken for, or None."""
+    """A topic of a bag. ``rate``: messages per second, None for fewer than two; ``use``: as a sensor or reference, or None."""
 
     topic: str
     type: str

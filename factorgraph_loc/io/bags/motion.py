@@ -35,7 +35,7 @@ Motion = Callable[[list[str]], tuple[Integers, Array]]
 
 
 class WheelSettings(motions.WheelSizes):
-    """A differential drive. ``radius`` and ``track`` of the rig ([odometry.wheels]) come before those given here."""
+    """A differential drive. ``radius`` and ``track`` of the rig ([odometry.wheels]) have precedence over these settings."""
 
     left: str
     """name of the left wheel's joint; for a topic for each wheel, the field with the number"""
@@ -107,7 +107,7 @@ class OdometryTopic(PoseTopic):
     """A topic of odometry, of tf with two frames, or of wheel joints."""
 
     use: Literal["pose", "twist"] = "pose"
-    """the pose of odometry, as motion between messages, or its twist; for wheels, how far they turned, or how fast"""
+    """the pose of odometry, as motion between messages, or its twist; for wheels, their angles or their angular rates"""
     wheels: WheelSettings | None = None
     """wheels of a topic of joints, or of two topics; topic is the one of the left wheel"""
 

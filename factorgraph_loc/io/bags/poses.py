@@ -37,7 +37,7 @@ STATIC = "/tf_static"
 MANY = 2000  # messages of a topic that are looked at
 ROBOT = ("base_link", "base_footprint", "base")
 ODOMETRY = ("odom", "odom_combined", "odometry")
-WORLD = ("mocap", "vicon", "optitrack", "world", "map")  # what is measured comes before what may be an estimate
+WORLD = ("mocap", "vicon", "optitrack", "world", "map")  # measured frames first, then those of estimates
 
 
 class PoseTopic(TopicSettings, Turned):

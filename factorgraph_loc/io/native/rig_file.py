@@ -94,7 +94,7 @@ class RobotOptions:
 
 
 def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
-    """A rig with these sensors, and remarks on what is a guess. InputError if a value is out of bounds, or there is no sensor."""
+    """A rig with these sensors, and remarks on guessed values. InputError if a value is out of bounds, or there is no sensor."""
     sections: dict[str, Any] = {}
     sensors: list[str] = []
     remarks: list[str] = []
