@@ -16,7 +16,7 @@ from factorgraph_loc.cli import show
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import error_text
 
-AGAIN = 0.05  # s
+RETRY_INTERVAL = 0.05  # s
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
 PIPE_CLOSED = 141  # 128 and the number of SIGPIPE, as in shells
 
@@ -75,7 +75,7 @@ def stoppable() -> Iterator[None]:
         if isinstance(unraisable.exc_value, Stop):
             number = unraisable.exc_value.number
             signal.signal(number, stop)
-            threading.Timer(AGAIN, os.kill, (os.getpid(), number)).start()
+            threading.Timer(RETRY_INTERVAL, os.kill, (os.getpid(), number)).start()
         else:
             hook(unraisable)
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 ALL = "(all logs)"
 SCORED = "poses scored"
 BASELINE = "dead_reckoning"
-ALIKE = 0.01  # relative difference of errors within which estimators are equally good
+EQUIVALENCE = 0.01  # relative difference of errors within which estimators are equally good
 
 
 def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ...]]:
@@ -120,9 +120,9 @@ def verdict(rows: Sequence[Row]) -> list[str]:
         if errors:
             best = min(errors, key=errors.__getitem__)
             line = f"least {kind} position error: {best}, {errors[best]:.3f} m"
-            near = [name for name in errors if name != best and errors[name] <= (1.0 + ALIKE) * errors[best]]
+            near = [name for name in errors if name != best and errors[name] <= (1.0 + EQUIVALENCE) * errors[best]]
             if near:
-                line += f", within {ALIKE:.0%} of it {', '.join(near)}"
+                line += f", within {EQUIVALENCE:.0%} of it {', '.join(near)}"
             if BASELINE in errors and best != BASELINE:
                 line += f" ({BASELINE}: {errors[BASELINE]:.3f} m)"
             lines.append(line)

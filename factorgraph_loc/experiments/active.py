@@ -26,7 +26,7 @@ from factorgraph_loc.experiments.active_results import (
     summary_cells,
 )
 from factorgraph_loc.experiments.execute import Files, execute, failure
-from factorgraph_loc.experiments.experiment_file import ENDLESS, Limits
+from factorgraph_loc.experiments.experiment_file import NO_TIME_LIMIT, Limits
 from factorgraph_loc.experiments.keys import digest_of
 from factorgraph_loc.experiments.pool import Processes
 from factorgraph_loc.experiments.store import METRICS, Store
@@ -207,7 +207,7 @@ def run_jobs(
     left = [job for job in jobs if store.state(job.key) != "ok"]
     done = len(jobs) - len(left)
     progress(done, len(jobs))
-    executor = Processes(max(1, min(workers, len(left))), Limits(time=ENDLESS))
+    executor = Processes(max(1, min(workers, len(left))), Limits(time=NO_TIME_LIMIT))
     for _ in execute(left, folder, executor, again=True) if left else ():
         done += 1
         progress(done, len(jobs))

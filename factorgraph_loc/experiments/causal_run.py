@@ -28,7 +28,9 @@ from factorgraph_loc.sensors.camera.use import PreparedLog
 from factorgraph_loc.text import listed
 from factors.se2 import Array
 
-NEW = 1000  # new objects between searches for garbage; a search of tens of thousands takes as long as many updates
+GARBAGE_THRESHOLD = (
+    1000  # new objects between searches for garbage; a search of tens of thousands takes as long as many updates
+)
 
 
 @dataclass
@@ -185,7 +187,7 @@ def only_new_searched() -> Iterator[None]:
     threshold = gc.get_threshold()
     gc.freeze()
     gc.callbacks.append(_keep)
-    gc.set_threshold(NEW, *threshold[1:])
+    gc.set_threshold(GARBAGE_THRESHOLD, *threshold[1:])
     try:
         yield
     finally:

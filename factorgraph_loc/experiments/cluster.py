@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from factorgraph_loc.experiments.experiment_file import Limits
 
 CONNECT = 10.0  # s to wait for the scheduler
-LOOK = 0.5  # s to wait for finished runs
-AHEAD = 2  # runs per busy worker, so that the next one does not wait for this process
+POLL_INTERVAL = 0.5  # s to wait for finished runs
+QUEUED = 2  # runs per busy worker, so that the next one does not wait for this process
 RESTART = 60.0  # s for a worker to restart
 _ONE = Lock()  # one run at a time in a process, for meaningful times
 
@@ -80,7 +80,7 @@ class Cluster(Executor):
             ) from error
 
     def submit(self, take: Take, left: int) -> None:
-        room = AHEAD * max(1, sum(self._client.nthreads().values()))
+        room = QUEUED * max(1, sum(self._client.nthreads().values()))
         while len(self._sent) < min(room, left) and (run := take()) is not None:
             findable = replace(run, source=_absolute(run.source)) if isinstance(run, PlannedRun) else run
             key = f"fgloc-{run.key}-{self._session}"
@@ -97,11 +97,13 @@ class Cluster(Executor):
 
     def _done(self) -> list[Any]:
         if not self._sent:
-            time.sleep(LOOK)
+            time.sleep(POLL_INTERVAL)
             return []
         try:
             with self._client.as_current():
-                done = self._distributed.wait(list(self._sent), timeout=LOOK, return_when="FIRST_COMPLETED").done
+                done = self._distributed.wait(
+                    list(self._sent), timeout=POLL_INTERVAL, return_when="FIRST_COMPLETED"
+                ).done
                 return list(done)
         except TimeoutError:
             return []

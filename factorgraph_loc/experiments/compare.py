@@ -18,7 +18,7 @@ from factorgraph_loc.evaluation.plots import plot_log, remove_plots
 from factorgraph_loc.evaluation.scores import REPORT
 from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, further_tables, markdown, unscored, verdict
 from factorgraph_loc.experiments.experiment import Prepared, run_experiment
-from factorgraph_loc.experiments.experiment_file import ENDLESS, Experiment
+from factorgraph_loc.experiments.experiment_file import NO_TIME_LIMIT, Experiment
 from factorgraph_loc.experiments.log_source import GivenSource
 from factorgraph_loc.experiments.output import TABLES, write_tables
 from factorgraph_loc.experiments.plan import plan
@@ -157,7 +157,7 @@ def _experiment(
         "logs": [plain(log.name) for log in logs],
         "estimators": [{"name": name, "settings": dict(settings)} for name, settings in estimators.items()],
         "report": {"metrics": [*REPORT, *further]} | ({"baseline": BASELINE} if BASELINE in estimators else {}),
-        "limits": {"time": ENDLESS},
+        "limits": {"time": NO_TIME_LIMIT},
         **keys,
     }
     return parse_model(Experiment, content, "the comparison")

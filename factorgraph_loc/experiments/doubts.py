@@ -12,7 +12,7 @@ from factorgraph_loc.model.map_frame import MapFrame
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.registry import detecting
 
-MOSTLY = 0.9  # fraction of the time with estimates
+LEAST_SHARE = 0.9  # fraction of the time with estimates
 
 
 def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[str, ...]:
@@ -28,7 +28,7 @@ def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[str, ...
         )
     begin, end = max(reference.t[0], final.t[0]), min(reference.t[-1], final.t[-1])
     whole = final.t[-1] - final.t[0]
-    if end - begin >= MOSTLY * whole:
+    if end - begin >= LEAST_SHARE * whole:
         return ()
     return (
         f"{log.name}: scored over {end - begin:.1f} s of {whole:.1f} s: the reference is there from {begin:.1f} s to {end:.1f} s",

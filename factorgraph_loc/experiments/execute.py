@@ -23,7 +23,7 @@ from factorgraph_loc.text import error_text, json_text
 
 Files = dict[str, bytes]
 Kind = Literal["error", "timeout", "memory", "killed", "vanished", "refused"]
-AGAIN = 0.5  # s after which a run that another process has claimed is tried again
+RETRY_INTERVAL = 0.5  # s after which a run that another process has claimed is tried again
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
@@ -110,7 +110,7 @@ def execute(runs: Sequence[Planned], folder: Path, executor: Executor, *, again:
         while (run := queue.next(loaded, avoided)) is not None:
             with ExitStack() as claim:
                 if not claim.enter_context(store.claim(run.key)):
-                    queue.later.append((time.monotonic() + AGAIN, run))
+                    queue.later.append((time.monotonic() + RETRY_INTERVAL, run))
                     continue
                 state = store.state(run.key, thorough=True)  # the caller considers it missing or damaged
                 if state not in ("ok", "failed") or (state == "failed" and again):

@@ -24,7 +24,7 @@ from factorgraph_loc.text import listed, plain, quoted
 PATH, PART = 1000, 255  # maximum bytes of a path, and of a name within it
 LONGEST_NAME = 200  # maximum characters of the experiment's name, which is a folder name
 MOST = 1000  # maximum number of logs, estimators, sets of sensors and metrics in a file; globs and seeds may expand to more
-ENDLESS = 1e9  # s: no limit of a run
+NO_TIME_LIMIT = 1e9  # s: no limit of a run
 MOST_SWEPT, MOST_VALUES = 50, 10_000  # maximum number of swept settings, and of values of one
 Name = Annotated[str, Field(min_length=1)]
 Seeds = Annotated[

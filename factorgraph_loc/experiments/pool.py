@@ -21,12 +21,12 @@ from factorgraph_loc.processes import ProcessDiedError, Worker, serve, start
 if TYPE_CHECKING:
     from factorgraph_loc.experiments.experiment_file import Limits
 
-LOOK = 0.1  # s between checks of memory and time
+CHECK_INTERVAL = 0.1  # s between checks of memory and time
 ATTEMPTS = (
     2  # a process may be killed because of others' memory; after two deaths the run itself is considered the cause
 )
 SHARE = 0.9  # of the machine's memory, for all workers together
-SLOW = ("cv2", "factorgraph_loc.experiments.output")  # modules that a worker imports before its first run
+PRELOADED = ("cv2", "factorgraph_loc.experiments.output")  # modules that a worker imports before its first run
 
 
 @dataclass(eq=False)
@@ -53,7 +53,7 @@ class Processes(Executor):
 
     def submit(self, take: Take, left: int) -> None:
         while len(self._team) < min(self._jobs, left):
-            self._team.append(_Worker(*start(serve, *SLOW)))
+            self._team.append(_Worker(*start(serve, *PRELOADED)))
             self._team[-1].send(compute)
         for worker in self._team:
             if worker.ready and worker.job is None:
@@ -65,7 +65,7 @@ class Processes(Executor):
                 worker.send(run)
 
     def finished(self) -> Iterator[tuple[str, Files]]:
-        readable = wait([worker.connection for worker in self._team], LOOK)
+        readable = wait([worker.connection for worker in self._team], CHECK_INTERVAL)
         for worker in list(self._team):
             run, failed = worker.job, self._too_much(worker)
             if worker.connection in readable:

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from factorgraph_loc.exports.runs import StoredRun
-from factorgraph_loc.exports.scene import GAP, LIT, SEEN
+from factorgraph_loc.exports.scene import DETECTION, GAP, SIGHTING
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera import summary as pictures_of
@@ -46,13 +46,13 @@ def record_camera(recording: rr.RecordingStream, log: Log, runs: Sequence[Stored
             t = np.array([t for t, _ in some])
             expected = [_expected(model, pose, log.world.points.positions) for pose in poses.at(t, max_gap=GAP)]
             _pixels_over_time(recording, f"{at}/image/map", t, expected)
-            recording.log(f"{at}/image/map", rr.Points2D.from_fields(radii=2.0, colors=LIT), static=True)
+            recording.log(f"{at}/image/map", rr.Points2D.from_fields(radii=2.0, colors=DETECTION), static=True)
     sightings = list(pictures_of.sightings(log))
     if sightings:
         labels = [name for _, names, _ in sightings for name in names]
         t = np.array([t for t, _, _ in sightings])
         _pixels_over_time(recording, f"{at}/image/landmarks", t, [pixels for _, _, pixels in sightings], labels)
-        style = rr.Points2D.from_fields(radii=3.0, colors=SEEN, show_labels=False)
+        style = rr.Points2D.from_fields(radii=3.0, colors=SIGHTING, show_labels=False)
         recording.log(f"{at}/image/landmarks", style, static=True)
 
 

@@ -21,7 +21,7 @@ from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.rerun_camera import TIMELINE, WORLD, camera_path, record_camera, times
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK, open_viewer
 from factorgraph_loc.exports.runs import StoredRun
-from factorgraph_loc.exports.scene import DARK, LIT, REFERENCE, Colour, colours
+from factorgraph_loc.exports.scene import DARK, DETECTION, REFERENCE, Colour, colours
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.model.log import Log
@@ -102,7 +102,7 @@ def _lamps(recording: rr.RecordingStream, what: str, positions: Mapping[str, Arr
         columns = rr.Points3D.columns(positions=np.array([positions[name] for name in flat]), labels=flat)
         columns = columns.partition([len(names) for names in lit])
         recording.send_columns(f"{WORLD}/{what}/lit", times(lights.t), columns)
-        style = rr.Points3D.from_fields(radii=2.0 * POINT, colors=LIT, show_labels=True)
+        style = rr.Points3D.from_fields(radii=2.0 * POINT, colors=DETECTION, show_labels=True)
         recording.log(f"{WORLD}/{what}/lit", style, static=True)
 
 

@@ -21,7 +21,7 @@ from factors.se2 import Array
 
 STORE = "store"  # of several runs
 COMPLETE = results.FILES[-1]  # written last, so that its presence marks a complete run
-OUTSIDE = 60.0  # s that an estimate may lie outside of its log
+MARGIN = 60.0  # s that an estimate may lie outside of its log
 
 
 class _Landmark(FileModel, extra="ignore"):
@@ -149,7 +149,7 @@ def _check_times(run: StoredRun, log: Log) -> None:
     """Raise InputError if the times do not overlap: a run of another log of the same name."""
     first, last = log.span()
     for trajectory in (run.causal, run.final):
-        if len(trajectory) and (trajectory.t[0] < first - OUTSIDE or trajectory.t[-1] > last + OUTSIDE):
+        if len(trajectory) and (trajectory.t[0] < first - MARGIN or trajectory.t[-1] > last + MARGIN):
             raise InputError(
                 f"{run.folder.path}: has estimates from {trajectory.t[0]:.1f} s to {trajectory.t[-1]:.1f} s of the log's time, "
                 f"expected some between {first:.1f} s and {last:.1f} s: is it a run of another log {log.name}?"

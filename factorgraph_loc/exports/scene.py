@@ -17,7 +17,7 @@ LIT_FOR = 0.5  # s that a tag or landmark stays highlighted after an observation
 GAP = 1.0  # s between poses, above which the path is interrupted
 SCALE_95 = math.sqrt(-2.0 * math.log(0.05))  # standard deviations that contain 95 % of a two-dimensional Gaussian
 Colour = tuple[int, int, int]  # red, green, blue of 255
-REFERENCE, DARK, LIT, SEEN = (128, 128, 128), (160, 160, 160), (230, 159, 0), (0, 158, 115)
+REFERENCE, DARK, DETECTION, SIGHTING = (128, 128, 128), (160, 160, 160), (230, 159, 0), (0, 158, 115)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ GRID = 2**26  # bytes of a grid, unpacked
 PIXELS = 2**26  # of an image; the limit of OpenCV is 2^30
 CELLS = 2**27  # rows times columns that a Parquet file declares
 MEMORY, MEMORY_PER_BYTE = 2**30, 32  # bytes that reading a file may take, and in addition for each byte of the file
-LOOK = 0.01  # s between checks of the memory
+CHECK_INTERVAL = 0.01  # s between checks of the memory
 LARGEST_POINTER = 1024  # bytes, as its specification says
 
 _limited = threading.Event()  # whether this process limits the memory that reading a file takes
@@ -154,7 +154,7 @@ def limited_memory(source: object, size: int) -> Iterator[None]:
     done, errors = threading.Event(), os.dup(2)
 
     def watch() -> None:
-        while not done.wait(LOOK):
+        while not done.wait(CHECK_INTERVAL):
             if resident_memory(os.getpid()) > limit:
                 text = f"error: {plain(source)}: reading it takes more than {most / 1e6:,.0f} MB of memory\n"
                 os.write(errors, text.encode(errors="backslashreplace"))

@@ -27,7 +27,7 @@ from factorgraph_loc.text import LISTED, NAME, error_text, listed, plain, quoted
 
 LONGEST_FILE = 100  # bytes of a generated file name
 DEEPEST = 64  # nesting levels of tables or lists, and parts of a key
-MANY = 1000  # maximum number of names to search for a similar one
+MOST_NAMES = 1000  # maximum number of names to search for a similar one
 MOST_ENTRIES = 1_000_000  # values of a file
 MOST_DIGITS = 40  # of an integer in JSON: an EPC of 96 bits has 29
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
@@ -224,7 +224,7 @@ def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
 
 def nearest(word: str, known: list[str]) -> str:
     """A hint for a misspelt word: the most similar known one, else all of them."""
-    short = [name for name in known if len(name) <= NAME][:MANY]
+    short = [name for name in known if len(name) <= NAME][:MOST_NAMES]
     matches = difflib.get_close_matches(word, short, n=1, cutoff=0.5) if len(word) <= NAME else []
     if matches:
         return f": did you mean {plain(matches[0])}?"

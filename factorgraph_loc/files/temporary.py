@@ -25,7 +25,7 @@ MARK = ".fgloc-"
 _NAME = re.compile(rf"\..*{re.escape(MARK)}([0-9a-f]{{8}})-([1-9][0-9]*)-[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
 _NAMED, _SUFFIX = 150, 60  # bytes used of a name and of a suffix; file systems allow 255 in total
 _MACHINE = f"{zlib.crc32(socket.gethostname().encode()):08x}"
-OLD = 7 * 86_400.0  # s after which a file of another machine, whose processes are unknown, is removed
+MAX_AGE = 7 * 86_400.0  # s after which a file of another machine, whose processes are unknown, is removed
 _swept: set[Path] = set()  # folders that this process has cleaned up
 _own: set[Path] = set()  # paths created by this process and not yet removed
 
@@ -66,7 +66,7 @@ def _is_left(entry: os.DirEntry[str]) -> bool:
         return False
     machine, process = name[1], int(name[2])
     if machine != _MACHINE:
-        return time.time() - entry.stat(follow_symlinks=False).st_mtime > OLD
+        return time.time() - entry.stat(follow_symlinks=False).st_mtime > MAX_AGE
     if process == os.getpid():
         return entry.name not in {path.name for path in _own}
     try:

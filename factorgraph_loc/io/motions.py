@@ -17,8 +17,8 @@ from factors.se2 import Array, Integers
 
 # m/s and rad/s: minimum rate of a jump, and its minimum ratio to the largest rate before
 SPEED, TURN, FASTER = 1.0, 2.0, 3.0
-NEAR, ZERO = 0.05, 1e-6  # m: from the origin after a reset of odometry; and tolerance of zeros
-HELD = 1.0  # s for which the previous motion is continued across a reset
+RESET_DISTANCE, ZERO = 0.05, 1e-6  # m: from the origin after a reset of odometry; and tolerance of zeros
+HOLD_TIME = 1.0  # s for which the previous motion is continued across a reset
 COUNTERS = (2**8, 2**16, 2**32)  # ranges of encoders that wrap to 0
 TURNS = ("left_angle", "left_rate")  # columns with angles of wheels, which need a radius
 WHEELS = ("left", "left_speed", *TURNS)
@@ -52,13 +52,13 @@ def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[s
     durations = _durations(t_ns)
     speeds, turns = np.hypot(moves[:, 0], moves[:, 1]) / durations, np.abs(moves[:, 2]) / durations
     fastest = _largest_before(speeds, SPEED)
-    home = np.hypot(poses[1:, 0], poses[1:, 1]) <= NEAR + fastest * durations
+    home = np.hypot(poses[1:, 0], poses[1:, 1]) <= RESET_DISTANCE + fastest * durations
     jumps = (speeds > FASTER * fastest) | (turns > FASTER * _largest_before(turns, TURN))
-    zeros = np.all(np.abs(poses[1:]) < ZERO, axis=1) & (speeds * durations > NEAR) & (durations > HELD)
+    zeros = np.all(np.abs(poses[1:]) < ZERO, axis=1) & (speeds * durations > RESET_DISTANCE) & (durations > HOLD_TIME)
     anew = np.flatnonzero((home & jumps) | zeros)
     for i in anew.tolist():
         previous = se2.log(moves[i - 1]) / durations[i - 1] if i else np.zeros(3)
-        moves[i] = se2.exp(previous * min(float(durations[i]), HELD))
+        moves[i] = se2.exp(previous * min(float(durations[i]), HOLD_TIME))
     _tell(source, t_ns, anew, warnings)
     return moves
 
@@ -75,11 +75,11 @@ def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array
     durations = _durations(t_ns)
     speeds = np.abs(steps).max(axis=1, initial=0.0) / durations
     fastest = _largest_before(speeds, SPEED)
-    home = np.abs(distances[1:]).max(axis=1, initial=0.0) <= NEAR + fastest * durations
+    home = np.abs(distances[1:]).max(axis=1, initial=0.0) <= RESET_DISTANCE + fastest * durations
     anew = np.flatnonzero(home & (speeds > FASTER * fastest))
     for i in anew.tolist():
         previous = steps[i - 1] / durations[i - 1] if i else np.zeros(2)
-        steps[i] = previous * min(float(durations[i]), HELD)
+        steps[i] = previous * min(float(durations[i]), HOLD_TIME)
     _tell(source, t_ns, anew, warnings)
     return steps
 

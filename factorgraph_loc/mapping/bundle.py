@@ -30,7 +30,7 @@ FOCAL_SIGMA, ASPECT_SIGMA = 0.1, 0.005  # standard deviations of an unknown foca
 CENTRE_SIGMA = 0.01  # standard deviation of an unknown principal point, relative to the focal length
 LENS_SIGMA = (0.1, 0.1, 0.003, 0.003)  # standard deviations of an unknown distortion
 FIXED = 1e-5  # standard deviation of the known calibration constants
-SOMEWHERE = 1000.0  # m, prior standard deviation of a point
+POINT_SIGMA = 1000.0  # m, prior standard deviation of a point
 CHUNK = 500  # points per computation of covariances
 
 
@@ -109,7 +109,7 @@ def marginals(
     count, total = len(cameras), tracks.count
     _, by_camera, by_point, _ = reproject(model, cameras, points, tracks)
     by_camera, by_point = by_camera / model.sigma, by_point / model.sigma
-    of_points = np.repeat(SOMEWHERE**-2 * np.eye(3)[None], total, axis=0)
+    of_points = np.repeat(POINT_SIGMA**-2 * np.eye(3)[None], total, axis=0)
     np.add.at(of_points, tracks.track, np.einsum("nij,nik->njk", by_point, by_point))
     of_cameras = np.array(information)
     np.add.at(of_cameras, tracks.frame, np.einsum("nij,nik->njk", by_camera, by_camera))

@@ -21,7 +21,7 @@ from factors.se2 import Array, Integers
 
 GATE = 16.27  # 99.9 % of chi-square with three degrees of freedom
 FARTHEST = 0.5  # m between two estimates of one point
-ALIKE = 90.0  # percentile of the differences of views of one point, above which points are not one
+PERCENTILE = 90.0  # percentile of the differences of views of one point, above which points are not one
 COMPARED = 2000  # points whose views are compared to learn that
 CELL = 0.5  # m: thinning keeps points in as many such cells as it can
 LEAST = 1e-6  # m: standard deviation of exact points when they are compared
@@ -169,7 +169,7 @@ def _limit(points: PointMap, views: list[Integers]) -> float:
     for mine in [mine for mine in views if len(mine) > 1][:COMPARED]:
         apart = distance_matrix(points.descriptors[mine], points.descriptors[mine], binary=points.feature == "orb")
         least.append(float(apart[np.triu_indices(len(mine), 1)].min()))
-    return float(np.percentile(least, ALIKE)) if least else 0.0
+    return float(np.percentile(least, PERCENTILE)) if least else 0.0
 
 
 def _covariances(points: PointMap, which: Integers) -> Array:

@@ -39,7 +39,7 @@ WINDOW = 90  # latest keyframes along which new tags are searched
 MARGIN = 1.0  # m beyond the reach: farther away, missed reads of a tag are ignored
 ITERATIONS, FINAL_ITERATIONS = 4, 40
 ROUNDS = 3  # of searching all tags again at the end
-ELSEWHERE = 13.8  # 99.9 % of chi-square with two degrees of freedom
+MOVED_GATE = 13.8  # 99.9 % of chi-square with two degrees of freedom
 
 Factors = list[tuple[Factor, tuple[int, ...]]]
 
@@ -132,7 +132,7 @@ class _Problem:
             mode, key = posterior.modes[0], landmark_key(tag)
             if self.mapped[tag]:
                 off = mode.position - self._values[key]
-                if off @ np.linalg.solve(mode.covariance, off) < ELSEWHERE:
+                if off @ np.linalg.solve(mode.covariance, off) < MOVED_GATE:
                     continue
             self._values[key] = mode.position
             self.mapped[tag], changed = True, True

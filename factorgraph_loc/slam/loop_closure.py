@@ -17,8 +17,7 @@ import numpy as np
 from factorgraph_loc.fusion.graph.graph import Guess, Keyframe
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.sensors.camera.known_points import lifted
-from factorgraph_loc.vision.association import TURNED as VIEWED
-from factorgraph_loc.vision.association import ZOOMED, Associations, Associator
+from factorgraph_loc.vision.association import LARGEST_ANGLE, LARGEST_RATIO, Associations, Associator
 from factorgraph_loc.vision.consensus import CameraPose, Truths
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.keypoints import Integers
@@ -29,14 +28,14 @@ from factors.se2 import Array
 
 INTERVAL = 0.9  # s between images that are compared
 SUCCESSIVE, BREAK = 3, 3.0  # images that must agree, and the maximum time [s] between them
-APART = np.array((0.1, 0.1, 0.03))  # m, m, rad: standard deviations of the motion between two of their poses
+MOTION_SIGMAS = np.array((0.1, 0.1, 0.03))  # m, m, rad: standard deviations of the motion between two of their poses
 FEWEST = 15  # points that must be found
 LEAST_SHARE = 0.1  # of the visible ones
 GRID, CELLS = (6, 4), 7  # cells of the image, and how many of them must contain a point
 # m, rad; and relative to the distance travelled: standard deviations of a track's drift in addition to its covariance
-DRIFT, DRIFT_OF_WAY = np.array((0.05, 0.05, 0.02)), np.array((0.003, 0.003, 0.0005))
+DRIFT, DRIFT_PER_METRE = np.array((0.05, 0.05, 0.02)), np.array((0.003, 0.003, 0.0005))
 GATE = 16.3  # 99.9 % of chi-square with three degrees of freedom
-SHIFTED, TURNED = 1.0, 0.3  # m, rad: errors of a track for which its points are found
+LARGEST_SHIFT, LARGEST_TURN = 1.0, 0.3  # m, rad: errors of a track for which its points are found
 FARTHEST = 15.0  # m
 
 
@@ -95,7 +94,7 @@ class LoopClosure:
             last = self._found[-1]
             went = se2.between(current(last.keyframe.key), image.guess[0])
             off = se2.log(se2.between(went, se2.between(last.pose, revisit.pose)))
-            agrees = bool(np.sum((off / APART) ** 2) < GATE)
+            agrees = bool(np.sum((off / MOTION_SIGMAS) ** 2) < GATE)
         self._found = [*self._found[1 - SUCCESSIVE :], revisit] if agrees else [revisit]
         return revisit if len(self._found) == SUCCESSIVE else None
 
@@ -147,26 +146,26 @@ def _on_floor(
 def _is_plausible(guess: Guess, pose: Array, travelled: float) -> bool:
     """Whether the track may have drifted from ``pose`` to ``guess`` over a distance ``travelled`` [m]."""
     off = se2.log(se2.between(guess[0], pose))
-    drift = DRIFT + DRIFT_OF_WAY * travelled
+    drift = DRIFT + DRIFT_PER_METRE * travelled
     return bool(positive.squared(off, guess[1] + np.diag(drift**2)) < GATE)
 
 
 def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truths:
-    """Which points (N,) the camera may see from the same side as before, if its pose is correct within :data:`SHIFTED` and
-    :data:`TURNED`.
+    """Which points (N,) the camera may see from the same side as before, if its pose is correct within :data:`LARGEST_SHIFT` and
+    :data:`LARGEST_TURN`.
     """
     rays, old_rays = points.positions - camera.position, points.positions - points.seen_from
     away, old_distance = np.linalg.norm(rays, axis=1), np.linalg.norm(old_rays, axis=1)
-    turn = np.arcsin(np.minimum(1.0, SHIFTED / away))
+    turn = np.arcsin(np.minimum(1.0, LARGEST_SHIFT / away))
     right, _, ahead = (rays @ camera.rotation).T
     half = math.atan(max(model.cx, model.width - model.cx) / model.fx)
     between = np.arccos(np.clip(np.einsum("ni,ni->n", rays, old_rays) / (away * old_distance), -1.0, 1.0))
     return np.asarray(
-        (np.abs(np.arctan2(right, ahead)) < half + TURNED + turn)
-        & (away < FARTHEST + SHIFTED)
-        & (between < VIEWED + turn)
-        & (away < ZOOMED * old_distance + SHIFTED)
-        & (old_distance < ZOOMED * away + SHIFTED)
+        (np.abs(np.arctan2(right, ahead)) < half + LARGEST_TURN + turn)
+        & (away < FARTHEST + LARGEST_SHIFT)
+        & (between < LARGEST_ANGLE + turn)
+        & (away < LARGEST_RATIO * old_distance + LARGEST_SHIFT)
+        & (old_distance < LARGEST_RATIO * away + LARGEST_SHIFT)
     )
 
 

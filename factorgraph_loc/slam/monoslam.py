@@ -59,17 +59,17 @@ from factorgraph_loc.slam.monoslam_state import (
     with_floor,
 )
 from factorgraph_loc.vision.consensus import CameraPose
-from factorgraph_loc.vision.relocalization import FLOATS, TILTS
+from factorgraph_loc.vision.relocalization import LARGEST_HEIGHT, LARGEST_TILT
 from factors import se2
 from factors.camera.model import TiltScale, carrier
 from factors.robust import huber_weight
 from factors.se2 import Array
 
 SETTLED = 1e-3  # m, rad: step of the iterated update below which it has converged
-LATELY = 5.0  # s: a point in the state that was not seen since may be hidden
+RECENT = 5.0  # s: a point in the state that was not seen since may be hidden
 LOST_AFTER = 5  # consecutive images without a match, after which the filter is lost
 SCALE = "scale_distance"  # the constant of the odometry
-VAGUE = 0.5  # m, rad: standard deviations beyond which the pose is unknown
+LARGEST_SIGMA = 0.5  # m, rad: standard deviations beyond which the pose is unknown
 
 
 class MonoslamSettings(FilterSettings):
@@ -258,7 +258,7 @@ class Monoslam(Filter):
 
     def _is_vague(self, state: SlamState) -> bool:
         """Whether the pose in a known map is too uncertain for linearization."""
-        return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > VAGUE**2)
+        return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > LARGEST_SIGMA**2)
 
     def _standing(self, camera: CameraPose, eye: Eye, lost_state: SlamState) -> SlamState | None:
         """The state of a robot with the relocalized ``camera``; None if it would float or tilt."""
@@ -269,7 +269,7 @@ class Monoslam(Filter):
         covariance[ROBOT:, ROBOT:] = lost_state.covariance[ROBOT : lost_state.base, ROBOT : lost_state.base]
         back = np.linalg.inv(eye.lift)
         covariance[:6, :6] = back @ camera.covariance @ back.T
-        if abs(position[2]) > FLOATS or rotation[2, 2] < math.cos(TILTS):
+        if abs(position[2]) > LARGEST_HEIGHT or rotation[2, 2] < math.cos(LARGEST_TILT):
             return None
         covariance[UPRIGHT, UPRIGHT] += np.square((s.tilt_sigma, s.tilt_sigma, s.height_sigma))
         return SlamState(robot, lost_state.constants, covariance, floor=lost_state.floor)
@@ -279,7 +279,7 @@ class Monoslam(Filter):
         state = counted(state, match.expected, frozenset(match.mapped), m.t)
         frame = m.frame
         wanted = min(self._settings.per_image, self._settings.max_points)
-        room = max(0, wanted - self._looker.in_view(state, eye, since=m.t - LATELY))
+        room = max(0, wanted - self._looker.in_view(state, eye, since=m.t - RECENT))
         for row in self._looker.new(m, state, eye, match, state.tracks)[:room]:
             name = f"met{state.met}" if m.names is None else m.names[row]
             descriptor = None if frame is None else frame.descriptors[row]

@@ -14,7 +14,7 @@ from factors.camera import inverse_depth
 from factors.se2 import Array, Integers
 
 INVERSE_DEPTH, INVERSE_DEPTH_SIGMA = 0.3, 1.0  # 1/m, of a new point: so vague that many of them do not give the scale
-TRIED, FOUND = 8, 0.5  # a point that was predicted this often is kept if this fraction was found
+FEWEST_TRIALS, LEAST_FOUND = 8, 0.5  # a point that was predicted this often is kept if this fraction was found
 
 
 def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> SlamState:
@@ -78,7 +78,8 @@ def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
     failed = {
         i
         for i, (p, start) in enumerate(zip(state.points, state.starts().tolist(), strict=True))
-        if (p.expected >= TRIED and p.matched < FOUND * p.expected) or (p.ray and _is_beyond_infinity(state, start + 5))
+        if (p.expected >= FEWEST_TRIALS and p.matched < LEAST_FOUND * p.expected)
+        or (p.ray and _is_beyond_infinity(state, start + 5))
     }
     left = [i for i in range(len(state.points)) if i not in failed]
     spare = len(left) - most

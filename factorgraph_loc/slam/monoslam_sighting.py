@@ -26,7 +26,7 @@ from factorgraph_loc.vision.relocalization import located
 from factors.camera import inverse_depth
 from factors.se2 import Array, Integers
 
-APART = 15.0  # px between a new point and all others
+CLEARANCE = 15.0  # px between a new point and all others
 FEWEST_FOUND, SHARE_FOUND = 5, 0.5  # named points that must agree in relocalization, and their fraction
 
 
@@ -103,7 +103,7 @@ class FeatureMatcher:
         occupied = np.concatenate((m.pixels[list(match.taken)].reshape(-1, 2), expected))
         chosen: list[int] = []
         for i in np.flatnonzero(followed).tolist():
-            if not len(occupied) or np.abs(occupied - m.pixels[i]).max(axis=1).min() > APART:
+            if not len(occupied) or np.abs(occupied - m.pixels[i]).max(axis=1).min() > CLEARANCE:
                 chosen.append(i)
                 occupied = np.concatenate((occupied, m.pixels[None, i]))
         return chosen

@@ -24,8 +24,8 @@ from factors.se2 import Array
 
 MAX_TIME = 2.0  # s between two images that are compared
 ENOUGH = 8  # tracks that agree with the wheels alone
-COMMON = 0.8  # share of the others that another turn explains
-TURNS, BETWEEN = np.linspace(-0.6, 0.6, 61), 0.01  # rad: other turns that are tried, and error of the nearest one
+EXPLAINED = 0.8  # share of the others that another turn explains
+TURNS, TURN_SIGMA = np.linspace(-0.6, 0.6, 61), 0.01  # rad: other turns that are tried, and error of the nearest one
 FARTHEST, NEAREST, DISTANCES = 100.0, 0.5, 2  # m, and how many distances of a point are tried
 
 
@@ -89,19 +89,19 @@ class MovingThings:
 def another(model: CameraModel, first: Array, second: Array, step: Increment, right: Truths) -> Truths:
     """Whether pairs of pixels (K, 2) fit the turn that explains most of the pairs that do not fit the ``step`` of the odometry.
 
-    None does if most fit the step (``right``), or if no turn explains :data:`COMMON` of the others.
+    None does if most fit the step (``right``), or if no turn explains :data:`EXPLAINED` of the others.
     """
     best, unexplained = right, ~right
     if 2 * np.count_nonzero(unexplained) >= len(right):
         for turn in TURNS.tolist():
             delta, covariance = step.delta.copy(), step.covariance.copy()
             delta[2] += turn
-            covariance[2, 2] += BETWEEN**2
+            covariance[2, 2] += TURN_SIGMA**2
             fits = fitting(model, first, second, replace(step, delta=delta, covariance=covariance))
             if np.count_nonzero(fits & unexplained) > np.count_nonzero(best & unexplained):
                 best = fits
     explained = np.count_nonzero(best & unexplained)
-    enough = explained > 0 and explained >= COMMON * np.count_nonzero(unexplained)
+    enough = explained > 0 and explained >= EXPLAINED * np.count_nonzero(unexplained)
     return best if enough else np.zeros(len(right), dtype=bool)
 
 

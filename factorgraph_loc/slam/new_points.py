@@ -24,7 +24,7 @@ FEWEST, MAX_WAITING = 3, 10  # sightings of one point
 MAX_SPREAD = 0.15  # standard deviation of an initial point, relative to its least depth
 GATE = 0.999  # probability of the chi-square test of the residuals
 PATIENCE = 20  # keyframes after which a point not seen again is dropped
-ORIGIN, UNTURNED, UPRIGHT = np.zeros(3), np.eye(3), np.zeros(2)
+ORIGIN, NO_ROTATION, UPRIGHT = np.zeros(3), np.eye(3), np.zeros(2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,5 +204,5 @@ def _triangulate(
         math.inf,
     )
     if ended == kernels.BEHIND:
-        return TriangulatedPoint(ORIGIN, UNTURNED, np.full(len(sightings), np.inf))
+        return TriangulatedPoint(ORIGIN, NO_ROTATION, np.full(len(sightings), np.inf))
     return TriangulatedPoint(*result) if ended == kernels.FOUND else None

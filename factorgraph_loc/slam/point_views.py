@@ -23,7 +23,7 @@ from factors.camera.kernels import NEAREST
 from factors.camera.model import CameraModel, camera_pose, linearize_in_space
 from factors.se2 import Array
 
-APART, VIEWS = 0.5, 4  # m travelled between views that a map keeps, and their number for each point
+VIEW_DISTANCE, VIEWS = 0.5, 4  # m travelled between views that a map keeps, and their number for each point
 NOISE = 3.0  # px: of the predicted pixel of a lost point, in addition to the error of the pose
 FARTHEST = 15.0  # m of its depth
 
@@ -67,7 +67,7 @@ class PointViews:
         if (
             last_view is not None
             and len(earlier) < VIEWS - 1
-            and (not earlier or last_view.travelled >= earlier[-1].travelled + APART)
+            and (not earlier or last_view.travelled >= earlier[-1].travelled + VIEW_DISTANCE)
         ):
             earlier.append(last_view)
         self._views[point] = view
@@ -121,7 +121,7 @@ class PointViews:
                 *(
                     earlier_view
                     for earlier_view in self._earlier[key]
-                    if self._views[key].travelled >= earlier_view.travelled + APART
+                    if self._views[key].travelled >= earlier_view.travelled + VIEW_DISTANCE
                 ),
                 self._views[key],
             )

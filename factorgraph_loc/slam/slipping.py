@@ -19,7 +19,7 @@ from factors.motion import Increment, propagate
 from factors.se2 import Array
 
 ENOUGH = 6  # points that must agree
-COMMON = np.diag((0.02, 0.02, 0.005)) ** 2  # m, rad: error that all points may have in common
+COMMON_COVARIANCE = np.diag((0.02, 0.02, 0.005)) ** 2  # m, rad: error that all points may have in common
 
 
 def unless_slipped(
@@ -72,7 +72,7 @@ def _evidence(
     # information of the image only
     posterior = positive.inverse(update.covariance)
     gained = positive.inverse(positive.nearest(posterior - positive.inverse(covariances[1])))
-    off, gained = gained @ posterior @ update.delta, gained + COMMON
+    off, gained = gained @ posterior @ update.delta, gained + COMMON_COVARIANCE
     return more_probable(off, (covariances[0] + gained, covariances[1] + gained))
 
 

@@ -38,12 +38,12 @@ from factors.camera.point import PointFactor, PointPrior
 from factors.graph import VectorPriorFactor, point_key, tilt_key
 from factors.se2 import Array
 
-PER_KEYFRAME, WAITING = 40, 160  # maximum number of estimated points per keyframe, and of points waiting
+PER_KEYFRAME, MOST_WAITING = 40, 160  # maximum number of estimated points per keyframe, and of points waiting
 STRIKES = 2
 LEVEL = np.zeros(2)  # no tilt
-OPEN = 30.0  # m: weak prior of a point, about the size of a building
-LOST = 10.0  # s for which a lost point is searched: after that, too many others in a building look like it
-AGREED = 0.5  # fraction of inliers required of points not seen for longer: similar descriptors agree by chance
+PRIOR_SIGMA = 30.0  # m: weak prior of a point, about the size of a building
+SEARCH_TIME = 10.0  # s for which a lost point is searched: after that, too many others in a building look like it
+LEAST_INLIERS = 0.5  # fraction of inliers required of points not seen for longer: similar descriptors agree by chance
 RECENT = 5.0  # s: the error of a point seen since is correlated with that of the track
 REVISITED = 6  # features of points not seen for longer that are accepted together, whatever the others say
 
@@ -137,7 +137,7 @@ class UnknownPoints:
         """Those of the rows with these ``names`` that are used, spread over the image."""
         priority = [len(names) if name in self._points else self._new.count(name) for name in names]
         pixels = np.asarray(image.m.pixels[list(rows)], dtype=float)
-        chosen = spread_out(pixels, PER_KEYFRAME + WAITING, priority).tolist()
+        chosen = spread_out(pixels, PER_KEYFRAME + MOST_WAITING, priority).tolist()
         pixels = pixels[chosen]
         sightings = sightings_of(self.model, image.keyframe.index, pixels)
         return _ChosenSightings([rows[i] for i in chosen], [names[i] for i in chosen], pixels, sightings)
@@ -189,7 +189,7 @@ class UnknownPoints:
                 self._views.keep(key, m.frame, row, self._distance_travelled, keyframe.key, guess)
             addition.values[key] = point.position
             graph.values[key], graph.spreads[key] = point.position, point.covariance
-            prior = PointPrior.of(pose, point.position, OPEN)
+            prior = PointPrior.of(pose, point.position, PRIOR_SIGMA)
             addition.hang(keyframe, Node((keyframe.key, key), prior, 3))
             for sighting in sightings:
                 self._hang(image, graph.keyframes[sighting.keyframe], key, sighting)
@@ -204,7 +204,7 @@ class UnknownPoints:
         self._again_as = {track: name for track, name in self._again_as.items() if name in gone}
         names: list[Hashable] = [self._again_as.get(track, track) for track in tracks]
         assigned = set(names)
-        lately = [name for name, point in self._points.items() if m.t - point.last < LOST]
+        lately = [name for name, point in self._points.items() if m.t - point.last < SEARCH_TIME]
         lost = [name for name in lately if name not in assigned and self._points[name].key in self._views]
         free = [i for i, name in zip(rows, names, strict=True) if name not in self._points]
         keys = [self._points[name].key for name in lost]
@@ -227,7 +227,9 @@ class UnknownPoints:
         frame, t, graph = image.m.frame, image.keyframe.t, image.graph
         if frame is None or not self._loops.is_due(image.m.t):
             return set()
-        old = [name for name, point in self._points.items() if t - point.last >= LOST and point.key in self._views]
+        old = [
+            name for name, point in self._points.items() if t - point.last >= SEARCH_TIME and point.key in self._views
+        ]
         if not old:
             return set()
         points = [self._points[name] for name in old]
@@ -347,7 +349,7 @@ class UnknownPoints:
         near = guess if since is None else (guess[0], since)  # of a pose among the points that were seen since
         camera, right, placed, tilt = lifted(model, *guess), known.copy(), guess, LEVEL
         # a name needs one other to confirm it
-        revisited = max(2 if named else REVISITED, math.ceil(AGREED * np.count_nonzero(~recent & ~known)))
+        revisited = max(2 if named else REVISITED, math.ceil(LEAST_INLIERS * np.count_nonzero(~recent & ~known)))
         for which, enough in ((recent, FEWEST), (~recent & ~known, revisited)):
             agrees = np.zeros(len(points), dtype=bool)
             if which.any():

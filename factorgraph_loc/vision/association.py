@@ -35,13 +35,13 @@ BITS = np.array([bin(i).count("1") for i in range(256)], dtype=np.int64)
 
 RATIO, GLOBAL_RATIO = 0.85, 0.8
 NEAREST, FARTHEST = 0.2, 50.0  # m, of points that are searched
-TURNED, ZOOMED = math.radians(50.0), 2.0  # bounds between views: angle, ratio of distances
+LARGEST_ANGLE, LARGEST_RATIO = math.radians(50.0), 2.0  # bounds between views: angle, ratio of distances
 GATE = float(chi_squared.quantile(0.99, 2))
 CELL = 20.0  # px, cells for sorting features
 # px, radius: added for errors of the prediction, and the largest gate
 SMALLEST_GATE, LARGEST_GATE = 3.0, 150.0
 MARGIN = 20.0  # px around the image: predicted points there are searched
-SAME = 4.0  # px: closer points and features may be the same
+SAME_PIXEL = 4.0  # px: closer points and features may be the same
 SAME_POINT = 0.15  # m: closer points may be the same
 CHANCE = 0.02  # fraction of pairs of different map points that are more similar than a match may be
 MANY = 5000  # views of a map: with more, only the most similar keyframes are compared with an image
@@ -109,7 +109,7 @@ class Associator:
         inside = (depth >= NEAREST) & (depth <= FARTHEST) & (np.abs(x) <= self._slopes[0] * depth)
         ahead = np.flatnonzero(inside & (np.abs(y) <= self._slopes[1] * depth))
         views, begins = agreeing_views(
-            ahead, position, self._positions, self._starts, self._seen_from, math.cos(TURNED), ZOOMED
+            ahead, position, self._positions, self._starts, self._seen_from, math.cos(LARGEST_ANGLE), LARGEST_RATIO
         )
         points = self._positions[ahead]
         predicted, by_camera, by_point = reprojection.linearize_in_space(model, position, rotation, points)
@@ -129,7 +129,7 @@ class Associator:
         near = costs <= self._farthest_look
         pairs, costs = pairs[near], costs[near]
         ratio = RATIO if self._binary else RATIO**2
-        pairs = pairs[clear_pairs(pairs, costs, predicted, features, ratio, SAME)]
+        pairs = pairs[clear_pairs(pairs, costs, predicted, features, ratio, SAME_PIXEL)]
         rows, matched_features = pairs[:, 0], pairs[:, 1]
         if len(rows) < FEWEST:
             return Associations(rows[:0], matched_features[:0], int(kept.sum()))

@@ -26,12 +26,12 @@ Truths = NDArray[np.bool_]
 FEWEST = 4  # points that must agree: three always determine a pose
 SAMPLE = 3
 HYPOTHESES, ROUND = 96, 16  # maximum number, and number between checks for termination
-MISSED = 1e-3  # probability that no outlier-free sample was drawn
+FAILURE = 1e-3  # probability that no outlier-free sample was drawn
 REACH = 10.0  # standard deviations of the prediction that bound a correction
 FARTHEST = 3.0  # bound of a single step, relative to REACH
 ROUNDING = 1e-12  # relative to the largest eigenvalue of a covariance: smaller ones count as zero
 RIDGE = 1e-9  # regularisation of the information, for points very close to the camera
-LOOSE, GATE = 25.0, 13.8  # squared residuals of inliers of a sample, and of the final pose (99.9 %)
+SAMPLE_GATE, GATE = 25.0, 13.8  # squared residuals of inliers of a sample, and of the final pose (99.9 %)
 JOINT = 0.99  # probability of the joint compatibility test
 
 
@@ -69,7 +69,7 @@ def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Arra
         return np.zeros(count, dtype=bool)
     whiteners, root = positive.whitener(covariances), root_of(camera)
     position, rotation, squared = _best_of_samples(model, camera, points, pixels, whiteners, REACH * root)
-    inside = squared < LOOSE
+    inside = squared < SAMPLE_GATE
     for _ in range(2):
         if np.count_nonzero(inside) < FEWEST:
             return np.zeros(count, dtype=bool)
@@ -107,13 +107,13 @@ def _best_of_samples(
             total = total + step
             position, rotation = moved(position, rotation, step @ root.T)
         squared = _squared(model, position, rotation, points, pixels, whiteners)
-        costs = np.minimum(squared, LOOSE).sum(axis=1)
+        costs = np.minimum(squared, SAMPLE_GATE).sum(axis=1)
         i = int(np.argmin(costs))
         if best is None or costs[i] < best[0]:
             best = float(costs[i]), position[i], rotation[i], squared[i]
         tried += ROUND
-        share = np.count_nonzero(best[3] < LOOSE) / count
-        if (1.0 - share**SAMPLE) ** tried < MISSED:
+        share = np.count_nonzero(best[3] < SAMPLE_GATE) / count
+        if (1.0 - share**SAMPLE) ** tried < FAILURE:
             break
     assert best is not None
     return best[1:]

@@ -31,11 +31,14 @@ MIN_MATCHES = 8
 MIN_SHARE = 0.3  # least fraction of inliers
 HYPOTHESES = 50
 NEWTON_STEPS, ITERATIONS, HALVINGS = 4, 15, 6
-AGREES, CLEAR = 3.0, 20.0  # standard deviations: inliers to their epipolar line, and least distance from the epipole
+INLIER_GATE, EPIPOLE_GATE = (
+    3.0,
+    20.0,
+)  # standard deviations: inliers to their epipolar line, and least distance from the epipole
 TURN_AGREES = 3.4  # standard deviations of two values: 99.7 %
 TURN_EXPLAINS = 0.5  # fraction of matches explained by a rotation if the robot may be at rest
 DEPTHS = 0.3  # 1/m: variation of the inverse depth across the image
-BLURRED = 0.05  # rad: largest standard deviation of a useful direction
+DIRECTION_SIGMA = 0.05  # rad: largest standard deviation of a useful direction
 NEAR, NEAREST = 1.0, 0.5  # m: few points are nearer, and none
 SHORTEST = 1e-4  # m, least translation with a direction
 SCALED = 0.01  # of the focal length, for its derivative
@@ -67,11 +70,11 @@ def frame_motion(
     pairs = RayPairs.of(model, first, second)
     turn = _turn(pairs, predicted, model.robust)
     distance = float(np.linalg.norm(translation(pairs.position, predicted.delta)))
-    may_rest = distance < AGREES * float(np.sqrt(np.trace(predicted.covariance[:2, :2])))
+    may_rest = distance < INLIER_GATE * float(np.sqrt(np.trace(predicted.covariance[:2, :2])))
     if may_rest and turn.agrees.mean() >= TURN_EXPLAINS:
         return turn
     moved = _refined(pairs, _start(pairs, predicted.delta, rng), model.robust)
-    if moved.agrees.sum() < max(MIN_MATCHES, MIN_SHARE * len(pairs)) or _blur(moved, model.position) > BLURRED:
+    if moved.agrees.sum() < max(MIN_MATCHES, MIN_SHARE * len(pairs)) or _blur(moved, model.position) > DIRECTION_SIGMA:
         return None
     return moved
 
@@ -127,14 +130,16 @@ def _start(pairs: RayPairs, predicted: Array, rng: np.random.Generator) -> Array
 
 def _misfit(pairs: RayPairs, motion: Array) -> float:
     residual = sampson(pairs, motion)[0]
-    return float(np.where(_agrees(pairs, motion, residual), residual**2, AGREES**2).sum())
+    return float(np.where(_agrees(pairs, motion, residual), residual**2, INLIER_GATE**2).sum())
 
 
 def _agrees(pairs: RayPairs, motion: Array, residual: Array) -> NDArray[np.bool_]:
     """Inliers: near their epipolar line and at a plausible depth. A feature that lies on its line by chance would be behind the
     camera or very near, with a large weight."""
     rho, sigma = nearness(pairs, motion)
-    return np.asarray((np.abs(residual) < AGREES) & (rho > -AGREES * sigma) & (rho < 1.0 / NEAREST + AGREES * sigma))
+    return np.asarray(
+        (np.abs(residual) < INLIER_GATE) & (rho > -INLIER_GATE * sigma) & (rho < 1.0 / NEAREST + INLIER_GATE * sigma)
+    )
 
 
 def _refined(pairs: RayPairs, motion: Array, robust: float) -> FrameMotion:
@@ -164,7 +169,7 @@ def _refined(pairs: RayPairs, motion: Array, robust: float) -> FrameMotion:
 
 
 def _weight(pairs: RayPairs, motion: Array, residual: Array, robust: float) -> Array:
-    clear = from_epipole(pairs, motion) > CLEAR
+    clear = from_epipole(pairs, motion) > EPIPOLE_GATE
     return np.asarray(huber_weight(residual**2, robust) * (clear & _agrees(pairs, motion, residual)))
 
 

@@ -25,8 +25,8 @@ CONFIDENCE, MOST_SAMPLES = 0.9999, 5000
 REFINEMENTS = 10
 CONVERGED = 1e-6  # m, rad
 # m, rad: height and tilt tolerated for a robot on the floor: errors of a pose in space, and of the camera's mounting
-FLOATS, TILTS = 0.3, 0.15
-DETERMINED = 0.5  # m, rad: standard deviations beyond which a pose is not determined
+LARGEST_HEIGHT, LARGEST_TILT = 0.3, 0.15
+LARGEST_SIGMA = 0.5  # m, rad: standard deviations beyond which a pose is not determined
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def on_floor(
     """The pose of a robot on the floor whose camera was found at ``camera``; None if it floats, tilts or is not determined."""
     position, rotation = reprojection.carrier(model, camera.position, camera.rotation)
     tilt = math.acos(float(np.clip(rotation[2, 2], -1.0, 1.0)))
-    if abs(position[2]) > FLOATS or tilt > TILTS:
+    if abs(position[2]) > LARGEST_HEIGHT or tilt > LARGEST_TILT:
         return None
     pose = np.array((position[0], position[1], math.atan2(rotation[1, 0], rotation[0, 0])))
     factor = ReprojectionFactor(model, points, pixels, point_covariances=covariances)
@@ -86,7 +86,7 @@ def on_floor(
     for _ in range(REFINEMENTS):
         residual, (jacobian,) = factor.linearize([pose])
         information = jacobian.T @ jacobian
-        if np.linalg.eigvalsh(information)[0] < DETERMINED**-2:
+        if np.linalg.eigvalsh(information)[0] < LARGEST_SIGMA**-2:
             return None
         step: Array = -np.asarray(np.linalg.solve(information, jacobian.T @ residual), dtype=float)
         pose = se2.compose(pose, se2.exp(step))
@@ -116,7 +116,7 @@ def _refined(
         weight = np.where(squared < (2.0 * GATE if i < 3 else GATE), huber_weight(squared, model.robust), 0.0)
         by_camera = whitener @ by_camera
         information = np.einsum("k,kri,krj->ij", weight, by_camera, by_camera)
-        if np.linalg.eigvalsh(information)[0] < DETERMINED**-2:
+        if np.linalg.eigvalsh(information)[0] < LARGEST_SIGMA**-2:
             return None
         step = -np.linalg.solve(information, np.einsum("k,kri,kr->i", weight, by_camera, residual))
         position = position + rotation @ step[3:]

@@ -21,7 +21,7 @@ RADIUS = 0.25  # of the longer side of an image: largest displacement of a featu
 EPIPOLAR = 1.5  # px from the epipolar line
 CONFIDENCE, DRAWS = 0.99, 300  # samples of five pairs
 FEWEST = 16  # pairs needed for a meaningful consensus
-ALIKE = 0.5  # share of the other pairs that agree, if they are of another body and not wrong
+OTHER_BODY = 0.5  # share of the other pairs that agree, if they are of another body and not wrong
 
 
 class _TrackedImage(NamedTuple):
@@ -87,7 +87,7 @@ def pairs(
     rejected = np.flatnonzero(~right)
     if len(rejected) >= FEWEST:
         too = _of_one_geometry(a[rejected], b[rejected], focal)
-        if np.count_nonzero(too) > ALIKE * len(rejected):
+        if np.count_nonzero(too) > OTHER_BODY * len(rejected):
             right[rejected] = too
     return matched[right]
 

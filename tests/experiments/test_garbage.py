@@ -2,7 +2,7 @@
 
 import gc
 
-from factorgraph_loc.experiments.causal_run import NEW, only_new_searched
+from factorgraph_loc.experiments.causal_run import GARBAGE_THRESHOLD, only_new_searched
 
 
 def test_what_was_there_is_not_searched_for_the_time_being():
@@ -20,7 +20,9 @@ def test_what_was_there_is_not_searched_for_the_time_being():
 def test_what_stays_is_searched_twice_and_never_again():
     with only_new_searched():
         before, searches = gc.get_freeze_count(), gc.get_stats()[2]["collections"]
-        kept = [[i] for i in range(50 * NEW)]  # fifty searches of new objects, five of those that outlived one
-        assert gc.get_freeze_count() > before + 30 * NEW
+        kept = [
+            [i] for i in range(50 * GARBAGE_THRESHOLD)
+        ]  # fifty searches of new objects, five of those that outlived one
+        assert gc.get_freeze_count() > before + 30 * GARBAGE_THRESHOLD
         assert gc.get_stats()[2]["collections"] == searches
-    assert len(kept) == 50 * NEW
+    assert len(kept) == 50 * GARBAGE_THRESHOLD

@@ -33,7 +33,7 @@ ERRORS = {
     "position per second [m]": "rpe_per_s.position",
     "rotation per second [rad]": "rpe_per_s.rotation",
 }
-EXPLAINED = (
+EXPLANATION = (
     "Absolute: between poses of the two, after the alignment. Per metre and per second: between the motions of the two over "
     "pieces of that length, not divided by it, plotted at the end of each piece. Rotations are the angle between two "
     "orientations. 95 %: this share of the errors is smaller; std: their standard deviation."
@@ -132,7 +132,7 @@ def page(score: TrajectoryScore) -> str:
         f"{len(score.estimate)} poses of {score.reference.name}."
     )
     sections: dict[str, Sequence[Part]] = {
-        "Errors": [EXPLAINED, errors_table(score), png(_errors(score))],
+        "Errors": [EXPLANATION, errors_table(score), png(_errors(score))],
         "Trajectories": ["At the compared poses, the estimate after its alignment.", png(_trajectories(score))],
         "How they were compared": [(("", ""), list(extents(score).items()))],
     }

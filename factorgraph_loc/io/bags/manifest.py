@@ -54,7 +54,7 @@ UNITS = {
 }
 
 
-BESIDE = {
+COMPANIONS = {
     "rig": 'no rig is given: set rig = "NAME.rig.toml" to a file next to this one; `fgloc rigs new` writes one',
     "world": 'no map is given: set world = "NAME.world.toml" to a file next to this one with tags and landmarks',
 }
@@ -125,7 +125,7 @@ def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
     content: dict[str, Any] = {"title": f"The bag {path.name}", "reader": "rosbag"}
     content["path"] = path.relative_to(root).as_posix()
     stem = path.with_suffix("") if path.is_file() else path
-    for kind, advice in BESIDE.items():
+    for kind, advice in COMPANIONS.items():
         if (file := stem.with_name(f"{stem.name}.{kind}.toml")).is_file():
             content[kind] = file.relative_to(root).as_posix()
         else:

@@ -23,7 +23,7 @@ from factorgraph_loc.text import quoted
 from factors.se2 import Array, Integers
 
 JOINTS = "sensor_msgs/msg/JointState"
-APART = 0.5  # of the usual time between messages of a wheel: more between left and right are no pair
+MAX_OFFSET = 0.5  # of the usual time between messages of a wheel: more between left and right are no pair
 ODOMETRY = "nav_msgs/msg/Odometry"
 TWISTS = {  # path of the twist by type
     "geometry_msgs/msg/Twist": "",
@@ -93,7 +93,7 @@ class TwoWheels:
         earlier = np.maximum(later - 1, 0)
         near = np.where(np.abs(r_ns[earlier] - l_ns) <= np.abs(r_ns[later] - l_ns), earlier, later)
         usual = float(np.median(np.diff(l_ns))) if len(l_ns) > 1 else 0.0
-        keep = np.flatnonzero(np.abs(r_ns[near] - l_ns) <= APART * usual)
+        keep = np.flatnonzero(np.abs(r_ns[near] - l_ns) <= MAX_OFFSET * usual)
         t_ns = np.maximum(l_ns, r_ns[near])[keep]
         if not len(t_ns):
             raise InputError(f"{self.rows.source} and {self._right.source}: no messages are near in time")

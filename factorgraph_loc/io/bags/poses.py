@@ -34,7 +34,7 @@ POSES = {  # the path of the pose by message type
     "geometry_msgs/msg/TransformStamped": "transform",
 }
 STATIC = "/tf_static"
-MANY = 2000  # messages of a topic that are looked at
+SAMPLE = 2000  # messages of a topic that are looked at
 ROBOT = ("base_link", "base_footprint", "base")
 ODOMETRY = ("odom", "odom_combined", "odometry")
 WORLD = ("mocap", "vicon", "optitrack", "world", "map")  # measured frames first, then those of estimates
@@ -317,7 +317,7 @@ def tree_of(bag: Bag, notes: list[str]) -> Tree:
 
 
 def _edges(bag: Bag, topic: str) -> Iterator[tuple[str, str]]:
-    for item in islice(bag.messages([topic]), MANY):
+    for item in islice(bag.messages([topic]), SAMPLE):
         transforms: Any = item.message.transforms
         for transform in transforms:
             yield plain(transform.child_frame_id), plain(transform.header.frame_id)

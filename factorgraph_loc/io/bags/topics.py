@@ -34,7 +34,7 @@ DEPTH = 6  # nesting levels of messages
 Row = tuple[Any, ...]
 Clock = Literal["header", "receive"]
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # the latter in old bags
-APART = 0.5  # s; larger differences between topics are clock offsets, not delays
+MAX_DELAY = 0.5  # s; larger differences between topics are clock offsets, not delays
 
 
 class TopicSettings(FileModel):
@@ -293,7 +293,7 @@ def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[str]]:
     # the delay is 0 if the recorder sets both timestamps
     compared = {s.topic.name: s.delay() if s.uses_header else 0.0 for s in stampers}
     known = {name: delay for name, delay in compared.items() if delay is not None}
-    if known and max(known.values()) - min(known.values()) > APART:
+    if known and max(known.values()) - min(known.values()) > MAX_DELAY:
         low, high = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
         warnings.append(
             f"the clocks of {low} and {high} differ by {known[high] - known[low]:.3f} s: "

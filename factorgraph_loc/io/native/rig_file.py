@@ -22,7 +22,7 @@ DEFAULT_RIG = Rig(
 )
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 Drive = Literal["differential", "omnidirectional", "none"]
-AROUND, HEIGHT = 0.25, 1.0  # m: distance of antennas from the robot's centre, height of antennas and camera
+RADIUS, HEIGHT = 0.25, 1.0  # m: distance of antennas from the robot's centre, height of antennas and camera
 FIELD_OF_VIEW = math.radians(60.0)
 # reads of antennas that nobody has calibrated: five in a row count as one, and few are read from behind
 READS = {
@@ -137,8 +137,8 @@ def _antennas(count: int) -> dict[str, dict[str, float]]:
     directions = [se2.wrap_scalar(first + 2.0 * math.pi * i / count) for i in range(count)]
     return {
         str(i): {
-            "x": round(AROUND * math.cos(yaw), 4),
-            "y": round(AROUND * math.sin(yaw), 4),
+            "x": round(RADIUS * math.cos(yaw), 4),
+            "y": round(RADIUS * math.sin(yaw), 4),
             "z": HEIGHT,
             "yaw": yaw,
         }
