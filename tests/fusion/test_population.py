@@ -44,6 +44,7 @@ class World:
         self.motion.add(VelocityOdometry(0.0, SPEED, turn))
         self.truth = START
         self.t = 0.0
+        self.silent = False
 
     def seeker(self):
         return Population(self.motion, BOUNDS, np.random.default_rng(self.rng.integers(2**32)))
@@ -63,7 +64,7 @@ class World:
 
     def hits(self):
         chance = np.stack([self.likelihood.probabilities(self.truth[None], k)[0] for k in range(self.antennas)])
-        return (self.rng.random(chance.shape) < chance).astype(np.int64)
+        return (self.rng.random(chance.shape) < (0.0 if self.silent else chance)).astype(np.int64)
 
 
 def scattered(seed, count=25):
@@ -85,6 +86,21 @@ def test_the_place_is_found_and_claimed():
     poses, weights = seeker.particles
     assert np.allclose(weights @ poses[:, :2], drawn[:, :2].mean(axis=0), atol=0.1)
     assert np.linalg.norm(drawn[:, :2].mean(axis=0) - seeker.best.pose[:2]) < 0.1
+
+
+def test_evidence_favours_a_world_that_fits():
+    found = []
+    for points in (scattered(1), scattered(2)):
+        world = World(scattered(1), 5)
+        other = RfidLikelihood(
+            RIG.rfid.model(), TagArray(np.column_stack((points, np.full(25, 1.2))), np.full(25, np.nan))
+        )
+        seeker = Population(world.motion, BOUNDS, np.random.default_rng(3))
+        world.told = other
+        for _ in range(6):
+            world.scan(seeker)
+        found.append(seeker.log_evidence)
+    assert found[0] > found[1] + 20.0
 
 
 def test_symmetric_places_stay_ambiguous():
@@ -131,6 +147,21 @@ def test_a_place_is_claimed_when_it_is_likely_enough(spread, claimed):
         if first is None and seeker.best is not None:
             first = seeker.best.t
     assert first == claimed
+
+
+def test_found_after_silence():
+    world = World(scattered(4), 2)
+    world.silent = True
+    seeker = world.seeker()
+    for _ in range(6):
+        world.scan(seeker)
+        assert seeker.best is None
+        assert all(np.isfinite(m.pose).all() for m in seeker.hypotheses)
+    world.silent = False
+    for _ in range(12):
+        at = world.scan(seeker)
+    assert seeker.best is not None
+    assert np.linalg.norm(seeker.best.pose[:2] - at[:2]) < 0.5
 
 
 def test_a_scan_that_is_older_than_the_last_is_left_out():
