@@ -22,12 +22,27 @@ def parser(description: str, sections: Sequence[str], out: str) -> argparse.Argu
     made.add_argument(
         "sections", nargs="*", choices=[*sections, []], default=[], metavar="SECTION", help="by default all"
     )
-    made.add_argument("--seeds", type=int, help="simulated logs of each kind; by default as many as the docs say")
+    made.add_argument(
+        "--seeds", type=_at_least_one, help="simulated logs of each kind; by default as many as the docs say"
+    )
     made.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at a time (%(default)s)")
     made.add_argument("--data-root", type=Path, help="folder of recorded data; by default FGLOC_DATA")
     made.add_argument("--docs", type=Path, metavar="PAGE", help="put the tables into this page, below <!-- tables -->")
     made.add_argument("-o", "--out", type=Path, default=Path(out), help="(%(default)s)")
     return made
+
+
+def _at_least_one(text: str) -> int:
+    if int(text) < 1:
+        raise argparse.ArgumentTypeError("expected 1 or more")
+    return int(text)
+
+
+def run_benchmark(description: str, sections: Sequence[str], name: str) -> None:
+    """The command of a benchmark with the common options alone; its package and the folder of its results have its ``name``."""
+    arguments = parser(description, sections, f"out/bench-{name}").parse_args()
+    options = Options(arguments.seeds, arguments.jobs, arguments.data_root, arguments.out)
+    run_sections(f"{name}_benchmark", arguments.sections or sections, options, arguments.docs)
 
 
 def run_sections(package: str, sections: Sequence[str], options: Options, page: Path | None) -> None:
