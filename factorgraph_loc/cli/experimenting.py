@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.experiments.experiment import Done, Prepared
 
 
-CONFIRMED_ABOVE = 2000  # runs above which confirmation is required
+MANY_RUNS = 2000  # runs above which confirmation is required
 SHOWN = 10  # failures and damaged runs that are printed
 
 app = typer.Typer(no_args_is_help=True, help="Experiments: run them, show their status, report their results.")
@@ -81,7 +81,7 @@ def run(
         bool, typer.Option("--verify", help="Compare stored results with their checksums; run damaged ones again.")
     ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and estimate their duration.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help=f"Confirm more than {CONFIRMED_ABOVE:,} runs.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help=f"Confirm more than {MANY_RUNS:,} runs.")] = False,
     json: Json = False,
 ) -> None:
     """Execute the runs of an experiment that have no result yet; can be interrupted and resumed at any time."""
@@ -89,9 +89,7 @@ def run(
     from factorgraph_loc.experiments.plan import MOST_RUNS, TooManyRunsError
 
     try:
-        prepared = prepare(
-            file, **options.given(), verify=verify, most=MOST_RUNS if yes or dry_run else CONFIRMED_ABOVE
-        )
+        prepared = prepare(file, **options.given(), verify=verify, most=MOST_RUNS if yes or dry_run else MANY_RUNS)
     except TooManyRunsError as error:
         if yes or dry_run:
             raise
@@ -151,10 +149,8 @@ def status(
     rows = [[label, *map(str, numbers)] for label, numbers in (*by_label.items(), ("(all)", total))]
     show.table(["label", *STATES], rows)
     _print_damaged(counted.damaged, file)
-    for failure in counted.failures:
-        show.line(
-            f"failed: {failure['log']}, {failure['label']}, seed {failure['seed']}: {failure['kind']}: {failure['reason']}"
-        )
+    for run in counted.failures:
+        show.line(f"failed: {run['log']}, {run['label']}, seed {run['seed']}: {run['kind']}: {run['reason']}")
 
 
 @app.command()

@@ -121,9 +121,7 @@ def _summary(sensor: SensorDescription) -> dict[str, Any]:
 
 
 def _document(sensor: SensorDescription) -> dict[str, Any]:
-    tables = [
-        {"name": name, "columns": [_column(column) for column in columns]} for name, columns in sensor.tables.items()
-    ]
+    tables = [{"name": name, "columns": [_column(c) for c in columns]} for name, columns in sensor.tables.items()]
     return {**_summary(sensor), "tables": tables, "settings": sensor.rig}
 
 
@@ -167,6 +165,4 @@ def _print_settings(settings: Sequence[Setting], hint: str = "", word: str = "se
 
 
 def _estimates(estimator: Description) -> str:
-    return ", ".join(
-        name for name, is_given in (("causal", estimator.causal), ("smoothed", estimator.smoothed)) if is_given
-    )
+    return ", ".join(kind for kind in ("causal", "smoothed") if getattr(estimator, kind))

@@ -269,11 +269,7 @@ def _of_toml(path: str | None) -> Iterator[tuple[str, Path]]:
             named = (
                 file.parent / text for text in _texts(NAMING[file.suffix](file)) if text and len(text.encode()) < 200
             )
-            waiting += [
-                candidate
-                for candidate in named
-                if candidate.is_relative_to(folder) and candidate.is_file() and _is_below(candidate, folder)
-            ]
+            waiting += [p for p in named if p.is_relative_to(folder) and p.is_file() and _is_below(p, folder)]
 
 
 def _is_below(path: Path, folder: Path) -> bool:

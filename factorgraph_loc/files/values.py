@@ -15,7 +15,7 @@ from factorgraph_loc.files.columns import SECONDS, Column
 from factors.se2 import Array
 
 NUMBER = (int, float, np.integer, np.floating)
-LOOP_COUNT = 30  # at most so many numbers: a loop is faster than NumPy
+FEW = 30  # numbers: a loop over at most so many is faster than NumPy
 
 
 def seconds_of(where: str, value: object, name: str = "t") -> float:
@@ -53,11 +53,7 @@ def within(where: str, column: Column, value: object, shape: tuple[int, ...]) ->
     if array.shape != shape:
         raise InputError(f"{where}: {field} has shape {array.shape}, expected {shape}")
     low, high = column.low, column.high
-    if (
-        column.kind != "whole"
-        and array.size <= LOOP_COUNT
-        and all(low <= number <= high for number in array.ravel().tolist())
-    ):
+    if column.kind != "whole" and array.size <= FEW and all(low <= x <= high for x in array.ravel().tolist()):
         return array if shape else float(array)
     if (bad := column.outside(array)).any():
         lack = ", or NaN where not measured" if column.may_lack else ""

@@ -30,7 +30,7 @@ APART = 0.9  # m or (for facings) rad, between candidates
 SAME = 0.05  # m between optima that are considered equal
 MERGED = 0.5  # m, or
 OVERLAP = 9.0  # squared Mahalanobis distance, between modes that are counted as one
-COARSE, FINE = (0.2, 0.15), (0.05, 0.03)  # m and rad within which observations are merged, on the lattice and after
+COARSE, FINE = (0.2, 0.15), (0.05, 0.03)  # m and rad within which counts are merged, on the lattice and after
 GAIN = 8.0  # of the log-likelihood; false reads can reach less at the best of a few thousand positions
 SURE = 0.95  # weight above which a mode is unique
 LARGEST_SIGMA = 1.0  # m
@@ -96,27 +96,27 @@ class TagPosterior:
         return self.is_explained and not self.is_ambiguous and self.modes[0].sigma < LARGEST_SIGMA
 
 
-def search(model: RfidModel, observations: TagReadCounts, heights: Array, facing: Array) -> list[TagPosterior]:
+def search(model: RfidModel, counts: TagReadCounts, heights: Array, facing: Array) -> list[TagPosterior]:
     """Search for T tags with ``heights`` (T,) and ``facing`` (T,), NaN where unknown.
 
-    ``observations``: read counts from known poses, relative to the world's origin.
+    ``counts``: of reads from known poses, relative to the world's origin.
     """
-    observations = merged(observations, *FINE)
+    counts = merged(counts, *FINE)
     uses_facing = any(m.uses_facing for m in model.models)
-    nothing = math.log1p(-model.false_read) * observations.rounds.sum()
-    reads = observations.hits.sum(axis=0)
+    nothing = math.log1p(-model.false_read) * counts.rounds.sum()
+    reads = counts.hits.sum(axis=0)
     odds = math.log(max(model.false_read, 1e-12)) - math.log1p(-model.false_read)
     nowhere = -model.tempering * (nothing + reads * odds)
     # a tag with fewer reads cannot be located
     searched = -model.tempering * reads * odds > GAIN
     coarse = _lattice_search(
-        model, merged(observations, *COARSE), searched, heights, facing if uses_facing else np.full(len(facing), np.nan)
+        model, merged(counts, *COARSE), searched, heights, facing if uses_facing else np.full(len(facing), np.nan)
     )
     if uses_facing and np.isnan(facing[coarse.tag]).any():
         between = np.pi / DIRECTIONS * np.where(np.isnan(facing[coarse.tag]), 1.0, 0.0)
         sides = [TagCandidates(coarse.tag, coarse.places, coarse.facing + s * between) for s in (-1.0, 0.0, 1.0)]
         coarse = TagCandidates(*(np.concatenate([getattr(c, n) for c in sides]) for n in ("tag", "places", "facing")))
-    fine, nll, covariances = refine(model, observations, heights, coarse)
+    fine, nll, covariances = refine(model, counts, heights, coarse)
     out = []
     for t in range(len(heights)):
         mine = np.flatnonzero(fine.tag == t)
@@ -126,15 +126,15 @@ def search(model: RfidModel, observations: TagReadCounts, heights: Array, facing
     return out
 
 
-def merged(observations: TagReadCounts, distance: float, angle: float) -> TagReadCounts:
+def merged(counts: TagReadCounts, distance: float, angle: float) -> TagReadCounts:
     """Read counts with those of one antenna added up while the robot stays within ``distance`` [m] and ``angle`` [rad]."""
-    group = np.empty(len(observations.antennas), dtype=np.int64)
+    group = np.empty(len(counts.antennas), dtype=np.int64)
     first: dict[int, int] = {}
     kept: list[int] = []
-    for k, antenna in enumerate(observations.antennas.tolist()):
+    for k, antenna in enumerate(counts.antennas.tolist()):
         i = first.get(antenna)
         if i is not None:
-            x, y, turned = observations.offsets[k] - observations.offsets[kept[i]]
+            x, y, turned = counts.offsets[k] - counts.offsets[kept[i]]
             if math.hypot(x, y) > distance or abs(wrap_scalar(turned)) > angle:
                 i = None
         if i is None:
@@ -142,17 +142,17 @@ def merged(observations: TagReadCounts, distance: float, angle: float) -> TagRea
             kept.append(k)
         group[k] = i
     rounds = np.zeros(len(kept), dtype=np.int64)
-    hits = np.zeros((len(kept), observations.hits.shape[1]), dtype=np.int64)
-    np.add.at(rounds, group, observations.rounds)
-    np.add.at(hits, group, observations.hits)
-    return TagReadCounts(observations.offsets[kept], observations.antennas[kept], rounds, hits)
+    hits = np.zeros((len(kept), counts.hits.shape[1]), dtype=np.int64)
+    np.add.at(rounds, group, counts.rounds)
+    np.add.at(hits, group, counts.hits)
+    return TagReadCounts(counts.offsets[kept], counts.antennas[kept], rounds, hits)
 
 
 def _lattice_search(
-    model: RfidModel, observations: TagReadCounts, read: NDArray[np.bool_], heights: Array, facing: Array
+    model: RfidModel, counts: TagReadCounts, read: NDArray[np.bool_], heights: Array, facing: Array
 ) -> TagCandidates:
     """The best candidates of each tag that is ``read`` (T,), on a lattice of all places within reach of an antenna."""
-    cells = _cells(observations.offsets[:, :2], reach(model))
+    cells = _cells(counts.offsets[:, :2], reach(model))
     uses_facing = any(m.uses_facing for m in model.models)
     free = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS) if uses_facing else np.array([np.nan])
     levels = np.round(heights / LEVEL)
@@ -164,7 +164,7 @@ def _lattice_search(
             tags = np.flatnonzero(wanted)
             if not len(tags):
                 continue
-            nll = _nll(model, observations, tags, cells, float(level) * LEVEL, float(direction))
+            nll = _nll(model, counts, tags, cells, float(level) * LEVEL, float(direction))
             for column, t in enumerate(tags.tolist()):
                 tables[t].append((nll[:, column], float(direction)))
     rows = [(t, *c) for t, table in enumerate(tables) if table for c in _best(cells, table)]
@@ -186,25 +186,20 @@ def _cells(places: Array, distance: float) -> Array:
 
 
 def _nll(
-    model: RfidModel,
-    observations: TagReadCounts,
-    tags: NDArray[np.int64],
-    cells: Array,
-    height: float,
-    direction: float,
+    model: RfidModel, counts: TagReadCounts, tags: NDArray[np.int64], cells: Array, height: float, direction: float
 ) -> Array:
     """Tempered negative log-likelihood (G, S) of S ``tags`` at all cells."""
     points = np.column_stack((cells, np.full(len(cells), height)))
     likelihood = RfidLikelihood(model, TagArray(points, np.full(len(cells), direction)))
     out = np.zeros((len(cells), len(tags)))
     for antenna in range(len(model.antennas)):
-        mine = np.flatnonzero(observations.antennas == antenna)
+        mine = np.flatnonzero(counts.antennas == antenna)
         for first in range(0, len(mine), LOOKS):
             part = mine[first : first + LOOKS]
-            q = np.clip(likelihood.probabilities(observations.offsets[part], antenna), 1e-12, 1.0 - 1e-12)
+            q = np.clip(likelihood.probabilities(counts.offsets[part], antenna), 1e-12, 1.0 - 1e-12)
             missed = np.log1p(-q)
-            out -= (observations.rounds[part] @ missed)[:, None]
-            hits = observations.hits[np.ix_(part, tags)]
+            out -= (counts.rounds[part] @ missed)[:, None]
+            hits = counts.hits[np.ix_(part, tags)]
             some = hits.any(axis=1)
             out -= (np.log(q[some]) - missed[some]).T @ hits[some]
     return model.tempering * out
@@ -266,14 +261,9 @@ def _modes(optima: TagCandidates, nll: Array, covariances: Array) -> tuple[TagMo
     return tuple(sorted(out, key=lambda mode: -mode.weight))
 
 
-def of_tags(observations: TagReadCounts, tags: Integers) -> TagReadCounts:
+def of_tags(counts: TagReadCounts, tags: Integers) -> TagReadCounts:
     """The read counts of some ``tags`` (C,)."""
-    return TagReadCounts(
-        observations.offsets,
-        observations.antennas,
-        observations.rounds,
-        np.ascontiguousarray(observations.hits[:, tags]),
-    )
+    return TagReadCounts(counts.offsets, counts.antennas, counts.rounds, np.ascontiguousarray(counts.hits[:, tags]))
 
 
 def reach(model: RfidModel) -> float:
@@ -292,7 +282,7 @@ def reach(model: RfidModel) -> float:
 
 
 def refine(
-    model: RfidModel, observations: TagReadCounts, heights: Array, candidates: TagCandidates
+    model: RfidModel, counts: TagReadCounts, heights: Array, candidates: TagCandidates
 ) -> tuple[TagCandidates, Array, Array]:
     """TagCandidates at the nearest local optimum, with negative log-likelihood (C,) and covariance (C, 2, 2)."""
     places, nll = candidates.places.copy(), np.empty(len(candidates.tag))
@@ -301,14 +291,14 @@ def refine(
     for first in range(0, len(nll), CHUNK):
         part = slice(first, first + CHUNK)
         tag, facing = candidates.tag[part], candidates.facing[part]
-        mine = of_tags(observations, tag)
+        mine = of_tags(counts, tag)
         places[part], nll[part], information = _refined(model, mine, heights[tag], facing, places[part])
         covariances[part] = np.linalg.inv(information + prior)
     return TagCandidates(candidates.tag, places, candidates.facing), nll, covariances
 
 
 def _refined(
-    model: RfidModel, observations: TagReadCounts, heights: Array, facing: Array, places: Array
+    model: RfidModel, counts: TagReadCounts, heights: Array, facing: Array, places: Array
 ) -> tuple[Array, Array, Array]:
     """Positions (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2) of C tags, a column of hits each.
 
@@ -317,7 +307,7 @@ def _refined(
 
     def at(places: Array, which: Integers) -> tuple[Array, Array, Array]:
         tags = TagArray(np.column_stack((places, heights[which])), facing[which])
-        return RfidLikelihood(model, tags).by_tag(np.zeros(3), of_tags(observations, which))
+        return RfidLikelihood(model, tags).by_tag(np.zeros(3), of_tags(counts, which))
 
     optima, every = minima(at, places, ITERATIONS, CONVERGED, largest=LARGEST_STEP), np.arange(len(places))
     states, information = optima.states, optima.curvatures

@@ -53,29 +53,19 @@ class MovingThings:
         self._images = [image for image in self._images if image[0].t >= keyframe.t - MAX_TIME]
         for old_keyframe, old_pixels in reversed(self._images):
             if old_keyframe.t < keyframe.t:
-                self._compare(
-                    [name for name in names if name in old_pixels],
-                    old_pixels,
-                    new_pixels,
-                    graph.between(old_keyframe, keyframe),
-                )
+                self._compare(old_pixels, new_pixels, graph.between(old_keyframe, keyframe))
         self._images.append((keyframe, new_pixels))
         known = set[Hashable]().union(*(pixels_by_name for _, pixels_by_name in self._images))
         self._moving &= known
         self._steady &= known
         self._doubts = not self._moving.isdisjoint(names)
 
-    def _compare(
-        self,
-        common: Sequence[Hashable],
-        old_pixels: Mapping[Hashable, Array],
-        new_pixels: Mapping[Hashable, Array],
-        step: Increment,
-    ) -> None:
-        """Learn from the ``common`` tracks of two images, and the ``step`` of the odometry between these."""
+    def _compare(self, old: Mapping[Hashable, Array], new: Mapping[Hashable, Array], step: Increment) -> None:
+        """Learn from the common tracks of two images, pixels by name, and the ``step`` of the odometry between these."""
+        common = [name for name in new if name in old]
         if not common:
             return
-        first, second = (np.array([by_name[name] for name in common]) for by_name in (old_pixels, new_pixels))
+        first, second = (np.array([by_name[name] for name in common]) for by_name in (old, new))
         right = fitting(self._model, first, second, step)
         with_other_turn = another(self._model, first, second, step, right)
         known = np.array([name in self._moving for name in common])

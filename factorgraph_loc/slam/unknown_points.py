@@ -45,7 +45,7 @@ PRIOR_SIGMA = 30.0  # m: weak prior of a point, about the size of a building
 SEARCH_TIME = 10.0  # s for which a lost point is searched: after that, too many others in a building look like it
 LEAST_INLIERS = 0.5  # fraction of inliers required of points not seen for longer: similar descriptors agree by chance
 RECENT = 5.0  # s: the error of a point seen since is correlated with that of the track
-REVISITED = 6  # features of points not seen for longer that are accepted together, whatever the others say
+REVISITED = 6  # features of points not seen for longer that are accepted together, even if the others disagree
 
 
 @dataclass
@@ -63,9 +63,7 @@ class _Point:
 
 @dataclass(frozen=True)
 class _NewImage:
-    """A new ``keyframe`` with its measurement ``m``, the graph, and what is added to that; ``model``: the camera as its constants
-    are estimated now.
-    """
+    """A new ``keyframe`` with its measurement ``m``, the graph, and its ``addition``; ``model``: the camera, with its estimates."""
 
     m: Pixels
     keyframe: Keyframe
@@ -128,9 +126,9 @@ class UnknownPoints:
         rows = list(rows) if m.frame is None else sorted(rows, key=m.frame.tracks.__getitem__)
         names = self._named(m, rows, lifted(model, *guess), graph)
         certain = self._revisited(image, guess, rows, names)
-        sighted = self._chosen(image, rows, names)
-        guess, count = self._see_again(image, guess, sighted, certain)
-        pose = self._begin(image, guess, sighted, PER_KEYFRAME - count, movers)
+        chosen = self._chosen(image, rows, names)
+        guess, count = self._see_again(image, guess, chosen, certain)
+        pose = self._begin(image, guess, chosen, PER_KEYFRAME - count, movers)
         return self._cameras.at_stamp(keyframe.index, (pose, guess[1]), graph)
 
     def _chosen(self, image: _NewImage, rows: Sequence[int], names: Sequence[Hashable]) -> _ChosenSightings:
@@ -143,37 +141,37 @@ class UnknownPoints:
         return _ChosenSightings([rows[i] for i in chosen], [names[i] for i in chosen], pixels, sightings)
 
     def _see_again(
-        self, image: _NewImage, guess: Guess, sighted: _ChosenSightings, certain: set[int]
+        self, image: _NewImage, guess: Guess, chosen: _ChosenSightings, certain: set[int]
     ) -> tuple[Guess, int]:
         """Add the observations of points that are in the graph: the guess, corrected by them, and their number. Those in the rows
         ``certain`` are identified without doubt."""
         m, keyframe = image.m, image.keyframe
-        old = [i for i, name in enumerate(sighted.names) if name in self._points]
-        old = [old[i] for i in spread_out(sighted.pixels[old], PER_KEYFRAME).tolist()]
-        names = [sighted.names[i] for i in old]
-        known = np.array([sighted.rows[i] in certain for i in old], dtype=bool)
+        old = [i for i, name in enumerate(chosen.names) if name in self._points]
+        old = [old[i] for i in spread_out(chosen.pixels[old], PER_KEYFRAME).tolist()]
+        names = [chosen.names[i] for i in old]
+        known = np.array([chosen.rows[i] in certain for i in old], dtype=bool)
         points = [self._points[name] for name in names]
-        guess, tilt, sigma, right = self._placed(image, points, sighted.pixels[old], guess, known)
+        guess, tilt, sigma, right = self._placed(image, points, chosen.pixels[old], guess, known)
         self._tilts(image, tilt, sigma)
         if m.frame is not None:
-            self._remember(m.frame, [sighted.rows[i] for i in old], names, right, keyframe.key, guess)
+            self._remember(m.frame, [chosen.rows[i] for i in old], names, right, keyframe.key, guess)
         for i, agrees in zip(old, right.tolist(), strict=True):
-            self._again(image, sighted.names[i], sighted.sightings[i], agrees, guess[0])
+            self._again(image, chosen.names[i], chosen.sightings[i], agrees, guess[0])
         self._cameras.anchor(keyframe, int(np.count_nonzero(right)))
         return guess, len(old)
 
     def _begin(
-        self, image: _NewImage, guess: Guess, sighted: _ChosenSightings, most: int, movers: MovingThings
+        self, image: _NewImage, guess: Guess, chosen: _ChosenSightings, most: int, movers: MovingThings
     ) -> Array:
         """Collect the sightings of other points, and make variables of at ``most`` this many that are determined now. Returns the
         pose (3,) of the keyframe, adjusted where the points of the graph do not determine it."""
         m, keyframe, graph, addition = image.m, image.keyframe, image.graph, image.addition
-        fresh = [i for i, name in enumerate(sighted.names) if name not in self._points]
+        fresh = [i for i, name in enumerate(chosen.names) if name not in self._points]
         for i in fresh:
-            self._new.add(sighted.names[i], sighted.sightings[i])
+            self._new.add(chosen.names[i], chosen.sightings[i])
         self._new.forget(keyframe.index, movers.moving())
         waiting = [
-            n for i in fresh if self._new.count(n := sighted.names[i]) >= FEWEST_SIGHTINGS and movers.is_static(n)
+            n for i in fresh if self._new.count(n := chosen.names[i]) >= FEWEST_SIGHTINGS and movers.is_static(n)
         ]
         bundle = self._cameras.bundled(keyframe, guess[0], self._new.those(movers.is_static), self._floor.sigma, graph)
         cameras, pose = bundle or (
@@ -185,7 +183,7 @@ class UnknownPoints:
             self._count += 1
             self._points[name] = _Point(key, keyframe.t, positive.inverse(point.covariance), label)
             if m.frame is not None:
-                row = sighted.rows[sighted.names.index(name)]
+                row = chosen.rows[chosen.names.index(name)]
                 self._views.keep(key, m.frame, row, self._distance_travelled, keyframe.key, guess)
             addition.values[key] = point.position
             graph.values[key], graph.spreads[key] = point.position, point.covariance
