@@ -1,15 +1,10 @@
 """From a bag of a robot that nobody knows to a comparison, as docs/rosbags.md tells."""
 
 import json
-import tomllib
 from pathlib import Path
 
-import numpy as np
 import pytest
-import tomli_w
 from scripts_here import run_script
-
-from factorgraph_loc.io.readers import load
 
 
 @pytest.fixture(scope="module")
@@ -40,16 +35,3 @@ def test_from_a_bag_to_a_comparison(recorded, fgloc, monkeypatch):
     pytest.importorskip("rerun", reason="needs the extra viewer")
     assert fgloc("view", "out", "run.toml", "--rrd", "drive.rrd").exit_code == 0
     assert Path("drive.rrd").stat().st_size > 10_000
-
-
-def test_the_wheels_and_what_is_not_read(recorded, fgloc, monkeypatch):
-    monkeypatch.chdir(recorded.parent)
-    manifest = tomllib.loads(fgloc("manifest", "drive.bag").stdout)
-    wheels = {"left": "wheel_left_joint", "right": "wheel_right_joint", "radius": 0.1, "track": 0.4}
-    manifest["options"]["odometry"] = {"topic": "/joint_states", "wheels": wheels}
-    Path("wheels.toml").write_text(tomli_w.dumps(manifest))
-    (by_wheels,), (by_poses,) = load(Path("wheels.toml")), load(Path("run.toml"))
-    assert by_wheels.metadata["not read"] == "/odom (nav_msgs/msg/Odometry), /scan (sensor_msgs/msg/LaserScan)"
-    moved = [log.streams["odometry"] for log in (by_wheels, by_poses)]
-    np.testing.assert_allclose(moved[0].dtheta, moved[1].dtheta, atol=1e-6)
-    assert "not read" in fgloc("info", "wheels.toml").stdout
