@@ -10,6 +10,7 @@ from factorgraph_loc.calibration.learn import Knowledge, has_heading, learn, sen
 from factorgraph_loc.calibration.turns import learn_by_turns
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.measurement import are_alike
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.sensors.smoothed import Traced
@@ -120,7 +121,7 @@ def _check_alike(first: Log, log: Log) -> None:
             if _has(one_log, sensor) and not _has(other_log, sensor):
                 raise InputError(f"{other_log.name}: has no {sensor}, expected one in every log to calibrate from")
     for name, stream in log.streams.items():
-        if name in first.streams and type(first.streams[name]) is not type(stream):
+        if name in first.streams and not are_alike(first.streams[name], stream):
             raise InputError(f"{log.name}: its {name} is of another kind than that of {first.name}")
     if has_heading(log) != has_heading(first):
         raise InputError(

@@ -36,7 +36,8 @@ from factors.update import Correction
 REFUTING = 8.0  # log-odds by which a track must lose: kidnappings are rare
 BEFORE = 2.0  # s before a suspicion, or before the evidence of a change, in which the change may be
 UNSURE = 5.0  # largest difference of a possible change's log-likelihood from the highest
-NEAR, SURE = 0.5, 0.9  # m: a pose is known once it is so near with so much probability
+NEAR, SURE = 0.5, 0.9  # m: a pose is known where it is so near with so much probability
+CERTAIN = NEAR**2 / (-2.0 * math.log(1.0 - SURE))  # m^2: a pose is known with variances of its position below this sum
 PROBATION = 5.0  # s after a track was rejected in which further measurements may contradict the next one
 # m, m, rad: spread of a pose that the search found, as a prior of what follows. The same measurements enter a graph as factors. The
 # particles that found it were moved along an odometry that may have failed.
@@ -108,15 +109,14 @@ class Tracking(Search):
         self._looked: deque[float] = deque()  # times of observations of sensors with a finder
         self._since = -math.inf
         self._rejected = -math.inf  # time of the last rejection of a track by particles
-        self._unsure = False  # whether a track found by particles has not yet been known to half a metre
 
     def is_unsure(self, t: float, covariance: Array) -> bool:
-        """Whether a track that particles found, or whose motion was unknown, has not been known since to :data:`NEAR` with
-        probability :data:`SURE`, nor is by its ``covariance`` (3, 3) at ``t``; whether its motion is unknown; or whether the last
-        track was rejected less than :data:`PROBATION` ago."""
+        """Whether the pose of a track at ``t``, with ``covariance`` (3, 3), is not known to :data:`NEAR` with probability
+        :data:`SURE`, its motion is unknown, or the last track was rejected less than :data:`PROBATION` ago."""
         if self._motion.is_slipping or self._rejected <= t < self._rejected + PROBATION:
             return True
-        return self._unsure and beyond(covariance, NEAR) > 1.0 - SURE
+        # the probability is at most that of a circle as wide as the trace
+        return bool(covariance[0, 0] + covariance[1, 1] > CERTAIN and beyond(covariance, NEAR) > 1.0 - SURE)
 
     @property
     def doubts(self) -> bool:
@@ -152,7 +152,6 @@ class Tracking(Search):
         if isinstance(m, Tick) and not self.waits:
             return None
         odometry, pose, covariance = track()
-        self._unsure = self.is_unsure(odometry.t, covariance)
         finder = None if isinstance(m, Tick) else self._finders.get(m.source)
         if finder is not None:
             since = finder.refuted_since(m, odometry, pose, covariance)
@@ -218,7 +217,6 @@ class Tracking(Search):
     def begin_track(self, *, found: bool) -> None:
         """A track begins: where the search ``found`` it, with the observations that led there again, or at a given prior."""
         self.end()
-        self._unsure = found and self._weighs  # a finder states the covariance of its pose
         if found:
             self._kept.clear()
             self._last.clear()

@@ -166,8 +166,13 @@ def selected(stream: Stream, keep: NDArray[np.bool_]) -> Stream:
     return replace(stream, **kept)
 
 
+def are_alike(first: Stream, second: Stream) -> bool:
+    """Whether two streams are of one kind."""
+    return type(first) is type(second)
+
+
 def joined(first: Stream, second: Stream) -> Stream:
-    if type(first) is not type(second):
+    if not are_alike(first, second):
         kinds = f"{type(first).__name__} and one with {type(second).__name__}"
         raise InputError(f"a log with {kinds} cannot be joined, expected tables of the same kind")
     second_columns = columns_of(second)

@@ -223,14 +223,14 @@ class RfidLikelihood:
         return Score(*kernels.scores(self.packed, self.arrays[1], looks.seen, alpha, poses, no_columns))
 
     def displaced(
-        self, poses: Array, looks: TagReadCounts, shifts: Array, margin: float, parameters: Array, odds: Array
+        self, poses: Array, looks: TagReadCounts, hypotheses: Array, margin: float, parameters: Array, odds: Array
     ) -> tuple[Integers, Array, NDArray[np.bool_]]:
         """The tags (U,) within a ``margin`` [m] of the reach from any of the poses (N, 3), or read, whose ``odds`` (T,) are not
-        ``-inf``; the tempered log-likelihood (U, K) of what was seen of each if it were ``shifts`` (K, 2) from where the map has
-        it, relative to a silence out of reach: the mean of the likelihood over the poses; and which of them were read.
-        ``parameters``: (Q,)."""
+        ``-inf``; the tempered log-likelihood (U, S) of the reads and misses of each for ``hypotheses`` (S, 4) of
+        :mod:`factors.rfid.tag_states`, relative to a silence out of reach: the mean of the likelihood over the poses; and which
+        of them were read. ``parameters``: (Q,)."""
         alpha = float(self.model.tempering)
-        return tag_states.displaced(*self._tabled, looks.seen, poses, margin, odds, shifts, alpha, parameters)
+        return tag_states.displaced(*self._tabled, looks.seen, poses, margin, odds, hypotheses, alpha, parameters)
 
     def log_likelihood(self, poses: Array, looks: TagReadCounts, parameters: Array | None = None) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.weighing`, :mod:`factors.rfid.places`):

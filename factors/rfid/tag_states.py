@@ -1,20 +1,22 @@
-"""Filtering of the state of each tag of a map: as surveyed, moved or dead.
+"""Filtering of the state of each tag of a map: as surveyed, weak, moved or dead.
 
-A tag is *as surveyed*, where the map has it; *moved*, at one of K places around there (:func:`displacements`); or *dead*: broken,
-hidden or gone, and never read. Given the robot's poses, the states of tags are independent, so each tag has a filter of its own,
-whose prediction is trivial, as states last. Of the tags as surveyed a scan tells the pose; of the others it tells their state only.
-With prior odds ``exp(odds)`` of dead or moved against as surveyed, and E the negative log-likelihood of a tag's reads and misses if
-it is as surveyed, relative to a silence out of range, a tag's likelihood of a pose is the mixture
+A tag is *as surveyed*: where the map has it, with the strength of its antenna's model; *weak*: there, but read much less, as on
+metal (:data:`WEAKNESSES`); *moved*: at one of the places around there (:func:`displacements`); or *dead*: broken, hidden or gone,
+and never read. Given the robot's poses, the states of tags are independent. So each tag has a filter of its own, whose prediction
+is trivial, because states last. A scan informs the pose by the tags as surveyed only.
+
+With prior odds ``exp(odds)`` of not as surveyed against as surveyed, and E the negative log-likelihood of a tag's reads and misses
+if it is as surveyed, relative to a silence out of range, a tag's likelihood of a pose is the mixture
 
  log p = log(exp(-E) + exp(odds + elsewhere)) - log(1 + exp(odds)),
 
-where ``elsewhere`` is the log-likelihood of the same reads and misses if the tag is dead or moved: the mean over these states,
-weighed by what is known before the scan, at the pose that was predicted. It is no function of the pose, which bounds what a tag
-costs a pose. As E is tempered, so is the evidence on the state. The odds in a likelihood are those before its scan, so that no
+where ``elsewhere`` is the log-likelihood of the same reads and misses if the tag is not as surveyed: the mean over these states,
+weighted by their probabilities before the scan, at the predicted pose. It is no function of the pose, which bounds the cost of a
+pose by a tag. As E is tempered, so is the evidence on the state. The odds in a likelihood are those before its scan, so that no
 scan is used twice.
 
-How many tags have moved is learnt as well: the more of those that were read are found to have moved, the likelier it is of the next
-one. The share has a beta prior with the mean that the rig tells.
+The share of moved tags is learnt as well, up to :data:`MOST_MOVED`: the more of the tags that were read have moved, the higher is
+the prior of the next one. The share has a beta prior with the mean of the rig.
 """
 
 import math
@@ -35,11 +37,17 @@ from factors.rfid.weighing import FARTHEST_RATIO, fast_exp, mark_near, place_loo
 from factors.se2 import Array, Integers
 
 KEPT = 200.0  # s of evidence that can be taken back
-BELIEVED = 0.5  # probability above which a tag is believed to be dead, or moved
+BELIEVED = 0.5  # probability above which a tag is believed to be dead, weak or moved
 LIMIT = math.log(BELIEVED / (1.0 - BELIEVED))
 PITCH, FARTHEST = 0.5, 1.5  # m: of the grid of displacements, and the largest of them
 WORTH = 20.0  # tags that were read: what the prior of the share of moved ones is worth
-DEAD = 1  # column of the weights: as surveyed, dead, and moved to each place
+# largest learnt share: a wrong pose or a wrong model is likelier than a map of which more tags have moved
+MOST_MOVED = 0.15
+# weak tags: changes of the logarithm of the range and of the logit of the read rate, as of the parameters of a detection model
+# (:mod:`factors.rfid.parameters`), and their shares
+WEAKNESSES = np.array(((0.0, -2.4, 0.5), (0.0, -3.7, 0.1), (-0.5, 0.0, 0.2), (-0.5, -1.0, 0.2)))
+# columns of the weights: as surveyed, then dead, weak, and moved to each place
+DEAD, WEAK, MOVED = 1, 2, 2 + len(WEAKNESSES)
 
 
 def displacements() -> Array:
@@ -50,26 +58,33 @@ def displacements() -> Array:
     return np.asarray(grid[(distance > 0.5 * PITCH) & (distance < FARTHEST + 1e-9)])
 
 
+def hypotheses() -> Array:
+    """The states (S, 4) of a tag that may be read, displacement [m] and change of strength: as surveyed, then weak, then moved."""
+    weak, moves = WEAKNESSES[:, :2], displacements()
+    still, usual = np.zeros_like(weak), np.zeros_like(moves)
+    return np.concatenate((np.zeros((1, 4)), np.hstack((still, weak)), np.hstack((moves, usual))))
+
+
 def _log(probability: float) -> float:
     return math.log(probability) if probability > 0.0 else -math.inf
 
 
 class TagStates:
-    """The states of T tags. ``dead`` and ``moved``: prior probabilities, together below 1, that a tag is so; ``prior``: the
-    log-odds of both."""
+    """The states of T tags. ``dead``, ``weak`` and ``moved``: prior probabilities, together below 1, that a tag is so; ``prior``:
+    the log-odds of all three against as surveyed."""
 
-    def __init__(self, count: int, dead: float, moved: float) -> None:
-        moves = displacements()
-        # of a tag as surveyed, then of moved ones
-        self.places = np.concatenate((np.zeros((1, 2)), moves))
-        each = _log(moved / len(moves))
-        prior = np.array((math.log(1.0 - dead - moved), _log(dead), *(each for _ in moves)))
+    def __init__(self, count: int, dead: float, weak: float, moved: float) -> None:
+        self.hypotheses = hypotheses()
+        places = len(self.hypotheses) - 1 - len(WEAKNESSES)
+        usual = 1.0 - dead - weak - moved
+        shares = (usual, dead, *(weak * WEAKNESSES[:, 2]), *np.full(places, moved / places))
+        prior = np.array([_log(share) for share in shares])
         self._weights = np.tile(prior, (count, 1))  # logarithms, not normalised
-        self._dead, self._moved, self._surveyed, self._raised = dead, moved, prior[0], 0.0
-        self.prior = float(_log(dead + moved) - prior[0])
-        self.odds: Array = np.full(count, self.prior)  # log-odds (T,) of dead or moved against as surveyed
+        self._prior, self._moved, self._raised = prior, moved, 0.0
+        self.prior = _odds(prior)
+        self.odds: Array = np.full(count, self.prior)  # log-odds (T,) of not as surveyed against as surveyed
         self._doubtful: Integers | None = None  # not known
-        # time, tags, and what they told of each state
+        # time, tags, and the log-likelihoods of their states
         self._told: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
         self._heard = -math.inf
 
@@ -80,41 +95,46 @@ class TagStates:
 
     @property
     def doubtful(self) -> Integers:
-        """The tags that are dead or moved with a probability above :data:`BELIEVED`, ascending."""
+        """The tags that are dead, weak or moved with a probability above :data:`BELIEVED`, ascending."""
         if self._doubtful is None:
             self._doubtful = np.flatnonzero(self.odds > LIMIT)
         return self._doubtful
 
     @property
-    def suspects(self) -> dict[int, float]:
-        """The probability of each of these, which is told."""
-        tags = self.doubtful
-        return dict(zip(tags.tolist(), (1.0 / (1.0 + np.exp(-self.odds[tags]))).tolist(), strict=True))
+    def suspects(self) -> dict[str, dict[int, float]]:
+        """By state, the doubtful tags that are most likely dead, weak or moved, with the probability of that."""
+        weights = self._weights[self.doubtful]
+        shares = np.exp(weights - weights.max(axis=1, keepdims=True))
+        shares /= shares.sum(axis=1, keepdims=True)
+        found = np.array((shares[:, DEAD], shares[:, WEAK:MOVED].sum(axis=1), shares[:, MOVED:].sum(axis=1)))
+        likeliest, out = found.argmax(axis=0), dict[str, dict[int, float]]()
+        for i, state in enumerate(("dead", "weak", "moved")):
+            chosen = np.flatnonzero(likeliest == i)
+            out[state] = dict(zip(self.doubtful[chosen].tolist(), found[i, chosen].tolist(), strict=True))
+        return out
 
     def were_read(self, tags: Integers) -> NDArray[np.bool_]:
-        """Which of ``tags`` (U,) were read, which are not dead then."""
+        """Which of ``tags`` (U,) were read, and are not dead therefore."""
         return np.asarray(self._weights[tags, DEAD] == -np.inf)
-
-    def was_read(self, tag: int) -> bool:
-        """Whether a tag was read."""
-        return bool(self.were_read(np.array((tag,)))[0])
 
     def hear(self, t: float, tags: Integers) -> None:
         """Tags (R,) were read at ``t``: they are not dead."""
         if len(tags):
-            self._changed(*_hear(self._weights, self.odds, tags, self._raised, self._moved))
+            if _hear(self._weights, self.odds, tags):
+                self._doubtful = None
+            self._raise_prior()
             self._heard = max(self._heard, t)
 
     def expect(self, tags: Integers, told: Array) -> Array:
-        """The log-likelihood (U,) of what was seen of U ``tags``, of those that are dead or moved. ``told`` (U, 1 + K): the
-        log-likelihoods if they are as surveyed, and at each place, relative to a silence out of range."""
+        """The log-likelihood (U,) of a scan's reads and misses of U ``tags`` that are not as surveyed. ``told`` (U, S): the
+        log-likelihoods for each of the ``hypotheses``, relative to a silence out of range."""
         return _expected(self._weights, tags, told)
 
     def learn(self, t: float, tags: Integers, told: Array) -> None:
-        """Take what was ``told`` (U, 1 + K) of U ``tags`` at ``t``, see :meth:`expect`."""
+        """Add the log-likelihoods ``told`` (U, S) of U ``tags`` at ``t``, see :meth:`expect`."""
         if len(tags):
             self._told.append((t, tags, told.astype(np.float32)))
-            self._changed(*_learn(self._weights, self.odds, tags, self._told[-1][2], 1.0, self._raised, self._moved))
+            self._add(tags, self._told[-1][2], 1.0)
         while self._told and self._told[0][0] < t - KEPT:
             self._told.popleft()
 
@@ -126,18 +146,23 @@ class TagStates:
             if row[0] < since:
                 kept.append(row)
             else:
-                self._changed(*_learn(self._weights, self.odds, row[1], row[2], -1.0, self._raised, self._moved))
+                self._add(row[1], row[2], -1.0)
         self._told = kept
 
-    def _changed(self, doubtful: bool, raised: float) -> None:
-        """Update what depends on the weights; ``doubtful``: whether another set of tags is doubtful; ``raised``: the logarithm by
-        which the prior of moved tags rises."""
-        if doubtful:
+    def _add(self, tags: Integers, told: NDArray[np.float32], sign: float) -> None:
+        if _learn(self._weights, self.odds, tags, told, sign):
             self._doubtful = None
+        self._raise_prior()
+
+    def _raise_prior(self) -> None:
+        """Raise the prior of moved tags to their share, at most :data:`MOST_MOVED`, among the tags that were read."""
+        raised = _raised(self._weights, self.odds, self._moved, self._raised)
         if raised != self._raised:
-            self._weights[:, DEAD + 1 :] += raised - self._raised
+            self._weights[:, MOVED:] += raised - self._raised
             self.odds, self._raised, self._doubtful = _all_odds(self._weights), raised, None
-            self.prior = float(np.logaddexp(_log(self._dead), _log(self._moved) + raised) - self._surveyed)
+            prior = self._prior.copy()
+            prior[MOVED:] += raised
+            self.prior = _odds(prior)
 
 
 @compiled
@@ -165,7 +190,7 @@ def displaced(
     poses: Array,
     margin: float,
     odds: Array,
-    shifts: Array,
+    hypotheses: Array,
     tempering: float,
     parameters: Array,
 ) -> tuple[Integers, Array, NDArray[np.bool_]]:
@@ -183,21 +208,25 @@ def displaced(
     for u in range(len(heard)):
         kept[u] = (kept[u] or heard[u]) and odds[near.tags[u]] > -np.inf
     found = np.flatnonzero(kept)
-    out = np.empty((len(found), len(shifts)))
+    out = np.empty((len(found), len(hypotheses)))
     each = len(poses)
-    size = len(shifts) * each
-    # what is seen of a tag that was moved is what is seen of the map's from poses that were moved the other way
-    moved = np.empty((size, 3))
+    size = len(hypotheses) * each
+    # reads of a tag that was moved are those of the map's tag from poses that were moved the other way
+    moved, changed = np.empty((size, 3)), np.empty((size, len(parameters)))
     for i in range(size):
-        shift, pose = shifts[i // each], poses[i % each]
-        moved[i, 0], moved[i, 1], moved[i, 2] = pose[0] - shift[0], pose[1] - shift[1], pose[2]
+        state, pose = hypotheses[i // each], poses[i % each]
+        moved[i, 0], moved[i, 1], moved[i, 2] = pose[0] - state[0], pose[1] - state[1], pose[2]
+        changed[i] = parameters
+        for m in range(len(packed.kinds)):
+            changed[i, 2 * m] += state[2]
+            changed[i, 2 * m + 1] += state[3]
     at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
     own, product, room = np.empty(size), np.empty(size), np.empty(size)
-    place_looks(placed, moved, looks, parameters.reshape(1, -1), parameters, at, models)
+    place_looks(placed, moved, looks, changed, parameters, at, models)
     matters = np.ones(len(looks[1]), np.bool_)
     for u in range(len(found)):
         weigh_tag(packed, tables, at, models, size, looks, tags, found[u], matters, own, product, room)
-        for i in range(len(shifts)):
+        for i in range(len(hypotheses)):
             most = own[i * each]
             for n in range(i * each + 1, (i + 1) * each):
                 most = max(most, own[n])
@@ -206,7 +235,7 @@ def displaced(
                 own[n] = max(tempering * (own[n] - most), -FARTHEST_RATIO)
         for n in range(size):
             own[n] = fast_exp(own[n])
-        for i in range(len(shifts)):
+        for i in range(len(hypotheses)):
             mean = 0.0
             for n in range(i * each, (i + 1) * each):
                 mean += own[n] / each
@@ -216,77 +245,59 @@ def displaced(
 
 @compiled
 def _log_sum(weights: Array, told: Array) -> float:
-    """The logarithm of the sum of all that ``weights`` and what is ``told``, which is added to all but the first, stand for."""
-    most = weights[0]
-    for k in range(1, len(weights)):
+    """The logarithm of the sum of the exponentials of ``weights`` and ``told`` (N,)."""
+    most = -math.inf
+    for k in range(len(weights)):
         most = max(most, weights[k] + told[k])
-    if most == -np.inf:
+    if most == -math.inf:
         return -math.inf
-    total = math.exp(weights[0] - most)
-    for k in range(1, len(weights)):
+    total = 0.0
+    for k in range(len(weights)):
         total += math.exp(weights[k] + told[k] - most)
     return float(most + math.log(total))
 
 
 @compiled
+def _odds(weights: Array) -> float:
+    """The log-odds of not as surveyed against as surveyed."""
+    return float(_log_sum(weights[DEAD:], np.zeros(len(weights) - DEAD)) - weights[0])
+
+
+@compiled
 def _expected(weights: Array, tags: Integers, told: Array) -> Array:
-    out, nothing = np.empty(len(tags)), np.zeros(told.shape[1])
+    out, added = np.empty(len(tags)), np.zeros(weights.shape[1] - DEAD)
     for u in range(len(tags)):
-        before = _log_sum(weights[tags[u], DEAD:], nothing)
-        out[u] = -np.inf if before == -np.inf else _log_sum(weights[tags[u], DEAD:], told[u]) - before
+        others = weights[tags[u], DEAD:]
+        added[:] = 0.0
+        before = _log_sum(others, added)
+        added[1:] = told[u, 1:]
+        out[u] = -np.inf if before == -np.inf else _log_sum(others, added) - before
     return out
 
 
 @compiled
-def _hear(weights: Array, odds: Array, tags: Integers, raised: float, moved: float) -> tuple[bool, float]:
-    """Take ``tags`` to be not dead. Returns whether another set of tags is doubtful, and the rise of the prior of moved tags."""
+def _hear(weights: Array, odds: Array, tags: Integers) -> bool:
+    """Take ``tags`` to be not dead. Returns whether another set of tags is doubtful."""
     changed = False
     for t in tags:
         if weights[t, DEAD] > -np.inf:
             weights[t, DEAD] = -np.inf
             before, odds[t] = odds[t], _odds(weights[t])
             changed |= (before > LIMIT) != (odds[t] > LIMIT)
-    return changed, _raised(weights, odds, raised, moved)
+    return changed
 
 
 @compiled
-def _learn(
-    weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32], sign: float, raised: float, moved: float
-) -> tuple[bool, float]:
-    """Add log-likelihoods. Returns whether another set of tags is doubtful, and the rise of the prior of moved tags."""
+def _learn(weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32], sign: float) -> bool:
+    """Add log-likelihoods. Returns whether another set of tags is doubtful."""
     changed = False
     for u in range(len(tags)):
         of_tag, before = weights[tags[u]], odds[tags[u]]
-        of_tag[0] += sign * told[u, 0]
-        for k in range(1, told.shape[1]):
-            of_tag[DEAD + k] += sign * told[u, k]
+        for k in range(told.shape[1]):
+            of_tag[k if k < DEAD else k + 1] += sign * told[u, k]
         odds[tags[u]] = _odds(of_tag)
         changed |= (before > LIMIT) != (odds[tags[u]] > LIMIT)
-    return changed, _raised(weights, odds, raised, moved)
-
-
-@compiled
-def _raised(weights: Array, odds: Array, raised: float, moved: float) -> float:
-    """The logarithm by which the prior of moved tags rises, by the share of moved ones among the tags that were read.
-
-    More tags are believed to have moved with a higher prior. The result is the lowest prior that explains itself, which depends on
-    the evidence only, not on its order. ``odds`` (T,) are those with a prior that has risen by ``raised``.
-    """
-    if moved == 0.0:
-        return 0.0
-    out, read = 0.0, 0
-    for t in range(len(odds)):
-        read += weights[t, DEAD] == -np.inf
-    while True:
-        found = 0
-        for t in range(len(odds)):
-            # a tag that was read is not dead, so its odds rise as the prior does
-            found += weights[t, DEAD] == -np.inf and odds[t] - raised + out > LIMIT
-        share = (WORTH * moved + found) / (WORTH + read)
-        higher = math.log(max(share / moved, 1.0))
-        if higher <= out:
-            return out
-        out = higher
+    return changed
 
 
 @compiled
@@ -295,5 +306,34 @@ def _all_odds(weights: Array) -> Array:
 
 
 @compiled
-def _odds(weights: Array) -> float:
-    return float(_log_sum(weights[DEAD:], np.zeros(len(weights) - DEAD)) - weights[0])
+def _raised(weights: Array, odds: Array, moved: float, raised: float) -> float:
+    """The logarithm by which the prior of moved tags rises, by the share of moved ones among the tags that were read.
+
+    More tags are believed to have moved with a higher prior. The result is the lowest prior that explains itself, which depends on
+    the evidence only, not on its order. ``weights`` (T, W) and ``odds`` (T,) are those with a prior that has risen by ``raised``.
+    """
+    if moved == 0.0:
+        return 0.0
+    most, read = max(MOST_MOVED, moved), 0
+    unraised = np.empty(
+        len(odds)
+    )  # log-odds of moved, without the rise, of those tags that could be believed to have moved
+    candidates = 0
+    for t in range(len(odds)):
+        if weights[t, DEAD] > -np.inf:
+            continue
+        read += 1
+        if odds[t] - raised + math.log(most / moved) > LIMIT:
+            moves = _log_sum(weights[t, MOVED:], np.zeros(weights.shape[1] - MOVED))
+            unraised[candidates] = moves - _log_sum(weights[t, :MOVED], np.zeros(MOVED)) - raised
+            candidates += 1
+    out = 0.0
+    while True:
+        found = 0
+        for i in range(candidates):
+            found += unraised[i] + out > LIMIT
+        share = min((WORTH * moved + found) / (WORTH + read), most)
+        higher = math.log(max(share / moved, 1.0))
+        if higher <= out:
+            return out
+        out = higher

@@ -27,7 +27,7 @@ FIELD_OF_VIEW = math.radians(60.0)
 # reads of antennas that nobody has calibrated: five in a row count as one, and few are read from behind
 READS = {
     "tempering": 0.2,
-    "models": {"default": {"kind": "beam", "behind": 0.05}},
+    "models": {"default": {"kind": "beam", "behind": 0.05, "prior": {"range_scale": 0.3, "read_rate": 1.0}}},
     "uncertainty": {"yaw": 0.02, "antenna_yaw": 0.015, "time_offset": 0.02},
 }
 # standard deviations of the constants of wheels that nobody has calibrated

@@ -34,6 +34,7 @@ from factors.se2 import Array, Integers
 CONFIRMED = (
     1.0  # s until a read counts as evidence on the state of its tag: a track that it contradicts may be doubted by then
 )
+CLEAR = math.log(0.99 / 0.01)  # log-odds of a tag that is clearly not as surveyed
 WIDENED = 4.0  # times the standard deviations of the pose for what scans tell of tags: scans in a row have its error in common
 STANDING = np.zeros(3)  # velocity
 EXACT = 0.2  # a survey is exact if its sigma is below this share of `pass_sigma`
@@ -119,8 +120,10 @@ class KnownTags:
             model, self.trust = settings.model(), trust(self.map.sigmas, settings.pass_sigma)
             self._tempering = model.tempering
             self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
-        dead, moved = (0.0, 0.0) if settings is None else (settings.dead_tags, settings.moved_tags)
-        self.states = TagStates(len(self.map.names), dead, moved)
+        shares = (0.0, 0.0, 0.0)
+        if settings is not None:
+            shares = settings.dead_tags, settings.weak_tags, settings.moved_tags
+        self.states = TagStates(len(self.map.names), *shares)
         self._excluded: set[int | None] = set()  # antennas that are dead
         self._waiting: deque[tuple[float, Integers, Array]] = deque()  # what reads told since `CONFIRMED` ago
 
@@ -193,13 +196,22 @@ class KnownTags:
         (Q,): those of the likelihood, as they are estimated to be."""
         assert self.likelihood is not None
         poses = sigma_poses(pose, np.ascontiguousarray(covariance), WIDENED * math.sqrt(3.0))
-        places = self.states.places, FARTHEST, parameters, self.states.odds
+        places = self.states.hypotheses, FARTHEST, parameters, self.states.odds
         return TagEvidence(*self.likelihood.displaced(poses, looks, *places))
 
     def with_states(self, looks: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
         """The looks at tags that may be dead or moved, of which they tell ``evidence``."""
         elsewhere = self.states.expect(evidence.tags, evidence.told)
         return looks.with_states(evidence.tags, self.states.odds[evidence.tags], elsewhere)
+
+    def without_doubtful(self, looks: TagReadCounts) -> TagReadCounts:
+        """The looks, in which a tag that is clearly not as surveyed by now does not inform the pose."""
+        clear = self.states.odds[looks.listed] > CLEAR
+        if not clear.any():
+            return looks
+        return replace(
+            looks, odds=np.where(clear, -math.log(1e-12), looks.odds), elsewhere=np.where(clear, 0.0, looks.elsewhere)
+        )
 
     def learn(self, t: float, evidence: TagEvidence) -> None:
         """Learn of the tags that were not read at ``t``, and of those that were read :data:`CONFIRMED` ago."""
@@ -221,10 +233,8 @@ class KnownTags:
         self.forget(math.nextafter(self.states.heard, math.inf))
 
     def _tell(self) -> None:
-        dead, moved = dict[str, float](), dict[str, float]()
-        for i, p in self.states.suspects.items():
-            (moved if self.states.was_read(i) else dead)[self.map.names[i]] = p
-        self._diagnostics.doubted |= {"dead_tags": dead, "moved_tags": moved}
+        for state, tags in self.states.suspects.items():
+            self._diagnostics.doubted[f"{state}_tags"] = {self.map.names[i]: p for i, p in tags.items()}
 
     def _listening(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
         """The active antennas: row of each, -1 if the rig lacks it; antenna index and number of rounds of each row. Cached, because

@@ -295,9 +295,14 @@ class TagSensor(Sensor):
         return terms
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """The factor as it is, so that no scan is weighed by tag states that were learnt from it. Phase, which has many local
-        optima, is left out while losses are wide."""
-        return None if width > 1.0 and cast(RfidFactor, factor).is_phase else factor
+        """The factor without tags that have clearly moved or died. Others have the odds before their scan, so that no scan is
+        weighed by what was learnt from it. Phase, which has many local optima, is left out while losses are wide."""
+        factor = cast(RfidFactor, factor)
+        if width > 1.0 and factor.is_phase:
+            return None
+        if not isinstance(factor.seen, TagReadCounts):
+            return factor
+        return replace(factor, seen=self.tags.without_doubtful(factor.seen))
 
     def rewind(self, t: float) -> None:
         self.tags.forget(math.nextafter(t, math.inf))

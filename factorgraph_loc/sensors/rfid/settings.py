@@ -34,7 +34,7 @@ class PriorSettings(FileModel):
 
     range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
     """standard deviation of the logarithm of a factor of its range"""
-    read_rate: Annotated[float, Field(ge=0.0, le=3.0)] = 0.5
+    read_rate: Annotated[float, Field(ge=0.0, le=3.0)] = 1.0
     """standard deviation of the logit of its largest probability"""
 
 
@@ -220,6 +220,8 @@ class RfidSettings(SensorSettings):
     """accuracy of the pose from one pass of a tag, for tags with an inexact survey"""
     dead_tags: Share = 0.03
     """prior share of broken, hidden or missing tags of a map"""
+    weak_tags: Share = 0.03
+    """prior share of tags that are read much less than the antennas' models say, as on metal"""
     moved_tags: Share = 0.03
     """prior share of tags that are half a metre or more from where the map has them"""
     uncertainty: RfidUncertainty = Field(default_factory=RfidUncertainty)

@@ -197,6 +197,7 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
         return
     for kind, why in (
         ("dead_tags", "are believed dead, as they were not read from where they should have been"),
+        ("weak_tags", "are probably weak, as they were read much less than the antennas' models say"),
         ("moved_tags", "are believed to have moved, as they were read from elsewhere than they should have been"),
     ):
         if suspects := diagnostics.doubted.get(kind):

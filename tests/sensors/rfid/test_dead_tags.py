@@ -42,9 +42,9 @@ def test_a_tag_is_given_up_and_taken_back(estimator: str) -> None:
     live = robot(estimator)
     for i in range(1, 8):
         live.push(scan(0.1 * i))
-    # seven silences of 0.1 each, from odds of 3 to 97
+    # seven silences of 0.1 each, from odds of 3 to 97; a weak tag, or one that has moved, may be silent as well
     assert live.diagnostics().doubted["dead_tags"].keys() == {"ahead"}
-    assert live.diagnostics().doubted["dead_tags"]["ahead"] > 0.9
+    assert live.diagnostics().doubted["dead_tags"]["ahead"] > 0.8
     live.push(scan(0.8, ("aside", "ahead")))
     assert not live.diagnostics().doubted["dead_tags"]
 
@@ -53,9 +53,11 @@ def test_a_tag_is_given_up_and_taken_back(estimator: str) -> None:
 def test_a_tag_that_comes_back_is_no_reason_to_doubt_the_place(estimator: str) -> None:
     live = robot(estimator)
     for i in range(1, 40):
+        live.push(VelocityOdometry(0.1 * i, 0.0, 0.0))
         live.push(scan(0.1 * i))
     assert live.diagnostics().doubted["dead_tags"].keys() == {"ahead"}
     for i in range(40, 50):
+        live.push(VelocityOdometry(0.1 * i, 0.0, 0.0))
         live.push(scan(0.1 * i, ("aside", "ahead")))
         assert live.estimate().status == "localized"
 
