@@ -147,12 +147,11 @@ def _aligned(trajectory: Trajectory | None, log: Log, align: Alignment, max_gap:
 def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: float = MAX_GAP) -> dict[str, Any]:
     """The figures of one trajectory against the reference, see :func:`errors`; all None without one.
 
-    ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95``, ``max``. ``rpe_*_per_m``: root mean square of
-    the relative errors over ``rpe_pieces`` of a metre of path; ``rpe_*_per_s``: over a second (see
-    :func:`~factorgraph_loc.evaluation.trajectories.score.pose_errors`). ``anees``: mean NEES, ideally 3 (2 if the
-    reference has no heading).
-    ``nees_bounds``: 95 % interval of the mean of as many *independent* NEES; errors along a trajectory are correlated, so a
-    consistent estimator is outside more often. ``coverage_95``: fraction of the times at which the true (x, y) lies in the 95 %
+    ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95``, ``max``. ``rpe_*_per_m``: root mean square of the
+    relative errors over ``rpe_pieces`` of a metre of path; ``rpe_*_per_s``: over a second (see
+    :func:`~factorgraph_loc.evaluation.trajectories.score.pose_errors`). ``anees``: mean NEES, ideally 3 (2 if the reference has no
+    heading). ``nees_bounds``: 95 % interval of the mean of as many *independent* NEES; errors along a trajectory are correlated, so
+    a consistent estimator is outside more often. ``coverage_95``: fraction of the times at which the true (x, y) lies in the 95 %
     ellipse. ``invalid_covariances``: number of scored poses whose covariance is not positive definite, excluded from these three.
     ``scored``: number of poses of the reference with an estimate.
     """

@@ -110,9 +110,7 @@ def mcnemar(a: ArrayLike, b: ArrayLike) -> McNemar:
 
 
 def quantile(values: ArrayLike, share: float) -> float:
-    """The least of the values (N,) that is at least as large as this ``share`` of them; values may be infinite. NaN without
-    values.
-    """
+    """The least of the values (N,) that is at least as large as this ``share`` of them, which may be infinite; NaN if N is 0."""
     known = np.asarray(values, dtype=float)
     return float(np.quantile(known, share, method="inverted_cdf")) if len(known) else math.nan
 

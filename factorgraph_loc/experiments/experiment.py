@@ -30,9 +30,7 @@ PACE = 20.0  # assumed ratio of log time to computing time of an unknown estimat
 
 @dataclass(frozen=True)
 class Prepared:
-    """An experiment with planned ``runs``; its results go to ``folder``, and ``states`` are those of the stored
-    results by key.
-    """
+    """An experiment with planned ``runs``; its results go to ``folder``, and ``states`` are those of the stored results by key."""
 
     experiment: Experiment
     folder: Path

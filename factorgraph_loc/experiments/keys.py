@@ -142,9 +142,7 @@ class _Digests(BaseModel):
 
 
 class FileDigests:
-    """The sha256 of files; with ``cache``, a JSON file, keyed by path, size and modification time, so that a file
-    is read once.
-    """
+    """The sha256 of files; with ``cache``, a JSON file, keyed by path, size and modification time, so that a file is read once."""
 
     def __init__(self, cache: Path | None) -> None:
         self._cache = cache

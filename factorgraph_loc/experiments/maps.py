@@ -64,11 +64,10 @@ class MapOptions:
 
     ``of``: landmarks, tags or points; None: points if the log has images, landmarks if it has sightings of them, else tags.
     ``estimator`` and ``settings``: for landmarks; ``points``: settings of points, fields of
-    :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`. ``extend``: keep the log's map, and add what it lacks.
-    ``poses``: of the robot, for tags: reference, or odometry, with estimation of the poses; None: the reference if there is one.
+    :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`. ``extend``: keep the log's map, and add what it lacks. ``poses``:
+    of the robot, for tags: reference, or odometry, with estimation of the poses; None: the reference if there is one.
     ``tag_height`` [m]: of tags that the log's map lacks; None: that of the antennas. ``drop_dead``: write the log's map without the
-    tags that are believed dead, and map nothing. ``prior``: see
-    :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
+    tags that are believed dead, and map nothing. ``prior``: see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
     """
 
     of: str | None = None

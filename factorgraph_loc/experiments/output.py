@@ -55,16 +55,15 @@ def write_run(
     :func:`~factorgraph_loc.evaluation.metrics.score`.
 
     ``estimates.parquet`` has one row per tick and kind: ``kind`` (causal, final), ``t_ns`` (absolute), ``x``, ``y`` [m],
-    ``heading`` [rad], covariances in the world frame; ``error_position`` [m], ``error_heading`` [rad, absolute] and ``nees`` at
-    the stamp of the reference nearest to the tick (null if another tick is nearer); ``update_ms`` (causal: the slowest update
-    since the previous tick, null if there was none), and of the causal estimate ``status`` and ``doubts_model`` (whether
-    measurements contradict the model of their sensor). ``causal.tum`` contains the
-    estimates from the first localized one on. ``learnt.json``:
-    ``constants`` by name with ``value`` and ``sigma``, ``landmarks`` by name with ``x``, ``y`` [m] and ``covariance`` (xx, xy,
-    yy) [m^2] in the world frame. ``events.csv``: ``t_ns`` (absolute), ``t`` [s from the log's start] and the event.
+    ``heading`` [rad], covariances in the world frame; ``error_position`` [m], ``error_heading`` [rad, absolute] and ``nees`` at the
+    stamp of the reference nearest to the tick (null if another tick is nearer); ``update_ms`` (causal: the slowest update since the
+    previous tick, null if there was none), and of the causal estimate ``status`` and ``doubts_model`` (whether measurements
+    contradict the model of their sensor). ``causal.tum`` contains the estimates from the first localized one on. ``learnt.json``:
+    ``constants`` by name with ``value`` and ``sigma``, ``landmarks`` by name with ``x``, ``y`` [m] and ``covariance`` (xx, xy, yy)
+    [m^2] in the world frame. ``events.csv``: ``t_ns`` (absolute), ``t`` [s from the log's start] and the event.
     ``innovations.parquet``: ``sensor``, ``t_ns`` (absolute), the normalised innovation squared ``nis`` and its degrees of freedom
-    ``dof``, of each update.
-    ``map.world.toml`` and the file of its points: the map with the learnt points, if there are any; see :func:`map_of`.
+    ``dof``, of each update. ``map.world.toml`` and the file of its points: the map with the learnt points, if there are any; see
+    :func:`map_of`.
 
     Everything is written to a temporary folder first; other files in ``out`` are not changed. Raises InputError if ``out``
     contains results and ``overwrite`` is off.

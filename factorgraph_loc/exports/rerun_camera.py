@@ -70,9 +70,7 @@ def _pictures(recording: rr.RecordingStream, at: str, pictures: Sequence[tuple[f
 def _pixels_over_time(
     recording: rr.RecordingStream, at: str, t: Array, pixels: Sequence[Array], labels: Sequence[str] | None = None
 ) -> None:
-    """Points (K, 2) in each image, shifted by half a pixel: the viewer's origin is the corner of the first pixel, not its
-    centre.
-    """
+    """Points (K, 2) in each image, shifted by half a pixel: the viewer's origin is a corner of the first pixel, not its centre."""
     columns = rr.Points2D.columns(positions=np.concatenate(pixels) + 0.5, labels=labels)
     recording.send_columns(at, times(t), columns.partition([len(p) for p in pixels]))
 

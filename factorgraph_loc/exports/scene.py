@@ -58,9 +58,7 @@ def ellipses(trajectory: Trajectory) -> tuple[Array, Array]:
 
 
 def outlines(centres: Array, covariances: Array) -> Array:
-    """Closed outlines (K, L, 2) of the 95 % ellipses of Gaussians with ``centres`` (K, 2) and ``covariances`` (K, 2,
-    2).
-    """
+    """Closed outlines (K, L, 2) of the 95 % ellipses of Gaussians with ``centres`` (K, 2) and ``covariances`` (K, 2, 2)."""
     return drawing_figures.ellipses(centres, covariances, SCALE_95)
 
 

@@ -41,8 +41,7 @@ class ColumnMapping(FileModel):
     file: str
     """file of the table, relative to the path of the manifest"""
     columns: dict[str, str]
-    """column of the file for each field; in JSON lines a path of keys, such as event.epc; without header the number from
-    1"""
+    """column of the file for each field; in JSON lines a path of keys, such as event.epc; without header the number from 1"""
     units: dict[str, str | float] = Field(default_factory=dict)
     """unit of each field, or a factor to ours"""
     separator: Literal[",", ";", "\t", " "] = ","

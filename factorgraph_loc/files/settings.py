@@ -26,9 +26,8 @@ _KINDS = {float: "number", int: "whole number", bool: "true or false", str: "tex
 class Setting:
     """A key of a model, with dots; ``*`` stands for a name of the user's own.
 
-    ``kind``: "number", "whole number", "true or false", "text", "choice", "table", or several of them; ``count``: how many values
-    a list has, 1 for no list, 0 for any number. ``default``: None for nothing. ``low``, ``high``: inclusive bounds, infinite
-    without.
+    ``kind``: "number", "whole number", "true or false", "text", "choice", "table", or several of them; ``count``: how many values a
+    list has, 1 for no list, 0 for any number. ``default``: None for nothing. ``low``, ``high``: inclusive bounds, infinite without.
     """
 
     key: str

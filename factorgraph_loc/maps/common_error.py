@@ -1,9 +1,8 @@
 """The common error of all points of a map near a place, if the map was made without a reference.
 
-Such a map is bent as the drive's trajectory was. A robot that is localized in it has the same error, with any number of points:
-it does not average out, unlike the points' own errors. It is therefore not part of an image's noise, but is added to the
-covariance in the frame of the map. It is the error of the drive's pose at the observation of the points, moved to the robot as a
-rigid body.
+Such a map is bent as the drive's trajectory was. A robot that is localized in it has the same error, with any number of points: it
+does not average out, unlike the points' own errors. It is therefore not part of an image's noise, but is added to the covariance in
+the frame of the map. It is the error of the drive's pose at the observation of the points, moved to the robot as a rigid body.
 """
 
 from __future__ import annotations

@@ -48,8 +48,7 @@ class FramePairs:
     def take(
         self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, predicted: Increment | None
     ) -> Node | None:
-        """Store the ``pixels`` (K, 2) of a keyframe, by ``names`` of tracks, and return the factor with the
-        previous image.
+        """Store the ``pixels`` (K, 2) of a keyframe, by ``names`` of tracks, and return the factor with the previous image.
 
         ``predicted``: the motion from that image's keyframe. None if there is no previous image, or the tracks do not determine
         the motion.

@@ -30,8 +30,7 @@ def bundled(
     poses: Sequence[Array],
     waiting: Mapping[Hashable, Sequence[PointSighting]],
 ) -> list[tuple[Array, Array]] | None:
-    """Adjusted poses (3,) and tilts (2,) of the last of consecutive ``keyframes``, while each shares points with the previous
-    one.
+    """Adjusted poses (3,) and tilts (2,) of the last of consecutive ``keyframes``, while each shares points with the previous one.
 
     The initial values are ``poses``; the first pose is fixed. None with fewer than :data:`ENOUGH` points, or if most sightings of
     a keyframe do not fit.

@@ -38,9 +38,7 @@ def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
 
 
 def _by_turn(prior: SlamState, posterior: SlamState) -> Array:
-    """The difference between two states in the error (12 + P + D,) of one rotation (3,) of the world, without the rotation
-    itself.
-    """
+    """The difference between two states in the error (12 + P + D,) of a rotation (3,) of the world, without the rotation."""
     own, ours = prior.robot, posterior.robot
     change = np.zeros((len(posterior.covariance), 3))
     change[SHIFT] = ours.rotation.T @ cross(own.position - ours.position)

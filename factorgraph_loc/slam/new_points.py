@@ -61,9 +61,7 @@ class KeyframeCamera:
 
 @dataclass(frozen=True, slots=True)
 class TriangulatedPoint:
-    """A point's ``position`` (3,), its ``covariance`` (3, 3) for exact poses, and squared whitened residuals (M,) of its
-    sightings.
-    """
+    """A point's ``position`` (3,), ``covariance`` (3, 3) for exact poses, and squared whitened residuals (M,) of its sightings."""
 
     position: Array
     covariance: Array

@@ -70,8 +70,7 @@ def detect(
 
 
 def orientations(space: ScaleSpace, points: Array, sigmas: Array) -> Array:
-    """The dominant direction (N,) [rad], in (-pi, pi], of E around ``points`` (N, 2) at scales ``sigmas`` (N,), both
-    in px."""
+    """The dominant direction (N,) [rad], in (-pi, pi], of E around ``points`` (N, 2) at scales ``sigmas`` (N,), both in px."""
     patches = space.patches(points, sigmas, np.zeros(len(points)), _OFFSETS)
     histograms = np.zeros((len(points), ORIENTATION_BINS), dtype=np.float32)
     orientation_histograms(patches, ORIENTATION_SIDE, _WEIGHTS, histograms)

@@ -75,10 +75,9 @@ def load(
     """The logs that ``log`` refers to.
 
     ``log``: a manifest, a folder in the native format or its ``run.toml``, a name in ``manifests()``, any path with ``reader``, or
-    a log.
-    ``options``: of the reader, overriding those of a manifest; a list, or text with commas, gives one log per value. ``rig`` and
-    ``world``, values or files, replace those of the log. ``data_root``: a folder that a manifest may lead to besides its own, by
-    default the environment's FGLOC_DATA. InputError describes what is invalid in one line.
+    a log. ``options``: of the reader, overriding those of a manifest; a list, or text with commas, gives one log per value. ``rig``
+    and ``world``, values or files, replace those of the log. ``data_root``: a folder that a manifest may lead to besides its own,
+    by default the environment's FGLOC_DATA. InputError describes what is invalid in one line.
     """
     new_rig = read_rig(rig) if isinstance(rig, str | Path) else rig
     new_world = read_world(world) if isinstance(world, str | Path) else world
