@@ -102,16 +102,20 @@ class TagStates:
 
     @property
     def suspects(self) -> dict[str, dict[int, float]]:
-        """By state, the doubtful tags that are most likely dead, weak or moved, with the probability of that."""
+        """The tags that are dead, weak or moved with a probability above :data:`BELIEVED`, by state, with that probability."""
         weights = self._weights[self.doubtful]
         shares = np.exp(weights - weights.max(axis=1, keepdims=True))
         shares /= shares.sum(axis=1, keepdims=True)
-        found = np.array((shares[:, DEAD], shares[:, WEAK:MOVED].sum(axis=1), shares[:, MOVED:].sum(axis=1)))
-        likeliest, out = found.argmax(axis=0), dict[str, dict[int, float]]()
-        for i, state in enumerate(("dead", "weak", "moved")):
-            chosen = np.flatnonzero(likeliest == i)
-            out[state] = dict(zip(self.doubtful[chosen].tolist(), found[i, chosen].tolist(), strict=True))
-        return out
+        states = {
+            "dead": shares[:, DEAD],
+            "weak": shares[:, WEAK:MOVED].sum(axis=1),
+            "moved": shares[:, MOVED:].sum(axis=1),
+        }
+        believed = {state: np.flatnonzero(share > BELIEVED) for state, share in states.items()}
+        return {
+            state: dict(zip(self.doubtful[rows].tolist(), states[state][rows].tolist(), strict=True))
+            for state, rows in believed.items()
+        }
 
     def were_read(self, tags: Integers) -> NDArray[np.bool_]:
         """Which of ``tags`` (U,) were read, and are not dead therefore."""
