@@ -30,7 +30,7 @@ from factorgraph_loc.text import quoted
 MOST_RUNS = 100_000
 # limits of what is simulated before the first run, each about a quarter of an hour of computing
 MOST_SECONDS = 2_000_000  # of simulated driving
-MOST_LOOKS = 2_000_000_000  # simulated observations of tags, landmarks and points
+MOST_OBSERVATIONS = 2_000_000_000  # simulated observations of tags, landmarks and points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ def plan(
     Estimators are run once for values of a sweep that do not apply to them, deterministic ones with the first seed only.
 
     Before any log is read, raises TooManyRunsError for more than ``most`` runs. Simulated logs with a total length above
-    :data:`MOST_SECONDS`, or with more observations than :data:`MOST_LOOKS`, raise InputError. Before anything runs, raises
+    :data:`MOST_SECONDS`, or with more observations than :data:`MOST_OBSERVATIONS`, raise InputError. Before anything runs, raises
     InputError for an unreadable log, two logs of one name, invalid settings or prior, or a sensor that no log has.
     """
     digests, facts = FileDigests(cache / "digests.json"), Facts(cache / "facts.json")
@@ -178,9 +178,9 @@ def _check_simulated(experiment: Experiment, digests: FileDigests, facts: Facts)
                 new = sum(not facts.has_facts(digests.of_source(source)) for source in sources)
                 size = sources[0].size() if new else (0.0, 0.0)
                 seconds, observations = seconds + new * size[0], observations + new * size[1]
-                if seconds > MOST_SECONDS or observations > MOST_LOOKS:
+                if seconds > MOST_SECONDS or observations > MOST_OBSERVATIONS:
                     what = f"{seconds:,.0f} s and {observations:,.0f} observations of tags, landmarks and points"
-                    expected = f"{MOST_SECONDS:,} s and {MOST_LOOKS:,} observations"
+                    expected = f"{MOST_SECONDS:,} s and {MOST_OBSERVATIONS:,} observations"
                     raise InputError(f"has to simulate drives of {what} or more, expected at most {expected}")
 
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.mapping.tag_looks import TagLooks
+from factorgraph_loc.mapping.tag_observations import TagObservations
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
@@ -36,7 +36,7 @@ INTERPOLATED, LONGEST = 0.05, 2.0  # s between interpolated poses, and at most b
 
 
 def focused(
-    log: Log, observations: TagLooks, learnt: Mapping[int, LearntPoint], keyframes: Trajectory | None = None
+    log: Log, observations: TagObservations, learnt: Mapping[int, LearntPoint], keyframes: Trajectory | None = None
 ) -> dict[int, LearntPoint]:
     """The ``learnt`` positions by tag, improved by the phases of the reads along the log's reference, or along the estimated
     ``keyframes``, which are interpolated.

@@ -13,7 +13,7 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.mapping import mapping
 from factorgraph_loc.mapping.mapping import LandmarkMap
 from factorgraph_loc.mapping.tag_focusing import focused
-from factorgraph_loc.mapping.tag_looks import TagLooks, tag_looks
+from factorgraph_loc.mapping.tag_observations import TagObservations, tag_observations
 from factorgraph_loc.mapping.tag_search import TagMode, TagPosterior, search
 from factorgraph_loc.mapping.tag_slam import tag_slam
 from factorgraph_loc.model.belief import EXACT_SIGMA, LearntPoint, PosePrior
@@ -77,7 +77,7 @@ def map_tags(
 
     Raises InputError if the log lacks what is needed, RunFailedError if no tag could be located.
     """
-    observations = tag_looks(log, height)
+    observations = tag_observations(log, height)
     given = np.isfinite(observations.positions[:, 0])
     known = given if extend else np.zeros_like(given)
     if poses == "reference":
@@ -116,7 +116,7 @@ def map_tags(
 
 
 def _along_reference(
-    log: Log, observations: TagLooks
+    log: Log, observations: TagObservations
 ) -> tuple[dict[int, LearntPoint], Array, list[TagPosterior], Array]:
     """Learnt tags by index; facings (T,); the search result of each tag; and the poses (K, 3) of the antenna observations."""
     if log.reference is None:
@@ -176,7 +176,7 @@ def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
 
 
 def _world(
-    log: Log, observations: TagLooks, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool
+    log: Log, observations: TagObservations, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool
 ) -> World:
     """The map for its file: learnt tags in the frame of the rig's survey, given tags unchanged."""
     survey: SurveySettings = log.rig.of(SurveySettings)

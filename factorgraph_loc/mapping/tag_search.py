@@ -40,7 +40,7 @@ CONVERGED = 1e-3  # m
 LARGEST_STEP = 0.5  # m
 CURVATURE_STEP = 0.02  # m, of the numerical curvature
 CHUNK = 256  # candidates per refinement, to bound the memory
-LOOKS = 2000  # observations per evaluation of the lattice, to bound the memory
+PER_EVALUATION = 2000  # observations per evaluation of the lattice, to bound the memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +194,8 @@ def _nll(
     out = np.zeros((len(cells), len(tags)))
     for antenna in range(len(model.antennas)):
         mine = np.flatnonzero(counts.antennas == antenna)
-        for first in range(0, len(mine), LOOKS):
-            part = mine[first : first + LOOKS]
+        for first in range(0, len(mine), PER_EVALUATION):
+            part = mine[first : first + PER_EVALUATION]
             q = np.clip(likelihood.probabilities(counts.offsets[part], antenna), 1e-12, 1.0 - 1e-12)
             missed = np.log1p(-q)
             out -= (counts.rounds[part] @ missed)[:, None]

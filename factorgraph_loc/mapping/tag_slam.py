@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.fusion.graph.marginals import IndeterminateError
 from factorgraph_loc.fusion.graph.problem import Problem
-from factorgraph_loc.mapping.tag_looks import TagLooks
+from factorgraph_loc.mapping.tag_observations import TagObservations
 from factorgraph_loc.mapping.tag_search import TagPosterior, of_tags, reach, search
 from factorgraph_loc.model.belief import LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
@@ -59,7 +59,11 @@ class TagSlam:
 
 
 def tag_slam(
-    log: Log, observations: TagLooks, prior: PosePrior, known: NDArray[np.bool_], progress: Callable[[float], None]
+    log: Log,
+    observations: TagObservations,
+    prior: PosePrior,
+    known: NDArray[np.bool_],
+    progress: Callable[[float], None],
 ) -> TagSlam:
     """Map the tags that are not ``known`` (T,); known ones stay at ``observations.positions``. The frame is that of the prior."""
     problem = _Problem(log, observations, prior, known)
@@ -80,7 +84,7 @@ def tag_slam(
 class _Problem:
     """The optimisation problem as built so far."""
 
-    def __init__(self, log: Log, observations: TagLooks, prior: PosePrior, known: NDArray[np.bool_]) -> None:
+    def __init__(self, log: Log, observations: TagObservations, prior: PosePrior, known: NDArray[np.bool_]) -> None:
         self._looks, self._prior, self._known = observations, prior, known
         self._constants = log.rig.estimated("odometry")
         wheels = moving(log.streams)

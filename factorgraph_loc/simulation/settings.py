@@ -18,7 +18,7 @@ from factorgraph_loc.sensors.registry import functions, sensors
 from factorgraph_loc.text import quoted
 
 MOST_TAGS = 10_000
-MOST_LOOKS = 50_000_000  # maximum number of simulated observations of one kind, which are all in memory
+MOST_OBSERVATIONS = 50_000_000  # maximum number of simulated observations of one kind, which are all in memory
 Surface = Literal["wall", "shelf", "floor"]
 
 
@@ -116,8 +116,10 @@ class SimulationSettings(FileModel):
     @model_validator(mode="after")
     def _fits(self) -> SimulationSettings:
         for what, count in self.observation_counts().items():
-            if count > MOST_LOOKS:
-                raise ValueError(f"{what} are observed {count:,.0f} times in all, expected at most {MOST_LOOKS:,}")
+            if count > MOST_OBSERVATIONS:
+                raise ValueError(
+                    f"{what} are observed {count:,.0f} times in all, expected at most {MOST_OBSERVATIONS:,}"
+                )
         return self
 
     def observation_counts(self) -> dict[str, float]:

@@ -103,7 +103,7 @@ class Monoslam(Filter):
         super().__init__(setup, settings)
         self._settings = settings
         self.supports_unknown_start = settings.landmarks == "known"
-        self._looker = FeatureMatcher(setup, self.diagnostics, settings.landmarks)
+        self._matcher = FeatureMatcher(setup, self.diagnostics, settings.landmarks)
         self._constants = self._motion.constants
         camera = setup.rig.find(CameraSettings) if any(name in setup.sensors for name in CAMERAS) else None
         self._scale = self._constants.names.index(SCALE) if SCALE in self._constants.names else None
@@ -168,8 +168,8 @@ class Monoslam(Filter):
         return SlamState(robot, np.zeros(len(self._constants.names)), covariance, floor=floor)
 
     def _seek(self, m: Pixels) -> SlamState | None:
-        eye = self._looker.eye
-        camera = None if eye is None else self._looker.relocated(m, eye)
+        eye = self._matcher.eye
+        camera = None if eye is None else self._matcher.relocated(m, eye)
         if eye is None or camera is None:
             return None
         sigmas = self._constants.sigmas
@@ -188,7 +188,7 @@ class Monoslam(Filter):
         return m.modality in self.modalities
 
     def _see(self, m: Pixels) -> None:
-        eye = self._looker.eye
+        eye = self._matcher.eye
         if eye is None:
             self.diagnostics.ignore("camera", len(m.pixels))
             return
@@ -204,9 +204,9 @@ class Monoslam(Filter):
     def _match(self, m: Pixels, state: SlamState, eye: Eye) -> tuple[SlamState, Match]:
         """The state before an image, and its matches. Without a map, the state is widened if wheels slipped by the image."""
         if self._settings.landmarks == "known" or state.image_odometry is None:
-            return state, self._looker.match(m, state, eye)
+            return state, self._matcher.match(m, state, eye)
         slip = self._motion.slip(self._motion.relative(state.image_odometry, self._odometry))
-        return self._looker.unless_slipped(m, state, eye, *slip)
+        return self._matcher.unless_slipped(m, state, eye, *slip)
 
     def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
         """The iterated Kalman update; beyond the gate the noise of a pixel is widened, and Huber weights are applied."""
@@ -249,7 +249,7 @@ class Monoslam(Filter):
         Points in the state are dropped with the old pose.
         """
         lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0
-        camera = self._looker.relocated(m, eye) if lost >= LOST_AFTER or self._is_vague(state) else None
+        camera = self._matcher.relocated(m, eye) if lost >= LOST_AFTER or self._is_vague(state) else None
         relocated = None if camera is None else self._standing(camera, eye, state)
         if relocated is None:
             return replace(state, lost=lost), False
@@ -279,8 +279,8 @@ class Monoslam(Filter):
         state = counted(state, match.expected, frozenset(match.mapped), m.t)
         frame = m.frame
         wanted = min(self._settings.per_image, self._settings.max_points)
-        room = max(0, wanted - self._looker.in_view(state, eye, since=m.t - RECENT))
-        for row in self._looker.new(m, state, eye, match, state.tracks)[:room]:
+        room = max(0, wanted - self._matcher.in_view(state, eye, since=m.t - RECENT))
+        for row in self._matcher.new(m, state, eye, match, state.tracks)[:room]:
             name = f"met{state.met}" if m.names is None else m.names[row]
             descriptor = None if frame is None else frame.descriptors[row]
             grown = with_point(state, MapPoint(name, True, descriptor, m.t), eye, m.pixels[row])

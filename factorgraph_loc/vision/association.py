@@ -84,7 +84,7 @@ class Associator:
         self._seen_from = np.ascontiguousarray(points.seen_from[order], dtype=float)
         self._descriptors: Descriptors = np.ascontiguousarray(points.descriptors[order])
         self._places: KeyframeLooks | None = None
-        self._farthest_look = self._look_alike()
+        self._largest_cost = self._cost_limit()
         corners = np.array(((-0.5, -0.5), (model.width, -0.5), (-0.5, model.height), (model.width, model.height)))
         # wide enough for an uncertain focal length
         self._slopes = 1.3 * np.abs(reprojection.undistorted(model, corners)).max(axis=0)
@@ -126,7 +126,7 @@ class Associator:
         pairs = gated_pairs(predicted[kept], inverses[kept], reaches[kept], features, CELL)
         pairs[:, 0] = np.flatnonzero(kept)[pairs[:, 0]]
         costs = self._costs(pairs, begins, views, frame.descriptors)
-        near = costs <= self._farthest_look
+        near = costs <= self._largest_cost
         pairs, costs = pairs[near], costs[near]
         ratio = RATIO if self._binary else RATIO**2
         pairs = pairs[clear_pairs(pairs, costs, predicted, features, ratio, SAME_PIXEL)]
@@ -184,7 +184,7 @@ class Associator:
             costs = distances(pairs, begins, views, self._descriptors, frame_descriptors)
         return np.asarray(costs)
 
-    def _look_alike(self) -> float:
+    def _cost_limit(self) -> float:
         """Upper limit of the cost of a match: few pairs of views of different points are below it."""
         if len(self._starts) < 3 or len(self._owners) == 0:
             return math.inf

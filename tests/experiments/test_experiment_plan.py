@@ -133,7 +133,7 @@ def test_what_is_to_simulate_is_counted_before_any_log_is_simulated(planned, mon
     """Each kind of limit, with 140 logs; those that are known already need not be simulated."""
     monkeypatch.setattr(keys, "_facts", lambda *_: pytest.fail("a log was looked at"))
     looks = expected.endswith("observations")
-    monkeypatch.setattr(plan_module, "MOST_LOOKS", 28_799_999 if looks else 10**12)
+    monkeypatch.setattr(plan_module, "MOST_OBSERVATIONS", 28_799_999 if looks else 10**12)
     with pytest.raises(InputError, match=rf"^has to simulate drives of .*{expected}.*, expected at most"):
         planned(logs=["one", {"simulate": "office", "settings": settings, "seeds": [3] if looks else range(140)}])
 

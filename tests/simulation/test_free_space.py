@@ -37,11 +37,11 @@ def test_a_line_is_clear_where_all_its_cells_are_free(office):
         a, b = space.centres[rng.integers(len(space.centres), size=2)]
         points = a + np.linspace(0.0, 1.0, max(2, math.ceil(np.hypot(*(b - a)) / SPACING)))[:, None] * (b - a)
         free = bool((space.cells(points) >= 0).all())
-        assert space.clear(a, b) == free
+        assert space.is_clear(a, b) == free
         counts[int(free)] += 1
         assert not (free and crosses(world, a[None], b[None])[0])
     assert counts.min() > 10
-    assert not space.clear(space.centres[0], np.array((-50.0, -50.0)))
+    assert not space.is_clear(space.centres[0], np.array((-50.0, -50.0)))
 
 
 def test_paths_join_their_ends_over_free_cells(office):
@@ -51,7 +51,7 @@ def test_paths_join_their_ends_over_free_cells(office):
         start, end = rng.integers(len(space.centres), size=2).tolist()
         corners = shortest_path(space, start, end)
         np.testing.assert_array_equal(corners[[0, -1]], space.centres[[start, end]])
-        assert all(space.clear(a, b) for a, b in pairwise(corners))
+        assert all(space.is_clear(a, b) for a, b in pairwise(corners))
 
 
 def test_a_world_without_room_is_an_error():

@@ -17,7 +17,7 @@ from factors.se2 import Array
 
 
 @dataclass(frozen=True, eq=False)
-class TagLooks:
+class TagObservations:
     """K antenna observations of T tags, ordered by time. An observation is what one antenna read in some inventory rounds.
 
     ``names``: T EPCs; ``t`` (K,) [s]; ``antennas`` (K,): indices in the ``model``; ``rounds`` (K,); ``hits`` (K, T).
@@ -41,7 +41,7 @@ class TagLooks:
         return TagReadCounts(poses, self.antennas[which], self.rounds[which], self.hits[which])
 
 
-def tag_looks(log: Log, height: float | None = None) -> TagLooks:
+def tag_observations(log: Log, height: float | None = None) -> TagObservations:
     """All antenna observations of the tags that a log read or that its map contains.
 
     Heights and facings come from the map. For other tags the height is ``height`` [m], by default the mean height of the
@@ -70,7 +70,7 @@ def tag_looks(log: Log, height: float | None = None) -> TagLooks:
     has_height = np.append(np.ones(len(given.names), dtype=bool), np.full(unmapped, height is not None))
     if height is None:
         height = float(np.mean([a.z for a in model.antennas]))
-    return TagLooks(
+    return TagObservations(
         model,
         names,
         np.array(t),
