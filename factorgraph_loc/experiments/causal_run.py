@@ -140,20 +140,20 @@ class CausalRun:
     def _initialize(self) -> None:
         assert self.prior is not None
         self._initialized = True
-        with self.guard.telling("the start", self.prior.t):
+        with self.guard.computing("the start", self.prior.t):
             self.estimator.initialize(self.frame.prior(self.prior))
 
     def _update(self, t: float, measurements: Iterator[Measurement]) -> None:
         started = perf_counter()
         for m in measurements:
             self.guard.process(self.estimator, m)
-        with self.guard.telling("the estimate", t):
+        with self.guard.computing("the estimate", t):
             sound(self.estimator.estimate())
         self._update_s.append(perf_counter() - started)
         self._update_t.append(t)
 
     def _tick(self, t: float) -> None:
-        with self.guard.telling("the estimate", t):
+        with self.guard.computing("the estimate", t):
             e = self.frame.estimate(sound(self.estimator.estimate(t)))
         self.guard.process(self.estimator, Tick(t))
         self.estimates.add(t, e)

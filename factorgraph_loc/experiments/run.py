@@ -135,7 +135,7 @@ def _start(use: Use, config: RunConfig, estimator: Estimator, prior: PosePrior |
 def _ended(guard: Guard, estimator: Estimator, frame: MapFrame) -> tuple[Ending, float]:
     """The end of a run, and the seconds that the final trajectory took."""
     started = perf_counter()
-    with guard.telling("the final trajectory"):
+    with guard.computing("the final trajectory"):
         final = frame.trajectory(sound_trajectory(estimator.trajectory()))
         seconds = perf_counter() - started
         diagnostics, learnt = estimator.diagnostics, estimator.learnt()
@@ -221,7 +221,7 @@ def _rehearse(
         estimator = registry.create(config.estimator, replace(setup, rng=np.random.default_rng(config.seed)), settings)
         ticks = Ticks(begin, config.tick_gap)
         CausalRun(guard, estimator, log, setup.sensors, prior, ticks, MapFrame(), end=first + _REHEARSAL).run()
-        with guard.telling("the final trajectory"):
+        with guard.computing("the final trajectory"):
             estimator.trajectory()
 
 

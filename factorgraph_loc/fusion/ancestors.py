@@ -20,15 +20,15 @@ def draw_ancestors(
     predicted: Array,
     constants: Array,
     log_weights: Array,
-    after: Array,
-    constants_after: Array,
+    later: Array,
+    later_constants: Array,
     covariance: Array,
     uniform: Array,
 ) -> Indices:
     """One index (M,) into the N particles for each later state.
 
     ``predicted`` (N, 3): the particles moved without noise; ``constants`` (N, P): their constants; ``log_weights`` (N,);
-    ``after`` (M, 3) and ``constants_after`` (M, P): the later states; ``covariance`` (3+P, 3+P): of the pose's body-frame error and
+    ``later`` (M, 3) and ``later_constants`` (M, P): the later states; ``covariance`` (3+P, 3+P): of the pose's body-frame error and
     of the constants; ``uniform`` (M,): draws from [0, 1).
     """
     size = constants.shape[1]
@@ -40,8 +40,8 @@ def draw_ancestors(
             predicted,
             constants @ by_constants,
             log_weights,
-            after,
-            constants_after @ by_constants,
+            later,
+            later_constants @ by_constants,
             np.ascontiguousarray(whitener[size:, size:]),
             uniform,
         )
@@ -53,36 +53,36 @@ def _draw(
     predicted: Array,
     whitened: Array,
     log_weights: Array,
-    after: Array,
-    whitened_after: Array,
+    later: Array,
+    whitened_later: Array,
     whitener: Array,
     uniform: Array,
 ) -> Indices:
-    """``whitened`` (N, P+3) and ``whitened_after`` (M, P+3): the constants' part of the whitened states; ``whitener`` (3, 3): of
-    what is left of the pose's error."""
+    """``whitened`` (N, P+3) and ``whitened_later`` (M, P+3): the constants' part of the whitened states; ``whitener`` (3, 3): of
+    the pose's error given the constants."""
     count = len(predicted)
     size = whitened.shape[1] - 3
     cosine, sine = np.empty(count), np.empty(count)
     for i in range(count):
         cosine[i], sine[i] = math.cos(predicted[i, 2]), math.sin(predicted[i, 2])
     density = np.empty(count)
-    rows = np.empty(len(after), np.int64)
-    for j in range(len(after)):
+    rows = np.empty(len(later), np.int64)
+    for j in range(len(later)):
         highest = -np.inf
         for i in range(count):
-            dx, dy = after[j, 0] - predicted[i, 0], after[j, 1] - predicted[i, 1]
+            dx, dy = later[j, 0] - predicted[i, 0], later[j, 1] - predicted[i, 1]
             along, lateral = cosine[i] * dx + sine[i] * dy, cosine[i] * dy - sine[i] * dx
-            turn = after[j, 2] - predicted[i, 2]
+            turn = later[j, 2] - predicted[i, 2]
             turn -= 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
             e0 = whitener[0, 0] * along
             e1 = whitener[1, 0] * along + whitener[1, 1] * lateral
             e2 = whitener[2, 0] * along + whitener[2, 1] * lateral + whitener[2, 2] * turn
-            e0 += whitened_after[j, size] - whitened[i, size]
-            e1 += whitened_after[j, size + 1] - whitened[i, size + 1]
-            e2 += whitened_after[j, size + 2] - whitened[i, size + 2]
+            e0 += whitened_later[j, size] - whitened[i, size]
+            e1 += whitened_later[j, size + 1] - whitened[i, size + 1]
+            e2 += whitened_later[j, size + 2] - whitened[i, size + 2]
             squared = e0 * e0 + e1 * e1 + e2 * e2
             for p in range(size):
-                squared += (whitened_after[j, p] - whitened[i, p]) ** 2
+                squared += (whitened_later[j, p] - whitened[i, p]) ** 2
             density[i] = log_weights[i] - 0.5 * squared
             highest = max(highest, density[i])
         if not highest > -np.inf:  # so far away that no density is left: by the weights alone

@@ -34,8 +34,8 @@ class Estimator(Protocol):
         """Start from a Gaussian; before that every estimate is ``unlocalized``. Odometry of before the start may come earlier or
         later than this, but not after the first measurement of another kind.
 
-        A prior without a heading is given only to an estimator of which :func:`finds_heading` is true: no estimate is
-        ``localized`` until what is seen has told the heading.
+        A prior without a heading needs an estimator for which :func:`finds_heading` is true. No estimate is ``localized``
+        before the observations determine the heading.
         """
 
     def process(self, measurement: Measurement) -> None:
@@ -48,7 +48,7 @@ class Estimator(Protocol):
         """The whole belief behind :meth:`estimate`."""
 
     def learnt(self) -> Learnt:
-        """Constants estimated on the way, with what came later, as :meth:`trajectory` has them."""
+        """Constants estimated from all measurements, consistent with :meth:`trajectory`."""
 
     def trajectory(self) -> Trajectory:
         """The best estimate of the whole past, with covariances, at the stamps of the ticks."""
@@ -56,18 +56,18 @@ class Estimator(Protocol):
 
 @runtime_checkable
 class ConcludingEstimator(Protocol):
-    """An estimator whose final trajectory is a solution of its own, which may have something to tell."""
+    """An estimator that solves a separate problem for its final trajectory. That solution may add diagnostics."""
 
     def final_diagnostics(self) -> Diagnostics:
-        """The diagnostics, and what the solution adds to them."""
+        """The diagnostics of the run and of the final solution."""
 
 
 @runtime_checkable
 class ForgettingEstimator(Protocol):
     """An estimator that can run for as long as one likes."""
 
-    def forget(self, before: float) -> None:
-        """Drop what only the trajectory before that time needs, as far as late measurements cannot change it any more."""
+    def forget(self, until: float) -> None:
+        """Drop the trajectory until this time [s], except for the part that late measurements can still change."""
 
 
 def finds_heading(estimator: Estimator) -> bool:

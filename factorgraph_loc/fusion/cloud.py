@@ -25,9 +25,9 @@ NOWHERE = np.zeros(3)
 NO_ODOMETRY = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 MODES = 5  # at most
 REACH = np.array((1.0, 1.0, 0.6))  # m, m, rad: from the middle of a mode to its ends
-BISECTIONS, SMALLEST = 8, 0.01  # of what is left of a likelihood: to find the share that is taken, and the least of it
-LEAST = 1e-3  # of the whole likelihood, that is taken at least: there is an end to what no particle explains
-CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad, in which the heaviest place is looked for
+BISECTIONS, SMALLEST = 8, 0.01  # steps to find the share of the remaining likelihood; least share of it
+LEAST = 1e-3  # least share of the whole likelihood: the steps end even if no particle explains it
+CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad: size of the cells among which the heaviest is sought
 
 T = TypeVar("T")
 Steps = Generator[float, None, T]  # a computation in steps: it yields the work of each step and returns the result
@@ -89,29 +89,29 @@ class Cloud:
         return replace(self, poses=self.poses[some], constants=self.constants[some], log_weights=weights)
 
     def density(self) -> tuple[Cloud, Array]:
-        """The cloud as a density with the moments of what it was drawn from: poses shrunk towards their mean, each with a Gaussian
-        kernel (Liu, West, in "Sequential Monte Carlo Methods in Practice", 2001, eq. 10.3.8) as wide as befits their number
-        (:func:`silverman`). Given the pose the constants are Gaussian: as particles they would die out, of a few families,
-        long before the landmarks have told them apart.
+        """A kernel density with the moments of the sampled density: poses shrunk towards their mean, each with a Gaussian kernel
+        (Liu, West, in "Sequential Monte Carlo Methods in Practice", 2001, eq. 10.3.8). The kernel's width depends on the number
+        of particles (:func:`silverman`). Given the pose the constants are Gaussian. As particles few distinct constants would
+        survive, long before landmarks determine them.
 
         Returns the shrunk cloud and the kernel's covariance (3+P, 3+P), of the pose's body-frame perturbation and of the
-        constants. Where the place is not known there are several modes, and the kernel leaves the poses alone.
+        constants. With several modes the kernel does not change the poses.
         """
         weights = self.weights
         middle, _ = self.moments
         errors, mean, covariance = self._errors()
-        # The covariance of a weighted sample is by sum(w^2) too small, and by more where many descend from few, of which only what
-        # the kernels drew is independent. It is little, but the constants would lose it with each resampling.
+        # The covariance of a weighted sample is too small by the factor 1 - sum(w^2), and smaller still if many particles have few
+        # ancestors. Without a correction the constants would lose this share with each resampling.
         lost = float(weights @ weights)
-        spreads = range(3, len(covariance))
-        covariance[spreads, spreads] += LEAST_VARIANCE
+        diagonal = range(3, len(covariance))
+        covariance[diagonal, diagonal] += LEAST_VARIANCE
         if not self.localized:
             covariance[:3] = covariance[:, :3] = 0.0
             constants = np.broadcast_to(mean[3:], self.constants.shape)
             return replace(self, constants=constants), _inflated(covariance, lost)
         covariance[range(3), range(3)] += MINIMUM_VARIANCE
         renewed = silverman(*errors.shape) ** 2
-        # regression (3, 3+P) on the pose, of itself and of the constants; and what it explains of the covariance
+        # regression (3, 3+P) of pose and constants on the pose, and the covariance that it explains
         by_pose = positive.solve(covariance[:3, :3], covariance[:3])
         explained = covariance[:, :3] @ by_pose
         shrunk = mean + np.sqrt(1.0 - renewed) * (errors[:, :3] - mean[:3]) @ by_pose
@@ -134,20 +134,20 @@ class Cloud:
         )
 
     def modes(self) -> tuple[Mode, ...]:
-        """The places where the weight is, the heaviest first: each with the moments of the particles around it."""
+        """The modes, heaviest first, each with the moments of the particles around it."""
         weights = self.weights
-        found: list[Mode] = []
+        modes: list[Mode] = []
         _, which = np.unique(cell_numbers(self.poses, CELL), return_inverse=True)
         free = np.ones(len(weights), dtype=bool)
-        while len(found) < MODES and weights[free].sum() > 0.01:
+        while len(modes) < MODES and weights[free].sum() > 0.01:
             heaviest = free & (which == np.argmax(np.bincount(which, weights * free)))
             middle, _ = _normalised_moments(self.poses[heaviest], weights[heaviest])
             for _ in range(2):
                 near = free & around(self.poses, middle)
                 middle, covariance = _normalised_moments(self.poses[near], weights[near])
-            found.append(Mode(float(weights[near].sum()), middle, covariance))
+            modes.append(Mode(float(weights[near].sum()), middle, covariance))
             free &= ~near
-        return tuple(sorted(found, key=lambda m: -m.weight))
+        return tuple(sorted(modes, key=lambda m: -m.weight))
 
 
 class Corrected(NamedTuple):
@@ -224,7 +224,7 @@ def around(poses: Array, middle: Array) -> NDArray[np.bool_]:
 
 
 def cell_numbers(poses: Array, cell: Array) -> NDArray[np.int64]:
-    """A number (N,) of the cell in which each pose (N, 3) lies, the cells having the size ``cell`` (3,) [m, m, rad]."""
+    """Numbers (N,) of the cells that contain poses (N, 3). ``cell`` (3,): the size of a cell [m, m, rad]."""
     places = np.floor(poses / cell).astype(np.int64)
     places -= places.min(axis=0)
     size = places.max(axis=0) + 1
@@ -232,8 +232,8 @@ def cell_numbers(poses: Array, cell: Array) -> NDArray[np.int64]:
 
 
 def largest_share(log_weights: Array, likelihood: Array, left: float, enough: float) -> float:
-    """The largest share of the log-likelihood (N,), at most ``left``, that keeps ``enough`` effective particles; not less than
-    :data:`LEAST`, so that a likelihood is taken in a few hundred shares at most."""
+    """The largest share of the log-likelihood (N,), at most ``left``, that keeps ``enough`` effective particles.
+    It is at least :data:`LEAST`, so that a likelihood is applied in a few hundred shares at most."""
 
     def effective(share: float) -> float:
         weighed = log_weights + share * likelihood
@@ -250,10 +250,9 @@ def largest_share(log_weights: Array, likelihood: Array, left: float, enough: fl
 
 
 def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
-    """A log-likelihood (N,) of time ``t`` by which particles of these ``log_weights`` (N,) can be weighed: one for which it is no
-    number is impossible.
+    """A log-likelihood (N,) at time ``t`` [s] with -inf in place of NaN, for particles with ``log_weights`` (N,).
 
-    RunFailedError if none is possible.
+    Such particles are impossible. RunFailedError if all particles are.
     """
     possible = np.isfinite(likelihood)
     if possible.all():
@@ -305,7 +304,7 @@ def _normalised_moments(poses: Array, weights: Array) -> tuple[Array, Array]:
 
 
 class CloudView:
-    """What sensors see of a particle filter, at its time."""
+    """The state of a particle filter as sensors read it, at the time of the filter."""
 
     offset = None
     newest = True

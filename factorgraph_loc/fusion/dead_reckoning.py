@@ -32,7 +32,7 @@ class _PoseRecord:
 
 
 class DeadReckoning(Filter):
-    """Odometry only, with the covariance that grows on the way."""
+    """Odometry only, with a covariance that grows with the distance."""
 
     modalities = frozenset[str]()
     smoothed = False

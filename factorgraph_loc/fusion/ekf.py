@@ -29,10 +29,10 @@ from factors import positive, se2
 from factors.motion import Increment
 from factors.se2 import Array
 
-NOWHERE = slice(POSE, POSE)  # the columns of a block that there is not
-MOST = 150  # components of the error state from which on positions of the map with a sigma are no part of it, but add to the noise
-# A filter begins with a heading of this many times the standard deviation with which it was found: as the same measurements are
-# processed again, a 16th of their information counts twice. Without any heading it would be linearised far from the truth.
+NOWHERE = slice(POSE, POSE)  # the columns of a missing block
+MOST = 150  # components of the error state: above this number, uncertain positions of the map only add to the noise
+# Factor on the standard deviation of a heading from the search, at the start of a filter. The same measurements are processed
+# again, therefore a 16th of their information counts twice. Without any heading the filter would be linearised far from the truth.
 HEADING_WIDENED = 4.0
 
 
@@ -43,9 +43,9 @@ class EkfSettings(FilterSettings):
     """linearisations of an update; 1 is the plain one, more linearise again at the updated pose (Bell and Cathey, 1993);
     sensors such as pixels and tags have as many as they need"""
     self_calibration: bool = True
-    """whether constants to which the rig gives an uncertainty are states"""
+    """whether constants with an uncertainty in the rig are states"""
     landmarks: MapUse = "known"
-    """known takes the map as it is and ignores other landmarks, extended estimates the others, unknown estimates all"""
+    """known: the map is fixed, without other landmarks; extended: the others are estimated; unknown: all are estimated"""
 
 
 class _State(NamedTuple):
@@ -68,11 +68,11 @@ class _State(NamedTuple):
     def with_block(self, new: NewVariable) -> _State:
         """The state with one more block."""
         size, columns = len(self.covariance), self.layout.columns
-        carried, spread = new.joint(self.covariance, columns)
+        cross, own = new.joint(self.covariance, columns)
         end = size + len(new.mean)
         covariance = np.empty((end, end))
         covariance[:size, :size] = self.covariance
-        covariance[size:, :size], covariance[:size, size:], covariance[size:, size:] = carried, carried.T, spread
+        covariance[size:, :size], covariance[:size, size:], covariance[size:, size:] = cross, cross.T, own
         rest = np.concatenate((self.rest, new.mean))
         return _State(self.pose, rest, covariance, self.layout.plus(new.name, len(new.mean)))
 
@@ -92,7 +92,7 @@ class _Record(NamedTuple):
 
 
 class _View:
-    """What sensors see of the filter, at its time."""
+    """The state of the filter as sensors read it, at the time of the filter."""
 
     offset = None
     newest = True
@@ -173,37 +173,37 @@ class Ekf(Filter):
         if self._state is None:
             return Learnt()
         values = {}
-        found, s = self._state.layout.values(self._state.rest), self._state
+        blocks, s = self._state.layout.values(self._state.rest), self._state
         for name, constants in self._blocks:
             if constants.names:
                 part = s.layout.columns[name]
                 sigmas = np.sqrt(np.diag(s.covariance[part, part]))
                 prefix = "" if name == MOTION else f"{name}."
-                for label, value, sigma in zip(constants.names, found.pop(name), sigmas, strict=True):
+                for label, value, sigma in zip(constants.names, blocks.pop(name), sigmas, strict=True):
                     values[prefix + label] = float(value), float(sigma)
         columns = s.layout.columns
-        others = ((name, at, s.covariance[columns[name], columns[name]]) for name, at in found.items())
-        return Learnt(values, learnt_landmarks(others))
+        landmarks = ((name, at, s.covariance[columns[name], columns[name]]) for name, at in blocks.items())
+        return Learnt(values, learnt_landmarks(landmarks))
 
     def trajectory(self) -> Trajectory:
         """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones with ``smooth`` off."""
         records: list[_Record] = self._records
-        if not records:  # nothing told where an unknown start was
+        if not records:  # an unknown start was never determined
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
         smoothed = records[-1].updated
         poses, covariances = [smoothed.pose], [smoothed.covariance[:3, :3]]
-        for after, record in zip(records[:0:-1], records[-2::-1], strict=True):
-            smoothed = self._smoothed(record.updated, after.step, smoothed) if self._smooth else record.updated
+        for later, record in zip(records[:0:-1], records[-2::-1], strict=True):
+            smoothed = self._smoothed(record.updated, later.step, smoothed) if self._smooth else record.updated
             poses.append(smoothed.pose)
             covariances.append(smoothed.covariance[:3, :3])
         times = np.array([r.t for r in records])
         return at_ticks(self._ticks, times, np.array(poses[::-1]), np.array(covariances[::-1]))
 
-    def _smoothed(self, here: _State, step: _Step, after: _State) -> _State:
-        """The state ``here`` given what came later: ``step`` led from it to where ``after`` is the smoothed state."""
-        after = after.first(len(here.covariance))
-        change = np.concatenate((se2.twist_to(step.pose, after.pose), after.rest - here.rest))
-        return here.plus(*positive.smoothed(here.covariance, step.transition, step.noise, change, after.covariance))
+    def _smoothed(self, state: _State, step: _Step, later: _State) -> _State:
+        """The smoothed ``state``; ``step`` leads from it to ``later``, the next smoothed state."""
+        later = later.first(len(state.covariance))
+        change = np.concatenate((se2.twist_to(step.pose, later.pose), later.rest - state.rest))
+        return state.plus(*positive.smoothed(state.covariance, step.transition, step.noise, change, later.covariance))
 
     def _start(self, prior: PosePrior) -> _State:
         sigmas = np.concatenate([constants.sigmas for _, constants in self._blocks])
@@ -225,27 +225,27 @@ class Ekf(Filter):
     def _see(self, m: Measurement) -> None:
         self._step = self._step or self._standstill()
         sensor, view = self._sensors[m.source], _View(self)
-        for seen in sensor.observe(m, view):
-            if isinstance(seen, Link):
+        for observation in sensor.observe(m, view):
+            if isinstance(observation, Link):
                 continue
-            if isinstance(seen, NewVariable):
-                if seen.sightings or len(self._state.covariance) < MOST:
-                    self._state = self._state.with_block(seen)
+            if isinstance(observation, NewVariable):
+                if observation.sightings or len(self._state.covariance) < MOST:
+                    self._state = self._state.with_block(observation)
                 continue
             s = self._state
             values = s.layout.values(s.rest)
-            correction = seen.correct(
-                s.pose, s.covariance, values, s.layout.columns, seen.iterations or self._iterations
+            correction = observation.correct(
+                s.pose, s.covariance, values, s.layout.columns, observation.iterations or self._iterations
             )
-            if seen.is_judged:
-                if not sensor.judge(seen, correction, view):
+            if observation.is_judged:
+                if not sensor.judge(observation, correction, view):
                     continue
-                self._search.slips.add(partial(_at_its_time, seen, s), self._odometry, view, correction)
+                self._search.slips.add(partial(_at_its_time, observation, s), self._odometry, view, correction)
             if self._search.serves(sensor):
-                here = _on_pose(seen, s)
-                self._search.expect(sensor, here, self._odometry, view)
-                evidence = partial(laplace_evidence, here, s.pose, s.covariance[:POSE, :POSE], correction)
-                self._search.keep(sensor, here, self._odometry, evidence)
+                on_pose = _on_pose(observation, s)
+                self._search.expect(sensor, on_pose, self._odometry, view)
+                evidence = partial(laplace_evidence, on_pose, s.pose, s.covariance[:POSE, :POSE], correction)
+                self._search.keep(sensor, on_pose, self._odometry, evidence)
             self._state = s.plus(correction.delta, correction.covariance)
         self._doubt(m)
 
@@ -256,11 +256,11 @@ class Ekf(Filter):
         """Go on at another place where the search rejects the track."""
         view = _View(self)
         refuted = self._search.refuted(m, lambda: Tracked(self._odometry, view.pose, view.covariance), self._pose_back)
-        found = self._search.best if refuted is not None else None
-        if refuted is not None and found is not None:
+        best = self._search.best if refuted is not None else None
+        if refuted is not None and best is not None:
             what = f"lost: {refuted.why} since {refuted.since:.1f} s; goes on at another place"
             self.diagnostics.events.append((m.t, what))
-            self._jump(self._search.brought(found, self._odometry), refuted)
+            self._jump(self._search.brought(best, self._odometry), refuted)
 
     def _pose_back(self, t: float, pose: Array) -> Array:
         """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""
@@ -276,24 +276,24 @@ class Ekf(Filter):
         pose = self._search.best if self._search.look(m, self._odometry) else None
         if pose is None:
             return None
-        self._search.begin_track(found=True)
+        self._search.begin_track(by_search=True)
         self.diagnostics.events.append((m.t, "localized"))
         return self._start(self._search.brought(pose, self._odometry))
 
-    def _jump(self, found: PosePrior, refuted: Refuted) -> None:
+    def _jump(self, best: PosePrior, refuted: Refuted) -> None:
         """Continue at another pose, which is not correlated with the rest of the state.
 
         Constants return to their estimates before the track was wrong.
         """
-        self._search.begin_track(found=True)
+        self._search.begin_track(by_search=True)
         for sensor in self._sensors.values():
             sensor.restart(refuted.since)
         right = next((r.updated for r in reversed(self._records) if r.t < refuted.since), self._state)
         s = right if right.layout == self._state.layout else self._state
-        body = se2.world_to_body(found.pose, found.covariance) + refuted.spread
+        body = se2.world_to_body(best.pose, best.covariance) + refuted.extra_covariance
         covariance = s.covariance.copy()
         covariance[:3], covariance[:, :3], covariance[:3, :3] = 0.0, 0.0, body
-        self._state = s._replace(pose=np.array(found.pose), covariance=covariance)
+        self._state = s._replace(pose=np.array(best.pose), covariance=covariance)
         self._step = _Step(self._state.pose, np.zeros((3, len(covariance))), body)
 
     def _estimate(self) -> PoseEstimate:
@@ -311,13 +311,13 @@ class Ekf(Filter):
         return _Step(self._state.pose, np.eye(3, len(self._state.covariance)), np.zeros((3, 3)))
 
 
-def _on_pose(seen: Observation, state: _State) -> Observation:
+def _on_pose(observation: Observation, state: _State) -> Observation:
     """An observation of the pose alone, with the blocks of a state."""
     values, columns = state.layout.values(state.rest), state.layout.columns
-    spreads = {name: state.covariance[columns[name], columns[name]] for name in seen.blocks}
-    return seen.on_pose({name: values[name] for name in seen.blocks}, spreads)
+    covariances = {name: state.covariance[columns[name], columns[name]] for name in observation.blocks}
+    return observation.on_pose({name: values[name] for name in observation.blocks}, covariances)
 
 
-def _at_its_time(seen: Observation, state: _State) -> Observation | None:
+def _at_its_time(observation: Observation, state: _State) -> Observation | None:
     """:func:`_on_pose` at the time of the observation, if that is possible."""
-    return _on_pose(seen, state).at_its_time()
+    return _on_pose(observation, state).at_its_time()

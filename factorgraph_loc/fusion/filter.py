@@ -1,4 +1,4 @@
-"""What filters have in common: prediction along the odometry, checkpoints for late measurements, and the record of the run."""
+"""The common base of filters: prediction by odometry, checkpoints for late measurements, and the record of the run."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ class Filter(Timeline):
         self._smooth = settings.smooth
         self._rng: np.random.Generator | None = None  # of a filter whose predictions draw
         self._state: Any = None
-        # the last prediction that was asked for, and the state that it began with: the next tick need not go there once more
+        # the last requested prediction and its initial state: the next tick can continue from it
         self._ahead: tuple[Any, Filter] | None = None
         self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        # whether the odometry at the state's time is final: at a start earlier rows may still come
+        # whether the odometry at the state's time is final; at a start earlier rows may still arrive
         self._moves = False
         self._ticks: list[float] = []
         self._records: list[Any] = []
@@ -88,10 +88,10 @@ class Filter(Timeline):
         """Nothing, unless the filter says otherwise."""
         return Learnt()
 
-    def forget(self, before: float) -> None:
-        """Forget the trajectory before then, but not what late measurements may still change."""
+    def forget(self, until: float) -> None:
+        """Forget the trajectory until this time, except for the part that late measurements can still change."""
         self._ahead = None
-        t = min(before, self._t - self._max_delay)
+        t = min(until, self._t - self._max_delay)
         records = max(0, bisect.bisect_left(self._records, t, key=lambda record: record.t) - 1)
         ticks = bisect.bisect_left(self._ticks, self._records[records].t) if records else 0
         del self._records[:records], self._ticks[:ticks]
@@ -99,7 +99,7 @@ class Filter(Timeline):
         def moved(at: _Checkpoint | None) -> _Checkpoint | None:
             return at and at._replace(records=at.records - records, ticks=at.ticks - ticks)
 
-        self._taken = deque(taken._replace(before=moved(taken.before)) for taken in self._taken)
+        self._taken = deque(taken._replace(checkpoint=moved(taken.checkpoint)) for taken in self._taken)
 
     @abstractmethod
     def trajectory(self) -> Trajectory:
@@ -127,10 +127,10 @@ class Filter(Timeline):
 
     @abstractmethod
     def _record(self) -> Any:
-        """What :meth:`trajectory` needs of this time, with its time as ``t``."""
+        """The data at this time that :meth:`trajectory` needs, with the time as ``t``."""
 
     def _seek(self, m: Any) -> Any:
-        """The state from a measurement alone, for an unknown start; None if it gives none."""
+        """The state from a measurement alone, at an unknown start. None if the measurement determines none."""
         return None
 
     def _estimate_at(self, t: float | None) -> PoseEstimate:
@@ -166,7 +166,7 @@ class Filter(Timeline):
         self._t = t
 
     def _travelled(self, t: float) -> Increment:
-        """The motion to ``t``, to which the odometry goes on."""
+        """Advance the odometry to ``t`` and return the motion since its last state."""
         self._odometry, increment = self._motion.travelled(self._odometry, t)
         return increment
 
@@ -193,12 +193,12 @@ class Filter(Timeline):
 
     def _process(self, m: Measurement) -> None:
         again = self._take_back(math.nextafter(m.t, math.inf)) if m.t < self._t else []
-        for one in (m, *again):
-            self._take(one)
+        for measurement in (m, *again):
+            self._take(measurement)
 
     def _take(self, m: Measurement) -> None:
         self._anchor()
-        before = _Checkpoint(self._state, self._t, self._odometry, len(self._records), len(self._ticks))
+        checkpoint = _Checkpoint(self._state, self._t, self._odometry, len(self._records), len(self._ticks))
         added = self.diagnostics.record()
         self._move(m.t)
         if isinstance(m, Tick):
@@ -208,12 +208,12 @@ class Filter(Timeline):
             self._see(m)
         self.diagnostics.added = None
         self._records.append(self._record())
-        self._remember(Taken(m, before, added), self._max_delay)
+        self._remember(Taken(m, checkpoint, added), self._max_delay)
 
     def _go_back(self, taken: Taken) -> None:
-        if taken.before is None:
+        if taken.checkpoint is None:
             return
-        self._state, self._t, self._odometry, records, ticks = taken.before
+        self._state, self._t, self._odometry, records, ticks = taken.checkpoint
         del self._records[records:], self._ticks[ticks:]
         for sensor in self._sensors.values():
             sensor.rewind(self._t)

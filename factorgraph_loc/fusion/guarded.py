@@ -1,9 +1,9 @@
-"""The one boundary around an estimator: what fails in it, and what it says that cannot be, ends as one line.
+"""The boundary around an estimator: a numerical failure and an impossible result become an error of one line.
 
-Whoever runs an estimator asks it through a :class:`Guard`. Numbers that measurements and settings may have can still be such that a
-matrix is singular or a sum overflows, in NumPy, in GTSAM or in compiled code, each with errors of its own: here, and nowhere else,
-they become a :class:`~factorgraph_loc.errors.RunFailedError` that names the estimator, the time and the measurement. What is wrong
-with the program itself (a name, a type, a key) is none of these, and passes.
+Every run calls its estimator through a :class:`Guard`. Valid measurements and settings can still make a matrix singular or a sum
+overflow. NumPy, GTSAM and compiled code raise different errors then. The guard converts them to a
+:class:`~factorgraph_loc.errors.RunFailedError` that names the estimator, the time and the measurement. Errors of the program (a
+name, a type, a key) are not converted.
 """
 
 import math
@@ -24,30 +24,30 @@ from factorgraph_loc.text import plain
 from factors import positive
 from factors.se2 import Array
 
-# singular matrices, overflows, divisions by zero, values that no function takes; all that GTSAM throws
+# singular matrices, overflows, divisions by zero, arguments out of range; all errors of GTSAM
 FAILURES = (ArithmeticError, ValueError, RuntimeError, IndexError)
-ROUNDING = 1e-6  # of a correlation matrix: eigenvalues that are no lower are those of rounding
-LEAST = 1e-9  # what they are raised to
+ROUNDING = 1e-6  # least eigenvalue of a correlation matrix that rounding explains, negated
+LEAST = 1e-9  # eigenvalues are raised to this
 
 
 class Guard:
-    """What runs of an estimator go through: ``guard.process(estimator, measurement)``, ``with guard.telling(what): ...``.
+    """Calls an estimator: ``guard.process(estimator, measurement)``, ``with guard.computing(what): ...``.
 
-    ``who``: the estimator and the log, or the estimator alone. Warnings of NumPy are silent inside, as what comes of them is
-    checked: :func:`sound`, :func:`sound_trajectory`.
+    ``who``: the estimator and the log, or the estimator alone. Warnings of NumPy are silent inside, because :func:`sound` and
+    :func:`sound_trajectory` check the results.
     """
 
     def __init__(self, who: str) -> None:
         self._who = who
-        self._last: Measurement | None = None  # what was taken
-        self._telling = ""  # what it is asked for
-        self._of: float | None = None  # and of which time
+        self._last: Measurement | None = None  # the last measurement
+        self._computing = ""  # the requested result
+        self._of: float | None = None  # the time [s] of that result
         self._silence = np.errstate(all="ignore")
         self._is_quiet = False
 
     @contextmanager
     def quiet(self) -> Iterator[None]:
-        """A context in which NumPy is silent all the time: it costs as much to silence it once as to give one row of odometry."""
+        """A context that silences NumPy for a whole run, because one switch takes as long as one row of odometry."""
         with np.errstate(all="ignore"):
             self._is_quiet = True
             try:
@@ -57,7 +57,7 @@ class Guard:
 
     def process(self, estimator: Estimator, measurement: Measurement) -> None:
         """Give a measurement to the estimator."""
-        self._last, self._telling, self._of = measurement, "", None
+        self._last, self._computing, self._of = measurement, "", None
         if not (self._is_quiet or measurement.is_motion):  # odometry is only stored, without warnings of NumPy
             with self:
                 estimator.process(measurement)
@@ -68,9 +68,9 @@ class Guard:
             self._pass_on(error)
             raise
 
-    def telling(self, what: str, t: float | None = None) -> Self:
-        """A context in which it is asked for something, such as ``the estimate``, of a time [s] or not."""
-        self._telling, self._of = what, t
+    def computing(self, what: str, t: float | None = None) -> Self:
+        """A context for a request of ``what``, such as ``the estimate``, at a time [s] or without one."""
+        self._computing, self._of = what, t
         return self
 
     def __enter__(self) -> Self:
@@ -91,10 +91,10 @@ class Guard:
             raise self._failure(_reason(error)) from error
 
     def _failure(self, why: str) -> RunFailedError:
-        asked = self._telling if self._of is None else f"{self._telling} at {self._of:.3f} s"
+        asked = self._computing if self._of is None else f"{self._computing} at {self._of:.3f} s"
         what = asked or (_named(self._last) if self._last is not None else "its start")
-        after = f" (after {_named(self._last)})" if self._telling and self._last is not None else ""
-        return RunFailedError(f"{self._who}: {what}{after}: {why}")
+        previous = f" (after {_named(self._last)})" if self._computing and self._last is not None else ""
+        return RunFailedError(f"{self._who}: {what}{previous}: {why}")
 
 
 def sound(estimate: PoseEstimate) -> PoseEstimate:
@@ -141,16 +141,16 @@ def sound_trajectory(trajectory: Trajectory) -> Trajectory:
 
 
 def _positive(covariance: Array, where: str = "") -> Array:
-    found = nearest_positive(covariance)
-    if found is None:
+    repaired = nearest_positive(covariance)
+    if repaired is None:
         why = "is not positive definite" if np.all(np.isfinite(covariance)) else "is not finite"
         raise ValueError(f"the covariance{where} {why}")
-    return found
+    return repaired
 
 
 def nearest_positive(covariance: Array) -> Array | None:
-    """The covariance (D, D), or the nearest one that is symmetric and positive definite where it is not by rounding alone; None
-    where it is no covariance."""
+    """The covariance (D, D), or the nearest symmetric positive definite one if only rounding makes it indefinite. None if it is
+    no covariance."""
     sigmas = np.sqrt(np.diag(covariance))
     if not (np.all(np.isfinite(covariance)) and np.all(sigmas > 0.0)):
         return None
@@ -164,8 +164,8 @@ def nearest_positive(covariance: Array) -> Array | None:
     if values[0] > LEAST and np.linalg.eigvalsh(covariance)[0] > 0.0:
         return covariance
     raised = (vectors * np.maximum(values, LEAST)) @ vectors.T
-    found = (raised + raised.T) / 2.0 * (sigmas[:, None] * sigmas)
-    return found if np.all(np.isfinite(found)) else None
+    repaired = (raised + raised.T) / 2.0 * (sigmas[:, None] * sigmas)
+    return repaired if np.all(np.isfinite(repaired)) else None
 
 
 def _named(measurement: Measurement) -> str:

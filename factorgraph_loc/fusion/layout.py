@@ -26,16 +26,16 @@ class Layout:
     @cached_property
     def columns(self) -> Mapping[str, slice]:
         """The columns of each block in the error state."""
-        found, start = {}, POSE
+        columns, start = {}, POSE
         for name, size in self.sizes.items():
-            found[name] = slice(start, start + size)
+            columns[name] = slice(start, start + size)
             start += size
-        return found
+        return columns
 
     def plus(self, name: str, size: int) -> Layout:
         """With one more block, which comes last."""
         return Layout({**self.sizes, name: size})
 
     def values(self, rest: Array) -> dict[str, Array]:
-        """The blocks of a state of which ``rest`` (R,) is all but the pose."""
+        """The blocks of a state by name. ``rest`` (R,): the state without the pose."""
         return {name: rest[part.start - POSE : part.stop - POSE] for name, part in self.columns.items()}

@@ -3,14 +3,14 @@
 Sequential importance resampling (Gordon, Salmond, Smith, 1993) on log-weights; resampling when the effective sample size falls
 below a share of the particles, from their density instead of the particles themselves (regularised particle filter: Musso,
 Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, chapter 12), so that they do not deplete where the motion
-adds next to no noise. Constants of odometry and sensor that are estimated travel with each particle. Their stated spread is a
-little too small where landmarks tell next to nothing of them: resampling moves their mean at random.
+adds next to no noise. Constants of odometry and sensor that are estimated travel with each particle. Their reported covariance
+is slightly too small if landmarks contain little information on them, because resampling moves their mean at random.
 
-Particles move when something is seen, and at least as often as clouds are kept for smoothing, along all of the odometry since. In
-between the estimate is their Gaussian, with the constants, predicted as the EKF predicts its own.
+Particles move by the whole odometry since their last motion, at each observation and whenever a cloud is kept for smoothing. In
+between the estimate is the Gaussian of poses and constants, predicted as in the EKF.
 
-Where the place is not known, at an unknown start or once it is refuted, particles are drawn from what the search among all that is
-seen tells of it (:mod:`~factorgraph_loc.fusion.search`). A start with an unknown heading is such a place.
+At an unknown start, and after the track is rejected, particles are drawn from the posterior of the search
+(:mod:`~factorgraph_loc.fusion.search`). A start with an unknown heading is an unknown start.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ class ParticleFilterSettings(FilterSettings):
     smoothing_interval: Annotated[float, Field(ge=0.1, le=60.0), InUnit("s")] = 1.0
     """time between the clouds through which these are drawn"""
     self_calibration: bool = True
-    """whether constants to which the rig gives an uncertainty travel with each particle; not the time offset of landmarks, and
-    not constants of a camera, which widen its noise"""
+    """whether constants with an uncertainty in the rig travel with each particle; not the time offset of landmarks, and not
+    constants of a camera, which widen its noise"""
 
 
 class ParticleFilter(Filter):
@@ -99,36 +99,36 @@ class ParticleFilter(Filter):
         self._changes: list[tuple[float, Change]] = []  # of the robot's place, each with when it was found out
 
     def belief(self, t: float | None = None) -> Belief:
-        """The particles with their weights, and the Gaussians of their modes; of all, once the place is known."""
+        """The particles with their weights, and the Gaussians of their modes. One Gaussian of all particles once localized."""
         if self._state is None:
             return Belief(())
-        there = self._at(t)
-        cloud = there._moved_on(twin(self._drawn_by))
-        modes = (Mode(1.0, *there._moments()),) if cloud.localized else cloud.modes()
+        predicted = self._at(t)
+        cloud = predicted._moved_on(twin(self._drawn_by))
+        modes = (Mode(1.0, *predicted._moments()),) if cloud.localized else cloud.modes()
         return Belief(modes, cloud.poses, cloud.weights)
 
     def learnt(self) -> Learnt:
         """The constants that are estimated."""
         if self._state is None:
             return Learnt()
-        cloud, values, others = self._state, {}, []
+        cloud, values, landmarks = self._state, {}, []
         labels = {name: constants.names for name, constants in self._blocks}
         for name, part in cloud.parts.items():
             mean, covariance = vector_moments(cloud.constants[:, part], cloud.weights)
             if name not in labels:
-                others.append((name, mean, covariance))
+                landmarks.append((name, mean, covariance))
                 continue
             prefix = "" if name == MOTION else f"{name}."
             for label, value, sigma in zip(labels[name], mean, np.sqrt(np.diag(covariance)), strict=True):
                 values[prefix + label] = float(value), float(sigma)
-        return Learnt(values, learnt_landmarks(others))
+        return Learnt(values, learnt_landmarks(landmarks))
 
     def trajectory(self) -> Trajectory:
         """Mean and covariance of trajectories drawn backwards, or the causal estimates with ``smooth`` off."""
         last = {r.t: r for r in self._records}
         records = [last[t] for t in sorted(set(self._ticks))]
         if not self._smooth or not records:
-            found = [(r.mean, r.covariance) for r in records]
+            moments = [(r.mean, r.covariance) for r in records]
         else:
             kept = [r for r in self._records if r.cloud is not None]
             records = [r for r in records if r.t >= kept[0].t]
@@ -136,23 +136,23 @@ class ParticleFilter(Filter):
                 kept.append(replace(self._records[-1], cloud=self._moved_on(twin(self._smoothing_rng))))
             changes = [change for _, change in self._changes]
             known = is_known(np.array([r.t for r in records]), changes)
-            records = [r for r, told in zip(records, known.tolist(), strict=True) if told]
+            records = [r for r, is_reported in zip(records, known.tolist(), strict=True) if is_reported]
             rng = twin(self._smoothing_rng)
             simulation = BackwardSimulation(
                 kept, self._increment, self._moved, rng, self._settings.smoothing_trajectories, changes
             )
-            found = [simulation.at(r) for r in records]
-        poses = np.array([pose for pose, _ in found]).reshape(-1, 3)
-        return Trajectory(np.array([r.t for r in records]), poses, np.array([c for _, c in found]).reshape(-1, 3, 3))
+            moments = [simulation.at(r) for r in records]
+        poses = np.array([pose for pose, _ in moments]).reshape(-1, 3)
+        return Trajectory(np.array([r.t for r in records]), poses, np.array([c for _, c in moments]).reshape(-1, 3, 3))
 
-    def forget(self, before: float) -> None:
-        """Forget the trajectory before then, from the last cloud back that is kept for smoothing."""
-        clouds = [r.t for r in self._records if r.cloud is not None and r.t <= before]
-        super().forget(max(clouds, default=-math.inf) if self._smooth else before)
+    def forget(self, until: float) -> None:
+        """Forget the trajectory until the last cloud for smoothing at or before this time."""
+        clouds = [r.t for r in self._records if r.cloud is not None and r.t <= until]
+        super().forget(max(clouds, default=-math.inf) if self._smooth else until)
 
     def _start(self, prior: PosePrior) -> Cloud:
         if prior.has_heading:
-            self._search.begin_track(found=False)
+            self._search.begin_track(by_search=False)
             return self._cloud(
                 self._drawn_by.multivariate_normal(prior.pose, prior.covariance, self._settings.particles)
             )
@@ -170,38 +170,38 @@ class ParticleFilter(Filter):
         super()._begin(m)
         if isinstance(m, Tick) and self._search.advance(m.t):
             self._t, self._odometry, self._moves = m.t, self._motion.state(m.t), True
-            found = self._found(m.t)
-            if found is not None:
-                self._state, self._begun = found, m.t
+            cloud = self._sampled_cloud(m.t)
+            if cloud is not None:
+                self._state, self._begun = cloud, m.t
                 self._records.append(self._record())
 
     def _seek(self, m: Measurement) -> Cloud | None:
-        return self._found(self._t) if self._search.look(m, self._odometry) else None
+        return self._sampled_cloud(self._t) if self._search.look(m, self._odometry) else None
 
-    def _found(self, since: float) -> Cloud | None:
-        """Particles drawn from what the search tells, None where it tells nothing; once that is one place a track begins, with what
-        was seen ``since`` then. Their constants are those of a track before, if there was one."""
+    def _sampled_cloud(self, since: float) -> Cloud | None:
+        """Particles drawn from the posterior of the search, None without one. A single pose of the search begins a track with the
+        measurements ``since`` then. The constants of the particles are those of the previous track, if there was one."""
         clouds = (r.cloud for r in reversed(self._records) if r.cloud is not None and r.t < since)
-        before = next((cloud for cloud in clouds if cloud.localized), None)
-        told = self._search.sample(self._drawn_by, self._settings.particles, self._odometry)
-        if told is None:
+        previous = next((cloud for cloud in clouds if cloud.localized), None)
+        sample = self._search.sample(self._drawn_by, self._settings.particles, self._odometry)
+        if sample is None:
             return None
-        cloud = replace(self._cloud(told[0], before), odometry=told[1], localized=self._search.best is not None)
+        cloud = replace(self._cloud(sample[0], previous), odometry=sample[1], localized=self._search.best is not None)
         if cloud.localized:
-            self._search.begin_track(found=True)
+            self._search.begin_track(by_search=True)
             for sensor in self._sensors.values():
                 sensor.restart(since)
             self.diagnostics.event(self._t, "recovered" if self._lost else "localized")
         return cloud
 
-    def _cloud(self, poses: Array, before: Cloud | None = None) -> Cloud:
-        """Particles at poses (N, 3), whose constants are those of others ``before``, or of the prior."""
+    def _cloud(self, poses: Array, previous: Cloud | None = None) -> Cloud:
+        """Particles at poses (N, 3). Their constants are drawn from the cloud ``previous``, or from the prior."""
         count = len(poses)
         poses[:, 2] = se2.wrap(poses[:, 2])
         log_weights = np.full(count, -np.log(count))
-        if before is not None:
-            rows = self._drawn_by.permutation(systematic(before.weights, self._drawn_by, count))
-            return replace(before, poses=poses, constants=before.constants[rows], log_weights=log_weights)
+        if previous is not None:
+            rows = self._drawn_by.permutation(systematic(previous.weights, self._drawn_by, count))
+            return replace(previous, poses=poses, constants=previous.constants[rows], log_weights=log_weights)
         sigmas = np.concatenate([constants.sigmas for _, constants in self._blocks])
         constants = self._drawn_by.standard_normal((count, len(sigmas))) * sigmas
         return Cloud(poses, constants, log_weights, parts=self._parts, odometry=self._odometry)
@@ -225,22 +225,22 @@ class ParticleFilter(Filter):
         return replace(cloud, poses=poses, odometry=self._odometry)
 
     def _moments(self) -> tuple[Array, Array]:
-        """Mean (3,) and covariance (3, 3) in the world's frame of where the robot is now."""
+        """Mean (3,) and covariance (3, 3) of the present pose in the world frame."""
         cloud = self._state
         if cloud.odometry.t == self._t:
             return cloud.moments
         mean, covariance = cloud.joint
         part = cloud.parts.get(MOTION, slice(0, 0))
-        _, pose, _, _, spread = self._motion.predicted(
+        _, pose, _, _, body = self._motion.predicted(
             cloud.odometry, self._t, cloud.moments[0], covariance, mean[part], POSE + part.start
         )
-        return pose, se2.body_to_world_one(pose, spread)
+        return pose, se2.body_to_world_one(pose, body)
 
     def _moved(self, cloud: Cloud, increment: Increment, noise: Array | None = None) -> tuple[Array, Array]:
         """Poses (N, 3) after the increment, each under its own constants, and with body-frame ``noise`` (N, 3), if any.
 
-        Returns also their transition (3, 3+P) from body-frame perturbation and constants. It is taken at the mean of the constants,
-        from which those of the particles differ so little that what they change on the way adds to the noise.
+        Returns also their transition (3, 3+P) from body-frame perturbation and constants, linearised at the mean of the constants.
+        The constants of the particles differ little from their mean. The effect of this difference is added to the noise.
         """
         by_constants = np.zeros((3, cloud.constants.shape[1]))
         delta = increment.delta
@@ -258,27 +258,26 @@ class ParticleFilter(Filter):
         self._state = self._moved_on(self._drawn_by)
         if not self._state.localized:
             if self._search.look(m, self._odometry):
-                self._state = self._found(self._t) or self._state
+                self._state = self._sampled_cloud(self._t) or self._state
             return
         sensor, view = self._sensors[m.source], CloudView(self)
-        for seen in sensor.observe(m, view):
-            if isinstance(seen, Link):
+        for observation in sensor.observe(m, view):
+            if isinstance(observation, NewVariable) and not observation.sightings:
+                new = observation
+                self._state = self._state.with_block(new.name, new.mean, new.noise, self._drawn_by)
+            if isinstance(observation, Link | NewVariable):
                 continue
-            if isinstance(seen, NewVariable):
-                if not seen.sightings:
-                    self._state = self._state.with_block(seen.name, seen.mean, seen.noise, self._drawn_by)
-                continue
-            here = seen
-            if seen.is_judged:
-                spreads = {name: view.spread(name) for name in seen.blocks}
-                here = seen.on_pose(view.values(seen.blocks), spreads)
-                correction = here.correct(view.pose, view.covariance, {}, {}, 1)
-                if not sensor.judge(here, correction, view):
+            on_pose = observation
+            if observation.is_judged:
+                covariances = {name: view.spread(name) for name in observation.blocks}
+                on_pose = observation.on_pose(view.values(observation.blocks), covariances)
+                correction = on_pose.correct(view.pose, view.covariance, {}, {}, 1)
+                if not sensor.judge(on_pose, correction, view):
                     continue
-                self._search.slips.add(here.at_its_time, self._odometry, view, correction)
-                self._search.expect(sensor, here, self._odometry, view)
-            evidence = self._weigh(seen)
-            self._search.keep(sensor, here, self._odometry, partial(float, evidence))
+                self._search.slips.add(on_pose.at_its_time, self._odometry, view, correction)
+                self._search.expect(sensor, on_pose, self._odometry, view)
+            evidence = self._weigh(observation)
+            self._search.keep(sensor, on_pose, self._odometry, partial(float, evidence))
         self._doubt(m)
 
     def _pass(self, tick: Tick) -> None:
@@ -289,23 +288,23 @@ class ParticleFilter(Filter):
             return
         self._state = self._moved_on(self._drawn_by)
         if self._search.advance(tick.t):
-            self._state = self._found(self._t) or self._state
+            self._state = self._sampled_cloud(self._t) or self._state
 
     def _doubt(self, m: Measurement) -> None:
-        """See whether what is seen refutes the particles, and put them where it tells."""
+        """Check whether the observations reject the particles. If they do, draw particles at the pose of the search."""
         view = CloudView(self)
         refuted = self._search.refuted(m, lambda: Tracked(self._odometry, view.pose, view.covariance), self._pose_back)
         if refuted is not None:
-            # for the final trajectory: since then the track was elsewhere
+            # for the final trajectory: the track was wrong since then
             self._records = [r.lost() if r.t >= refuted.since else r for r in self._records]
             self.diagnostics.event(self._t, f"lost: {refuted.why} since {refuted.since:.1f} s")
             self._lost = True
             self._changes.append((self._t, refuted.change))
-            self._state = self._found(refuted.since) or self._state
+            self._state = self._sampled_cloud(refuted.since) or self._state
 
     def _go_back(self, taken: Taken) -> None:
         super()._go_back(taken)
-        self._changes = [(found, change) for found, change in self._changes if found <= self._t]
+        self._changes = [(rejected, change) for rejected, change in self._changes if rejected <= self._t]
 
     def _pose_back(self, t: float, pose: Array) -> Array:
         """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""

@@ -1,13 +1,13 @@
 """The final trajectory of a particle filter, by backward simulation.
 
-Trajectories are drawn backwards through the clouds that were kept (Godsill, Doucet, West, JASA 99(465), 2004). Where the robot
-stands, or where constants travel with the particles, next to nothing is added from one cloud to the next: of the
-particles as they are each would have but one ancestor, and the trajectories would soon coalesce. So a cloud stands for a density
-with Gaussian kernels (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.2), and from
-the kernel of the ancestor the state is drawn given what comes later: one step of Rauch, Tung and Striebel.
+Trajectories are drawn backwards through the clouds that were kept (Godsill, Doucet, West, JASA 99(465), 2004). A robot at
+rest, and constants, have almost no noise between two clouds. Each particle would then have one possible ancestor, and the
+trajectories would soon coalesce. Therefore a cloud represents a density with Gaussian kernels (Musso, Oudjane, Le Gland, in
+"Sequential Monte Carlo Methods in Practice", 2001, section 12.2). The state is drawn from the kernel of the ancestor given the
+later state, by one step of Rauch, Tung and Striebel.
 
-Where no particle explains a later pose the filter was set elsewhere in between: if it was lost, the later pose is carried back by
-odometry, else the trajectory goes on from the filter's own cloud.
+If no particle explains a later pose, the filter was moved to another pose in between. If the filter was lost, the later pose is
+moved back by odometry. Otherwise the trajectory continues from the filter's own cloud.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class BackwardSimulation:
     def at(self, record: Record) -> tuple[Array, Array]:
         """Mean (3,) and covariance (3, 3) in the world's frame of the trajectories at a record between two kept ones."""
         k = int(np.searchsorted(self._t, record.t, side="right")) - 1
-        if any(self._t[k] < after <= record.t for _, after in self._changes):
+        if any(self._t[k] < end <= record.t for _, end in self._changes):
             return self._carried_back(self._drawn[k + 1], self._increment(record, self._kept[k + 1]))
         since = self._increment(self._kept[k], record)
         poses, _ = self._moved(self._drawn[k], since)
@@ -84,20 +84,20 @@ class BackwardSimulation:
             share = since.duration / whole.duration
             poses = se2.compose(poses, se2.exp(share * self._missed[k]))
             extra = share * (1.0 - share) * whole.covariance
-        return _spread(poses, extra)
+        return _moments(poses, extra)
 
     @staticmethod
-    def _carried_back(after: Cloud, increment: Increment) -> tuple[Array, Array]:
-        """The same at a record from which ``increment`` leads to a cloud, where those before tell nothing."""
-        return _spread(se2.compose(after.poses, se2.inverse(increment.delta)), increment.covariance)
+    def _carried_back(later: Cloud, increment: Increment) -> tuple[Array, Array]:
+        """The same at a record before the cloud ``later``, from this cloud and the ``increment`` in between alone."""
+        return _moments(se2.compose(later.poses, se2.inverse(increment.delta)), increment.covariance)
 
-    def _step(self, cloud: Cloud, increment: Increment, after: Cloud) -> tuple[Cloud, Array]:
-        """Where the states ``after`` came from, and the noise (M, 3) of the motion in between."""
-        here, kernel = cloud.density()
-        after = replace(
-            after, constants=after.constants[:, : cloud.constants.shape[1]]
+    def _step(self, cloud: Cloud, increment: Increment, later: Cloud) -> tuple[Cloud, Array]:
+        """The ancestors of the states ``later``, and the noise (M, 3) of the motion in between."""
+        smooth, kernel = cloud.density()
+        later = replace(
+            later, constants=later.constants[:, : cloud.constants.shape[1]]
         )  # without blocks that came later
-        predicted, by_state = self._moved(here, increment)
+        predicted, by_state = self._moved(smooth, increment)
         transition = np.eye(len(kernel))
         transition[:3] = by_state
         carried = transition @ kernel
@@ -105,34 +105,34 @@ class BackwardSimulation:
         covariance[:3, :3] += increment.covariance
         rows = draw_ancestors(
             predicted,
-            here.constants,
-            here.log_weights,
-            after.poses,
-            after.constants,
+            smooth.constants,
+            smooth.log_weights,
+            later.poses,
+            later.constants,
             covariance,
-            self._rng.random(len(after.poses)),
+            self._rng.random(len(later.poses)),
         )
         error = np.concatenate(
-            (se2.log(se2.between(predicted[rows], after.poses)), after.constants - here.constants[rows]), axis=1
+            (se2.log(se2.between(predicted[rows], later.poses)), later.constants - smooth.constants[rows]), axis=1
         )
         gain = positive.solve(covariance, carried).T
         step = error @ gain.T + positive.draws(kernel - gain @ carried, len(rows), self._rng)
-        constants = here.constants[rows] + step[:, 3:]
-        poses = se2.compose(here.poses[rows], se2.exp(step[:, :3]))
+        constants = smooth.constants[rows] + step[:, 3:]
+        poses = se2.compose(smooth.poses[rows], se2.exp(step[:, :3]))
         jumped = np.sum(error[:, :3] * positive.solve(covariance[:3, :3], error[:, :3].T).T, axis=1) > BREAK
         if jumped.any() and cloud.localized:
             poses[jumped] = cloud.poses[systematic(cloud.weights, self._rng, int(jumped.sum()))]
         elif jumped.any():
             noise = positive.draws(increment.covariance, int(jumped.sum()), self._rng)
-            poses[jumped] = se2.compose(after.poses[jumped], se2.inverse(se2.compose(increment.delta, se2.exp(noise))))
-        drawn = replace(after, poses=poses, constants=constants)
-        missed = se2.log(se2.between(self._moved(drawn, increment)[0], after.poses))
+            poses[jumped] = se2.compose(later.poses[jumped], se2.inverse(se2.compose(increment.delta, se2.exp(noise))))
+        drawn = replace(later, poses=poses, constants=constants)
+        missed = se2.log(se2.between(self._moved(drawn, increment)[0], later.poses))
         if cloud.localized:
             missed[jumped] = 0.0
         return drawn, missed
 
 
-def _spread(poses: Array, extra: Array) -> tuple[Array, Array]:
+def _moments(poses: Array, extra: Array) -> tuple[Array, Array]:
     """Mean (3,) and covariance (3, 3) in the world's frame of poses (N, 3), each with a body-frame covariance ``extra`` (3, 3)."""
     mean, covariance = pose_moments(poses, np.full(len(poses), 1.0 / len(poses)))
     return mean, covariance + se2.body_to_world(mean, extra)

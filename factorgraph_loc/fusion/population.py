@@ -4,7 +4,7 @@ They begin evenly over the bounds of the map, over its free space, or with any h
 applied by progressive correction (:func:`~factorgraph_loc.fusion.cloud.corrected`), so that few particles find narrow modes.
 Resampling draws from kernels whose width in a large map is that of the first particles' distances. The number of particles follows
 the size of the posterior (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). Each resampling also draws some particles anywhere, and
-some beside others, with little weight: they recover a pose that was lost because tags were silent or misplaced.
+some near others, with little weight. They recover a pose that was lost because tags were silent or misplaced.
 
 Observations wait in a queue and are processed in slices of fixed work, so that results do not depend on the machine.
 """
@@ -34,8 +34,8 @@ DENSITY = 25.0  # particles per m^2 and rad at first
 FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 40_000, 4000
 GROWTH = 4  # largest factor on the number of particles in one resampling
 RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # relative effective sizes: when to resample; what a share of a likelihood leaves
-FRESH, ELSEWHERE = 2000, 1e-3  # particles drawn anew at a resampling, and their total weight
-ASTRAY, BESIDE = 500, np.array((0.7, 0.7, 0.3))  # number of these that are drawn beside others, and how far: m, m, rad
+FRESH, ELSEWHERE = 2000, 1e-3  # new particles at a resampling, and their total weight
+ASTRAY, BESIDE = 500, np.array((0.7, 0.7, 0.3))  # number of these near other particles, and their distance: m, m, rad
 NOISE = 2.0  # factor on the covariance of the odometry, for its constants, which are not estimated here
 OUTSIDE = -1.0  # log-weight per motion of a particle outside of free space
 
@@ -101,7 +101,7 @@ class Population:
         self._room = np.empty(0)  # of each particle for itself, in cells, when it was drawn
         self._begun: ChainState | None = None  # at the last observation that left the queue
         self._hypotheses: tuple[Mode, ...] | None = ()
-        self._telling = 0  # observations with detections
+        self._informative = 0  # observations with detections
         self._things: set[Hashable] = set()
         self._since = [math.inf for _ in CLEAR]  # since when the pose has had these probabilities
         self._waiting: deque[_Waiting] = deque()
@@ -170,13 +170,13 @@ class Population:
 
     def denies(self, place: PosePrior) -> bool:
         """Whether the observations exclude a pose at the time of the last one."""
-        if self._telling < CLEAR_OBSERVATIONS or self.newest is None or place.t != self.newest.t:
+        if self._informative < CLEAR_OBSERVATIONS or self.newest is None or place.t != self.newest.t:
             return False
         assert self._cloud is not None
         error = self._cloud.poses - place.pose
         error[:, 2] = se2.wrap(error[:, 2])
-        spread = place.covariance + WIDENED
-        near = np.sum(error * positive.solve(spread, error.T).T, axis=1) < REACH**2
+        covariance = place.covariance + WIDENED
+        near = np.sum(error * positive.solve(covariance, error.T).T, axis=1) < REACH**2
         return float(self._cloud.weights[near].sum()) < NEGLIGIBLE
 
     def _processed(self, new: _Waiting) -> Steps[None]:
@@ -185,7 +185,7 @@ class Population:
         if self._cloud is None or self.newest is None:
             count = int(np.clip(DENSITY * self._volume, FEWEST_AT_FIRST, MOST))
             self._room = self._room_of(count)
-            cloud = _cloud(self._anywhere(count, odometry), np.full(count, -math.log(count)))
+            cloud = _cloud(self._draw_anywhere(count, odometry), np.full(count, -math.log(count)))
             yield float(BEGUN * count)
         else:
             cloud = self._cloud
@@ -202,7 +202,7 @@ class Population:
         self.newest, self._hypotheses = odometry, None
         self.log_evidence += evidence
         self.rival_evidence += new.rival
-        self._telling += observation.found > 0
+        self._informative += observation.found > 0
         self._things.update(observation.things)
         near = self._weight_of_best()
         self._since = [
@@ -212,7 +212,7 @@ class Population:
 
     def _weight_of_best(self) -> float:
         """The probability that the robot is near the heaviest mode; 0 with too few observations."""
-        if self._telling < CLEAR_OBSERVATIONS or len(self._things) < CLEAR_THINGS or self._cloud is None:
+        if self._informative < CLEAR_OBSERVATIONS or len(self._things) < CLEAR_THINGS or self._cloud is None:
             return 0.0
         error = self._cloud.poses - self.hypotheses[0].pose
         near = (np.hypot(error[:, 0], error[:, 1]) < NEAR_POSITION) & (np.abs(se2.wrap(error[:, 2])) < NEAR_HEADING)
@@ -234,7 +234,7 @@ class Population:
         room = self._room[rows]
         drawn = kld.jittered(cloud.poses, rows, self._rng, room)
         beside = se2.compose(drawn[:ASTRAY], se2.exp(BESIDE * self._rng.standard_normal((ASTRAY, 3))))
-        poses = np.concatenate((drawn, beside, self._anywhere(FRESH - ASTRAY, now)))
+        poses = np.concatenate((drawn, beside, self._draw_anywhere(FRESH - ASTRAY, now)))
         self._room = np.concatenate((room / np.bincount(rows)[rows], np.zeros(ASTRAY), self._room_of(FRESH - ASTRAY)))
         log_weights = np.full(len(poses), math.log((1.0 - ELSEWHERE) / len(rows)))
         log_weights[len(rows) :] = math.log(ELSEWHERE / FRESH)
@@ -251,7 +251,7 @@ class Population:
         """The room (N,) of each of ``count`` particles that are drawn anywhere, in cells; none around a known position."""
         return np.full(count, self._volume / float(np.prod(kld.CELL)) / count if self._start is None else 0.0)
 
-    def _anywhere(self, count: int, now: ChainState) -> Array:
+    def _draw_anywhere(self, count: int, now: ChainState) -> Array:
         """Poses (N, 3) where the robot may be ``now``: from its start, evenly over free space, or evenly over the bounds, one in
         each layer of each axis (Latin hypercube)."""
         if self._start is not None:

@@ -1,4 +1,4 @@
-"""The estimators by name, what is known of each, and how one is made for a run."""
+"""The estimators by name, their descriptions and settings, and their construction for a run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from factorgraph_loc.plugins import ESTIMATORS, load
 from factorgraph_loc.sensors.registry import Channel, channels, parent_of
 from factorgraph_loc.text import listed, quoted
 
-FINAL_ONLY = "final_only"  # the setting of an estimator that need solve nothing on the way
+FINAL_ONLY = "final_only"  # the setting of an estimator that can solve only at the end
 
 
 @dataclass(frozen=True)
 class Description:
-    """What there is to know of an estimator. ``about``: one sentence; ``sensors``: channels that it takes; ``causal``: whether it
-    has estimates while it runs; ``smoothed``: whether its final trajectory uses all measurements; ``settings``: all its
+    """An estimator. ``about``: one sentence; ``sensors``: channels that it uses; ``causal``: whether it has estimates during a
+    run; ``smoothed``: whether its final trajectory uses all measurements; ``settings``: all its
     settings."""
 
     name: str
@@ -39,8 +39,8 @@ def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
 
 
 def for_final_only(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Settings of estimators by name, of which only the final trajectories are wanted: those that have ``final_only`` solve nothing
-    on the way. InputError if none of them has, nor is an offline one."""
+    """Settings of estimators by name for a comparison of final trajectories: ``final_only`` is set for estimators that have it.
+    InputError if no estimator has it or is an offline one."""
     can = [name for name in settings if FINAL_ONLY in settings_type(name).model_fields]
     if not can and all(getattr(estimator_type(name), "causal", True) for name in settings):
         able = [name for name in ESTIMATORS if FINAL_ONLY in settings_type(name).model_fields]
@@ -71,7 +71,7 @@ def _takes(kind: type[Any], channel: Channel) -> bool:
     modalities = getattr(kind, "modalities", EVERY)
     streams = channels()[parent_of(channel.name) or channel.name].streams
     measured = [load(place).kind for place in streams]
-    return any(one.is_motion or one.modality in modalities for one in measured)
+    return any(k.is_motion or k.modality in modalities for k in measured)
 
 
 def check_names(names: Sequence[str]) -> None:
@@ -88,6 +88,6 @@ def estimator_type(name: str) -> type[Any]:
 
 
 def settings_type(name: str) -> type[FileModel]:
-    """The class of its settings: beside it, ``EkfSettings`` of ``Ekf``. InputError for an unknown estimator."""
+    """The class of its settings in the same module, ``EkfSettings`` of ``Ekf``. InputError for an unknown estimator."""
     check_names([name])
     return cast(type[FileModel], load(f"{ESTIMATORS.place(name)}Settings"))

@@ -27,7 +27,7 @@ from factors.se2 import Array
 
 DURATION = 60.0  # s of observations that are kept
 SLICE = 2_500_000  # work (:mod:`.population`) of one slice
-PAUSE = 0.05  # s between two slices, at least: a measurement and a tick often come at once
+PAUSE = 0.05  # least s between two slices: a measurement and a tick often arrive together
 
 
 class Search:
@@ -68,7 +68,7 @@ class Search:
         return sensor.name in self._sensors
 
     def remember(self) -> None:
-        """Keep the odometry for a search on the way."""
+        """Keep the odometry for a later search."""
         self._motion.keep(2.0 * DURATION)
         self._horizon = 2.0 * DURATION
 
@@ -86,14 +86,14 @@ class Search:
         sensor, finder = self._sensors.get(m.source), self._finders.get(m.source)
         if sensor is None:
             return False
-        told = finder is not None and finder.look(m, odometry)
-        if told:
+        is_informative = finder is not None and finder.look(m, odometry)
+        if is_informative:
             self.newest = odometry
         if self._population is not None and self._is_due(sensor, odometry.t):
-            seen = sensor.evidence(m)
-            if seen is not None:
-                self._population.add(odometry, seen)
-        return self.advance(odometry.t) or told
+            observation = sensor.evidence(m)
+            if observation is not None:
+                self._population.add(odometry, observation)
+        return self.advance(odometry.t) or is_informative
 
     def weigh(self, observation: Evidence, odometry: ChainState) -> None:
         """Weigh the particles by an observation that is not a sensor's, once they have begun."""
@@ -116,9 +116,9 @@ class Search:
     def best(self) -> PosePrior | None:
         """The pose, at its time, if one is clear; else None."""
         for finder in self._finders.values():
-            found = finder.best
-            if found is not None and not self._denied(found):
-                return found
+            best = finder.best
+            if best is not None and not self._denied(best):
+                return best
         return None if self._population is None else self._population.best
 
     @property
@@ -167,13 +167,13 @@ class Search:
     @property
     def _leading(self) -> Finder | Population | None:
         """Which source leads: a finder that one measurement is enough for, else the particles, else any finder."""
-        told = [finder for finder in self._finders.values() if finder.newest is not None]
-        for finder in told:
+        informative = [finder for finder in self._finders.values() if finder.newest is not None]
+        for finder in informative:
             if finder.at_once and (self._population is None or finder.best is not None):
                 return finder
         if self._population is not None and self._population.newest is not None:
             return self._population
-        return next(iter(told), None)
+        return next(iter(informative), None)
 
     def _is_due(self, sensor: Sensor, t: float) -> bool:
         """Whether a sensor's last evidence is long enough ago."""

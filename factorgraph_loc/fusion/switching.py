@@ -1,9 +1,9 @@
 """The paper's fusion rule: RFID when tags are read, vision otherwise (Raoui, Bouyakhf, Devy, ICINCO 2011, section 5).
 
-A scan in which a tag of the map is read makes the particle filter active, one without makes the EKF active, which uses all other
-sensors. The other filter processes odometry only. At a hand-over the new filter starts from mean and covariance of the pose, so
-that uncertain constants of the odometry count as noise in both. The final trajectory is smoothed over all hand-overs (Rauch, Tung,
-Striebel, 1965), from the causal estimates.
+A scan with a read of a mapped tag makes the particle filter active. A scan without one makes the EKF active, which uses all other
+sensors. The other filter processes odometry only. At a hand-over the new filter starts from mean and covariance of the pose.
+Therefore uncertain constants of the odometry count as noise in both. The final trajectory is smoothed over all hand-overs (Rauch,
+Tung, Striebel, 1965), from the causal estimates.
 """
 
 from dataclasses import dataclass, replace
@@ -28,8 +28,8 @@ from factors import positive, se2
 from factors.motion import ChainState, Increment, propagate
 from factors.se2 import Array
 
-JUMPED = 50.0  # Mahalanobis distance squared beyond which an estimate did not come from the one before
-LEAST = np.diag((1e-4, 1e-4, 1e-4)) ** 2  # m, m, rad: particles that agree to the last digit are no Gaussian
+JUMPED = 50.0  # squared Mahalanobis distance: above it an estimate does not follow from the previous one
+LEAST = np.diag((1e-4, 1e-4, 1e-4)) ** 2  # m, m, rad: identical particles have no proper covariance
 
 
 class SwitchingSettings(FilterSettings):
@@ -41,7 +41,7 @@ class SwitchingSettings(FilterSettings):
 
 @dataclass(frozen=True)
 class _PoseBelief:
-    """What was believed at one time: ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
+    """The causal estimate at one time: ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
 
     odometry: ChainState
     pose: Array
@@ -62,8 +62,8 @@ class Switching:
         sensors = bound_sensors(Binding(setup, self._motion, Diagnostics()))
         self._scanners = {name: sensor for name, sensor in sensors.items() if sensor.gathers}
         scanning = {sensor_of(name).name for name in self._scanners}
-        others = {sensor_of(name).name for name in sensors} - scanning
-        by_tags = replace(setup, sensors=tuple(s for s in setup.sensors if sensor_of(s).name not in others))
+        vision = {sensor_of(name).name for name in sensors} - scanning
+        by_tags = replace(setup, sensors=tuple(s for s in setup.sensors if sensor_of(s).name not in vision))
         by_sight = replace(setup, sensors=tuple(s for s in setup.sensors if sensor_of(s).name not in scanning))
         delay = settings.max_delay
         of_tags = ParticleFilterSettings(
@@ -88,9 +88,9 @@ class Switching:
         if measurement.is_motion:
             self._tags.process(measurement)
             counted = self.diagnostics.ignored, self.diagnostics.late
-            before = [dict(counts) for counts in counted]
+            previous = [dict(counts) for counts in counted]
             self._vision.process(measurement)
-            for counts, once in zip(counted, before, strict=True):  # the second filter counted the same rows
+            for counts, once in zip(counted, previous, strict=True):  # the second filter counted the same rows
                 counts.clear()
                 counts.update(once)
             self._motion.add(measurement)
@@ -126,30 +126,30 @@ class Switching:
         """The smoothed estimates at the ticks, or the causal ones with ``smooth`` off."""
         times = sorted(self._records)
         records = [self._records[t] for t in times]
-        found = [(r.pose, r.covariance) for r in records[-1:]]
-        for record, after in zip(records[-2::-1], records[:0:-1], strict=True):
-            step = self._motion.relative(record.odometry, after.odometry)
-            found.append(_smoothed(record, step, found[-1]) if self._smooth else (record.pose, record.covariance))
-        poses = np.array([pose for pose, _ in found[::-1]]).reshape(-1, 3)
-        covariances = np.array([covariance for _, covariance in found[::-1]]).reshape(-1, 3, 3)
+        track = [(r.pose, r.covariance) for r in records[-1:]]
+        for record, later in zip(records[-2::-1], records[:0:-1], strict=True):
+            step = self._motion.relative(record.odometry, later.odometry)
+            track.append(_smoothed(record, step, track[-1]) if self._smooth else (record.pose, record.covariance))
+        poses = np.array([pose for pose, _ in track[::-1]]).reshape(-1, 3)
+        covariances = np.array([covariance for _, covariance in track[::-1]]).reshape(-1, 3, 3)
         ticks = [t for t in self._ticks if times and t >= times[0]]
         return at_ticks(ticks, np.array(times), poses, covariances)
 
-    def forget(self, before: float) -> None:
-        """Forget the trajectory before then, as far as both filters do not need it for late measurements."""
+    def forget(self, until: float) -> None:
+        """Forget the trajectory until this time, except for the part that the filters need for late measurements."""
         for part in (self._tags, self._vision):
-            part.forget(before)
-        self._ticks = [t for t in self._ticks if t >= before]
-        self._records = {t: record for t, record in self._records.items() if t >= before}
+            part.forget(until)
+        self._ticks = [t for t in self._ticks if t >= until]
+        self._records = {t: record for t, record in self._records.items() if t >= until}
 
-    def _hand_over(self, other: Filter) -> None:
-        """Make ``other`` the active filter, unless there is no pose to start it from."""
-        if other is self._active:
+    def _hand_over(self, successor: Filter) -> None:
+        """Make ``successor`` the active filter, unless the present one has no pose."""
+        if successor is self._active:
             return
         now = self._active.estimate()
         if now.status != "localized":
             return
-        self._active = other
+        self._active = successor
         self._active.initialize(PosePrior(now.t, now.pose, now.covariance + LEAST))
 
     def _record(self) -> None:
@@ -159,12 +159,12 @@ class Switching:
             self._records[now.t] = _PoseBelief(self._motion.state(now.t), now.pose, body + LEAST)
 
 
-def _smoothed(record: _PoseBelief, step: Increment, after: tuple[Array, Array]) -> tuple[Array, Array]:
-    """A record given what came later: ``step`` led from it to where ``after`` is the smoothed pose with its covariance."""
+def _smoothed(record: _PoseBelief, step: Increment, later: tuple[Array, Array]) -> tuple[Array, Array]:
+    """The smoothed ``record``; ``step`` leads from it to ``later``, the next smoothed pose with its covariance."""
     predicted = propagate(record.covariance, step)
-    error = se2.log(se2.between(se2.compose(record.pose, step.delta), after[0]))
-    if positive.squared(error, predicted + after[1]) > JUMPED:
+    error = se2.log(se2.between(se2.compose(record.pose, step.delta), later[0]))
+    if positive.squared(error, predicted + later[1]) > JUMPED:
         return record.pose, record.covariance
     moved = se2.adjoint(se2.inverse(step.delta))
-    change, covariance = positive.smoothed(record.covariance, moved, step.covariance, error, after[1])
+    change, covariance = positive.smoothed(record.covariance, moved, step.covariance, error, later[1])
     return se2.compose(record.pose, se2.exp(change)), covariance

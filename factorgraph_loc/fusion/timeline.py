@@ -29,10 +29,10 @@ from factors.motion import Increment
 
 
 class Taken(NamedTuple):
-    """A processed measurement, the estimator's state ``before`` it, and what it added to the diagnostics."""
+    """A processed measurement, the estimator's state before it (``checkpoint``), and its additions to the diagnostics."""
 
     measurement: Measurement
-    before: Any = None
+    checkpoint: Any = None
     added: Sequence[Addition] = ()
 
 
@@ -48,7 +48,7 @@ class Timeline(ABC):
         self._sensors: dict[str, Sensor] = {}  # by name
         self._t = -math.inf  # the newest time
         self._begun = math.inf  # when the estimator started; infinite before
-        self._taken: deque[Taken] = deque()  # the last measurements, in the order in which they were processed
+        self._taken: deque[Taken] = deque()  # the last measurements, in their order of processing
         self._seeking: Tracking | None = None  # finds the start with the measurements that are kept
 
     def process(self, measurement: Measurement) -> None:
@@ -72,8 +72,8 @@ class Timeline(ABC):
         ``ambiguous`` while a search is going on, and while the track does not explain the measurements.
         """
         if self._begun < math.inf:
-            found = self._estimate_at(t)
-            return replace(found, doubts_model=True) if self._doubts_model() else found
+            estimate = self._estimate_at(t)
+            return replace(estimate, doubts_model=True) if self._doubts_model() else estimate
         at = self._t if t is None else max(t, self._t)
         modes = [] if self._seeking is None else self._seeking.modes(at)
         if not modes:
@@ -131,11 +131,11 @@ class Timeline(ABC):
                 self._drop_late(m)
                 return
         self._t = max(self._t, m.t)
-        told = search.advance(m.t) if isinstance(m, Tick) else search.look(m, self._motion.state(m.t))
-        if not told and search.newest is None and not search.waits and start is None:
+        is_informative = search.advance(m.t) if isinstance(m, Tick) else search.look(m, self._motion.state(m.t))
+        if not is_informative and search.newest is None and not search.waits and start is None:
             return  # the run begins with the first informative measurement
         self._remember(Taken(m), DURATION if start is None else START_KEPT)
-        best = search.best if told else None
+        best = search.best if is_informative else None
         if best is None:
             return
         again = self._take_back(-math.inf)
@@ -144,12 +144,12 @@ class Timeline(ABC):
         t = again[0].t if kept is None else kept.t
         moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))
         self.initialize(self._prior(t, best, moved, kept))
-        search.begin_track(found=True)
+        search.begin_track(by_search=True)
         self._replay(again)
 
     def _prior(self, t: float, best: PosePrior, moved: Increment, start: KnownPosition | None) -> PosePrior:
-        """The prior at ``t``, for a search that found the pose ``best`` after the robot ``moved``; ``start``: its known position
-        at ``t``."""
+        """The prior at ``t``. ``best``: the pose of the search; ``moved``: the motion from ``t`` to that pose; ``start``: the known
+        position at ``t``, if any."""
         raise NotImplementedError
 
     def _replay(self, measurements: Sequence[Measurement]) -> None:

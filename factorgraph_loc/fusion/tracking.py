@@ -33,46 +33,46 @@ from factors.motion import ChainState, Increment
 from factors.se2 import Array
 from factors.update import Correction
 
-REFUTING = 8.0  # log-odds by which a track must lose: kidnappings are rare
-BEFORE = 2.0  # s before a suspicion, or before the evidence of a change, in which the change may be
+REFUTING = 8.0  # log-odds against a track that reject it: kidnappings are rare
+BEFORE = 2.0  # s: a change is at most this much earlier than a suspicion or its evidence
 UNSURE = 5.0  # largest difference of a possible change's log-likelihood from the highest
-NEAR, SURE = 0.5, 0.9  # m: a pose is known where it is so near with so much probability
+NEAR, SURE = 0.5, 0.9  # m: a pose is known if its error is below NEAR with probability SURE
 CERTAIN = NEAR**2 / (-2.0 * math.log(1.0 - SURE))  # m^2: a pose is known with variances of its position below this sum
-PROBATION = 5.0  # s after a track was rejected in which further measurements may contradict the next one
-# m, m, rad: spread of a pose that the search found, as a prior of what follows. The same measurements enter a graph as factors. The
-# particles that found it were moved along an odometry that may have failed.
+PROBATION = 5.0  # s after the rejection of a track: further measurements may contradict the next one
+# m, m, rad: standard deviations of the prior at a pose of the search. They are wide: the same measurements enter a graph as
+# factors, and the odometry that moved the particles of the search may have failed.
 FOUND = np.diag((1.0, 1.0, 0.5)) ** 2
-APART = 16.0  # squared Mahalanobis distance from the track, beyond which a pose is another one
-WINDOW = 3.0  # s of observations that are compared
-ONSETS = (0.75, 1.5, 3.0)  # s ago, when the wheels may have begun to slip, or to hold again
-SHARES = (0.0, 0.33, 0.67, 1.5)  # of the way that the odometry reports, which the robot may have gone
+APART = 16.0  # squared Mahalanobis distance: above it a pose differs from the track
+WINDOW = 3.0  # s: duration of the compared observations
+ONSETS = (0.75, 1.5, 3.0)  # s ago: possible times of the begin or end of wheel slip
+SHARES = (0.0, 0.33, 0.67, 1.5)  # possible shares of the reported distance that the robot has driven
 SURPRISING = 2.0  # standard deviations of the sum of surprises that starts a comparison
-ENOUGH = 2  # observations, of which more are compared
-STILL, SPEED = 0.05, 0.5  # m: a way that wheels at rest report; m/s: of a robot that is carried
+ENOUGH = 2  # a comparison needs more observations
+STILL, SPEED = 0.05, 0.5  # m: largest reported distance of wheels at rest; m/s: speed of a carried robot
 _ANGLES = np.arange(8) * math.pi / 4.0
 # velocities (9, 3) of a robot whose wheels are at rest: none, or carried in some direction
 CARRIED = np.concatenate((np.zeros((1, 3)), SPEED * np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(8)))))
-CLEAR = 3.0  # standard deviations of the start that the way must be long
-RARE, MOST = 7.0, 3.0  # log-odds that a hypothesis needs, as odometry is seldom wrong; most that one observation adds
-EVERY, HOLDS = 1.0, 1.0  # s between comparisons while the wheels slip; log-odds of wheels that hold again
-# s: the last time at which a robot that was carried away was at the old place, -inf if it never was there, and the first at the new
-# one. Between them its place is unknown: the final trajectory has no poses there, so that scoring, which goes across no gap of more
-# than MAX_GAP, makes up none.
+CLEAR = 3.0  # least length of the motion, in standard deviations of its start
+RARE, MOST = 7.0, 3.0  # least log-odds of a hypothesis: odometry is seldom wrong; most that one observation adds
+EVERY, HOLDS = 1.0, 1.0  # s between comparisons while the wheels slip; log-odds that end a slip
+# s: the last time of a carried robot at its old place (-inf if it never was there), and the first time at the new one. Between them
+# the pose is unknown and the final trajectory has no poses. Scoring does not interpolate over gaps longer than MAX_GAP, and thus
+# not over this one.
 Change = tuple[float, float]
-SPARE = 1e-3  # s: a gap is longer than what scoring goes across by so much
+SPARE = 1e-3  # s: by this much a gap exceeds MAX_GAP
 
 
 def is_known(t: Array, changes: Iterable[Change]) -> NDArray[np.bool_]:
-    """At which of the times ``t`` (N,) the place of the robot is known."""
+    """Whether the pose of the robot is known at times ``t`` (N,)."""
     known = np.ones(len(t), dtype=bool)
-    for before, after in changes:
-        more = 0.5 * max(MAX_GAP + SPARE - (after - before), 0.0)
-        known &= (t <= before - more) | (t >= after + more)
+    for last, first in changes:
+        more = 0.5 * max(MAX_GAP + SPARE - (first - last), 0.0)
+        known &= (t <= last - more) | (t >= first + more)
     return known
 
 
 class WeighedObservation(NamedTuple):
-    """An observation on the way, and its log-probability under the track."""
+    """An observation with the odometry at its time, and its log-probability under the track (``evidence``)."""
 
     odometry: ChainState
     observation: Observation
@@ -88,13 +88,13 @@ class Tracked(NamedTuple):
 
 
 class Refuted(NamedTuple):
-    """Why a track is rejected, and since when it is wrong; ``change``: between which times the robot left it; ``spread`` (3, 3): to
-    be added to the covariance of the new pose."""
+    """The reason for the rejection of a track, and the time since which it is wrong. ``change``: the robot left the track between
+    these times; ``extra_covariance`` (3, 3): added to the covariance of the new pose."""
 
     why: str
     since: float
     change: Change
-    spread: Array
+    extra_covariance: Array
 
 
 class Tracking(Search):
@@ -135,10 +135,10 @@ class Tracking(Search):
         self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: Callable[[], float]
     ) -> None:
         """Keep an observation that was applied to a track; ``evidence()``: its log-probability under the track."""
-        seen = observation.at_its_time() if self._weighs else None
-        if seen is None or not self._is_due(sensor, odometry.t):
+        current = observation.at_its_time() if self._weighs else None
+        if current is None or not self._is_due(sensor, odometry.t):
             return
-        self._kept.append(WeighedObservation(odometry, seen, evidence()))
+        self._kept.append(WeighedObservation(odometry, current, evidence()))
         while self._kept[0].odometry.t < odometry.t - DURATION:
             self._kept.popleft()
         if self._population is not None:
@@ -156,8 +156,8 @@ class Tracking(Search):
         if finder is not None:
             since = finder.refuted_since(m, odometry, pose, covariance)
             if since is not None:
-                before = max((t for t in self._looked if t < since), default=-math.inf)
-                return Refuted(self._sensors[m.source].lost, since, (before, since), np.zeros((3, 3)))
+                last = max((t for t in self._looked if t < since), default=-math.inf)
+                return Refuted(self._sensors[m.source].lost, since, (last, since), np.zeros((3, 3)))
         return self._refuted_by_all(odometry, pose, covariance, pose_at)
 
     def _refuted_by_all(
@@ -195,8 +195,8 @@ class Tracking(Search):
         return PosePrior(now.t, pose, best.covariance + se2.body_to_world(pose, since.covariance))
 
     def _change(self, best: PosePrior, pose_at: Callable[[float, Array], Array]) -> tuple[float, Change]:
-        """The most likely time of the change: from then on the observations are more likely at the other pose, before on the
-        track. And the observations between which it may have been."""
+        """The most likely time of the change, and the interval that contains it. Before the change the observations are more likely
+        on the track, from then on at the other pose."""
         times: list[float] = []
         likelihoods: list[float] = []  # logarithms, of a change just before each time
         total, highest, earliest = 0.0, -math.inf, self._since
@@ -211,13 +211,13 @@ class Tracking(Search):
             if total >= highest - UNSURE:
                 earliest = min(earliest, t)
         possible = np.flatnonzero(np.array(likelihoods) >= highest - UNSURE)
-        before = max((row.odometry.t for row in self._kept if row.odometry.t < times[possible[-1]]), default=-math.inf)
-        return times[int(np.argmax(likelihoods))], (before, times[possible[0]])
+        last = max((row.odometry.t for row in self._kept if row.odometry.t < times[possible[-1]]), default=-math.inf)
+        return times[int(np.argmax(likelihoods))], (last, times[possible[0]])
 
-    def begin_track(self, *, found: bool) -> None:
-        """A track begins: where the search ``found`` it, with the observations that led there again, or at a given prior."""
+    def begin_track(self, *, by_search: bool) -> None:
+        """Begin a track: at the pose of the search (``by_search``), with its observations again, or at a given prior."""
         self.end()
-        if found:
+        if by_search:
             self._kept.clear()
             self._last.clear()
 
@@ -298,14 +298,14 @@ class SlipMonitor:
         if len(rows) <= ENOUGH:
             return 0.0, begin
         states = np.array([row.odometry for row in rows])[:, 1:4]
-        ways, start = se2.log(se2.between(states[0], states)), rows[0].corrected()
-        length = float(np.hypot(*ways[-1, :2]))
+        motions, start = se2.log(se2.between(states[0], states)), rows[0].corrected()
+        length = float(np.hypot(*motions[-1, :2]))
         if length < STILL:
             passed = np.array([row.odometry.t - rows[0].odometry.t for row in rows])
             length = SPEED * passed[-1]
             poses = start + passed[None, :, None] * CARRIED[:, None, :]
         else:
-            poses = se2.compose(start, se2.exp(np.array((1.0, *SHARES))[:, None, None] * ways))
+            poses = se2.compose(start, se2.exp(np.array((1.0, *SHARES))[:, None, None] * motions))
         if length < CLEAR * math.sqrt(np.trace(rows[0].correction.covariance[:2, :2])):
             return 0.0, begin
         observations = [observation for row in rows if (observation := row.observed()) is not None]
@@ -334,8 +334,8 @@ def is_doubted(sensors: Iterable[Sensor]) -> bool:
 
 def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:
     error = se2.log(se2.between(pose, best.pose))
-    spread = covariance + se2.world_to_body(best.pose, best.covariance)
-    return float(error @ positive.solve(spread, error[:, None])[:, 0]) > APART
+    combined = covariance + se2.world_to_body(best.pose, best.covariance)
+    return float(error @ positive.solve(combined, error[:, None])[:, 0]) > APART
 
 
 def beyond(covariance: Array, distance: float) -> float:
@@ -354,7 +354,7 @@ def laplace_evidence(observation: Observation, pose: Array, covariance: Array, c
         return correction.evidence
     delta = correction.delta[:3]
     at = se2.compose(pose, se2.exp(delta))
-    _, before = np.linalg.slogdet(covariance)
-    _, after = np.linalg.slogdet(correction.covariance[:3, :3])
+    _, prior = np.linalg.slogdet(covariance)
+    _, posterior = np.linalg.slogdet(correction.covariance[:3, :3])
     moved = positive.squared(delta, covariance)
-    return float(observation.log_likelihood(at[None], {})[0] - 0.5 * moved + 0.5 * (after - before))
+    return float(observation.log_likelihood(at[None], {})[0] - 0.5 * moved + 0.5 * (posterior - prior))

@@ -103,7 +103,7 @@ class Localizer:
         if start is not None and not start.has_heading and not finds_heading(new):
             raise InputError(f"{self._name} cannot find an unknown heading with this rig and map, expected a heading")
         if start is not None and not math.isnan(start.t):
-            with guard.telling("the start", start.t):
+            with guard.computing("the start", start.t):
                 new.initialize(self._frame.prior(start))
         with self._lock:
             self._begin_anew(new, start, guard)
@@ -141,7 +141,7 @@ class Localizer:
             self._require_whole()
             if self._estimator is None or not self._is_under_way(self._newest):
                 return Belief(())
-            with self._guard.telling("the belief", self._newest):
+            with self._guard.computing("the belief", self._newest):
                 return copy.deepcopy(self._frame.belief(sound_belief(self._estimator.belief(self._newest))))
 
     def trajectory(self) -> Trajectory:
@@ -150,7 +150,7 @@ class Localizer:
             self._require_whole()
             if self._estimator is None or self._ticks is None or not self._ticks.count:
                 return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
-            with self._guard.telling("the trajectory"):
+            with self._guard.computing("the trajectory"):
                 return copy.deepcopy(self._frame.trajectory(sound_trajectory(self._estimator.trajectory())))
 
     def learnt(self) -> Learnt:
@@ -159,7 +159,7 @@ class Localizer:
             self._require_whole()
             if self._estimator is None:
                 return Learnt()
-            with self._guard.telling("what was learnt"):
+            with self._guard.computing("what was learnt"):
                 return copy.deepcopy(self._estimator.learnt())
 
     def diagnostics(self) -> Diagnostics:
@@ -218,7 +218,7 @@ class Localizer:
             self._ticks = Ticks(m.t)
             if self._prior is not None:
                 self._prior = replace(self._prior, t=m.t)
-                with self._guard.telling("the start", m.t):
+                with self._guard.computing("the start", m.t):
                     estimator.initialize(self._frame.prior(self._prior))
         # as in a run of a log: a tick follows all measurements up to its time
         for t in self._ticks.advance(m.t):
@@ -252,7 +252,7 @@ class Localizer:
             raise InputError(
                 f"t is {at:.3f} s, {at - self._newest:.0f} s ahead of all measurements, expected the same clock"
             )
-        with self._guard.telling("the estimate", at):
+        with self._guard.computing("the estimate", at):
             estimate = self._frame.estimate(sound(self._estimator.estimate(at)))
         # copied, because the estimator may reuse its arrays
         self._last = _copied(estimate, at)

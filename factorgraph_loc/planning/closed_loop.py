@@ -40,7 +40,7 @@ NEXT, NEXT_HEADING = 3.0, 1.0  # m, rad: modes closer to each other are one plac
 SHOWN = 300  # particles of a belief that are stored
 SPREAD = 2000  # samples of a belief without particles
 WRONG = 3.0  # times the limits: larger errors are false claims
-MODES, LIKELY = 3, 0.05  # maximum number of modes, and their least weight, from which distant places are planned
+MODES, LIKELY = 3, 0.05  # maximum number and least weight of modes as starting points of plans to distant places
 TAGS, PLACES, SPREAD_OVER = 8, 6, 40  # nearest tags, nearest of the places spread over free space, and number of those
 LOOK = 0.5  # m between proximity readings
 PAUSE = 1.0  # s that a robot waits if it has no path
@@ -182,11 +182,11 @@ class _ClosedLoop:
         done = self._take(robot.begin())
         while not done and robot.metres < settings.max_metres - 1e-3 and robot.t < settings.max_seconds:
             choice = self._choose()
-            before = robot.t
+            begin = robot.t
             if choice.path is not None:
                 metres = min(choice.metres, settings.max_metres - robot.metres)
                 done = self._take(robot.drive(choice.path.poses, metres))
-            if robot.t == before:
+            if robot.t == begin:
                 done = self._take(robot.wait(PAUSE))
         self._feed(Tick(robot.t))
         return done
@@ -204,8 +204,8 @@ class _ClosedLoop:
                 self._looked_at = self._robot.metres
                 # filters move at scans and ticks only
                 self._feed(Tick(self._robot.t))
-                with self._guard.telling("the walls", self._robot.t):
-                    self._estimator.see(self._robot.proximity, self._robot.look())
+                with self._guard.computing("the walls", self._robot.t):
+                    self._estimator.see(self._robot.proximity, self._robot.read_proximity())
             if report.sensor in self._robot.decisive and self._is_sure():
                 position, heading = self.errors()
                 if position < self._settings.position_limit and heading < self._settings.heading_limit:
@@ -218,7 +218,7 @@ class _ClosedLoop:
         self._guard.process(self._estimator, measurement)
 
     def _estimate(self) -> PoseEstimate:
-        with self._guard.telling("the estimate", self._robot.t):
+        with self._guard.computing("the estimate", self._robot.t):
             return sound(self._estimator.estimate())
 
     def _is_sure(self) -> bool:
@@ -232,7 +232,7 @@ class _ClosedLoop:
     def _choose(self) -> Choice:
         self._feed(Tick(self._robot.t))
         started = perf_counter()
-        with self._guard.telling("the belief", self._robot.t):
+        with self._guard.computing("the belief", self._robot.t):
             belief = self._estimator.belief()
         particles, weights = _sampled(belief, self._space, self._rng)
         modes = _places(belief)
@@ -332,8 +332,8 @@ def _places(belief: Belief) -> tuple[Mode, ...]:
         error = [se2.between(place.pose, mode.pose) for place in places]
         near = [i for i, e in enumerate(error) if math.hypot(e[0], e[1]) < NEXT and abs(e[2]) < NEXT_HEADING]
         if near:
-            one = places[near[0]]
-            places[near[0]] = Mode(one.weight + mode.weight, one.pose, one.covariance)
+            merged = places[near[0]]
+            places[near[0]] = Mode(merged.weight + mode.weight, merged.pose, merged.covariance)
         else:
             places.append(mode)
     return tuple(place for place in places[:MODES] if place.weight >= LIKELY)

@@ -38,11 +38,11 @@ DIMS = ("x", "y", "heading")
 POSITION = ("x", "y")
 CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: cells of histograms; an integer number of headings
 FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations below which nothing is gained
-LOOK = 1.5  # m between stations, each of which stands for the rounds on that distance, or in turns of the same duration
+LOOK = 1.5  # m between stations; a station represents the rounds on that distance, or in turns of the same duration
 LOOKS = 10  # maximum number of stations; on a longer path they are farther apart
 SAMPLES, SCANS = 256, 48  # particles that are weighted, and those that scans are drawn from
 FEWEST = 10  # least number of particles
-SEVERAL = 0.5  # nats by which the entropy of a unimodal belief may be below that of a Gaussian with its covariance
+SEVERAL = 0.5  # nats: largest difference of a unimodal belief's entropy from that of a Gaussian with its covariance
 WIDEST_HEADING = 0.8  # rad: largest standard deviation of a Gaussian heading
 
 
@@ -95,13 +95,12 @@ def expected_gain(
     samples: int = SAMPLES,
     scans: int = SCANS,
 ) -> Array:
-    """Expected reduction of entropy (C,) [nats] on each of C paths, for a belief of particles (M, 3) in the world with weights
-    (M,).
+    """Expected reduction of entropy (C,) [nats] on each of C paths.
 
-    The entropy afterwards is that of the pose at the end. ``dims``: position, or position and heading. ``space``: a particle
-    whose path leads into a wall stops there and measures no more. ``places`` (M,): the mode of each particle; the entropy is then
-    that of the mode index. ``noise``: of the odometry on the path, none by default. ``samples``: number of particles that are
-    weighted; ``scans`` of these draw measurements of all ``sensors``.
+    The belief has particles (M, 3) in the world frame with weights (M,). The entropy afterwards is that of the pose at the end.
+    ``dims``: position, or position and heading. ``space``: a particle whose path leads into a wall stops and measures no more.
+    ``places`` (M,): the mode of each particle; the entropy is then that of the mode index. ``noise``: of the odometry on the path,
+    none by default. ``samples``: number of particles that are weighted; ``scans`` of these draw measurements of all ``sensors``.
     """
     if not paths:
         return np.empty(0)
@@ -120,9 +119,9 @@ def expected_gain(
     stations = [_stations(metres, LOOK) for metres in passed]
     normals = rng.standard_normal((max(len(s) for s in stations), count, 3))
     last = np.full((len(paths), count), np.iinfo(np.int64).max) if space is None else free_steps(space, poses, paths)
-    after = np.empty((len(paths), scans))
+    posterior = np.empty((len(paths), scans))
     even: Array32 = np.full((1, count), 1.0 / count, dtype=np.float32)
-    before = _entropies(poses[None] if cells is None else cells, np.zeros(1, dtype=np.int64), even, chosen, several)[0]
+    prior = _entropies(poses[None] if cells is None else cells, np.zeros(1, dtype=np.int64), even, chosen, several)[0]
     for c, (path, steps) in enumerate(zip(paths, stations, strict=True)):
         at = np.empty((len(steps), count, 3))
         sigmas = np.zeros((len(steps), 3)) if noise is None else _sigmas(path, steps, noise)
@@ -137,8 +136,8 @@ def expected_gain(
         if cells is not None or (several and noise is None):
             # the entropy at the end of the path, up to the alignment with the histogram's cells
             index = np.zeros_like(index)
-        after[c] = _entropies(at if cells is None else cells, index, np.exp(log_weights), chosen, several)
-    return np.asarray(before - after.mean(axis=1))
+        posterior[c] = _entropies(at if cells is None else cells, index, np.exp(log_weights), chosen, several)
+    return np.asarray(prior - posterior.mean(axis=1))
 
 
 def _columns(dims: Sequence[str]) -> list[int]:
@@ -176,13 +175,13 @@ def _stations(passed: Array, each: float) -> Places:
     """
     count = min(max(1, round(passed[-1] / each)), LOOKS)
     middles = (np.arange(count) + 0.5) * passed[-1] / count
-    looks = np.searchsorted(passed, middles - 1e-9)
-    return np.concatenate(([0], looks, [len(passed) - 1])).astype(np.int64)
+    observations = np.searchsorted(passed, middles - 1e-9)
+    return np.concatenate(([0], observations, [len(passed) - 1])).astype(np.int64)
 
 
 def _sigmas(path: Path, steps: Places, noise: OdometryModel) -> Array:
     """Standard deviations (S, 3) of the motion from one station to the next."""
-    distance = np.diff(path.way[steps])
+    distance = np.diff(path.metres[steps])
     rotation = np.diff(path.turned[steps])
     out = np.zeros((len(steps), 3))
     for column, growth in enumerate((noise.along, noise.lateral, noise.heading)):
@@ -198,13 +197,13 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
     body = se2.world_to_body(mean, covariance)
     poses = se2.compose(mean, path.poses)
     passed = path.passed(1.0, sensors.metres_per_radian)
-    told = expected_information(poses[1:], np.diff(passed), sensors)
+    by_pose = expected_information(poses[1:], np.diff(passed), sensors)
+    columns = (path.metres.tolist(), path.poses.tolist(), path.turned.tolist())
     states = [
-        ChainState(way / SPEED, x, y, heading, way, turn, 0.0)
-        for way, (x, y, heading), turn in zip(path.way.tolist(), path.poses.tolist(), path.turned.tolist(), strict=True)
+        ChainState(d / SPEED, x, y, heading, d, turn, 0.0) for d, (x, y, heading), turn in zip(*columns, strict=True)
     ]
-    for (before, after), information in zip(pairwise(states), told, strict=True):
-        body = propagate(body, odometry.relative_motion(sensors.odometry, before, after))
+    for (start, end), information in zip(pairwise(states), by_pose, strict=True):
+        body = propagate(body, odometry.relative_motion(sensors.odometry, start, end))
         # equals the inverse of the summed information, also for a singular covariance
         body = np.linalg.solve(np.eye(3) + body @ information, body)
         body = (body + body.T) / 2.0
@@ -218,15 +217,15 @@ def fisher_gain(
     Accuracy better than :data:`~factorgraph_loc.planning.information.FINEST` counts nothing.
     """
     fine = np.diag(FINEST**2)
-    after = [gaussian_entropy(expected_covariance(mean, covariance, path, sensors) + fine, dims) for path in paths]
-    return np.asarray(gaussian_entropy(covariance + fine, dims) - np.array(after, dtype=float))
+    entropies = [gaussian_entropy(expected_covariance(mean, covariance, path, sensors) + fine, dims) for path in paths]
+    return np.asarray(gaussian_entropy(covariance + fine, dims) - np.array(entropies, dtype=float))
 
 
-def expected_information(poses: Array, ways: Array, sensors: Sensors) -> Array:
-    """Fisher information (N, 3, 3) on a body-frame perturbation of poses (N, 3), from all sensors, while driving ``ways`` (N,)
-    metres about each pose, or turning for the same time.
+def expected_information(poses: Array, lengths: Array, sensors: Sensors) -> Array:
+    """Fisher information (N, 3, 3) on a body-frame perturbation of poses (N, 3), from all sensors, while driving
+    ``lengths`` (N,) [m] around each pose, or turning for the same time.
     """
     out = np.zeros((len(poses), 3, 3))
     for forecast in sensors.forecasts:
-        out += forecast.information(poses, ways)
+        out += forecast.information(poses, lengths)
     return out

@@ -119,8 +119,8 @@ def _number_cells(poses: Array, cell: Array, dims: int, out: Places) -> None:
             keys[i, a] = math.floor(value / cell[a])
         slot = (keys[i, 0] * 73856093 ^ keys[i, 1] * 19349663 ^ keys[i, 2] * 83492791) & (size - 1)
         while owner[slot] >= 0:
-            other = keys[owner[slot]]
-            if other[0] == keys[i, 0] and other[1] == keys[i, 1] and other[2] == keys[i, 2]:
+            key = keys[owner[slot]]
+            if key[0] == keys[i, 0] and key[1] == keys[i, 1] and key[2] == keys[i, 2]:
                 break
             slot = (slot + 1) & (size - 1)
         if owner[slot] < 0:

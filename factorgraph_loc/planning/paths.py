@@ -33,7 +33,7 @@ class Path:
     kind: str
 
     @cached_property
-    def way(self) -> Array:
+    def metres(self) -> Array:
         """Distance (S,) [m] driven up to each pose."""
         steps = se2.log(se2.between(self.poses[:-1], self.poses[1:]))
         return np.concatenate((np.zeros(1), np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
@@ -46,13 +46,13 @@ class Path:
     @property
     def length(self) -> float:
         """Length [m]."""
-        return float(self.way[-1])
+        return float(self.metres[-1])
 
     def passed(self, per_metre: float, per_radian: float) -> Array:
         """Expected counts (S,) up to each pose of events with rates ``per_metre`` and ``per_radian``, the larger of both per
         step.
         """
-        steps = np.maximum(np.diff(self.way) * per_metre, np.diff(self.turned) * per_radian)
+        steps = np.maximum(np.diff(self.metres) * per_metre, np.diff(self.turned) * per_radian)
         return np.concatenate((np.zeros(1), np.cumsum(steps)))
 
     def duration(self, speed: float, turn_rate: float) -> float:
@@ -61,7 +61,7 @@ class Path:
 
     def until(self, length: float) -> Path:
         """The path up to the last pose within ``length`` [m]."""
-        return Path(self.poses[self.way <= length + 1e-9], self.kind)
+        return Path(self.poses[self.metres <= length + 1e-9], self.kind)
 
 
 def look_around() -> Path:
@@ -111,11 +111,11 @@ def waypoint_paths(
     start = _nearest_cell(space, pose[:2])
     ends = space.cells(np.asarray(targets, dtype=float).reshape(-1, 2))
     ends = ends[(ends >= 0) & (ends != start)]
-    ways, before = csgraph.dijkstra(space.graph, directed=False, indices=start, limit=within, return_predecessors=True)
-    ends = ends[(ways[ends] >= beyond) & np.isfinite(ways[ends])]
+    metres, links = csgraph.dijkstra(space.graph, directed=False, indices=start, limit=within, return_predecessors=True)
+    ends = ends[(metres[ends] >= beyond) & np.isfinite(metres[ends])]
     out = []
-    for end in ends[np.argsort(ways[ends], kind="stable")[:nearest]].tolist():
-        points = space.centres[chain(before, end)[::-1]]
+    for end in ends[np.argsort(metres[ends], kind="stable")[:nearest]].tolist():
+        points = space.centres[chain(links, end)[::-1]]
         if space.cells(pose[None, :2])[0] >= 0:
             points[0] = pose[:2]
         out.append(Path(_driven(pose, straightened(space, points)), "waypoint"))
@@ -153,11 +153,11 @@ def free_steps(space: FreeSpace, poses: Array, paths: Sequence[Path], between: i
 def _arc(turn: float, curvature: float, length: float) -> Path:
     """A turn in place and an arc."""
     count = max(1, math.ceil(length / STEP - 1e-9))
-    way = np.minimum(STEP * np.arange(count + 1), length)
-    driven = se2.exp(np.column_stack((way, np.zeros(len(way)), curvature * way)))
+    driven = np.minimum(STEP * np.arange(count + 1), length)
+    poses = se2.exp(np.column_stack((driven, np.zeros(len(driven)), curvature * driven)))
     if turn == 0.0:
-        return Path(driven, "arc")
-    turned = se2.compose(np.array((0.0, 0.0, turn)), driven)
+        return Path(poses, "arc")
+    turned = se2.compose(np.array((0.0, 0.0, turn)), poses)
     return Path(np.concatenate((np.zeros((1, 3)), turned)), "arc")
 
 
@@ -196,7 +196,7 @@ def _free_steps(
     for m in range(len(poses)):
         c, s = math.cos(poses[m, 2]), math.sin(poses[m, 2])
         for p in range(len(first) - 1):
-            last, leaving, before = 0, True, -1.0
+            last, leaving, clearance = 0, True, -1.0
             for k in range(first[p], first[p + 1]):
                 free, previous = True, max(k - 1, first[p])
                 for part in range(1, between + 1):
@@ -210,10 +210,10 @@ def _free_steps(
                         break
                     if index[i, j] >= 0:
                         leaving = False
-                    elif not leaving or distance[i, j] < before:
+                    elif not leaving or distance[i, j] < clearance:
                         free = False
                         break
-                    before = distance[i, j]
+                    clearance = distance[i, j]
                 if not free:
                     break
                 last = k - first[p]

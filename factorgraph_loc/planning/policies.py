@@ -135,8 +135,8 @@ class Information:
 
     @staticmethod
     def _far(s: Situation, paths: Sequence[Path]) -> Array:
-        """Gains with respect to the mode index or, for a single mode, to the position in it. Particles would spread over a long
-        path and run into walls that the real robot avoids by planning again.
+        """Information gains on the mode index, or on the position if the belief has a single mode. On a long path particles would
+        diverge and run into walls that the real robot avoids by planning again.
         """
         if len(s.modes) == 1:
             (mode,) = s.modes
@@ -189,14 +189,14 @@ class Patrol:
             # the longest free path; of equal ones that with the smallest turn
             best = int(np.lexsort((turns, -free.round(1), turns > BACK))[0])
         direction = _direction(straight[best][1])
-        way = situation.settings.max_metres
-        along = np.arange(0.0, way + STEP, STEP)
+        length = situation.settings.max_metres
+        along = np.arange(0.0, length + STEP, STEP)
         poses = np.column_stack(
             (along * math.cos(direction), along * math.sin(direction), np.full(len(along), direction))
         )
         if direction != 0.0:
             poses = np.concatenate((np.zeros((1, 3)), poses))
-        return Choice(Path(poses, "patrol"), way, np.empty(0))
+        return Choice(Path(poses, "patrol"), length, np.empty(0))
 
 
 class NearestTags:

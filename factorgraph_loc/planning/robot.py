@@ -45,7 +45,7 @@ class ProximitySensor:
     def expected(self, poses: Array) -> Array:
         """Expected free lengths [m] (M, D) at poses (M, 3)."""
         steps = free_steps(self.space, poses, self._rays)
-        return np.stack([ray.way[at] for ray, at in zip(self._rays, steps, strict=True)], axis=1)
+        return np.stack([ray.metres[at] for ray, at in zip(self._rays, steps, strict=True)], axis=1)
 
     def read(self, pose: Array, rng: np.random.Generator) -> Array:
         """Measured free lengths [m] (D,) at a pose (3,)."""
@@ -87,8 +87,8 @@ class SimulatedRobot:
         made = [
             (name, on_robot(world, simulation.rig, simulation, of(name))) for name, on_robot in functions("on_robot")
         ]
-        self.sensors: dict[str, LiveSensor] = {name: one for name, one in made if one is not None}
-        self._order = sorted(self.sensors.values(), key=lambda one: not one.decides)
+        self.sensors: dict[str, LiveSensor] = {name: sensor for name, sensor in made if sensor is not None}
+        self._order = sorted(self.sensors.values(), key=lambda sensor: not sensor.decides)
         self._measured = [0] * len(self._order)
         self._noise, self._lengths = of("steps"), of("lengths")
         self._scale, self._drift, self._scale_of_turns = of("constants").normal(
@@ -104,64 +104,64 @@ class SimulatedRobot:
     @property
     def channels(self) -> tuple[str, ...]:
         """Channels of its measurements."""
-        return (IncrementOdometry.sensor, *(one.channel for one in self._order))
+        return (IncrementOdometry.sensor, *(sensor.channel for sensor in self._order))
 
     @property
     def decisive(self) -> tuple[str, ...]:
         """The channels after whose measurements it checks whether it is localized."""
-        return tuple(one.channel for one in self._order if one.decides or not self._order[0].decides)
+        return tuple(sensor.channel for sensor in self._order if sensor.decides or not self._order[0].decides)
 
     def begin(self) -> Iterator[Measurement]:
         """Measurements before the first motion: a row of odometry without motion, and one of each sensor."""
         yield IncrementOdometry(0.0, 0.0, 0.0, 0.0)
-        yield from self._found()
+        yield from self._measure()
 
     def free_ahead(self, paths: Sequence[Path]) -> Array:
         """Free length [m] (C,) of each of C paths, within the range of the proximity sensor."""
         # as finely as it drives: a corner may lie between two poses of a path
         steps = free_steps(self._space, self.pose[None], paths, BETWEEN)[:, 0]
-        way = np.array([path.way[step] for path, step in zip(paths, steps.tolist(), strict=True)])
-        return np.asarray(np.minimum(way, self._settings.sight))
+        lengths = np.array([path.metres[step] for path, step in zip(paths, steps.tolist(), strict=True)])
+        return np.asarray(np.minimum(lengths, self._settings.sight))
 
-    def look(self) -> Array:
+    def read_proximity(self) -> Array:
         """Free lengths [m] (D,) measured by its proximity sensor."""
         return self.proximity.read(self.pose, self._lengths)
 
     def drive(self, path: Array, metres: float) -> Iterator[Measurement]:
         """Follow a path (S, 3) in the robot's frame for at most ``metres``, not counting turns in place; stop before a wall."""
-        for told in self._told(path, metres):
+        for reported in self._reported_motions(path, metres):
             n1, n2, n3 = self._noise.standard_normal(3)
-            root = math.sqrt(math.hypot(told[0], told[1]))
-            dx = (told[0] - wheels.ALONG * root * n1) / (1.0 + self._scale)
-            dy = (told[1] - wheels.LATERAL * root * n2) / (1.0 + self._scale)
+            root = math.sqrt(math.hypot(reported[0], reported[1]))
+            dx = (reported[0] - wheels.ALONG * root * n1) / (1.0 + self._scale)
+            dy = (reported[1] - wheels.LATERAL * root * n2) / (1.0 + self._scale)
             drifted = self._drift * math.hypot(dx, dy) + wheels.HEADING * root * n3
-            moved = np.array((dx, dy, (told[2] - drifted) / (1.0 + self._scale_of_turns)))
-            there = se2.compose(self.pose, moved)
-            if root > 0.0 and not self._is_free(there):
+            moved = np.array((dx, dy, (reported[2] - drifted) / (1.0 + self._scale_of_turns)))
+            pose = se2.compose(self.pose, moved)
+            if root > 0.0 and not self._is_free(pose):
                 return
-            self.pose, self.metres = there, self.metres + math.hypot(dx, dy)
-            yield from self._passed(told)
+            self.pose, self.metres = pose, self.metres + math.hypot(dx, dy)
+            yield from self._passed(reported)
 
     def wait(self, seconds: float) -> Iterator[Measurement]:
         """Stand still."""
         for _ in range(max(1, round(seconds / PERIOD))):
             yield from self._passed(np.zeros(3))
 
-    def _passed(self, told: Array) -> Iterator[Measurement]:
+    def _passed(self, reported: Array) -> Iterator[Measurement]:
         """The measurements of one period."""
         self.t = round(self.t + PERIOD, 6)
         self._truth.append((self.t, *self.pose.tolist()))
-        yield IncrementOdometry(self.t, float(told[0]), float(told[1]), float(told[2]))
-        yield from self._found()
+        yield IncrementOdometry(self.t, float(reported[0]), float(reported[1]), float(reported[2]))
+        yield from self._measure()
 
-    def _found(self) -> Iterator[Measurement]:
+    def _measure(self) -> Iterator[Measurement]:
         """The measurements of the sensors that are due."""
         for i, sensor in enumerate(self._order):
             if self.t * sensor.rate >= self._measured[i] - 1e-6:
                 self._measured[i] += 1
                 yield sensor.measure(self.t, self.pose)
 
-    def _told(self, path: Array, metres: float) -> Array:
+    def _reported_motions(self, path: Array, metres: float) -> Array:
         """Reported motions (N, 3) of one period each along a path, each in the robot's frame before it."""
         twists = se2.log(se2.between(path[:-1], path[1:]))
         lengths = np.hypot(twists[:, 0], twists[:, 1])
@@ -170,12 +170,12 @@ class SimulatedRobot:
         if not keep.any():
             return np.empty((0, 3))
         poses = np.concatenate((path[:1], path[1:][keep]))
-        way = Trajectory(np.concatenate((np.zeros(1), np.cumsum(seconds[keep]))), poses)
-        times = np.append(np.arange(0.0, way.t[-1] - 1e-6, PERIOD), way.t[-1])
-        at = way.at(times)
+        driven = Trajectory(np.concatenate((np.zeros(1), np.cumsum(seconds[keep]))), poses)
+        times = np.append(np.arange(0.0, driven.t[-1] - 1e-6, PERIOD), driven.t[-1])
+        at = driven.at(times)
         return se2.between(at[:-1], at[1:])
 
-    def _is_free(self, there: Array) -> bool:
+    def _is_free(self, target: Array) -> bool:
         """Whether the robot may move there: to a free cell or, from a cell that is not free, to one no nearer to a wall."""
-        ahead = Path(np.stack((np.zeros(3), se2.between(self.pose, there))), "step")
+        ahead = Path(np.stack((np.zeros(3), se2.between(self.pose, target))), "step")
         return bool(free_steps(self._space, self.pose[None], [ahead])[0, 0])

@@ -16,7 +16,7 @@ from factorgraph_loc.sensors.registry import functions
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 
-SPEED = 0.5  # m/s, for the noise of the odometry that grows with time
+SPEED = 0.5  # m/s: converts noise of the odometry per second to noise per metre
 METRES_PER_RADIAN = 0.5  # of a robot that turns in place at 1 rad/s
 
 
@@ -33,7 +33,7 @@ class Sensors:
     @property
     def goals(self) -> Array:
         """Places (K, 2) near which the sensors are most informative."""
-        return np.concatenate([np.empty((0, 2)), *(one.goals for one in self.forecasts)])
+        return np.concatenate([np.empty((0, 2)), *(forecast.goals for forecast in self.forecasts)])
 
     @staticmethod
     def of(
@@ -53,5 +53,5 @@ class Sensors:
             if only is None or name in only
         ]
         # those with goals first: the order affects the rounding of sums
-        found = sorted((one for one in made if one is not None), key=lambda one: not len(one.goals))
-        return Sensors(odometry_model(rig, constants_as_noise=True), tuple(found), speed / turn_rate)
+        forecasts = sorted((f for f in made if f is not None), key=lambda f: not len(f.goals))
+        return Sensors(odometry_model(rig, constants_as_noise=True), tuple(forecasts), speed / turn_rate)

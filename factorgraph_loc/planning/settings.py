@@ -24,7 +24,7 @@ class PolicySettings(FileModel):
     per_metre: Annotated[float, Field(ge=0.0, le=100.0), InUnit("nats/m")] = 0.3
     """cost of a near path by its length; far ones have none"""
     expectation: Literal["sampled", "fisher"] = "sampled"
-    """over sampled scans or, for a unimodal belief, by the Fisher information in closed form"""
+    """sampled: over sampled scans; fisher: by the Fisher information in closed form, if the belief is unimodal"""
     per_second: Annotated[float, Field(ge=0.0, le=100.0), InUnit("nats/s")] = 0.0
     """cost of a path by its duration"""
     samples: Annotated[int, Field(ge=8, le=10_000)] = 128

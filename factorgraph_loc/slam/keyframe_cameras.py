@@ -69,7 +69,7 @@ class KeyframeCameras:
         if self._offset is None or graph.constants is None or keyframe not in self.twists:
             return guess
         twist = self.twists[keyframe]
-        variance = graph.spreads[graph.shared[0]][self._offset, self._offset]
+        variance = graph.covariances[graph.shared[0]][self._offset, self._offset]
         later = se2.exp(sign * float(graph.constants[self._offset]) * twist)
         carried = se2.adjoint(se2.inverse(later))
         covariance = carried @ guess[1] @ carried.T + sign * variance * np.outer(twist, twist)

@@ -2,10 +2,10 @@
 
 About once a second an image is compared with the possibly visible ones of these points, without a predicted pose
 (Associator.relocalized of :mod:`factorgraph_loc.vision.association`). The resulting pose must be on the floor. The points are
-matched again from that pose, and enough of the visible ones must match, in all parts of the image. Places in a building look
-alike: therefore the poses of consecutive images must agree by odometry, within the possible drift of the track. Geometric
-verification and consistency over consecutive images: Cadena, Galvez-Lopez, Tardos, Neira, IEEE Transactions on Robotics 28(4),
-2012.
+matched again from that pose, and enough of the visible ones must match, in all parts of the image. Places in a building
+resemble each other. Therefore the poses of consecutive images must agree by odometry, within the possible drift of the track.
+Geometric verification and consistency over consecutive images: Cadena, Galvez-Lopez, Tardos, Neira, IEEE Transactions on Robotics
+28(4), 2012.
 """
 
 import math

@@ -16,7 +16,7 @@ from factors.se2 import Array
 
 
 def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
-    """The covariance (12 + P + D, 12 + P + D) of ``posterior``, an update of ``prior``, for an invariant error with the
+    """The covariance (12 + P + D, 12 + P + D) of ``posterior``, an update of ``prior``. The error is invariant and has the
     covariance of the update.
 
     ``scale``: index of the constant that scales distances, or None.

@@ -109,8 +109,8 @@ class PointMapper(Mapper):
     def forget(self, first: Keyframe) -> Sequence[int]:
         return [] if self._unknown is None else self._unknown.forget(first)
 
-    def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
-        return None if self._unknown is None else self._unknown.learnt(values, spreads)
+    def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
+        return None if self._unknown is None else self._unknown.learnt(values, covariances)
 
 
 def bind(sensors: Mapping[str, Sensor], diagnostics: Diagnostics, settings: GraphSettings) -> Mapper:

@@ -107,11 +107,11 @@ class PointViews:
         return self._with_views(PointMap.of(tuple(names), positions, covariances), views)
 
     def settled(
-        self, points: PointMap, keys: Sequence[int], values: Mapping[int, Array], spreads: Mapping[int, Array]
+        self, points: PointMap, keys: Sequence[int], values: Mapping[int, Array], pose_covariances: Mapping[int, Array]
     ) -> PointMap:
         """The map of the points ``keys`` with all their views at the poses of their keyframes, which are among ``values``.
 
-        The body-frame covariances of these poses, among ``spreads``, are those of the common error of all points of a view.
+        ``pose_covariances``: body-frame covariances of these poses by key, of the common error of all points of a view.
         """
         rows = [
             (i, view)
@@ -130,7 +130,7 @@ class PointViews:
             return points
         views = [view for _, view in rows]
         poses = np.array([values.get(view.keyframe, view.guess[0]) for view in views])
-        body = np.array([spreads.get(view.keyframe, view.guess[1]) for view in views])
+        body = np.array([pose_covariances.get(view.keyframe, view.guess[1]) for view in views])
         seen_from = np.array([camera_pose(self._model, pose)[0] for pose in poses])
         common = carried(se2.body_to_world(poses, body), seen_from[:, :2] - poses[:, :2])
         return replace(self._with_views(points, rows), seen_from=seen_from, common=common)

@@ -186,7 +186,7 @@ class UnknownPoints:
                 row = chosen.rows[chosen.names.index(name)]
                 self._views.keep(key, m.frame, row, self._distance_travelled, keyframe.key, guess)
             addition.values[key] = point.position
-            graph.values[key], graph.spreads[key] = point.position, point.covariance
+            graph.values[key], graph.covariances[key] = point.position, point.covariance
             prior = PointPrior.of(pose, point.position, PRIOR_SIGMA)
             addition.hang(keyframe, Node((keyframe.key, key), prior, 3))
             for sighting in sightings:
@@ -295,18 +295,18 @@ class UnknownPoints:
         self._cameras.forget(first.index)
         return forgotten
 
-    def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
+    def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
         """All points that were ever in the graph and are not forgotten, under the first of their keys; features with some views.
-        ``values`` and ``spreads`` are of keyframes too."""
+        ``values`` and ``covariances`` include those of keyframes."""
         keys: dict[str, int] = {}
         for point in sorted((*self._points.values(), *self._astray, *self._gone), key=lambda point: point.key):
             if point.key in values:
                 keys.setdefault(point.name, point.key)
         if not keys:
             return None
-        positions, covariances = (np.array([part[key] for key in keys.values()]) for part in (values, spreads))
-        points = PointMap.of(tuple(keys), positions, covariances)
-        return self._views.settled(points, tuple(keys.values()), values, spreads)
+        positions, of_points = (np.array([part[key] for key in keys.values()]) for part in (values, covariances))
+        points = PointMap.of(tuple(keys), positions, of_points)
+        return self._views.settled(points, tuple(keys.values()), values, covariances)
 
     def _tilts(self, image: _NewImage, tilt: Array, sigma: float) -> None:
         """Make a variable of the ``tilt`` of the robot at a new keyframe, of a floor that is level to ``sigma`` [rad]."""

@@ -45,7 +45,7 @@ def test_a_failure_is_one_line_with_estimator_time_and_measurement(error, reason
         guard.process(failing(error), SEEN)
     assert str(told.value) == f"ekf on hall: bearing_range at 3.250 s: {reason}"
     assert told.value.__cause__ is error
-    with pytest.raises(RunFailedError) as told, guard.telling("the estimate at 4.000 s"):
+    with pytest.raises(RunFailedError) as told, guard.computing("the estimate at 4.000 s"):
         raise error
     assert str(told.value) == f"ekf on hall: the estimate at 4.000 s (after bearing_range at 3.250 s): {reason}"
 
@@ -69,10 +69,10 @@ def test_warnings_are_silent_inside_and_as_before_outside():
         guard.process(SimpleNamespace(process=overflow), Tick(1.0))
         with guard.quiet():
             guard.process(SimpleNamespace(process=overflow), Tick(1.0))
-            with guard.telling("the estimate"):
+            with guard.computing("the estimate"):
                 overflow()
             overflow()
-        with guard.telling("the estimate"):
+        with guard.computing("the estimate"):
             overflow()
     assert np.geterr() == before
 
@@ -100,7 +100,7 @@ def test_a_sound_estimate_is_the_same():
 )
 def test_what_cannot_be_is_a_failure(given, why):
     guard = Guard("ekf on hall")
-    with pytest.raises(RunFailedError) as told, guard.telling("the estimate", 1.0):
+    with pytest.raises(RunFailedError) as told, guard.computing("the estimate", 1.0):
         sound(given)
     assert str(told.value) == f"ekf on hall: the estimate at 1.000 s: {why}"
 
@@ -125,11 +125,11 @@ def test_a_trajectory_names_the_time_of_the_pose_that_cannot_be():
     for bad in (np.full((3, 3), np.nan), np.diag((1.0, -1.0, 1.0)), np.zeros((3, 3))):
         wrong = covariances.copy()
         wrong[1] = bad
-        with pytest.raises(RunFailedError, match=r"final: the covariance at 1\.000 s is not"), guard.telling("final"):
+        with pytest.raises(RunFailedError, match=r"final: the covariance at 1\.000 s is not"), guard.computing("final"):
             sound_trajectory(Trajectory(t, poses, wrong))
     poses = poses.copy()
     poses[2, 1] = np.inf
-    with pytest.raises(RunFailedError, match=r"the pose at 2\.000 s is not finite"), guard.telling("final"):
+    with pytest.raises(RunFailedError, match=r"the pose at 2\.000 s is not finite"), guard.computing("final"):
         sound_trajectory(Trajectory(t, poses))
     assert len(sound_trajectory(Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3))))) == 0
 

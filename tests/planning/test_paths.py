@@ -36,7 +36,7 @@ def test_primitives_have_their_length_and_start_at_the_robot(length):
     assert 30 <= len(paths) <= 60
     for path in paths:
         np.testing.assert_array_equal(path.poses[0], 0.0)
-        assert np.diff(path.way).max() <= STEP + 1e-9
+        assert np.diff(path.metres).max() <= STEP + 1e-9
         assert path.length == pytest.approx(length) or path.length == pytest.approx(length / 2.0)
         # the robot drives forwards: along its heading, or on an arc
         steps = se2.log(se2.between(path.poses[:-1], path.poses[1:]))
@@ -104,7 +104,7 @@ def test_waypoints_are_spread(office):
 
 
 def free_length(space, poses, path):
-    return path.way[free_steps(space, poses, [path])[0]]
+    return path.metres[free_steps(space, poses, [path])[0]]
 
 
 def test_free_length_agrees_with_distances_to_walls(office):
@@ -115,7 +115,7 @@ def test_free_length_agrees_with_distances_to_walls(office):
     steps = free_steps(space, poses, paths)
     free, before, after, beyond = [], [], [], []
     for path, last in zip(paths, steps, strict=True):
-        np.testing.assert_array_equal(free_length(space, poses, path), path.way[last])
+        np.testing.assert_array_equal(free_length(space, poses, path), path.metres[last])
         for pose, end in zip(poses[:20], last[:20].tolist(), strict=True):
             at = se2.compose(pose, path.poses)[:, :2]
             free.append(at[: end + 1])

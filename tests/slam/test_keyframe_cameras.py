@@ -18,7 +18,7 @@ POSE = np.array((2.0, -1.0, 0.7))
 ROOT = np.array(((0.1, 0.0, 0.0), (0.02, 0.2, 0.0), (0.0, -0.03, 0.06)))
 STEP = 1e-6
 GRAPH = SimpleNamespace(
-    constants=np.array((0.02, OFFSET)), spreads={7: np.diag((0.01, SIGMA)) ** 2}, shared=(7,), twist=lambda _: TWIST
+    constants=np.array((0.02, OFFSET)), covariances={7: np.diag((0.01, SIGMA)) ** 2}, shared=(7,), twist=lambda _: TWIST
 )
 
 

@@ -1,8 +1,8 @@
 """The offline optimum: the whole run as one robust least-squares problem, solved once all measurements are there.
 
 The losses may have many optima. One is found from the start, a second by graduated non-convexity: the losses begin wide and narrow
-to their own scale (Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020, here for the Geman-McClure loss). Those of links between
-poses, of which most may be false, begin so wide that they are convex. The better optimum counts.
+to their own scale (Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020, here for the Geman-McClure loss). Most links
+between poses may be false, so their losses begin wide enough to be convex. The better optimum counts.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> 
     keyframes = list(graph.keyframes.values())
     body = se2.world_to_body(graph.prior.pose, graph.prior.covariance)
     factors: list[tuple[Factor, tuple[int, ...]]] = [(PriorFactor(graph.prior.pose, body), (keyframes[0].key,))]
-    means, spreads = graph.constant_priors()
-    factors += [(VectorPriorFactor(means[key], np.sqrt(np.diag(spreads[key]))), (key,)) for key in means]
+    means, covariances = graph.constant_priors()
+    factors += [(VectorPriorFactor(means[key], np.sqrt(np.diag(covariances[key]))), (key,)) for key in means]
     factors += [graph.odometry_factor(k) for k in keyframes[1:]]
     for node in (node for keyframe in keyframes for node in keyframe.nodes):
         factor, sensor = node.factor, graph.sensors.get(node.sensor)
@@ -78,16 +78,16 @@ def solve_whole(graph: Graph, start: Values, widest: float) -> tuple[Array, Arra
         best = problem.solve(best.values)
     values = best.values
     try:
-        found = problem.covariances(values, [k for k in values if is_pose(k) or not is_of_keyframe(k)])
+        marginals = problem.covariances(values, [k for k in values if is_pose(k) or not is_of_keyframe(k)])
     except IndeterminateError as error:
         raise graph.unsolved(error) from error
-    graph.report_damping(found.damping)
+    graph.report_damping(marginals.damping)
     for key in graph.values:
         graph.values[key] = values[key]
         if not is_of_keyframe(key):
-            graph.spreads[key] = found.by_key[key]
+            graph.covariances[key] = marginals.by_key[key]
     keys = [k.key for k in graph.keyframes.values()]
-    return np.array([values[key] for key in keys]), np.array([found.by_key[key] for key in keys])
+    return np.array([values[key] for key in keys]), np.array([marginals.by_key[key] for key in keys])
 
 
 class AtTheEnd:

@@ -15,7 +15,7 @@ from factors import chain, se2
 from factors.graph import Factor, Stack, Stackable, Values, index_of, is_pose
 from factors.se2 import Array
 
-MOST_PARAMETERS = 40  # all have to do with all: beyond this number GTSAM's elimination, which knows better, is faster
+MOST_PARAMETERS = 40  # the solver is dense in the parameters: above this number GTSAM's sparse elimination is faster
 Placed = tuple[Factor, tuple[int, ...]]  # a factor with the keys of its variables
 State = tuple[Array, Array]  # poses (N, 3), and parameters (P,)
 
@@ -42,7 +42,7 @@ class Chained:
         return bool(self._poses)
 
     def begin(self, values: Values) -> State | None:
-        """The state at ``values``; None where there are too many parameters."""
+        """The state at ``values``; None if it has too many parameters."""
         ends = np.cumsum([0, *(len(values[key]) for key in self._vectors)]).tolist()
         if ends[-1] > MOST_PARAMETERS:
             return None
@@ -56,8 +56,8 @@ class Chained:
     def values(self, state: State) -> Values:
         """A state as values by key."""
         poses, parameters = state
-        found = {key: parameters[columns] for key, columns in self._columns.items()}
-        return dict(zip(self._poses, poses, strict=True)) | found
+        vectors = {key: parameters[columns] for key, columns in self._columns.items()}
+        return dict(zip(self._poses, poses, strict=True)) | vectors
 
     def cost(self, state: State) -> float:
         return sum(stack.cost(*state) for stack in self._stacks)
@@ -77,25 +77,25 @@ class Chained:
         """The state after a step of Levenberg and Marquardt, and the largest component of the step; None where the problem is
         nearly singular."""
         try:
-            found, poses, parameters = chain.solved(self.system(state), damping)
+            is_solved, poses, parameters = chain.solved(self.system(state), damping)
         except np.linalg.LinAlgError:
             return None
-        if not found:
+        if not is_solved:
             return None
         largest = max(np.abs(poses).max(initial=0.0), np.abs(parameters).max(initial=0.0))
         return (se2.compose(state[0], se2.exp(poses)), state[1] + parameters), float(largest)
 
     def covariances(self, values: Values) -> Covariances | None:
-        """Marginal covariances of all variables; None where they must be found with more digits."""
+        """Marginal covariances of all variables; None if they need higher precision."""
         state = self.begin(values)
         if state is None:
             return None
         try:
-            found, of_poses, of_parameters = chain.covariances(self.system(state))
+            is_solved, of_poses, of_parameters = chain.covariances(self.system(state))
         except np.linalg.LinAlgError:
             return None
         variances = np.concatenate((np.diagonal(of_poses, axis1=1, axis2=2).ravel(), np.diag(of_parameters)))
-        if not (found and np.all(np.isfinite(variances)) and np.all(variances > 0.0)):
+        if not (is_solved and np.all(np.isfinite(variances)) and np.all(variances > 0.0)):
             return None
         shared = {key: of_parameters[columns, columns] for key, columns in self._columns.items()}
         return Covariances(dict(zip(self._poses, of_poses, strict=True)) | shared, 0.0)
@@ -120,19 +120,19 @@ class Chained:
 
 
 def _kind(factor: Factor, keys: tuple[int, ...]) -> Hashable:
-    """What factors have in common that are linearised by one call, None for those that are not."""
+    """A key that is equal for factors linearised by one call; None for a factor linearised separately."""
     kind = cast(Stackable, factor).kind if _is_stackable(type(factor)) else None
     return None if kind is None else (type(factor), kind, *[key for key in keys if not is_pose(key)])
 
 
 @cache
 def _is_stackable(kind: type[Factor]) -> bool:
-    """Whether factors of a class become stacks; to ask that of each factor takes longer than to linearise it."""
+    """Whether factors of a class become stacks. It is cached, because the check takes longer than a linearisation."""
     return hasattr(kind, "kind") and hasattr(kind, "stack")
 
 
 class _Others:
-    """Factors of any kind, each linearised by itself."""
+    """Factors of any kind, each linearised separately."""
 
     def __init__(self, placed: Sequence[Placed], place: dict[int, int], columns: dict[int, slice]) -> None:
         self._placed, self._place, self._columns = placed, place, columns

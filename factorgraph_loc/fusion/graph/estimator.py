@@ -1,10 +1,10 @@
 """The graph estimators: the smoother, one factor graph over the run, and the batch solution.
 
-By default causal estimates come from a window, from which poses older than 10 s are marginalised out, and the whole problem is
-solved at the end. With ``lag = "all"`` the whole history stays in iSAM2; with a number of seconds each pose keeps the estimate
-that it left the window with. Where landmarks or points are estimated, which loops may close at any time, the default is the whole
-history. With ``final_only``, as in the batch, the graph is built with a guess and solved at the end only; but where points are
-estimated, such a guess drifts too far to tell which sightings belong together, and iSAM2 solves the graph on the way.
+By default causal estimates come from a window, and poses older than 10 s are marginalised out. The whole problem is solved at the
+end. With ``lag = "all"`` the whole history stays in iSAM2. With a number of seconds each pose keeps its estimate at the time when
+it left the window. If landmarks or points are estimated, the default is the whole history, because a loop may close at any time.
+With ``final_only``, as in the batch, the graph is built with a guess and solved only at the end. If points are estimated, such a
+guess drifts too far for the association of sightings, and iSAM2 solves the graph online.
 
 When the search rejects the track and finds another pose, the graph goes back to the time of the change, and goes on at that pose
 after a step of unknown length. Measurements are replayed in slices of fixed work, so that results do not depend on the machine;
@@ -45,7 +45,7 @@ from factors.se2 import Array
 __all__ = ["Batch", "BatchSettings", "Smoother", "SmootherSettings"]
 
 
-REPLAYED, TICK = 300, 2  # work of which so much is done at once, and that of a tick; see `Sensor.work`
+REPLAYED, TICK = 300, 2  # work of one slice of a replay, and of a tick; see `Sensor.work`
 WIDEST = 8.0  # how many times wider than its own scale a robust loss begins where the problem is solved from a guess
 
 
@@ -75,7 +75,7 @@ class Smoother(Timeline):
         self._graph = Graph(self._motion, sensors, mapper, self.diagnostics)
         self._search = self._seeking = Tracking(sensors, self._motion, setup.rng, diagnostics)
         self._search.remember()
-        # where landmarks are estimated too, they cannot tell the place
+        # landmarks that are estimated cannot determine an unknown start
         self.supports_unknown_start = settings.landmarks == "known"
         self._backend: Backend
         if settings.final_only and not mapper.estimates:
@@ -93,7 +93,7 @@ class Smoother(Timeline):
             self._seek_heading(prior, self._search)
             return
         self._t = self._begun = prior.t
-        self._search.begin_track(found=False)
+        self._search.begin_track(by_search=False)
         self._backend.begin(self._graph.begin(prior))
 
     def _renew(self, m: Measurement) -> None:
@@ -138,13 +138,13 @@ class Smoother(Timeline):
         """The diagnostics, and what the final trajectory adds to them."""
         return self.diagnostics if self._graph.prior is None else self._concluded().graph.diagnostics
 
-    def forget(self, before: float) -> None:
-        """Forget the trajectory before then, as far as it has left a window whose ``lag`` is set; else all is kept."""
+    def forget(self, until: float) -> None:
+        """Forget the trajectory until this time that has left the window. Without a set ``lag`` all is kept."""
         if isinstance(self._backend, Incremental):
-            self._backend.forget(min(before, self._taken_until - self._settings.max_delay))
+            self._backend.forget(min(until, self._taken_until - self._settings.max_delay))
 
     def _concluded(self) -> _Conclusion:
-        """The graph as it is at its end, which is solved beside it: nothing that comes later shall depend on who asked."""
+        """A solved copy of the graph at its end. The original is not changed, so that later results do not depend on this call."""
         if self._conclusion is None:
             graph = self._graph.copy()
             graph.newest.nodes += self._builder.waiting()
@@ -176,8 +176,8 @@ class Smoother(Timeline):
                 return Tracked(odometry, graph.pose, graph.covariance)
             return Tracked(odometry, *graph.moved(m.t)[:2])
 
-        def back(t: float, here: Array) -> Array:
-            return self._placed(t, PosePrior(m.t, here, FOUND))
+        def back(t: float, pose: Array) -> Array:
+            return self._placed(t, PosePrior(m.t, pose, FOUND))
 
         refuted = self._search.refuted(m, track, back)
         best = None if refuted is None else self._search.best
@@ -187,7 +187,7 @@ class Smoother(Timeline):
             self._go_on(refuted, best)
 
     def _go_on(self, refuted: Refuted, best: PosePrior) -> None:
-        """Take back what was added since the track was wrong, and add it once more at the ``best`` place."""
+        """Remove the keyframes since the track was wrong, and replay their measurements from the ``best`` pose."""
         graph, since = self._graph, refuted.since
         first = graph.newest.index + 1  # the number of the first keyframe that is taken back
         while first > 1 and graph.keyframes[first - 1].t >= since and self._backend.is_open(first - 2):
@@ -208,7 +208,7 @@ class Smoother(Timeline):
             sensor.restart(t)
         graph.forget_points()
         self._backend.begin(keyframe)
-        self._search.begin_track(found=True)
+        self._search.begin_track(by_search=True)
         self._replay(replay)
 
     def _placed(self, t: float, best: PosePrior) -> Array:
@@ -223,11 +223,11 @@ class Smoother(Timeline):
 
     @property
     def _taken_until(self) -> float:
-        """The time until which all that came has been taken in."""
+        """The time [s] until which all measurements are processed."""
         return min((m.t for m in self._behind), default=self._t)
 
     def _catch_up(self) -> None:
-        """Go on with what is taken in once more, for one slice of work."""
+        """Continue a replay by one slice of work."""
         work = REPLAYED
         while self._behind and work > 0:
             m = self._behind.popleft()
@@ -249,31 +249,31 @@ def _learnt(graph: Graph, poses: Iterable[Array] = (), covariances: Iterable[Arr
     """The constants and landmarks that are estimated; points at final ``poses`` of all keyframes, with their body-frame
     ``covariances``."""
     values: dict[str, tuple[float, float]] = {}
-    blocks = [(name, graph.values[key], graph.spreads[key]) for name, key in graph.keys.items() if is_landmark(key)]
+    blocks = [(name, graph.values[key], graph.covariances[key]) for name, key in graph.keys.items() if is_landmark(key)]
     landmarks = learnt_landmarks(blocks)
     for name, key in graph.keys.items():
         if is_landmark(key):
             continue
         prefix = "" if name == MOTION else f"{name}."
-        sigmas = np.sqrt(np.diag(graph.spreads[key]))
+        sigmas = np.sqrt(np.diag(graph.covariances[key]))
         for label, value, sigma in zip(graph.constants[name].names, graph.values[key], sigmas, strict=True):
             values[prefix + label] = (float(value), float(sigma))
     numbered = graph.keyframes.values()
-    at, spreads = ({k.key: v for k, v in zip(numbered, part)} for part in (poses, covariances))  # noqa: B905
-    points = graph.mapper.learnt(graph.departed[0] | graph.values | at, graph.departed[1] | graph.spreads | spreads)
-    return Learnt(values, landmarks, points)
+    means, bodies = ({k.key: v for k, v in zip(numbered, part)} for part in (poses, covariances))  # noqa: B905
+    means, bodies = graph.departed[0] | graph.values | means, graph.departed[1] | graph.covariances | bodies
+    return Learnt(values, landmarks, graph.mapper.learnt(means, bodies))
 
 
 def _trajectory(graph: Graph, poses: Array, covariances: Array) -> Trajectory:
-    """The trajectory from all keyframes, ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3), at the ticks, but for those
-    at which nobody knows where the robot was; see :func:`factors.motion.poses_between`."""
+    """The trajectory from all keyframes, ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3), at the ticks. Ticks with
+    an unknown pose are left out. See :func:`factors.motion.poses_between`."""
     newest = {tick.t: tick for tick in graph.ticks}
     stamps = np.array(sorted(newest))
     ticks = [newest[t] for t in stamps[is_known(stamps, graph.changes)].tolist()]
     keyframes = list(graph.keyframes.values())
-    before = np.array([tick.keyframe - keyframes[0].index for tick in ticks], dtype=np.int64)
+    previous = np.array([tick.keyframe - keyframes[0].index for tick in ticks], dtype=np.int64)
     ends = np.array([tick.odometry for tick in ticks]).reshape(-1, STATE)
-    starts = np.array([k.odometry for k in keyframes]).reshape(-1, STATE)[before]
+    starts = np.array([k.odometry for k in keyframes]).reshape(-1, STATE)[previous]
     deltas, noises = graph.motion.relatives(starts, ends, graph.value(MOTION, NOTHING_KNOWN))
     steps = [graph.recalibrated(k.from_previous) for k in keyframes[1:] if k.from_previous is not None]
     later = (
@@ -282,5 +282,5 @@ def _trajectory(graph: Graph, poses: Array, covariances: Array) -> Trajectory:
         np.array([step.duration for step in steps]),
         np.array([k.is_elsewhere for k in keyframes[1:]], dtype=np.bool_),
     )
-    at, spread = poses_between(before, deltas, noises, np.abs(ends[:, 0] - starts[:, 0]), *later, poses, covariances)
-    return Trajectory(np.array([tick.t for tick in ticks]), at, se2.body_to_world(at, spread))
+    at, body = poses_between(previous, deltas, noises, np.abs(ends[:, 0] - starts[:, 0]), *later, poses, covariances)
+    return Trajectory(np.array([tick.t for tick in ticks]), at, se2.body_to_world(at, body))

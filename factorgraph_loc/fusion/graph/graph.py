@@ -38,7 +38,7 @@ from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
 STATE = len(ChainState._fields)
-NOTHING_KNOWN = np.zeros(0)  # of constants, where none are estimated
+NOTHING_KNOWN = np.zeros(0)  # values of constants if none are estimated
 
 
 @dataclass(frozen=True)
@@ -117,14 +117,14 @@ def jumps(guess: Guess, pose: Array) -> bool:
 
 @dataclass(frozen=True)
 class GraphView:
-    """What a mapper sees of its graph: the ``keyframes`` by number; estimates of all variables but poses, to which it adds
-    (``values``, ``spreads``); the ``current`` estimate of a variable by key; which keyframes are open; the motion ``between``
-    two of them; what wheels that ``slip`` do to an increment, and the robot's velocity (``twist``, (3,)) at a time, as the motion
-    tells them; keys of the sensor's constants (``shared``), and the values (P,) of these."""
+    """The graph as its mapper reads it. ``keyframes``: by number; ``values``, ``covariances``: estimates of all variables but
+    poses, where the mapper adds its own; ``current``: the estimate of a variable by key; ``is_open``: whether a keyframe is open;
+    ``between``: the motion between two keyframes; ``slip``: the effect of slipping wheels on an increment; ``twist``: the robot's
+    velocity (3,) at a time; ``shared``: keys of the sensor's constants; ``constants`` (P,): their values."""
 
     keyframes: Mapping[int, Keyframe]
     values: Values
-    spreads: Values
+    covariances: Values
     current: Callable[[int], Array]
     is_open: Callable[[int], bool]
     between: Callable[[Keyframe, Keyframe], Increment]
@@ -181,8 +181,8 @@ class Mapper:
         Returns the keys of these points."""
         return ()
 
-    def learnt(self, values: Mapping[int, Array], spreads: Mapping[int, Array]) -> PointMap | None:
-        """All points that ever were in the graph. ``values`` and ``spreads``: of the points and of the poses of keyframes."""
+    def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
+        """All points that ever were in the graph. ``values`` and ``covariances``: of the points and of the poses of keyframes."""
         return None
 
 
@@ -200,7 +200,7 @@ class Graph:
         self.constants: dict[str, Estimated] = {MOTION: motion.constants}
         self.constants |= {name: sensor.constants for name, sensor in sensors.items()}
         self.keys = {n: constants_key(i) for i, (n, c) in enumerate(self.constants.items()) if c.names}
-        self.values, self.spreads = self.constant_priors()
+        self.values, self.covariances = self.constant_priors()
         self.departed: tuple[Values, Values] = {}, {}
         self.keyframes: dict[int, Keyframe] = {}  # consecutive numbers
         self.ticks: list[TickAt] = []
@@ -221,13 +221,13 @@ class Graph:
         return self.newest
 
     def copy(self) -> Graph:
-        """One of its own with the same content, to be solved beside this one."""
+        """An independent graph with the same content, to be solved separately."""
         graph = object.__new__(Graph)
         vars(graph).update(vars(self))
         graph.diagnostics = self.diagnostics.copy()
         graph.keyframes = {i: replace(k, nodes=list(k.nodes)) for i, k in self.keyframes.items()}
         graph.newest = graph.keyframes[self.newest.index]
-        graph.values, graph.spreads = dict(self.values), dict(self.spreads)
+        graph.values, graph.covariances = dict(self.values), dict(self.covariances)
         return graph
 
     def anchor(self) -> None:
@@ -254,8 +254,8 @@ class Graph:
             for departed in self.departed:
                 departed.pop(key, None)
 
-    def before(self, t: float) -> Keyframe:
-        """The last keyframe at or before ``t``; the oldest one that is kept where all are later."""
+    def keyframe_before(self, t: float) -> Keyframe:
+        """The last keyframe at or before ``t``; the oldest one in the graph if all are later."""
         keyframe = self.newest
         while keyframe.t > t and keyframe.index - 1 in self.keyframes:
             keyframe = self.keyframes[keyframe.index - 1]
@@ -267,11 +267,11 @@ class Graph:
         return self.recalibrated(self.motion.relative(start, self.motion.state(t)))
 
     def part_of_step(self, keyframe: Keyframe, t: float) -> Increment:
-        """The motion from a keyframe to ``t``, before the next one, of which the odometry may be forgotten: the part of the step to
-        that by time, along its arc."""
-        after = self.keyframes[keyframe.index + 1]
-        assert after.from_previous is not None
-        step, share = self.recalibrated(after.from_previous), (t - keyframe.t) / (after.t - keyframe.t)
+        """The motion from a keyframe to ``t``, a time before the next keyframe. It is a share of the step to that keyframe by time,
+        along its arc, because the odometry may be forgotten."""
+        following = self.keyframes[keyframe.index + 1]
+        assert following.from_previous is not None
+        step, share = self.recalibrated(following.from_previous), (t - keyframe.t) / (following.t - keyframe.t)
         delta = se2.exp(share * se2.log(step.delta))
         return Increment(delta, share * step.covariance, share * step.duration, share * step.still)
 
@@ -290,21 +290,21 @@ class Graph:
         return increment if key is None else self.motion.recalibrated(increment, self.values[key])
 
     def value(self, name: str, default: Array | None = None) -> Array:
-        """The estimate of a block, ``default`` where there is none; KeyError where that is None."""
+        """The estimate of a block, or ``default`` without an estimate. KeyError if ``default`` is None."""
         if default is not None and name not in self.keys:
             return default
         return self.values[self.keys[name]]
 
     def constant_priors(self) -> tuple[Values, Values]:
         """Means and covariances of the sensors' constants before any measurement."""
-        held = [(self.keys[name], c) for name, c in self.constants.items() if c.names]
-        return {key: np.zeros(len(c.names)) for key, c in held}, {key: np.diag(c.sigmas**2) for key, c in held}
+        sigmas = {self.keys[name]: c.sigmas for name, c in self.constants.items() if c.names}
+        return {key: np.zeros(len(s)) for key, s in sigmas.items()}, {key: np.diag(s**2) for key, s in sigmas.items()}
 
     def new_block(self, new: NewVariable, covariance: Array) -> int:
         """A landmark that becomes a variable, as seen from a pose with this body-frame ``covariance`` (3, 3); its key."""
         numbers = [index_of(key) for key in self.keys.values() if is_landmark(key)]
         key = self.keys[new.name] = landmark_key(1 + max(numbers, default=-1))
-        self.values[key], (_, self.spreads[key]) = new.mean, new.joint(covariance, {})
+        self.values[key], (_, self.covariances[key]) = new.mean, new.joint(covariance, {})
         return key
 
     def node(self, keyframe: Keyframe, term: Term, sensor: str) -> Node:
@@ -313,7 +313,7 @@ class Graph:
         return Node(keys, term.factor, term.rows, sensor=sensor)
 
     def odometry_factor(self, keyframe: Keyframe) -> tuple[Factor, tuple[int, ...]]:
-        """The factor from the keyframe before, and its keys. The constants of the odometry do not tell how a robot is carried."""
+        """The factor from the previous keyframe, and its keys. Constants of the odometry do not apply while a robot is carried."""
         assert keyframe.from_previous is not None
         keys: tuple[int, ...] = (keyframe.key - 1, keyframe.key)
         if MOTION in self.keys and not keyframe.is_elsewhere:
@@ -327,8 +327,8 @@ class Graph:
         return keyframe.factor, keys
 
     def drop_astray(self, keyframes: Collection[Keyframe], values: Values) -> bool:
-        """Take sightings out of the graph that cannot be of their points, as these are estimated, and points of which too few are
-        left. Returns whether there were any."""
+        """Remove sightings that do not fit the estimate of their point, and points with too few remaining sightings. Returns
+        whether any was removed."""
         mapper = self.mapper
         if not mapper.estimates:
             return False
@@ -348,26 +348,26 @@ class Graph:
         return True
 
     def forget_points(self) -> None:
-        """Give up the points that the keyframes that are left do not tell."""
+        """Remove points that the remaining keyframes do not determine."""
         keyframes = self.keyframes.values()
-        seen = Counter(key for k in keyframes for node in k.nodes for key in node.keys if is_point(key))
+        sightings = Counter(key for k in keyframes for node in k.nodes for key in node.keys if is_point(key))
         if self.mapper.estimates:
-            kept = {key for key, count in seen.items() if count >= self.mapper.fewest}
+            kept = {key for key, count in sightings.items() if count >= self.mapper.fewest}
             for k in keyframes:
                 k.nodes = [node for node in k.nodes if all(key in kept or not is_point(key) for key in node.keys)]
             for key in [key for key in self.values if is_point(key) and key not in kept]:
-                del self.values[key], self.spreads[key]
+                del self.values[key], self.covariances[key]
             self.mapper.keep_only(kept)
         for key in [k for k in self.values if is_of_keyframe(k) and index_of(k) >= self.newest.index]:
             del self.values[key]  # the tilt of a keyframe that was taken back
 
     def forget_landmarks(self, known: Collection[int]) -> None:
-        """Give up the landmarks that neither the keyframes that are left tell, nor a summary of what has left the graph, whose
-        variables are ``known``."""
-        told = {key for k in self.keyframes.values() for node in k.nodes for key in node.keys}
+        """Remove landmarks that no remaining keyframe observes and no summary contains. ``known``: variables of the summary of
+        marginalised keyframes."""
+        observed = {key for k in self.keyframes.values() for node in k.nodes for key in node.keys}
         for name, key in list(self.keys.items()):
-            if is_landmark(key) and key not in told and key not in known:
-                del self.keys[name], self.values[key], self.spreads[key]
+            if is_landmark(key) and key not in observed and key not in known:
+                del self.keys[name], self.values[key], self.covariances[key]
 
     def report_damping(self, damping: float) -> None:
         """Note as an event that covariances needed a larger damping than before."""

@@ -1,7 +1,7 @@
 """A graph kept solved by iSAM2 (Kaess et al., IJRR 31(2), 2012), with its full history or with a window.
 
-A solver of GTSAM is unusable after an exception in an update. All that it holds is kept beside it, too: after a failure a new
-solver is built from that, once. If that fails as well, the run ends with an error.
+A solver of GTSAM is unusable after an exception in an update. Its factors and values are therefore also kept here. After a failure
+a new solver is built from these copies, once. If the new solver fails as well, the run ends with an error.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from factors.graph import GTSAM_ERRORS, Values, index_of, is_constant, is_landma
 from factors.se2 import Array
 
 ITERATIONS_AFTER_FAILURE = 10
-LAG = 10.0  # s of the window that causal estimates come from, where none is set
-# m, rad: a window, whose oldest points are soon linearised for good, linearises anew what moves that far from where it saw points
+LAG = 10.0  # s: default length of the window for causal estimates
+# m, rad: a window with points linearises a variable again after this change. Its oldest points are soon linearised permanently.
 NEAR_POINTS = 0.02
-ROUNDING = 1e-6  # s; differences of times are as exact as that
+ROUNDING = 1e-6  # s: rounding error of differences of times
 
 
 class Incremental:
@@ -61,21 +61,20 @@ class Incremental:
         self._solved = -math.inf  # the time of the newest keyframe in the solver
         self._oldest = 0  # the number of the oldest keyframe that has not left the window
 
-    def forget(self, before: float) -> None:
-        """Forget keyframes before then, as far as they have left the window; where the whole problem is solved at the end, all are
-        kept."""
+    def forget(self, until: float) -> None:
+        """Forget keyframes until this time that have left the window. All are kept if the whole problem is solved at the end."""
         graph = self._graph
-        if self._is_whole or not graph.keyframes or before < next(iter(graph.keyframes.values())).t:
+        if self._is_whole or not graph.keyframes or until < next(iter(graph.keyframes.values())).t:
             return
-        # points that wait are looked for in the newest ones
-        last = min(graph.before(before).index, self._oldest, graph.newest.index - graph.mapper.horizon)
-        graph.forget(min(last, self._solver.oldest))  # it may have to be built anew
+        # sightings of points that wait are in the newest keyframes
+        last = min(graph.keyframe_before(until).index, self._oldest, graph.newest.index - graph.mapper.horizon)
+        graph.forget(min(last, self._solver.oldest))  # a rebuilt solver needs the rest
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
         """The whole graph, solved to the end: poses (M, 3) and body-frame covariances (M, 3, 3) of the keyframes.
 
-        With a set lag each pose is as it left the window, the others as they are now; those that wait for the solver are as they
-        were expected."""
+        With a set lag a pose has its estimate at the time when it left the window. Poses in the window have the current estimate,
+        poses that wait for the solver the predicted one."""
         if self._settings.smooth and self._is_whole:
             return solve_whole(graph, self._newest_values(graph), self._widest)
         estimates = [keyframe.causal for keyframe in graph.keyframes.values()]
@@ -83,7 +82,7 @@ class Incremental:
             waiting = self._waiting.values
             try:
                 for key in [key for key in graph.values if not is_of_keyframe(key) and key not in waiting]:
-                    graph.values[key], graph.spreads[key] = self._marginal(key, graph=graph)
+                    graph.values[key], graph.covariances[key] = self._marginal(key, graph=graph)
                 estimates = [
                     k.final or (k.causal if k.key in waiting else self._marginal(k.key, graph=graph))
                     for k in graph.keyframes.values()
@@ -92,8 +91,8 @@ class Incremental:
                 raise graph.unsolved(error) from error
         if self._waiting.nodes or len(graph.newest.nodes) > len(self._graph.newest.nodes):
             estimates[-1] = graph.pose, graph.covariance
-        found = [estimate for estimate in estimates if estimate is not None]
-        return np.array([p for p, _ in found]), np.array([c for _, c in found])
+        known = [estimate for estimate in estimates if estimate is not None]
+        return np.array([p for p, _ in known]), np.array([c for _, c in known])
 
     def _newest_values(self, graph: Graph) -> Values:
         """The newest estimates of all variables of a copy of the graph."""
@@ -102,10 +101,10 @@ class Incremental:
         return known | {key: self._solver.value(key) for key in keys if key not in known}
 
     def begin(self, newest: Keyframe) -> None:
-        """Solve the graph anew: it begins, or keyframes were taken back and ``newest`` was added."""
+        """Build a new solver: at the start, or after keyframes were removed and ``newest`` was added."""
         newest.causal = self._graph.pose, self._graph.covariance
         summary = self._solver.summary(failed=False)
-        summary = None if summary is None else summary.before(newest.index)
+        summary = None if summary is None else summary.before_pose(newest.index)
         self._graph.forget_landmarks(frozenset() if summary is None else summary.keys)
         self._start_again(newest, summary, "CHOLESKY" if self._maps else "QR")
 
@@ -148,7 +147,7 @@ class Incremental:
         return self._is_whole or self.is_open(keyframe)
 
     def _update(self, addition: Addition) -> None:
-        """Solve with an addition and what waits; after a failure once more, with a new solver."""
+        """Solve with an addition and the waiting factors. After a failure a new solver tries again."""
         newest, nodes, values = self._graph.newest, addition.nodes, addition.values
         if self._waiting.nodes or self._waiting.values:
             nodes, values = self._waiting.nodes + nodes, self._waiting.values | values
@@ -179,7 +178,7 @@ class Incremental:
             if key not in graph.values or (is_of_keyframe(key) and not self.is_open(index_of(key))):
                 continue
             if is_landmark(key) or key in self._followed:
-                graph.values[key], graph.spreads[key] = self._marginal(key)
+                graph.values[key], graph.covariances[key] = self._marginal(key)
             else:
                 graph.values[key] = self._value(key)
 
@@ -189,19 +188,19 @@ class Incremental:
             raise IndeterminateError(key)
         return value
 
-    def _marginal(self, key: int, spread: Array | None = None, graph: Graph | None = None) -> Guess:
-        """Estimate and covariance of a variable; ``spread``: that covariance, if known; ``graph``: where to report, of a copy."""
+    def _marginal(self, key: int, known: Array | None = None, graph: Graph | None = None) -> Guess:
+        """Estimate and covariance of a variable; ``known``: that covariance, if known; ``graph``: where to report, of a copy."""
         value = self._value(key)
         try:
-            covariance = self._solver.covariance(key) if spread is None else spread
+            covariance = self._solver.covariance(key) if known is None else known
         except GTSAM_ERRORS:
             covariance = np.full((1, 1), np.nan)
         if _is_definite(covariance):
             return value, covariance
         if not (np.all(np.isfinite(covariance)) and np.all(np.diag(covariance) > 0.0)):
-            found = covariances(*self._solver.linear(), (key,))
-            (graph or self._graph).report_damping(found.damping)
-            covariance = found.by_key[key]
+            marginals = covariances(*self._solver.linear(), (key,))
+            (graph or self._graph).report_damping(marginals.damping)
+            covariance = marginals.by_key[key]
         return value, positive.sound(covariance)
 
     def _leave(self, window: Window, now: float, new: Collection[int]) -> None:
@@ -222,31 +221,31 @@ class Incremental:
         points = graph.mapper.leave(now - self._lag)
         # of a start of the whole problem the covariance is not asked
         asked = [] if self._is_whole else [*(k.key for k in leaving), *constants, *points]
-        spreads = window.covariances(asked) if asked else {}
+        marginals = window.covariances(asked) if asked else {}
         for k in leaving:
             k.final = k.causal
         try:
             for k in leaving:
                 assert k.causal is not None
-                k.final = self._marginal(k.key, k.causal[1] if self._is_whole else spreads.get(k.key))
+                k.final = self._marginal(k.key, k.causal[1] if self._is_whole else marginals.get(k.key))
             for key in constants:
-                graph.values[key], graph.spreads[key] = self._marginal(key, spreads.get(key))
+                graph.values[key], graph.covariances[key] = self._marginal(key, marginals.get(key))
         except GTSAM_ERRORS:
             pass  # the causal estimates stay
         first = window.oldest  # what is still in the solver is needed where that is rebuilt
         for key in [key for key in graph.values if is_of_keyframe(key) and index_of(key) < first]:
             del graph.values[key]
-        self._forget(points, spreads)
+        self._forget(points, marginals)
 
-    def _forget(self, points: Iterable[int], spreads: Mapping[int, Array]) -> None:
-        """Keep the estimates of points that leave the window, and their covariances, of which some are known."""
+    def _forget(self, points: Iterable[int], marginals: Mapping[int, Array]) -> None:
+        """Keep estimates and covariances of points that leave the window. ``marginals``: the covariances that are known."""
         for key in points:
             try:
-                found = self._marginal(key, spreads.get(key))
+                estimate = self._marginal(key, marginals.get(key))
             except GTSAM_ERRORS:
-                found = self._graph.values[key], self._graph.spreads[key]
-            self._graph.departed[0][key], self._graph.departed[1][key] = found
-            del self._graph.values[key], self._graph.spreads[key]
+                estimate = self._graph.values[key], self._graph.covariances[key]
+            self._graph.departed[0][key], self._graph.departed[1][key] = estimate
+            del self._graph.values[key], self._graph.covariances[key]
 
     def _start_again(
         self, newest: Keyframe, summary: MarginalSummary | None, factorization: str, *, failed: bool = False
@@ -277,13 +276,13 @@ class Incremental:
             raise graph.unsolved(error) from error
 
     def _priors(self) -> list[gtsam.NonlinearFactor]:
-        """What is known before any measurement."""
-        prior, spread_as = self._graph.prior, gtsam.noiseModel.Gaussian.Covariance
+        """The prior factors of the first pose and of the constants."""
+        prior, gaussian = self._graph.prior, gtsam.noiseModel.Gaussian.Covariance
         assert prior is not None
-        noise = spread_as(se2.world_to_body(prior.pose, prior.covariance))
+        noise = gaussian(se2.world_to_body(prior.pose, prior.covariance))
         start = gtsam.PriorFactorPose2(self._graph.keyframes[0].key, gtsam.Pose2(*prior.pose), noise)
-        means, spreads = self._graph.constant_priors()
-        return [start, *(gtsam.PriorFactorVector(key, mean, spread_as(spreads[key])) for key, mean in means.items())]
+        means, covariances = self._graph.constant_priors()
+        return [start, *(gtsam.PriorFactorVector(key, mean, gaussian(covariances[key])) for key, mean in means.items())]
 
     def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
         """The time of each variable of a window that begins; points are as if they were seen now."""
@@ -298,10 +297,10 @@ class Incremental:
         if self._maps or (MOTION in self._graph.keys and not keyframe.is_elsewhere):
             factor, keys = self._graph.odometry_factor(keyframe)
             return Node(keys, factor, 3)
-        # GTSAM's own factors do not follow where points have gone
-        before, noise = keyframe.key - 1, gtsam.noiseModel.Gaussian.Covariance(step.covariance)
-        native = gtsam.BetweenFactorPose2(before, keyframe.key, gtsam.Pose2(*step.delta), noise)
-        return Node((before, keyframe.key), native=native)
+        # GTSAM's own factors are not linearised again when points move
+        previous, noise = keyframe.key - 1, gtsam.noiseModel.Gaussian.Covariance(step.covariance)
+        native = gtsam.BetweenFactorPose2(previous, keyframe.key, gtsam.Pose2(*step.delta), noise)
+        return Node((previous, keyframe.key), native=native)
 
     def _new_solver(self, factorization: str) -> FullHistory | Window:
         parameters = gtsam.ISAM2Params()
@@ -313,7 +312,7 @@ class Incremental:
             return FullHistory(parameters, threshold, self._failed.append)
         parameters.findUnusedFactorSlots = True
         threshold = min(threshold, NEAR_POINTS) if self._maps else threshold
-        # with points each pose leaves by itself: a window that is built anew soon linearises what it knew where it knew it
+        # with points poses leave one at a time, so that a rebuilt window soon linearises at its former points
         return Window(parameters, threshold, self._failed.append, self._lag + self._margin if self._maps else math.inf)
 
 

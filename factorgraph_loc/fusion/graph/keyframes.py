@@ -39,7 +39,7 @@ Backend = AtTheEnd | Incremental  # keeps the graph solved, or its guess
 
 
 class _KeyframeView:
-    """What sensors see of the graph: the estimate ``pose`` and ``covariance`` of one keyframe."""
+    """The graph as sensors read it: the estimate ``pose`` and ``covariance`` of one keyframe."""
 
     localized = True
 
@@ -61,7 +61,7 @@ class _KeyframeView:
         return self.graph.values[self.graph.keys[name]] if name in self.graph.keys else None
 
     def spread(self, name: str) -> Array:
-        return self.graph.spreads[self.graph.keys[name]]
+        return self.graph.covariances[self.graph.keys[name]]
 
     def joint(self) -> tuple[Array, Mapping[str, slice]]:
         return self.covariance, {}
@@ -74,18 +74,18 @@ class _KeyframeView:
         graph = self.graph
         if not next(iter(graph.keyframes.values())).t <= t < self.t:
             return None
-        before = graph.before(t)
-        if before is self.keyframe or not self.is_kept(before.index):
+        keyframe = graph.keyframe_before(t)
+        if keyframe is self.keyframe or not self.is_kept(keyframe.index):
             return None
-        return EarlierPose(before.t, graph.part_of_step(before, t) if t > before.t else None)
+        return EarlierPose(keyframe.t, graph.part_of_step(keyframe, t) if t > keyframe.t else None)
 
     def on_pose(self, observation: Observation) -> Observation:
         """An observation of the pose alone, with its blocks where they are estimated to be."""
-        values, spreads = {}, {}
+        values, covariances = {}, {}
         for name in observation.blocks:
             key = self.graph.keys[name]
-            values[name], spreads[name] = self.graph.values[key], self.graph.spreads[key]
-        return observation.on_pose(values, spreads)
+            values[name], covariances[name] = self.graph.values[key], self.graph.covariances[key]
+        return observation.on_pose(values, covariances)
 
 
 class Builder:
@@ -102,7 +102,7 @@ class Builder:
         graph.t = max(graph.t, t)
         if t - graph.newest.t >= self._settings.keyframe_max_interval:
             self._add_keyframe(odometry, None)
-        graph.ticks.append(TickAt(t, graph.before(t).index, odometry))
+        graph.ticks.append(TickAt(t, graph.keyframe_before(t).index, odometry))
 
     def take(self, m: Measurement, odometry: ChainState) -> bool:
         """Take a measurement, with the ``odometry`` at its time; False where it is too late."""
@@ -113,18 +113,18 @@ class Builder:
             if not sensor.gathers:
                 return True
         newest = graph.newest
-        before = newest if m.t >= newest.t else graph.before(m.t)
-        if before is not newest and not self._backend.is_open(before.index):
+        keyframe = newest if m.t >= newest.t else graph.keyframe_before(m.t)
+        if keyframe is not newest and not self._backend.is_open(keyframe.index):
             return False
-        offset = graph.since(before, m.t) if m.t > before.t else None
-        guess = (graph.pose, graph.covariance) if before is newest else None
+        offset = graph.since(keyframe, m.t) if m.t > keyframe.t else None
+        guess = (graph.pose, graph.covariance) if keyframe is newest else None
         if sensor.gathers and guess is not None:
             self._gather_from(sensor, m, odometry, offset, guess)
             return True
         addition = Addition(self.gather())
-        guess = self._see(before, m, odometry, offset, guess, addition)
+        guess = self._see(keyframe, m, odometry, offset, guess, addition)
         if addition.nodes:
-            self._backend.attach(before, addition, guess)
+            self._backend.attach(keyframe, addition, guess)
         return True
 
     def _needs_keyframe(self, m: Measurement, sensor: Sensor) -> bool:
@@ -139,14 +139,14 @@ class Builder:
         return since >= interval or (since > 0.0 and m.source == mapper.sensor and mapper.is_due(m))
 
     def gather(self) -> list[Node]:
-        """What waits on the newest keyframe becomes factors of it."""
+        """Turn the observations that wait on the newest keyframe into its factors."""
         nodes = self.waiting() if self._waiting else []
         self._graph.newest.nodes += nodes
         self._waiting = []
         return nodes
 
     def waiting(self) -> list[Node]:
-        """What waits on the newest keyframe and is in no graph yet, as factors."""
+        """Factors of the observations that wait on the newest keyframe and are in no graph yet."""
         if self._gatherer is None:
             return []
         terms = self._gatherer.gathered(self._waiting)
@@ -159,7 +159,7 @@ class Builder:
     def _gather_from(
         self, sensor: Sensor, m: Measurement, odometry: ChainState, offset: Increment | None, guess: Guess
     ) -> None:
-        """Update the newest pose, of which there is a ``guess``, by the observations of a sensor, which wait from now on."""
+        """Correct the ``guess`` of the newest pose by the observations of a sensor, and keep these until :meth:`gather`."""
         graph = self._graph
         if self._gatherer is not sensor:
             nodes = self.gather()
@@ -177,31 +177,31 @@ class Builder:
         """Add the observations of a measurement to an ``addition``, or where that is None to those that wait; the estimate of the
         newest keyframe in the ``view`` is corrected by each. Returns whether any was applied."""
         applied = False
-        for seen in sensor.observe(m, view):
-            if isinstance(seen, Link):
+        for observation in sensor.observe(m, view):
+            if isinstance(observation, Link):
                 if addition is not None:
-                    self._add_link(seen, sensor, view.keyframe, addition)
+                    self._add_link(observation, sensor, view.keyframe, addition)
                 continue
-            if isinstance(seen, NewVariable):
+            if isinstance(observation, NewVariable):
                 if addition is not None:
-                    self._add_block(seen, sensor, view, addition)
+                    self._add_block(observation, sensor, view, addition)
                 continue
-            here = view.on_pose(seen)
-            correction = here.correct(view.pose, view.covariance, {}, {}, here.iterations or ITERATIONS_OF_GUESS)
-            if seen.is_judged and not sensor.judge(here, correction, view):
+            on_pose = view.on_pose(observation)
+            correction = on_pose.correct(view.pose, view.covariance, {}, {}, on_pose.iterations or ITERATIONS_OF_GUESS)
+            if observation.is_judged and not sensor.judge(on_pose, correction, view):
                 continue
             applied = True
             if addition is None:
-                self._waiting.append(seen)
+                self._waiting.append(observation)
             else:
-                for term in seen.terms:
+                for term in observation.terms:
                     addition.hang(view.keyframe, self._graph.node(view.keyframe, term, sensor.name))
             if view.newest:
-                if seen.is_judged:
-                    self._search.slips.add(here.at_its_time, odometry, view, correction)
-                self._search.expect(sensor, here, odometry, view)
-                evidence = partial(laplace_evidence, here, view.pose, view.covariance, correction)
-                self._search.keep(sensor, here, odometry, evidence)
+                if observation.is_judged:
+                    self._search.slips.add(on_pose.at_its_time, odometry, view, correction)
+                self._search.expect(sensor, on_pose, odometry, view)
+                evidence = partial(laplace_evidence, on_pose, view.pose, view.covariance, correction)
+                self._search.keep(sensor, on_pose, odometry, evidence)
                 view.pose = se2.moved(view.pose, correction.delta)
                 view.covariance = correction.covariance[:3, :3]
         return applied
@@ -248,7 +248,7 @@ class Builder:
 
     def _add_link(self, link: Link, sensor: Sensor, keyframe: Keyframe, addition: Addition) -> None:
         """A factor on a keyframe and an earlier one, which waits for the final problem if that has left the solver."""
-        earlier = self._graph.before(link.earlier)
+        earlier = self._graph.keyframe_before(link.earlier)
         node = Node((keyframe.key, earlier.key), link.factor, link.rows, sensor=sensor.name)
         keyframe.nodes.append(node)
         if self._backend.is_open(earlier.index):
@@ -260,7 +260,7 @@ class Builder:
         def between(first: Keyframe, last: Keyframe) -> Increment:
             return graph.recalibrated(graph.motion.relative(first.odometry, last.odometry))
 
-        estimates = graph.values, graph.spreads, backend.current, backend.is_open
+        estimates = graph.values, graph.covariances, backend.current, backend.is_open
         key = graph.keys.get(sensor.name)
         shared = () if key is None else (key,)
         constants = None if key is None else graph.values[key]
@@ -268,13 +268,13 @@ class Builder:
         return GraphView(graph.keyframes, *estimates, *motion, shared, constants)
 
     def _add_block(self, new: NewVariable, sensor: Sensor, view: _KeyframeView, addition: Addition) -> None:
-        """A landmark comes into the graph, with the sightings that told it, or with its prior."""
+        """Add a landmark to the graph, with the sightings that determine it or with its prior."""
         key = self._graph.new_block(new, view.covariance)
         addition.values[key] = new.mean
         if not new.sightings:
             native = gtsam.PriorFactorVector(key, new.mean, gtsam.noiseModel.Gaussian.Covariance(new.noise))
             addition.hang(view.keyframe, Node((key,), VectorPriorFactor(new.mean, new.noise), len(new.mean), native))
-        for t, seen in new.sightings:
-            keyframe = self._graph.before(t)
+        for t, observation in new.sightings:
+            keyframe = self._graph.keyframe_before(t)
             if keyframe.t <= t and self._backend.is_open(keyframe.index):
-                addition.hang(keyframe, *(self._graph.node(keyframe, term, sensor.name) for term in seen.terms))
+                addition.hang(keyframe, *(self._graph.node(keyframe, term, sensor.name) for term in observation.terms))

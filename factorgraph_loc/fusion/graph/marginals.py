@@ -14,7 +14,7 @@ import numpy as np
 from factors.se2 import Array
 
 DAMPINGS = (0.0, 1e-10, 1e-7)
-_NEAR = re.compile(r"variable\s+(\d+)")  # in what GTSAM says of an indeterminate system
+_NEAR = re.compile(r"variable\s+(\d+)")  # in GTSAM's message about an indeterminate system
 
 
 class IndeterminateError(RuntimeError):
@@ -35,18 +35,18 @@ class Covariances:
 
 def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys: Sequence[int]) -> Covariances:
     """Marginal covariances of the variables ``keys``; IndeterminateError where no damping helps. ``sizes``: of all variables."""
-    found = _solved(graph, keys, robust=False)
-    if isinstance(found, dict):
-        return Covariances(found, 0.0)
+    result = _solved(graph, keys, robust=False)
+    if isinstance(result, dict):
+        return Covariances(result, 0.0)
     for damping in DAMPINGS:
-        found = _solved(_damped(graph, sizes, damping) if damping else graph, keys, robust=True)
-        if isinstance(found, dict):
-            return Covariances(found, damping)
-    raise found
+        result = _solved(_damped(graph, sizes, damping) if damping else graph, keys, robust=True)
+        if isinstance(result, dict):
+            return Covariances(result, damping)
+    raise result
 
 
 def damped(damping: float) -> str:
-    """What the diagnostics say of a damping."""
+    """The text of the event that reports a damping."""
     return f"covariances: the graph hardly determines them, relative damping of {damping:g}"
 
 
@@ -62,29 +62,29 @@ def _solved(
     graph: gtsam.GaussianFactorGraph, keys: Sequence[int], *, robust: bool
 ) -> dict[int, Array] | IndeterminateError:
     order = gtsam.Ordering.OrderingType.COLAMD
-    found: dict[int, Array] = {}
+    marginals: dict[int, Array] = {}
     try:
         if not robust:
             tree = graph.eliminateMultifrontal(order)
-            found = {key: np.asarray(tree.marginalCovariance(key)) for key in keys}
+            marginals = {key: np.asarray(tree.marginalCovariance(key)) for key in keys}
         else:
             tree = graph.eliminateMultifrontal(order, gtsam.EliminateQR)
             for key in keys:
                 conditional = tree.marginalFactor(key, gtsam.EliminateQR)  # owns what R() shows
                 root = np.linalg.inv(conditional.R())
-                found[key] = np.asarray(root @ root.T, dtype=float)
+                marginals[key] = np.asarray(root @ root.T, dtype=float)
     except (RuntimeError, IndexError) as error:  # IndexError: a variable that no factor is on
         return IndeterminateError(blamed(error))
     except np.linalg.LinAlgError:
         return IndeterminateError(key)
-    for key, covariance in found.items():
+    for key, covariance in marginals.items():
         if not (np.all(np.isfinite(covariance)) and np.all(np.diag(covariance) > 0.0)):
             return IndeterminateError(key)
-    return found
+    return marginals
 
 
 def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:
-    """The graph, and a prior on each variable of the share ``damping`` of what its own factors tell of it."""
+    """The graph with a prior on each variable. Its information is the share ``damping`` of that of the variable's factors."""
     keys, (_, columns, values) = graph.keyVector(), graph.sparseJacobian_()
     ends = np.cumsum([sizes[key] for key in keys])
     # the last column is that of the right side

@@ -1,4 +1,4 @@
-"""The whole run as one nonlinear least-squares problem, solved at once.
+"""The whole run as one nonlinear least-squares problem, solved in one piece.
 
 Levenberg-Marquardt in Python. Our factors are linearised here, where the values are at hand, because each callback from GTSAM would
 copy all of them. A row of poses is solved by compiled code, anything else with GTSAM's sparse elimination.
@@ -81,8 +81,8 @@ class Problem:
         return graph
 
     def covariances(self, values: Values, keys: Iterable[int]) -> Covariances:
-        """Marginal covariances of variables at a solution, poses in the body frame; IndeterminateError where there are none."""
-        found = None if self._chain is None else self._chain.covariances(values)
-        if found is not None:
-            return found
+        """Marginal covariances of variables at a solution, poses in the body frame. IndeterminateError if there are none."""
+        marginals = None if self._chain is None else self._chain.covariances(values)
+        if marginals is not None:
+            return marginals
         return covariances(self.linearize(values), {key: len(value) for key, value in values.items()}, list(keys))

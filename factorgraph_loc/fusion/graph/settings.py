@@ -19,12 +19,12 @@ class GraphSettings(FileModel):
     max_delay: Annotated[float, Field(ge=0.0, le=4.0), InUnit("s")] = 0.5
     """how late a measurement may come; later ones are counted and dropped"""
     self_calibration: bool = True
-    """whether constants to which the rig gives an uncertainty are variables"""
+    """whether constants with an uncertainty in the rig are variables"""
     landmarks: MapUse = "known"
-    """known takes the map as it is and ignores other landmarks, extended estimates the others, unknown estimates all, as runs with
-    images and measured motion alone do by default where the map has no points"""
+    """known: the map is fixed, without other landmarks; extended: the others are estimated; unknown: all are estimated, the
+    default of runs with only images and measured motion if the map has no points"""
     visual_odometry: bool = False
-    """whether features that are followed from image to image, and are no points of map or graph, tell the motion"""
+    """whether tracked features that are no points of map or graph constrain the motion"""
 
 
 def _lag(value: Any, bounded: ValidatorFunctionWrapHandler) -> Any:
@@ -51,7 +51,7 @@ class SmootherSettings(GraphSettings):
     smooth: bool = True
     """whether the final trajectory uses all measurements, else it repeats the causal one"""
     final_only: bool = False
-    """whether nothing is solved on the way, so that there are no causal estimates, and the whole problem at the end"""
+    """whether the problem is solved only at the end, without causal estimates"""
 
     @model_validator(mode="after")
     def _has_a_final(self) -> "SmootherSettings":

@@ -49,13 +49,13 @@ FOREVER = 1e300  # s; a lag with which only the variables with the stamp minus i
 
 
 class FullHistory:
-    """An incremental solver from whose graph nothing leaves. Methods may raise errors of GTSAM; the solver is then lost.
+    """An incremental solver that keeps its whole graph. After an error of GTSAM in a method the solver is unusable.
 
     ``threshold``: how far iSAM2 lets a variable move from where it is linearised, in m, rad or the units of constants.
-    ``on_failure``: called with the reason where a factor cannot be linearised, which is then left out.
+    ``on_failure``: called with the reason if a factor cannot be linearised. That factor is left out.
 
-    Constants are in all branches of iSAM2's tree, and in each update: to read an estimate it solves the whole tree for its
-    variables. What the last update touched is at the root, and is solved for by itself.
+    Constants are in all branches of iSAM2's tree, and in each update. To read an estimate iSAM2 therefore solves the whole tree.
+    Variables of the last update are at the root and are solved separately.
     """
 
     _solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
@@ -116,8 +116,8 @@ _State = tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Values, frozenset[int]]
 
 
 class Window(FullHistory):
-    """Poses older than ``lag`` [s] are marginalised out with each update. One with which nothing leaves takes less time: iSAM2 then
-    puts the newest pose at the root of its tree."""
+    """A solver that marginalises poses older than ``lag`` [s] out with each update. An update without such poses takes less time,
+    because iSAM2 then puts the newest pose at the root of its tree."""
 
     _solver: gtsam.IncrementalFixedLagSmoother
 
@@ -129,8 +129,8 @@ class Window(FullHistory):
         self._solver = gtsam.IncrementalFixedLagSmoother(lag, parameters)
         self._ours = LinearFactors(threshold, parameters.relinearizeSkip, on_failure)
         self._stamps: dict[int, float] = {}  # of the variables that may leave
-        # when something last left: all factors, where iSAM2 had the variables, where a new window would have them, and which
-        # factors are ours
+        # at the last marginalisation: all factors, linearisation points of iSAM2, those of a new window, and slots of our
+        # factors
         self._left: _State = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, frozenset()
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
@@ -186,41 +186,41 @@ class Window(FullHistory):
         return read(self._solver, key)
 
     def covariances(self, keys: Sequence[int]) -> dict[int, Array]:
-        """Marginal covariances by key, from one elimination of the window; none where that fails, or has lost one."""
+        """Marginal covariances by key, from one elimination of the window. Empty if that fails or a variable has left."""
         order = gtsam.Ordering()
         for key in keys:
             order.push_back(key)
-        found, end = {}, 0
+        marginals, end = {}, 0
         try:
             joint = invert_covariance(self.linear()[0].marginal(keys).hessian(order)[0])
             for key in keys:
                 start, end = end, end + len(self._ours.at[key])
-                found[key] = joint[start:end, start:end].copy()
+                marginals[key] = joint[start:end, start:end].copy()
         except (*GTSAM_ERRORS, LookupError, np.linalg.LinAlgError):
             return {}
-        return found
+        return marginals
 
     @property
     def oldest(self) -> int:
         return oldest_pose(self._left[0].keyVector())
 
     def summary(self, *, failed: bool) -> MarginalSummary | None:
-        graph, held, at, ours = self._left if failed else self._state()
-        return MarginalSummary.of(graph, held, at, ours) if graph.size() else None
+        graph, points, at, ours = self._left if failed else self._state()
+        return MarginalSummary.of(graph, points, at, ours) if graph.size() else None
 
     def _state(self) -> _State:
-        """A copy of what the solver has, which changes in place."""
-        held = gtsam.Values(self._solver.getISAM2().getLinearizationPoint())
-        return gtsam.NonlinearFactorGraph(self._solver.getFactors()), held, self._ours.framed, self._ours.slots
+        """A copy of the solver's state, which the solver changes in place."""
+        points = gtsam.Values(self._solver.getISAM2().getLinearizationPoint())
+        return gtsam.NonlinearFactorGraph(self._solver.getFactors()), points, self._ours.framed, self._ours.slots
 
 
 def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[int, gtsam.NonlinearFactor]:
-    """Factors that tell nothing, by the variables on which they are besides. As these leave the solver at once, iSAM2 takes what
-    marginal ``factors`` are on for what it marginalised itself, and never linearises it elsewhere."""
+    """Factors without information between variables of marginal ``factors`` and new variables, by the key of the latter. The new
+    variables leave immediately. iSAM2 then treats the former like its own separators and keeps their linearisation points."""
     marginal = (factor.keys() for factor in factors if isinstance(factor, gtsam.LinearContainerFactor))
-    held = dict.fromkeys(key for keys in marginal for key in keys)
+    fixed = dict.fromkeys(key for keys in marginal for key in keys)
     unit, out = gtsam.noiseModel.Unit.Create(1), dict[int, gtsam.NonlinearFactor]()
-    for i, key in enumerate(held):
+    for i, key in enumerate(fixed):
         nothing = np.zeros((1, len(values[key])))
         factor = gtsam.JacobianFactor(leaving_key(i), np.ones((1, 1)), key, nothing, np.zeros(1), unit)
         out[leaving_key(i)] = gtsam.LinearContainerFactor(factor)
@@ -228,15 +228,15 @@ def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[i
 
 
 class LinearFactors:
-    """Our factors in a solver, and where that linearises its variables: those that moved as far as ``threshold``, at each update
-    whose number ``skip`` divides. ``on_failure`` is called with the reason where a factor cannot be linearised, which is then left
-    out."""
+    """Our factors in a solver, and the linearisation points of its variables. Variables that moved by ``threshold`` are linearised
+    again, at every ``skip``-th update. ``on_failure`` is called with the reason if a factor cannot be linearised. That factor is
+    left out."""
 
     def __init__(self, threshold: float, skip: int, on_failure: Callable[[str], None]) -> None:
         self._threshold, self._skip, self._on_failure = threshold, skip, on_failure
         self._updates = 0
-        self.at: Values = {}  # where each variable is linearised
-        self._held: Values = {}  # places that iSAM2 does not move: where it has them, but for a translation of all
+        self.at: Values = {}  # linearisation point of each variable
+        self._held: Values = {}  # linearisation points that iSAM2 does not move, up to a common translation
         self._on: defaultdict[int, dict[int, _Linear]] = defaultdict(dict)  # the factors on each, by their identity
         self._slots: set[int] = set()
         self._added: list[_Linear] = []  # those of the last update, with their places in it as slots
@@ -270,9 +270,9 @@ class LinearFactors:
         for linear, linearized in zip(self._added, jacobian_factors(ours, self.at, self._on_failure), strict=True):
             linear.slot = graph.size()
             keys = linear.node.keys
-            # a factor does without the point that it is linearised at where the solver never leaves that
-            held = self._held and not self._held.keys().isdisjoint(keys)
-            graph.add(self._on_held(keys, linearized) if held else gtsam.LinearContainerFactor(linearized))
+            # a factor needs no linearisation point of its own if the solver never moves that of its variables
+            is_fixed = self._held and not self._held.keys().isdisjoint(keys)
+            graph.add(self._on_held(keys, linearized) if is_fixed else gtsam.LinearContainerFactor(linearized))
         return graph, removed
 
     def _on_held(self, keys: Sequence[int], linearized: gtsam.GaussianFactor) -> gtsam.LinearContainerFactor:
@@ -296,9 +296,9 @@ class LinearFactors:
         self._held.pop(key, None)
         for linear in self._on.pop(key, {}).values():
             self._slots.discard(linear.slot)
-            for other in linear.node.keys:
-                if other != key:
-                    self._on[other].pop(id(linear), None)
+            for neighbour in linear.node.keys:
+                if neighbour != key:
+                    self._on[neighbour].pop(id(linear), None)
 
     @property
     def framed(self) -> Values:
@@ -324,19 +324,19 @@ class LinearFactors:
         anew += self._followed({key: read(solver, key) for key in keys if is_place(key) and fixed.count(key)})
         return list({number: linear for key in anew for number, linear in self._on.get(key, {}).items()}.values())
 
-    def _followed(self, held: Values) -> list[int]:
-        """The variables among the ``held`` ones, given with their estimates, whose factors are to be linearised at other points.
+    def _followed(self, estimates: Values) -> list[int]:
+        """The variables with fixed linearisation points whose factors must be linearised again, given the ``estimates`` of all.
 
-        None if all are poses: in a known map GTSAM's factors of the odometry are not moved."""
-        if all(map(is_pose, held)):
+        Empty if all are poses: in a known map GTSAM's factors of the odometry are not linearised again."""
+        if all(map(is_pose, estimates)):
             return []
-        for key in held:
+        for key in estimates:
             self._held.setdefault(key, self.at[key])
-        way = np.mean([held[key][:2] - self._held[key][:2] for key in held], axis=0)
-        moved = {key: now for key, now in held.items() if np.abs(now - self.at[key]).max() >= self._threshold}
-        if np.abs(way).max() >= self._threshold:
-            self._held |= {key: np.append(self._held[key][:2] + way, self._held[key][2:]) for key in held}
-            moved = held
+        translation = np.mean([estimates[key][:2] - self._held[key][:2] for key in estimates], axis=0)
+        moved = {key: now for key, now in estimates.items() if np.abs(now - self.at[key]).max() >= self._threshold}
+        if np.abs(translation).max() >= self._threshold:
+            self._held |= {key: np.append(self._held[key][:2] + translation, self._held[key][2:]) for key in estimates}
+            moved = estimates
         self.at |= moved
         return list(moved)
 

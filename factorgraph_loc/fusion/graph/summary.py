@@ -1,8 +1,8 @@
-"""What the graph of a window knows of what has left it.
+"""The information that a window keeps on marginalised variables.
 
-GTSAM marginalises a variable into linear factors on those that it shared factors with. They and the priors hold all that the
-window's own measurements do not contain, correlations included: a rebuilt window begins with them. Marginals of single variables
-in their place would count the measurements among them twice, and lose their correlations.
+GTSAM marginalises a variable into linear factors on its neighbours in the graph. These factors and the priors contain all
+information outside of the window's own measurements, correlations included. A rebuilt window begins with them. Marginals of single
+variables would count common measurements twice, and lose the correlations.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def oldest_pose(keys: Iterable[int]) -> int:
 
 @dataclass(frozen=True)
 class MarginalSummary:
-    """``factors``: marginal ones, and priors; ``keys`` of all variables of the graph; ``at``: where each is linearised."""
+    """``factors``: marginal ones, and priors; ``keys`` of all variables of the graph; ``at``: their linearisation points."""
 
     factors: tuple[gtsam.NonlinearFactor, ...]
     keys: frozenset[int]
@@ -33,17 +33,17 @@ class MarginalSummary:
 
     @classmethod
     def of(
-        cls, graph: gtsam.NonlinearFactorGraph, held: gtsam.Values, at: Values, ours: Collection[int] = ()
+        cls, graph: gtsam.NonlinearFactorGraph, points: gtsam.Values, at: Values, ours: Collection[int] = ()
     ) -> MarginalSummary:
-        """Of a graph that iSAM2 has linearised where it ``held`` the variables, to be linearised ``at`` there. ``ours``: places of
-        factors of our own, which are not marginal ones."""
+        """The summary of a graph. ``points``: linearisation points of iSAM2; ``at``: those of the summary; ``ours``: slots of our
+        factors, which are not marginal."""
         every = (graph.at(i) for i in range(graph.size()) if i not in ours)
-        there = to_gtsam(at)
+        values = to_gtsam(at)
 
         def placed(factor: gtsam.LinearContainerFactor) -> gtsam.LinearContainerFactor:
-            """iSAM2 never moves what a marginal factor is on, and so gives it no place: elsewhere it needs one."""
+            """The factor with linearisation points, which it lacks in iSAM2: there its variables are never linearised again."""
             return gtsam.LinearContainerFactor(
-                gtsam.LinearContainerFactor(factor.factor(), held).linearize(there), there
+                gtsam.LinearContainerFactor(factor.factor(), points).linearize(values), values
             )
 
         kept = tuple(
@@ -56,13 +56,13 @@ class MarginalSummary:
         """The index of the oldest pose."""
         return oldest_pose(self.keys)
 
-    def before(self, pose: int) -> MarginalSummary:
-        """What is left once the poses from the index ``pose`` on are taken back: others come under their keys."""
+    def before_pose(self, pose: int) -> MarginalSummary:
+        """The summary without the poses from the index ``pose`` on. Their keys are used again."""
         kept = frozenset(key for key in self.keys if not is_of_keyframe(key) or index_of(key) < pose)
         return MarginalSummary(tuple(self.on(kept)), kept, {key: self.at[key] for key in kept})
 
     def on(self, present: Collection[int]) -> list[gtsam.NonlinearFactor]:
-        """The factors on variables that are ``present``, with all that those on others tell of these."""
+        """The factors on the variables ``present``. All others are marginalised out."""
         kept: list[gtsam.NonlinearFactor] = []
         linear, gone, at = gtsam.GaussianFactorGraph(), set[int](), to_gtsam(self.at)
         for factor in self.factors:
@@ -82,8 +82,8 @@ class MarginalSummary:
 
 
 def is_missing(node: Node, present: Collection[int], known: Collection[int]) -> bool:
-    """Whether a factor is to be added to a graph of the variables ``present``, of which a summary tells those that are ``known``:
-    it holds priors of what is no pose, and what hangs on a pose that is gone."""
+    """Whether a graph of the variables ``present`` needs a factor in addition to its summary. ``known``: variables of the summary,
+    which contains priors of all variables but poses, and factors on poses that have left."""
     if any(key not in present for key in node.keys):
         return False
     return node.has_pose or node.keys[0] not in known
