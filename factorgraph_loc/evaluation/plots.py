@@ -122,7 +122,7 @@ def reliability_diagram(log: Log, estimator: str, reliability: Mapping[str, Reli
         axis.errorbar(
             place,
             np.ones(len(place)),
-            2.0 * sensor.spread / sensor.predicted,
+            2.0 * sensor.sigma / sensor.predicted,
             fmt="none",
             color=COLOURS[1],
             label=label,

@@ -34,7 +34,7 @@ def test_a_right_model_is_not_doubted():
     found, warnings = told(office())
     assert not warnings
     assert found.together < 1.3
-    assert np.all(np.abs(found.observed - found.predicted) < 4.0 * found.spread)
+    assert np.all(np.abs(found.observed - found.predicted) < 4.0 * found.sigma)
     assert {"1 to 2 m", "4 to 5 m", "antenna 1", "antenna 8"} <= {*found.groups}
 
 
