@@ -29,15 +29,15 @@ def compiled(**options: Any) -> Callable[[Function], Function]: ...
 
 
 def compiled(function: Any = None, /, **options: Any) -> Any:
-    """``numba.njit`` with these options. The code is kept beside the function's file, else in the user's cache folder; where
-    neither can be written it is compiled in each process."""
+    """``numba.njit`` with these options. The code is cached next to the function's file, else in the user's cache folder. If
+    neither is writable, each process compiles the function."""
     if function is None:
-        return lambda one: _compiled(one, options)
+        return lambda decorated: _compiled(decorated, options)
     return _compiled(function, options)
 
 
 def _compiled(function: Any, options: dict[str, Any]) -> Any:
-    # nothing calls it from C, for which numba would compile another function around it
+    # C code never calls it: no wrapper is needed, which numba would compile too
     made = numba.njit(**{"no_cfunc_wrapper": True, **options})(function)
     with suppress(RuntimeError):  # there is no place for it
         made._cache = _Shared(function)  # what `cache=True` does with numba's own class
@@ -49,13 +49,13 @@ class _Shared(FunctionCache):
     is locked itself, which is no circle. Locks end with their process."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        found = super().load_overload(sig, target_context)
-        if found is None:
+        code = super().load_overload(sig, target_context)
+        if code is None:
             self._lock()
-            found = super().load_overload(sig, target_context)  # another process may have saved it in the meantime
-            if found is not None:
+            code = super().load_overload(sig, target_context)  # another process may have saved it in the meantime
+            if code is not None:
                 self._unlock()
-        return found
+        return code
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
@@ -92,5 +92,5 @@ class _Shared(FunctionCache):
 
 @cache
 def _locks(folder: str) -> int:
-    """A file of a folder, open for locks, of which closing would end all."""
+    """An open file of a folder, for locks. It stays open, because closing it releases all locks."""
     return os.open(Path(folder) / "compiling.lock", os.O_RDWR | os.O_CREAT, 0o666)

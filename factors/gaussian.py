@@ -1,7 +1,7 @@
 """Small matrices and Gaussians in compiled code: products, solutions, roots and inverses; prediction and smoothing.
 
-Plain loops: calls of LAPACK take longer than the arithmetic of small matrices, and what NumPy does with slices and matrices is
-compiled anew into each function that uses it, which takes a second or more.
+Plain loops: calls of LAPACK take longer than the arithmetic of small matrices, and numba compiles NumPy's
+operations on slices and matrices again into each function that uses them, in a second or more each.
 """
 
 import math
@@ -66,7 +66,7 @@ def solved(matrix: Array, right: Array) -> tuple[Array, float]:
 
 @compiled(error_model="numpy")
 def _substitute(upper: Array, out: Array) -> None:
-    """Solve ``upper`` (D, D), of which the upper half is read, times x = ``out`` (D, N), in place."""
+    """Solve ``upper`` (D, D) x = ``out`` (D, N) in place; only the upper half of ``upper`` is read."""
     size, width = out.shape
     for i in range(size - 1, -1, -1):
         for k in range(i + 1, size):
@@ -137,14 +137,14 @@ def invert_covariance(covariance: Array) -> Array:
 def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
     """The predicted covariance (S, S). ``transition`` (R, S): its first rows, the others are those of the identity; ``noise`` (R,
     R): added to the first components."""
-    rows, moved, after = len(transition), product(transition, covariance), covariance.copy()
+    rows, moved, out = len(transition), product(transition, covariance), covariance.copy()
     own = product_by_transpose(moved, transition)
     for i in range(rows):
-        for j in range(rows, len(after)):
-            after[i, j] = after[j, i] = moved[i, j]
+        for j in range(rows, len(out)):
+            out[i, j] = out[j, i] = moved[i, j]
         for j in range(rows):
-            after[i, j] = own[i, j] + noise[i, j]
-    return after
+            out[i, j] = own[i, j] + noise[i, j]
+    return out
 
 
 @compiled
@@ -156,14 +156,14 @@ def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, 
     smoothed state after that step differs by ``change`` (S,) from the predicted one, and has the covariance ``later`` (S, S).
     LinAlgError if the predicted covariance is singular, or if rounding leaves no positive definite one.
     """
-    size, after, moved = len(covariance), predicted(covariance, transition, noise), product(transition, covariance)
+    size, prediction, moved = len(covariance), predicted(covariance, transition, noise), product(transition, covariance)
     carried = covariance.copy()  # transition times covariance
     put(moved, carried)
-    gain, _ = solved(after, carried)  # its transpose
+    gain, _ = solved(prediction, carried)  # its transpose
     for i in range(size):
         for j in range(size):
-            after[i, j] = later[i, j] - after[i, j]
-    correction, half, out = np.zeros(size), product(after, gain), covariance.copy()
+            prediction[i, j] = later[i, j] - prediction[i, j]
+    correction, half, out = np.zeros(size), product(prediction, gain), covariance.copy()
     for k in range(size):
         for i in range(size):
             correction[i] += gain[k, i] * change[k]

@@ -23,7 +23,7 @@ from factors.compiled import compiled
 from factors.gaussian import cholesky
 from factors.se2 import Array, Integers
 
-MOST_TERMS = 3  # that a `gtsam.JacobianFactor` takes in Python; a conditional is one, and takes any number
+MOST_TERMS = 3  # of a `gtsam.JacobianFactor` in Python; a conditional is such a factor and may have any number
 RELATIVE_RIDGE, RIDGE = 1e-9, 1e-10  # of the mean curvature of a cost, and of any: against division by zero
 LEAST = 1e-12  # a cost of zero has no gradient
 Values = dict[int, Array]
@@ -54,7 +54,7 @@ def landmark_key(index: int) -> int:
 
 
 def point_key(index: int) -> int:
-    """The key of the point in space that was taken in as number ``index``."""
+    """The key of the point in space that was added as number ``index``."""
     return int(gtsam.symbol("p", index))
 
 
@@ -125,11 +125,11 @@ class Stack(Protocol):
 
 
 class Alike(Factor, Protocol):
-    """A factor of which many are linearised by one call."""
+    """A kind of factor that is linearised by one call for many factors."""
 
     @property
     def alike(self) -> Hashable:
-        """What those have in common that are linearised together."""
+        """Equal for factors that are linearised together."""
 
     @staticmethod
     def linearize_all(factors: Sequence[Any], values: Sequence[Sequence[Array]]) -> tuple[Array, list[Array]]:
@@ -138,11 +138,11 @@ class Alike(Factor, Protocol):
 
 @runtime_checkable
 class Stackable(Factor, Protocol):
-    """A factor on one pose or on two that follow one another, and perhaps on one vector, many of which become a stack."""
+    """A factor on one pose or on two consecutive ones, and perhaps on one vector. Many such factors become a stack."""
 
     @property
     def kind(self) -> Hashable:
-        """What those that go into one stack have in common beside their type and their vector; None for one that goes into none."""
+        """Equal for factors of one type and vector that share a stack; None for a factor outside stacks."""
 
     def stack(self, factors: Sequence[Any], numbers: Sequence[int], column: int) -> Stack:
         """``factors`` of this type and kind as one, each on the pose with its number; ``column``: of the vector among the
@@ -223,9 +223,9 @@ class PriorFactor:
 class VectorPriorFactor:
     """A Gaussian prior of a vector: ``mean`` (P,), and standard deviations (P,) or a covariance (P, P)."""
 
-    def __init__(self, mean: Array, spread: Array) -> None:
+    def __init__(self, mean: Array, uncertainty: Array) -> None:
         self._mean = mean
-        self._whitener = np.diag(1.0 / spread) if spread.ndim == 1 else positive.whitener(spread)
+        self._whitener = np.diag(1.0 / uncertainty) if uncertainty.ndim == 1 else positive.whitener(uncertainty)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (P,) and its Jacobian."""
@@ -270,8 +270,8 @@ def retract(key: int, value: Array, step: Array) -> Array:
 
 
 def frame_motions(values: Values) -> tuple[Array, list[int]]:
-    """The steps (n, 3) of the tangent spaces of all variables, one below the other, by which they move with the frame of the world
-    in x, in y, and about its origin, and where that of each ends."""
+    """The tangent steps (n, 3) of all variables, stacked, when the world frame moves in x, in y, and about its origin; and the end
+    row of each variable."""
     parts = []
     for key, value in values.items():
         part = np.zeros((len(value), 3))

@@ -44,24 +44,24 @@ def minima(
     are shortened to the ``largest`` (D,) allowed. A problem is solved when a step is below ``converged`` (D,).
     """
     states, which = np.array(start, dtype=float), np.arange(len(start))
-    found = Minima(states, *(np.array(part) for part in at(states, which)))
+    best = Minima(states, *(np.array(part) for part in at(states, which)))
     damping = np.full(len(start), DAMPING)
     for _ in range(iterations):
-        _, _, gradient, curvature = (part[which] for part in found)
+        _, _, gradient, curvature = (part[which] for part in best)
         scale = np.maximum(np.einsum("nii->ni", curvature), LEAST)
         damped = curvature + (damping[which, None] * scale)[..., None] * np.eye(scale.shape[1])
         step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
         step *= np.minimum(1.0, (largest / np.maximum(np.abs(step), 1e-12)).min(axis=1))[:, None]
         tried = moved(states[which], step)
-        there = Minima(tried, *at(tried, which))
-        better = there.costs <= found.costs[which]
-        for part, new in zip(found, there, strict=True):
+        trial = Minima(tried, *at(tried, which))
+        better = trial.costs <= best.costs[which]
+        for part, new in zip(best, trial, strict=True):
             part[which[better]] = new[better]
         damping[which] *= np.where(better, 0.1, 10.0)
         which = which[np.any(np.abs(step) > converged, axis=1) & (damping[which] < MAX_DAMPING)]
         if not len(which):
             break
-    return found
+    return best
 
 
 def minimum(
@@ -83,8 +83,8 @@ def minimum(
     def moved(states: Array, steps: Array) -> Array:
         return np.clip(states + steps, low, high)
 
-    found = minima(only, start[None], iterations, converged, moved=moved, largest=largest)
-    return found.states[0], float(found.costs[0]), found.curvatures[0]
+    solution = minima(only, start[None], iterations, converged, moved=moved, largest=largest)
+    return solution.states[0], float(solution.costs[0]), solution.curvatures[0]
 
 
 def descended(

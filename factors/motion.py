@@ -52,7 +52,7 @@ def propagate(covariance: Array, increment: Increment) -> Array:
 
 @compiled
 def poses_between(
-    before: Integers,
+    previous: Integers,
     deltas: Array,
     noises: Array,
     durations: Array,
@@ -63,18 +63,18 @@ def poses_between(
     poses: Array,
     covariances: Array,
 ) -> tuple[Array, Array]:
-    """T poses (T, 3) and body-frame covariances (T, 3, 3), each after the one with the number ``before`` (T,) of M ``poses`` (M, 3)
-    with ``covariances`` (M, 3, 3).
+    """T poses (T, 3) and body-frame covariances (T, 3, 3), each after the pose number ``previous`` (T,) of M ``poses``
+    (M, 3) with ``covariances`` (M, 3, 3).
 
     ``deltas`` (T, 3), ``noises`` (T, 3, 3) and ``durations`` (T,) [s]: of the motion from there; ``steps`` (M-1, 3) and so on: of
-    that from each pose to the next. What the odometry then misses the next pose by is spread in proportion to time. The covariance
-    goes linearly from one to the other, plus that of a bridge pinned at both ends. ``elsewhere`` (M-1,): whether the robot was
-    carried to the next pose, which tells nothing of those before.
+    that from each pose to the next. The misclosure of the odometry at the next pose is distributed in proportion to time. The
+    covariance is interpolated linearly, plus that of a bridge pinned at both ends. ``elsewhere`` (M-1,): whether the robot was
+    carried to the next pose, which then does not inform the poses in between.
     """
-    count = len(before)
-    at, spreads = np.empty((count, 3)), np.empty((count, 3, 3))
+    count = len(previous)
+    at, out = np.empty((count, 3)), np.empty((count, 3, 3))
     for i in range(count):
-        k = before[i]
+        k = previous[i]
         x, y, heading = compose_scalars(poses[k, 0], poses[k, 1], poses[k, 2], deltas[i, 0], deltas[i, 1], deltas[i, 2])
         if k < len(steps) and not elsewhere[k]:
             share = durations[i] / step_durations[k]
@@ -86,8 +86,8 @@ def poses_between(
             for m in range(3):
                 for n in range(3):
                     ends = (1.0 - share) * covariances[k, m, n] + share * covariances[k + 1, m, n]
-                    spreads[i, m, n] = ends + share * (1.0 - share) * step_noises[k, m, n]
+                    out[i, m, n] = ends + share * (1.0 - share) * step_noises[k, m, n]
         else:
-            put(carried(covariances[k], deltas[i], noises[i]), spreads[i])
+            put(carried(covariances[k], deltas[i], noises[i]), out[i])
         at[i, 0], at[i, 1], at[i, 2] = x, y, heading
-    return at, spreads
+    return at, out

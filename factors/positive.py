@@ -87,9 +87,9 @@ def solve(covariances: Array, right: Array) -> Array:
 def inverse(covariances: Array) -> Array:
     """The inverses of covariances (..., D, D)."""
     try:
-        found = np.asarray(np.linalg.inv(covariances), dtype=float)
-        if np.all(np.diagonal(found, axis1=-2, axis2=-1) > 0.0):
-            return found
+        inverses = np.asarray(np.linalg.inv(covariances), dtype=float)
+        if np.all(np.diagonal(inverses, axis1=-2, axis2=-1) > 0.0):
+            return inverses
     except np.linalg.LinAlgError:
         pass
     root = _whitener(covariances)
@@ -110,8 +110,8 @@ def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, 
     positive as its parts, for any gain."""
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (covariance, transition, noise, change, later))
     try:
-        correction, after = gaussian.smoothed(*arrays)
-        return correction, after
+        correction, smoothed_covariance = gaussian.smoothed(*arrays)
+        return correction, smoothed_covariance
     except np.linalg.LinAlgError:
         rows, full, later = len(transition), np.eye(len(change)), later.copy()
     full[:rows] = transition

@@ -5,7 +5,7 @@ A pose is ``(x, y, heading)``: metres, metres, radians counter-clockwise. A tang
 Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, appendix A (eqs. 153 to 166).
 
 Functions of arrays broadcast over leading axes, ``(..., 3)``. The compiled functions take numbers (``_scalars``), one pose
-(``_one``), or many poses; compiled code calls them, and so do filters, for which NumPy is too slow.
+(``_one``), or many poses. Compiled code and filters call them, because NumPy is slow for single poses.
 """
 
 import math
@@ -240,16 +240,16 @@ def between_scalars(
 
 @compiled
 def moved(pose: Array, twist: Array) -> Array:
-    """The pose (3,) moved by a twist in its own frame, of which the first three components are read."""
+    """The pose (3,) moved by the first three components of a twist in its own frame."""
     x, y, turned = exp_scalars(twist[0], twist[1], twist[2])
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrap_scalar(pose[2] + turned)))
 
 
 @compiled
-def twist_to(pose: Array, other: Array) -> Array:
+def twist_to(pose: Array, target: Array) -> Array:
     """The twist (3,) in the frame of a pose (3,) that leads from it to another: the inverse of :func:`moved`."""
-    x, y, turned = between_scalars(pose[0], pose[1], pose[2], other[0], other[1], other[2])
+    x, y, turned = between_scalars(pose[0], pose[1], pose[2], target[0], target[1], target[2])
     return np.array(log_scalars(x, y, turned))
 
 
@@ -293,8 +293,8 @@ def inverse_right_jacobian(xi: Array) -> Array:
 
 @compiled
 def body_to_world_one(pose: Array, covariance: Array) -> Array:
-    """:func:`body_to_world` of one pose (3,), and of the first three components of a covariance (S, S), of which the
-    upper triangle is read: the result is symmetric to the last bit."""
+    """:func:`body_to_world` of one pose (3,), and of the first three components of a covariance (S, S). Only the upper
+    triangle is read, so the result is exactly symmetric."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     out = np.empty((3, 3))
     a, b, e = covariance[0, 0], covariance[0, 1], covariance[1, 1]
@@ -321,12 +321,12 @@ def all_moved(poses: Array, delta: Array, twists: Array) -> Array:
 
 
 @compiled(error_model="numpy", fastmath={"arcp", "contract", "reassoc"})
-def twists_to(pose: Array, others: Array) -> Array:
+def twists_to(pose: Array, targets: Array) -> Array:
     """The twists (N, 3) in the frame of a pose (3,) that lead from it to others (N, 3)."""
-    out, c, s = np.empty_like(others), math.cos(pose[2]), math.sin(pose[2])
-    for n in range(len(others)):
-        dx, dy = others[n, 0] - pose[0], others[n, 1] - pose[1]
-        angle = _wrapped_of_many(others[n, 2] - pose[2])
+    out, c, s = np.empty_like(targets), math.cos(pose[2]), math.sin(pose[2])
+    for n in range(len(targets)):
+        dx, dy = targets[n, 0] - pose[0], targets[n, 1] - pose[1]
+        angle = _wrapped_of_many(targets[n, 2] - pose[2])
         p, q = _arc_of_many(angle)
         x, y, scale = c * dx + s * dy, c * dy - s * dx, 1.0 / (p * p + q * q)
         out[n, 0], out[n, 1], out[n, 2] = scale * (p * x + q * y), scale * (p * y - q * x), angle

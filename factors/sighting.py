@@ -26,7 +26,7 @@ class SightingFactor(Protocol):
 
 
 def delayed(offset: Array | None, twist: Array | None, seconds: float) -> Array | None:
-    """The ``offset`` (3,) of a sighting that is ``seconds`` later, for a robot with velocity ``twist`` (3,)."""
+    """The ``offset`` (3,) of a sighting ``seconds`` later, at the robot velocity ``twist`` (3,)."""
     if twist is None or seconds == 0.0:
         return offset
     later = se2.exp(twist * seconds)
@@ -35,23 +35,22 @@ def delayed(offset: Array | None, twist: Array | None, seconds: float) -> Array 
 
 @dataclass(frozen=True)
 class Marginalized:
-    """A sighting factor on the pose only: its other values are fixed at ``values``, with covariances ``spreads``, None for exact
-    ones.
+    """A sighting factor on the pose only: its other values are fixed at ``values``, with ``covariances``, None for exact values.
 
     An error of a value is common to all K sightings: its covariance is multiplied by K, so that it does not average out.
     """
 
     factor: SightingFactor
     values: tuple[Array, ...]
-    spreads: tuple[Array | None, ...]
+    covariances: tuple[Array | None, ...]
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, g), and its Jacobian (K, g, 3) by the pose."""
-        residual, (by_pose, *others) = self.factor.whitened([values[0], *self.values])
+        residual, (by_pose, *by_values) = self.factor.whitened([values[0], *self.values])
         noise = np.eye(residual.shape[1])
-        for block, spread in zip(others, self.spreads, strict=True):
-            if spread is not None:
-                noise = noise + len(block) * block @ spread @ block.transpose(0, 2, 1)
+        for block, covariance in zip(by_values, self.covariances, strict=True):
+            if covariance is not None:
+                noise = noise + len(block) * block @ covariance @ block.transpose(0, 2, 1)
         if noise.ndim == 2:
             return residual, [by_pose]
         whitener = positive.whitener(noise)

@@ -61,7 +61,7 @@ def update_state(
     the error state as ``linearize`` gets it.
     """
     size, priors = len(covariance), [covariance]
-    if common:  # where the sightings are tempered, so are these
+    if common:  # they are tempered like the sightings
         tempering = weight(np.zeros(1))[0]
         priors = [np.eye(size + common) / share for share in sorted({1.0, tempering}, reverse=True)]
         for prior in priors:
@@ -69,12 +69,12 @@ def update_state(
     iterated = priors[0], weight, iterations, dof, converged
     try:
         solve = [_informed(np.asarray(np.linalg.inv(prior))) for prior in priors]
-        found = _iterated(solve[0], solve[-1], linearize, *iterated)
-        _require_sound(found.delta, found.covariance)
+        correction = _iterated(solve[0], solve[-1], linearize, *iterated)
+        _require_sound(correction.delta, correction.covariance)
     except np.linalg.LinAlgError:
         solve = [_rooted(positive.root(prior)) for prior in priors]
-        found = _iterated(solve[0], solve[-1], linearize, *iterated)
-    return replace(found, delta=found.delta[:size], covariance=found.covariance[:size, :size])
+        correction = _iterated(solve[0], solve[-1], linearize, *iterated)
+    return replace(correction, delta=correction.delta[:size], covariance=correction.covariance[:size, :size])
 
 
 # Correction (S,) and covariance (S, S) from a Jacobian (K, g, D), residuals (K, g), their weights (K,), and the correction (D,) at
@@ -93,7 +93,7 @@ def _iterated(
     converged: float,
 ) -> Correction:
     zero = np.zeros(len(covariance))
-    residual, blocks = map(np.ascontiguousarray, linearize(zero))  # compiled code is compiled anew for others
+    residual, blocks = map(np.ascontiguousarray, linearize(zero))  # other memory orders would compile the code again
     size = blocks.shape[2]
     squared = normalised(residual, blocks, np.arange(size), np.ascontiguousarray(covariance))
     widening = np.maximum(1.0, squared / GATES[blocks.shape[1]])
@@ -104,11 +104,11 @@ def _iterated(
     tempering = weight(np.zeros(1))[0]
     if widening.max() > 1.0 or tempering < 1.0:
         delta, updated = solve(blocks, residual, tempering * widening**-2, zero[:size])
-    first, before = residual, zero
+    first, previous = residual, zero
     for _ in range(iterations - 1):
-        if np.abs(delta - before).max() < converged:
+        if np.abs(delta - previous).max() < converged:
             break
-        before = delta
+        previous = delta
         residual, blocks = map(np.ascontiguousarray, linearize(delta))
         weights = weight(np.einsum("ki,ki->k", residual, residual))
         delta, updated = solve(blocks, residual, weights, delta[:size])
@@ -185,16 +185,16 @@ def corrected(
     """
     total = prior.copy()
     pull = inform(residual, jacobian, columns, weights, at, total)
-    after, delta = invert_covariance(total), np.zeros(len(prior))
+    posterior, delta = invert_covariance(total), np.zeros(len(prior))
     for i in range(len(prior)):
         for a in range(len(columns)):
-            delta[i] += after[i, columns[a]] * pull[a]
-    return delta, after, pull
+            delta[i] += posterior[i, columns[a]] * pull[a]
+    return delta, posterior, pull
 
 
 @compiled(error_model="numpy")
 def normalised(residual: Array, jacobian: Array, columns: Integers, covariance: Array) -> Array:
-    """Normalised innovation squared (K,) of K whitened residuals (K, g), each by itself, with Jacobians (K, g, D) by the
+    """Normalised innovation squared (K,) of K independent whitened residuals (K, g) with Jacobians (K, g, D) by the
     ``columns`` (D,) of a state with this ``covariance`` (S, S)."""
     size, wide = residual.shape[1], len(columns)
     out, left, whitened = np.zeros(len(residual)), np.empty((size, size)), np.empty(size)
@@ -202,17 +202,17 @@ def normalised(residual: Array, jacobian: Array, columns: Integers, covariance: 
         for i in range(size):
             whitened[i] = residual[k, i]
             for j in range(i + 1):
-                spread = 1.0 if i == j else 0.0
+                element = 1.0 if i == j else 0.0
                 for a in range(wide):
                     if jacobian[k, i, a] != 0.0:
                         carried = 0.0
                         for b in range(wide):
                             carried += covariance[columns[a], columns[b]] * jacobian[k, j, b]
-                        spread += jacobian[k, i, a] * carried
+                        element += jacobian[k, i, a] * carried
                 for m in range(j):
-                    spread -= left[i, m] * left[j, m]
+                    element -= left[i, m] * left[j, m]
                 # with unit noise a pivot is at least 1, whatever rounding leaves of it
-                left[i, j] = math.sqrt(max(spread, 0.5)) if i == j else spread / left[j, j]
+                left[i, j] = math.sqrt(max(element, 0.5)) if i == j else element / left[j, j]
             for m in range(i):
                 whitened[i] -= left[i, m] * whitened[m]
             whitened[i] /= left[i, i]

@@ -31,7 +31,7 @@ def adjusted(
     whiteners: Array,
     iterations: int,
 ) -> tuple[Array, Array, Array]:
-    """Poses (N, 3), of which the first is held, and tilts (N, 2) that fit best to what is seen of points (P, 3); and the whitened,
+    """The most likely poses (N, 3), with the first one fixed, and tilts (N, 2), from pixels of points (P, 3); and the whitened,
     robustly weighted residuals (M, 2).
 
     ``frames`` (M,): the pose that each of the ``pixels`` (M, 2) was seen from; those of point p are from ``starts`` (P + 1,) p on.
@@ -41,7 +41,7 @@ def adjusted(
     n, count = len(frames), len(points)
     tilts, damping = np.zeros((len(poses), 2)), DAMPING
     residual, jacobian = np.empty((n, 2)), np.empty((n, 2, WIDTH))
-    other, others = np.empty((n, 2)), np.empty((n, 2, WIDTH))
+    trial, by_trial = np.empty((n, 2)), np.empty((n, 2, WIDTH))
     camera = k, position, rotation
     cost = _looked(camera, poses, tilts, points, frames, starts, pixels, noise, deltas, whiteners, residual, jacobian)
     for _ in range(iterations):
@@ -57,14 +57,14 @@ def adjusted(
             for j in range(3):
                 new_points[p, j] += shifts[p, j]
         new = _looked(
-            camera, new_poses, new_tilts, new_points, frames, starts, pixels, noise, deltas, whiteners, other, others
+            camera, new_poses, new_tilts, new_points, frames, starts, pixels, noise, deltas, whiteners, trial, by_trial
         )
         if not new <= cost:
             damping *= 10.0
             continue
         gained = cost - new
         poses, tilts, points, cost, damping = new_poses, new_tilts, new_points, new, damping / 10.0
-        residual, jacobian, other, others = other, others, residual, jacobian
+        residual, jacobian, trial, by_trial = trial, by_trial, residual, jacobian
         if gained <= GAIN * cost:
             break
     return poses, tilts, residual
@@ -114,12 +114,12 @@ def _step(
 ) -> tuple[Array, Array]:
     """The damped step (N, 5) of poses and tilts, and that of the points (P, 3)."""
     count, n = len(starts) - 1, len(frames)
-    told, pull = _without_points(poses, tilts, tilt, deltas, whiteners, damping)
+    hessian, pull = _without_points(poses, tilts, tilt, deltas, whiteners, damping)
     inverses, pulls, mixed = np.empty((count, 3, 3)), np.zeros((count, 3)), np.zeros((n, POINT, 3))
     for p in range(count):
         of_point = damping * np.eye(3)
         for m in range(starts[p], starts[p + 1]):
-            _add(residual[m], jacobian[m], POINT * frames[m], told, pull, of_point, pulls[p], mixed[m])
+            _add(residual[m], jacobian[m], POINT * frames[m], hessian, pull, of_point, pulls[p], mixed[m])
         put(inverse(of_point), inverses[p])
         for m in range(starts[p], starts[p + 1]):
             share = product(mixed[m], inverses[p])
@@ -128,12 +128,12 @@ def _step(
                     pull[POINT * frames[m] + i, 0] -= share[i, j] * pulls[p, j]
                     for o in range(starts[p], starts[p + 1]):
                         for q in range(POINT):
-                            told[POINT * frames[m] + i, POINT * frames[o] + q] -= share[i, j] * mixed[o, q, j]
+                            hessian[POINT * frames[m] + i, POINT * frames[o] + q] -= share[i, j] * mixed[o, q, j]
     for i in range(3):  # the first pose is held
-        for j in range(len(told)):
-            told[i, j] = told[j, i] = 0.0
-        told[i, i], pull[i, 0] = 1.0, 0.0
-    step, shifts = solved(told, pull)[0].reshape(len(poses), POINT), np.empty((count, 3))
+        for j in range(len(hessian)):
+            hessian[i, j] = hessian[j, i] = 0.0
+        hessian[i, i], pull[i, 0] = 1.0, 0.0
+    step, shifts = solved(hessian, pull)[0].reshape(len(poses), POINT), np.empty((count, 3))
     for p in range(count):
         left = pulls[p].copy().reshape(1, 3)
         for m in range(starts[p], starts[p + 1]):
@@ -146,12 +146,12 @@ def _step(
 def _without_points(
     poses: Array, tilts: Array, tilt: float, deltas: Array, whiteners: Array, damping: float
 ) -> tuple[Array, Array]:
-    """What odometry and level floors tell: information (5 N, 5 N) and gradient (5 N, 1)."""
+    """The cost of odometry and tilt: Gauss-Newton Hessian (5 N, 5 N) and gradient (5 N, 1)."""
     size = POINT * len(poses)
-    told, pull = damping * np.eye(size), np.zeros((size, 1))
+    hessian, pull = damping * np.eye(size), np.zeros((size, 1))
     for i in range(len(poses)):
         for j in range(2):
-            told[POINT * i + 3 + j, POINT * i + 3 + j] += 1.0 / tilt**2
+            hessian[POINT * i + 3 + j, POINT * i + 3 + j] += 1.0 / tilt**2
             pull[POINT * i + 3 + j, 0] -= tilts[i, j] / tilt**2
     for i in range(len(deltas)):
         off, by_start, by_end, _ = between(poses[i], poses[i + 1], deltas[i], np.zeros((3, 0)), whiteners[i])
@@ -160,9 +160,9 @@ def _without_points(
                 for j in range(3):
                     pull[POINT * a + j, 0] -= left[r, j] * off[r]
                     for q in range(3):
-                        told[POINT * a + j, POINT * i + q] += left[r, j] * by_start[r, q]
-                        told[POINT * a + j, POINT * (i + 1) + q] += left[r, j] * by_end[r, q]
-    return told, pull
+                        hessian[POINT * a + j, POINT * i + q] += left[r, j] * by_start[r, q]
+                        hessian[POINT * a + j, POINT * (i + 1) + q] += left[r, j] * by_end[r, q]
+    return hessian, pull
 
 
 @compiled(error_model="numpy")
@@ -170,7 +170,7 @@ def _add(
     residual: Array,
     jacobian: Array,
     place: int,
-    told: Array,
+    hessian: Array,
     pull: Array,
     of_point: Array,
     point_pull: Array,
@@ -188,4 +188,4 @@ def _add(
         for i in range(POINT):
             pull[place + i, 0] -= jacobian[r, i] * residual[r]
             for j in range(POINT):
-                told[place + i, place + j] += jacobian[r, i] * jacobian[r, j]
+                hessian[place + i, place + j] += jacobian[r, i] * jacobian[r, j]

@@ -55,16 +55,16 @@ class ReprojectionFactor:
         """Whether the pose is its only variable."""
         return not self.estimated and not self.moved_by
 
-    def packed(self) -> pixel_kernels.Seen:
-        """The arguments of the compiled code, for a factor :attr:`of_pose_alone`."""
-        model, offset, noise, spreads = self.model, self.offset, self.offset_covariance, self.point_covariances
-        return pixel_kernels.Seen(
+    def packed(self) -> pixel_kernels.PackedImage:
+        """The arguments of the compiled code. The factor must be :attr:`of_pose_alone`."""
+        model, offset, noise, covariances = self.model, self.offset, self.offset_covariance, self.point_covariances
+        return pixel_kernels.PackedImage(
             lens_of(model),
             model.position,
             model.rotation,
             np.ascontiguousarray(self.points, dtype=float),
             np.ascontiguousarray(self.pixels, dtype=float),
-            EXACT if spreads is None else np.ascontiguousarray(spreads),
+            EXACT if covariances is None else np.ascontiguousarray(covariances),
             NOT_MOVED if offset is None else offset,
             NO_SPREAD if noise is None else noise,
             float(model.sigma),
@@ -106,15 +106,15 @@ class ReprojectionFactor:
         value and by the tilt, without robust weights."""
         moved_by, displacements = np.array(self.moved_by, dtype=np.int64), values[1 + bool(self.estimated) :]
         moves = None if not self.moved_by else np.array((*displacements, np.zeros(3)))[moved_by]
-        here = self.fixed(values[1 : 1 + bool(self.estimated)], moves)
+        on_pose = self.fixed(values[1 : 1 + bool(self.estimated)], moves)
         pose, width = np.ascontiguousarray(values[0], dtype=float), POINT if self.of_pose_alone else WIDTH
-        residual, jacobian = pixel_kernels.whitened(here.packed(), pose, width)
+        residual, jacobian = pixel_kernels.whitened(on_pose.packed(), pose, width)
         blocks = [jacobian[..., :TILT]]
         if self.estimated:
             by_parameters = jacobian[..., CONSTANTS:]
             by_parameters[..., 3:6] = by_parameters[..., 3:6] @ _turns(self.estimated, values[1])
             if self.twist is not None:
-                twist = self.twist if here.offset is None else se2.adjoint(here.offset) @ self.twist
+                twist = self.twist if on_pose.offset is None else se2.adjoint(on_pose.offset) @ self.twist
                 by_parameters[..., TIME_OFFSET] = blocks[0] @ twist
             blocks.append(by_parameters[..., list(self.estimated)])
         by_point = jacobian[..., POINT:CONSTANTS]
@@ -155,11 +155,11 @@ def image_update(
     of the updated pose, because pixels are so much more accurate than a survey that it matters.
     """
     size = len(covariance)
-    seen = factor.packed() if factor.of_pose_alone else None
+    packed = factor.packed() if factor.of_pose_alone else None
 
     def linearize(delta: Array) -> tuple[Array, Array]:
-        if seen is not None and size == len(pose):
-            residual, jacobian = pixel_kernels.whitened(seen, moved(pose, delta))
+        if packed is not None and size == len(pose):
+            residual, jacobian = pixel_kernels.whitened(packed, moved(pose, delta))
             return residual + jacobian[..., size:] @ delta[size:], jacobian
         at = [v + delta[column] for v, column in zip(values, columns, strict=True)]
         residual, blocks = factor.whitened([se2.compose(pose, se2.exp(delta[:3])), *at])
@@ -170,12 +170,12 @@ def image_update(
             jacobian[..., :3] = jacobian[..., :3] @ se2.right_jacobian(delta[:3])
         return residual + blocks[-1] @ delta[size:], jacobian
 
-    found = update_state(linearize, covariance, factor.weight, iterations, factor.dof(), converged, TILTS)
+    correction = update_state(linearize, covariance, factor.weight, iterations, factor.dof(), converged, TILTS)
     if not values:
-        return found
+        return correction
     reset = np.eye(size)
-    reset[:3, :3] = se2.right_jacobian(found.delta[:3])
-    return replace(found, covariance=reset @ found.covariance @ reset.T)
+    reset[:3, :3] = se2.right_jacobian(correction.delta[:3])
+    return replace(correction, covariance=reset @ correction.covariance @ reset.T)
 
 
 def _turns(estimated: tuple[int, ...], changes: Array) -> Array:

@@ -5,8 +5,8 @@ III (parametrization and measurement), IV (initialization) and VI (conversion to
 (x, y, z) [m] at the first sighting, azimuth and elevation [rad] of the ray in the world, and the inverse depth [1/m]. The world's
 z axis is up here, so the direction is singular only for points straight above or below.
 
-A Gaussian of the inverse depth represents all depths from a minimum to infinity, so a new point gives information on the camera's
-rotation at once, and on its translation when there is parallax.
+A Gaussian of the inverse depth represents all depths from a minimum to infinity, so the first sighting of a point already informs
+the camera's rotation. It informs the translation as soon as there is parallax.
 """
 
 import numpy as np
@@ -58,13 +58,13 @@ def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array)
     inverse = rays[:, 5, None]
     away = rays[:, :3] - position
     # the vector to the point, times its inverse depth
-    way = inverse * away + ahead
-    pixels, by_camera, by_way = linearize_in_space(model, np.zeros(3), rotation, way)
-    by_camera[..., 3:] = -inverse[:, None] * (by_way @ rotation)
+    direction = inverse * away + ahead
+    pixels, by_camera, by_direction = linearize_in_space(model, np.zeros(3), rotation, direction)
+    by_camera[..., 3:] = -inverse[:, None] * (by_direction @ rotation)
     by_rays = np.empty((len(rays), 2, SIZE))
-    by_rays[..., :3] = inverse[:, None] * by_way
-    by_rays[..., 3:5] = by_way @ by_angles
-    by_rays[..., 5] = np.einsum("kij,kj->ki", by_way, away)
+    by_rays[..., :3] = inverse[:, None] * by_direction
+    by_rays[..., 3:5] = by_direction @ by_angles
+    by_rays[..., 5] = np.einsum("kij,kj->ki", by_direction, away)
     return pixels, by_camera, by_rays
 
 

@@ -15,7 +15,7 @@ BEHIND = 100.0  # residual of a point behind the camera, in standard deviations
 # columns of a Jacobian: by the pose, by roll and pitch, by the point, and by all parameters of the camera
 TILT, POINT, CONSTANTS, WIDTH = 3, 5, 8, 16
 
-# fx, fy, cx, cy, k1, k2, p1, p2, and the reciprocal of the x^2 + y^2 up to which the distortion polynomial is used
+# fx, fy, cx, cy, k1, k2, p1, p2, and 1 / r^2; the distortion polynomial is valid where x^2 + y^2 < r^2
 Lens = tuple[float, ...]
 Place = tuple[tuple[float, ...], ...]
 
@@ -85,18 +85,18 @@ def in_camera(
 
 
 @compiled(error_model="numpy")
-def undistorted(k: Lens, seen: Array) -> tuple[Array, Array]:
-    """The directions (K, 2) that are distorted to ``seen`` (K, 2) with positive determinant, and the remaining errors (K,) of the
-    distorted directions; NaN for NaN."""
-    n = len(seen)
+def undistorted(k: Lens, distorted: Array) -> tuple[Array, Array]:
+    """The directions (K, 2) whose distortion is ``distorted`` (K, 2), with positive determinant; and the remaining errors (K,) of
+    the distorted directions. NaN for NaN."""
+    n = len(distorted)
     directions, errors = np.full((n, 2), np.nan), np.full(n, np.inf)
     for i in range(n):
         # start on the axis, where every lens is invertible, towards the direction without distortion
-        x, y, step_x, step_y, share = 0.0, 0.0, seen[i, 0], seen[i, 1], 1.0
+        x, y, step_x, step_y, share = 0.0, 0.0, distorted[i, 0], distorted[i, 1], 1.0
         for _ in range(MOST_STEPS):
             to_x, to_y = x + share * step_x, y + share * step_y
             xd, yd, xx, xy, yx, yy = _distorted(k, to_x, to_y)
-            eu, ev, determinant = seen[i, 0] - xd, seen[i, 1] - yd, xx * yy - xy * yx
+            eu, ev, determinant = distorted[i, 0] - xd, distorted[i, 1] - yd, xx * yy - xy * yx
             error = math.sqrt(eu * eu + ev * ev)
             if not (determinant > 0.0 and error < errors[i]):  # step too long, or over a fold
                 share *= 0.5
@@ -191,7 +191,7 @@ def project_planar(
 
 @compiled(error_model="numpy")
 def linearize(camera: tuple[Lens, Array, Array], pose: Array, points: Array) -> tuple[Array, Array]:
-    """Pixels (K, 2) of ``points`` (K, 3) and their Jacobian (K, 2, WIDTH), for a robot that does not tilt."""
+    """Pixels (K, 2) of ``points`` (K, 3) and their Jacobian (K, 2, WIDTH). The robot does not tilt."""
     pixels, jacobian = np.empty((len(points), 2)), np.empty((len(points), 2, WIDTH))
     level, upright = np.zeros(2), np.eye(3)
     for i in range(len(points)):
@@ -212,7 +212,7 @@ def turned(roll: float, pitch: float) -> Array:
 
 
 @compiled(error_model="numpy")
-def seen(
+def whiten(
     k: Lens,
     position: Array,
     rotation: Array,
@@ -245,7 +245,7 @@ def see(
     residual: Array,
     jacobian: Array,
 ) -> float:
-    """One of :func:`seen`: the squared residual; ``residual`` and ``jacobian`` in place. ``at``: pose, tilt, point and pixel."""
+    """One point of :func:`whiten`: the squared residual; fills ``residual`` and ``jacobian``. ``at``: pose, tilt, point, pixel."""
     pose, tilt, point, measured = at
     u, v, depth = project_planar(camera, pose, tilt, turned(tilt[0], tilt[1]), point, jacobian)
     residual[0], residual[1] = (u - measured[0]) / sigma, (v - measured[1]) / sigma

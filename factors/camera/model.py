@@ -27,14 +27,14 @@ from factors.compiled import compiled
 from factors.se2 import Array
 
 # the constants of a camera that can be estimated: position [m] and small rotations [rad] about the robot's axes, logarithm of the
-# focal length, and time offset [s] by which images are later than their timestamps
+# focal length, and time offset [s] of images relative to their timestamps
 PARAMETERS = ("x", "y", "z", "roll", "pitch", "yaw", "focal", "time_offset")
 FOCAL, TIME_OFFSET = PARAMETERS.index("focal"), PARAMETERS.index("time_offset")
 WIDEST = 4.0  # of x^2 + y^2 (63 degrees off the axis): maximum for the distortion polynomial
 GRID = 33  # rows and columns of pixels at which a lens is checked
 NONE = 1e-9  # tolerance of distorted directions
 
-# columns: the camera's axes in the frame of a robot with z up, for a camera that looks along the robot's x axis
+# columns: axes of a forward-facing camera in the robot frame (z up)
 FORWARD: Array = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
 
 
@@ -83,8 +83,8 @@ class CameraModel:
 
 
 def mounting(roll: float, pitch: float, yaw: float) -> Array:
-    """The rotation (3, 3) of a camera in the robot frame that looks along x, rotated by ``roll`` about x, ``pitch`` about y (down
-    is positive), ``yaw`` about z (left is positive)."""
+    """The rotation (3, 3) of a camera in the robot frame. The forward-facing camera is rotated by ``roll`` about x, ``pitch`` about
+    y (down is positive), ``yaw`` about z (left is positive)."""
     (a, b), (c, d), (e, f) = ((math.cos(w), math.sin(w)) for w in (roll, pitch, yaw))
     about_x = np.array(((1.0, 0.0, 0.0), (0.0, a, -b), (0.0, b, a)))
     about_y = np.array(((c, 0.0, d), (0.0, 1.0, 0.0), (-d, 0.0, c)))
@@ -157,8 +157,8 @@ def predict(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Arra
 def undistorted(model: CameraModel, pixels: Array) -> Array:
     """Directions (K, 2), as (x, y) at depth 1 in the camera frame, of ``pixels`` (K, 2): the inverse of :func:`project`, by
     Newton's method."""
-    seen = (np.asarray(pixels, dtype=float) - (model.cx, model.cy)) / (model.fx, model.fy)
-    return np.asarray(reprojection_kernels.undistorted(lens_of(model), np.ascontiguousarray(seen))[0])
+    distorted = (np.asarray(pixels, dtype=float) - (model.cx, model.cy)) / (model.fx, model.fy)
+    return np.asarray(reprojection_kernels.undistorted(lens_of(model), np.ascontiguousarray(distorted))[0])
 
 
 def rays(model: CameraModel, pixels: Array) -> Array:
@@ -176,8 +176,8 @@ def folded(model: CameraModel) -> Array | None:
     u, v = (np.linspace(-0.5, side - 0.5, GRID) for side in (model.width, model.height))
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     lens = lens_of(model)
-    seen = (pixels - (model.cx, model.cy)) / (model.fx, model.fy)
-    directions, errors = reprojection_kernels.undistorted(lens, seen)
+    distorted = (pixels - (model.cx, model.cy)) / (model.fx, model.fy)
+    directions, errors = reprojection_kernels.undistorted(lens, distorted)
     bad = ~(errors < NONE) | (lens[8] * np.sum(directions**2, axis=1) >= 1.0)
     return np.asarray(pixels[np.argmax(bad)]) if bad.any() else None
 
@@ -205,10 +205,10 @@ def linearize_in_space(
     """Pixels (K, 2) of ``points`` (K, 3) in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world; their Jacobians by
     the camera's perturbation (K, 2, 6), rotation before translation, both in the camera frame as in ``gtsam.Pose3``, and by the
     points (K, 2, 3)."""
-    found: tuple[Array, Array, Array] = reprojection_kernels.linearize_in_space(
+    linear: tuple[Array, Array, Array] = reprojection_kernels.linearize_in_space(
         lens_of(model), *(np.ascontiguousarray(part, dtype=float) for part in (position, rotation, points))
     )
-    return found
+    return linear
 
 
 def log_likelihood(
@@ -230,13 +230,13 @@ def log_likelihood(
         whiteners = positive.whitener(covariances)
     camera = lens_of(model), model.position, model.rotation
     poses, points, pixels = (np.ascontiguousarray(part, dtype=float) for part in (poses, points, pixels))
-    seen = poses, points, pixels, whiteners, np.ascontiguousarray(whiteners @ tilts)
-    return np.asarray(reprojection_kernels.log_likelihood(*camera, *seen, model.robust, model.tempering))
+    sightings = poses, points, pixels, whiteners, np.ascontiguousarray(whiteners @ tilts)
+    return np.asarray(reprojection_kernels.log_likelihood(*camera, *sightings, model.robust, model.tempering))
 
 
 def lens_of(model: CameraModel) -> Lens:
-    """The camera's constants for the kernels: :meth:`CameraModel.intrinsics`, and the reciprocal of the x^2 + y^2 up to which the
-    polynomial is used: where the radial part stops growing, at most :data:`WIDEST`; 0 without distortion, for no limit."""
+    """The camera's constants for the kernels: :meth:`CameraModel.intrinsics` and 1 / r^2. The distortion polynomial is valid up
+    to the radius r, where its radial part stops growing, at most :data:`WIDEST`. Without distortion the last value is 0."""
     end = 0.0
     if any(model.distortion):
         k1, k2, *_ = model.distortion
@@ -255,14 +255,14 @@ SILLS = 0.05  # share of images with another scale
 
 @dataclass(frozen=True)
 class TiltScale:
-    """How level a floor is, from what all points of an image have in common: a Bayesian filter over the scale of the tilt.
+    """A Bayesian filter of the tilt's scale, which measures how level a floor is. All points of an image share one tilt.
 
-    ``sigma``: the standard deviation [rad] of roll and pitch. ``guess``, ``told``: logarithms of what is guessed of each of the
-    :data:`SCALES`, and of what images told."""
+    ``sigma``: the standard deviation [rad] of roll and pitch. For each of the :data:`SCALES`, ``guess``: log prior;
+    ``log_evidence``: log-likelihood of the images."""
 
     sigma: float
     guess: Array
-    told: Array
+    log_evidence: Array
 
     @staticmethod
     def guessed(sigma: float) -> TiltScale:
@@ -270,31 +270,31 @@ class TiltScale:
         return TiltScale(sigma, -0.5 * (np.log(SCALES / sigma) / VAGUE) ** 2, np.zeros(len(SCALES)))
 
     def learnt(self, tilt: Array, covariance: Array, prior: float) -> tuple[TiltScale, float]:
-        """What is known after the ``tilt`` (2,) of an image with its ``covariance`` (2, 2), found with the standard deviation
-        ``prior``; and the standard deviation to be expected in this image."""
-        told = self.told.copy()
-        sigma, here = _learnt(tilt, covariance, prior, self.guess, told)
-        return TiltScale(sigma, self.guess, told), here
+        """The filter updated by the ``tilt`` (2,) of an image with ``covariance`` (2, 2), estimated with the prior sigma ``prior``;
+        and the expected standard deviation in this image."""
+        log_evidence = self.log_evidence.copy()
+        sigma, image_sigma = _learnt(tilt, covariance, prior, self.guess, log_evidence)
+        return TiltScale(sigma, self.guess, log_evidence), image_sigma
 
 
 @compiled(error_model="numpy")
-def _learnt(tilt: Array, covariance: Array, prior: float, prior_log: Array, told: Array) -> tuple[float, float]:
-    """See :meth:`TiltScale.learnt`: what is to be expected later, and in this image; ``told`` in place."""
+def _learnt(tilt: Array, covariance: Array, prior: float, prior_log: Array, log_evidence: Array) -> tuple[float, float]:
+    """The expected standard deviations later and in this image: :meth:`TiltScale.learnt`. Updates ``log_evidence``."""
     determinant = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
     a, b, d = covariance[1, 1] / determinant, -covariance[0, 1] / determinant, covariance[0, 0] / determinant
     x, y = a * tilt[0] + b * tilt[1], b * tilt[0] + d * tilt[1]
     image = np.empty(len(SCALES))
     for i, scale in enumerate(SCALES):
-        # what the image tells without its prior, and a tilt of this scale
+        # likelihood of the image under this scale, with its prior divided out
         more = 1.0 / scale**2 - 1.0 / prior**2
         determinant = (a + more) * (d + more) - b * b
         fit = ((d + more) * x * x - 2.0 * b * x * y + (a + more) * y * y) / determinant
         image[i] = 0.5 * (fit - math.log(determinant)) - 2.0 * math.log(scale)
-    image, before, any_scale = _normalised(image), _normalised(prior_log + told), SILLS / len(SCALES)
-    here = image * ((1.0 - SILLS) * before + any_scale)
+    image, predicted, any_scale = _normalised(image), _normalised(prior_log + log_evidence), SILLS / len(SCALES)
+    posterior = image * ((1.0 - SILLS) * predicted + any_scale)
     for i in range(len(SCALES)):
-        told[i] = (1.0 - 1.0 / MEMORY) * told[i] + math.log((1.0 - SILLS) * image[i] + any_scale)
-    return _scale(_normalised(prior_log + told)), _scale(here / here.sum())
+        log_evidence[i] = (1.0 - 1.0 / MEMORY) * log_evidence[i] + math.log((1.0 - SILLS) * image[i] + any_scale)
+    return _scale(_normalised(prior_log + log_evidence)), _scale(posterior / posterior.sum())
 
 
 @compiled(error_model="numpy")

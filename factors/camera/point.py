@@ -19,7 +19,7 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, slots=True)
 class PointFactor:
-    """A point ``seen`` at a pixel (2,). ``lens``: of the ``model``, for compiled code.
+    """A point observed at a ``pixel`` (2,). ``lens``: of the ``model``, for compiled code.
 
     The values of the factor are the robot's pose (3,); corrections (P,) of the constants with indices ``estimated`` in
     :data:`~factors.camera.model.PARAMETERS`, if any; the robot's roll and pitch (2,) [rad]; and the point (3,). ``twist`` (3,): the
@@ -28,7 +28,7 @@ class PointFactor:
 
     model: CameraModel
     lens: Lens
-    seen: Array
+    pixel: Array
     estimated: tuple[int, ...] = ()
     twist: Array | None = None
 
@@ -47,7 +47,7 @@ class PointFactor:
     def linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, list[Array]]:
         """:meth:`linearize` of N factors with the same camera and constants: residuals (N, 2) and Jacobians (N, 2, d)."""
         estimated, constants = factors[0].estimated, values[0][1]
-        residual, jacobian, _ = _seen(factors, values)
+        residual, jacobian, _ = _linearize_all(factors, values)
         if TIME_OFFSET in estimated:
             twists, later = _later(factors, values)
             jacobian[..., CONSTANTS + TIME_OFFSET] = np.einsum("nri,ni->nr", jacobian[..., :TILT], twists)
@@ -65,14 +65,14 @@ class PointFactor:
 
     def cost(self, values: Sequence[Array]) -> float:
         """The robust loss."""
-        return float(huber_loss(_seen([self], [values])[2], self.model.robust).sum())
+        return float(huber_loss(_linearize_all([self], [values])[2], self.model.robust).sum())
 
     def is_astray(self, values: Sequence[Array]) -> bool:
         """Whether the point cannot be what the robot saw: it is behind the camera, or :data:`BEHIND` standard deviations away."""
-        return bool(_seen([self], [values])[2][0] >= BEHIND**2)
+        return bool(_linearize_all([self], [values])[2][0] >= BEHIND**2)
 
 
-def _seen(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array, Array]:
+def _linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array, Array]:
     first = factors[0]
     model, lens, (_, *constants, _, _) = first.model, first.lens, values[0]
     if constants:
@@ -80,15 +80,15 @@ def _seen(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> 
         changes[list(first.estimated)] = constants[0]
         model = recalibrated(model, changes)
         lens = lens_of(model)
-    poses, tilts, points, seen = (
+    poses, tilts, points, pixels = (
         np.array([v[0] for v in values], dtype=float),
         np.array([v[-2] for v in values], dtype=float),
         np.array([v[-1] for v in values], dtype=float),
-        np.array([f.seen for f in factors], dtype=float),
+        np.array([f.pixel for f in factors], dtype=float),
     )
     if TIME_OFFSET in first.estimated:
         poses = se2.compose(poses, _later(factors, values)[1])
-    return kernels.seen(lens, model.position, model.rotation, poses, tilts, points, seen, model.sigma, model.robust)
+    return kernels.whiten(lens, model.position, model.rotation, poses, tilts, points, pixels, model.sigma, model.robust)
 
 
 def _later(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array]:
@@ -103,8 +103,8 @@ class PointPrior:
     """A weak prior of a point: where it is from the robot, ``mean`` (3,) [m] with the standard deviation ``sigma`` [m] of each
     coordinate.
 
-    The values of the factor are the robot's pose (3,) and the point (3,). Priors in the frame of the world would tell of that: a
-    thousand of 30 m hold the robot to a metre.
+    The values of the factor are the robot's pose (3,) and the point (3,). Priors in the world frame would
+    constrain the robot: a thousand priors of 30 m fix its position to a metre.
     """
 
     mean: Array
@@ -118,11 +118,11 @@ class PointPrior:
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (3,) and its Jacobians."""
         pose, point = values
-        there = _from_robot(pose, point)
+        relative = _from_robot(pose, point)
         c, s = math.cos(pose[2]), math.sin(pose[2])
-        by_pose = np.array(((-1.0, 0.0, there[1]), (0.0, -1.0, -there[0]), (0.0, 0.0, 0.0)))
+        by_pose = np.array(((-1.0, 0.0, relative[1]), (0.0, -1.0, -relative[0]), (0.0, 0.0, 0.0)))
         by_point = np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
-        return (there - self.mean) / self.sigma, [by_pose / self.sigma, by_point / self.sigma]
+        return (relative - self.mean) / self.sigma, [by_pose / self.sigma, by_point / self.sigma]
 
     def cost(self, values: Sequence[Array]) -> float:
         """Half the squared whitened residual."""

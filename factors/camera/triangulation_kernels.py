@@ -24,7 +24,7 @@ def triangulated(
     rays: Array,
     pixels: Array,
     sigmas: Array,
-    spread: float,
+    largest_sigma: float,
     parallax: float,
     nearest: float,
     robust: float,
@@ -33,29 +33,29 @@ def triangulated(
     with rotations ``turns`` (M, 3, 3).
 
     ``rays`` (M, 3): its directions in their frames; ``pixels`` (M, 2) with standard deviations ``sigmas`` (M,) of each coordinate.
-    ``spread``: the largest standard deviation of the point that is allowed, relative to its least depth. ``parallax`` [rad]: the
+    ``largest_sigma``: the largest allowed standard deviation of the point, relative to its least depth. ``parallax`` [rad]: the
     least angle between the outermost rays; ``nearest`` [m]: the least depth; ``robust``: scale of Huber's loss, infinite for least
     squares.
 
     A linear start, the point nearest to all rays, then Gauss-Newton steps on the reprojection error (Hartley and Zisserman,
     "Multiple View Geometry", 2004, chapter 12).
     """
-    ways = np.empty_like(rays)
+    directions = np.empty_like(rays)
     for m in range(len(rays)):
-        way = product(turns[m], rays[m].reshape(3, 1))
-        ways[m, 0], ways[m, 1], ways[m, 2] = way[0, 0], way[1, 0], way[2, 0]
+        direction = product(turns[m], rays[m].reshape(3, 1))
+        directions[m, 0], directions[m, 1], directions[m, 2] = direction[0, 0], direction[1, 0], direction[2, 0]
     covariance, squared = np.zeros((3, 3)), np.full(len(rays), np.inf)
     point = np.zeros(3)
-    if product_by_transpose(ways, ways).min() > math.cos(parallax):
+    if product_by_transpose(directions, directions).min() > math.cos(parallax):
         return NONE, point, covariance, squared
-    point = _nearest(centres, ways)
+    point = _nearest(centres, directions)
     for iteration in range(ITERATIONS + 1):
-        told, pull, depth = _told(k, centres, turns, pixels, sigmas, point, robust, squared)
+        information, pull, depth = _inform(k, centres, turns, pixels, sigmas, point, robust, squared)
         if not depth > nearest:
             return BEHIND, point, covariance, squared
-        covariance = inverse(told)
+        covariance = inverse(information)
         # the initial point may be less accurate
-        if not _is_below(covariance, ((2.0 if iteration == 0 else 1.0) * spread * depth) ** 2):
+        if not _is_below(covariance, ((2.0 if iteration == 0 else 1.0) * largest_sigma * depth) ** 2):
             return NONE, point, covariance, squared
         if iteration < ITERATIONS:
             step = product(covariance, pull).reshape(3)
@@ -66,24 +66,24 @@ def triangulated(
 
 
 @compiled(error_model="numpy")
-def _nearest(centres: Array, ways: Array) -> Array:
-    """The point nearest to rays from ``centres`` (M, 3) in the directions ``ways`` (M, 3)."""
+def _nearest(centres: Array, directions: Array) -> Array:
+    """The point nearest to rays from ``centres`` (M, 3) in the directions ``directions`` (M, 3)."""
     left, right = np.zeros((3, 3)), np.zeros((3, 1))
-    for m in range(len(ways)):
+    for m in range(len(directions)):
         for i in range(3):
             for j in range(3):
-                across = (1.0 if i == j else 0.0) - ways[m, i] * ways[m, j]
+                across = (1.0 if i == j else 0.0) - directions[m, i] * directions[m, j]
                 left[i, j] += across
                 right[i, 0] += across * centres[m, j]
     return solved(left, right)[0].reshape(3)
 
 
 @compiled(error_model="numpy")
-def _told(
+def _inform(
     k: Lens, centres: Array, turns: Array, pixels: Array, sigmas: Array, point: Array, robust: float, squared: Array
 ) -> tuple[Array, Array, float]:
     """The information (3, 3) on a point and its gradient (3, 1), and the least depth; ``squared`` residuals (M,) in place."""
-    told, pull, depth, row, error = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3), np.empty(2)
+    information, pull, depth, row, error = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3), np.empty(2)
     for m in range(len(centres)):
         local = product((point - centres[m]).reshape(1, 3), turns[m])
         depth = min(depth, local[0, 2])
@@ -100,8 +100,8 @@ def _told(
             for i in range(3):
                 pull[i, 0] -= weight * row[i] * error[r]
                 for j in range(3):
-                    told[i, j] += weight * row[i] * row[j]
-    return told, pull, depth
+                    information[i, j] += weight * row[i] * row[j]
+    return information, pull, depth
 
 
 @compiled(error_model="numpy")

@@ -16,7 +16,7 @@ Row = tuple[float, float, float]
 REWEIGHTED, STILL = 50, 1e-5  # most rounds to find a tilt, and standard deviations that the last may change it
 
 
-class Seen(NamedTuple):
+class PackedImage(NamedTuple):
     """A :class:`~factors.camera.factor.ReprojectionFactor` on the pose only, for compiled code.
 
     ``point_covariances`` (K, 3, 3), or (0, 3, 3) for an exact map; ``offset`` (3,) and ``offset_covariance`` (3, 3): zero for none.
@@ -38,30 +38,30 @@ class Seen(NamedTuple):
 
 
 @compiled(error_model="numpy")
-def whitened(seen: Seen, pose: Array, width: int = POINT) -> tuple[Array, Array]:
+def whitened(image: PackedImage, pose: Array, width: int = POINT) -> tuple[Array, Array]:
     """See :meth:`~factors.camera.factor.ReprojectionFactor.whitened`: residual (K, 2), and the first ``width`` columns of its
     Jacobian (K, 2, WIDTH) by the pose (3), by the tilt (2) in standard deviations, by the point (3) and by the camera's constants
     (8), without a time offset."""
-    count, row = len(seen.points), np.empty((2, WIDTH))
+    count, row = len(image.points), np.empty((2, WIDTH))
     residual, jacobian = np.empty((count, 2)), np.empty((count, 2, width))
-    camera, scale = (seen.lens, seen.position, seen.rotation), 1.0 / seen.sigma
-    at, level, upright = compose_one(pose, seen.offset), np.zeros(2), np.eye(3)
+    camera, scale = (image.lens, image.position, image.rotation), 1.0 / image.sigma
+    at, level, upright = compose_one(pose, image.offset), np.zeros(2), np.eye(3)
     # of the variable's pose, seen from the pose of the image
-    back = between_one(seen.offset, np.zeros(3))
-    co, so = math.cos(seen.offset[2]), math.sin(seen.offset[2])
-    exact, common = len(seen.point_covariances) == 0, np.trace(seen.offset_covariance) > 0.0
+    back = between_one(image.offset, np.zeros(3))
+    co, so = math.cos(image.offset[2]), math.sin(image.offset[2])
+    exact, common = len(image.point_covariances) == 0, np.trace(image.offset_covariance) > 0.0
     for k in range(count):
-        u, v, _ = project_planar(camera, at, level, upright, seen.points[k], row)
-        eu, ev = scale * (u - seen.pixels[k, 0]), scale * (v - seen.pixels[k, 1])
+        u, v, _ = project_planar(camera, at, level, upright, image.points[k], row)
+        eu, ev = scale * (u - image.pixels[k, 0]), scale * (v - image.pixels[k, 1])
         for r in range(2):
             for j in range(WIDTH):
-                row[r, j] *= seen.tilt * scale if TILT <= j < POINT else scale
+                row[r, j] *= image.tilt * scale if TILT <= j < POINT else scale
         if common or not exact:
             uu, uv, vv = 1.0, 0.0, 1.0
             if not exact:
-                uu, uv, vv = _widened(seen.point_covariances[k], row, POINT, 1.0, uu, uv, vv)
+                uu, uv, vv = _widened(image.point_covariances[k], row, POINT, 1.0, uu, uv, vv)
             if common:  # this error is common to all points, so it must not average out
-                uu, uv, vv = _widened(seen.offset_covariance, row, 0, float(count), uu, uv, vv)
+                uu, uv, vv = _widened(image.offset_covariance, row, 0, float(count), uu, uv, vv)
             # by the inverse of the lower root (a, 0; b, d)
             a = math.sqrt(uu)
             b = uv / a
@@ -93,10 +93,10 @@ def _widened(
 
 
 @compiled(error_model="numpy")
-def linearized(seen: Seen, pose: Array) -> tuple[Array, Array]:
+def linearized(image: PackedImage, pose: Array) -> tuple[Array, Array]:
     """See :meth:`~factors.camera.factor.ReprojectionFactor.linearize`: residual (2K,) and Jacobian (2K, 3)."""
-    residual, jacobian = whitened(seen, pose)
-    return marginal(residual, jacobian, seen.robust, seen.tempering)
+    residual, jacobian = whitened(image, pose)
+    return marginal(residual, jacobian, image.robust, image.tempering)
 
 
 @compiled(error_model="numpy")
@@ -164,15 +164,15 @@ def marginal(residual: Array, jacobian: Array, robust: float, tempering: float) 
 
 
 @compiled(error_model="numpy")
-def leaning(seen: Seen, pose: Array, covariance: Array) -> tuple[Array, Array]:
+def leaning(image: PackedImage, pose: Array, covariance: Array) -> tuple[Array, Array]:
     """Roll and pitch (2,) [rad] of a robot at a ``pose`` (3,) with this ``covariance`` (3, 3), as least squares find them in an
     image, and their covariance (2, 2)."""
-    residual, jacobian = whitened(seen, pose)
+    residual, jacobian = whitened(image, pose)
     prior = np.eye(POINT)
     put(inverse(covariance), prior)
     known = np.arange(POINT), np.ones(len(residual)), np.zeros(POINT)
-    delta, after, _ = corrected(prior, residual, jacobian, *known)
-    return seen.tilt * delta[3:], seen.tilt**2 * after[3:, 3:]
+    delta, posterior, _ = corrected(prior, residual, jacobian, *known)
+    return image.tilt * delta[3:], image.tilt**2 * posterior[3:, 3:]
 
 
 @compiled(error_model="numpy")
@@ -199,7 +199,7 @@ def placed(position: Array, rotation: Array, tilt: float, pose: Array, covarianc
 
 
 @compiled(error_model="numpy")
-def spread(by_point: Array, covariances: Array, sigma: float) -> Array:
+def pixel_noise(by_point: Array, covariances: Array, sigma: float) -> Array:
     """The covariance (K, 2, 2) of pixels with noise ``sigma`` [px], of points with ``covariances`` (K, 3, 3)."""
     out = np.empty((len(by_point), 2, 2))
     for k in range(len(by_point)):

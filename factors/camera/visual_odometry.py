@@ -82,16 +82,16 @@ def translation(position: Array, motion: Array) -> Array:
 def nearness(pairs: RayPairs, motion: Array) -> tuple[Array, Array]:
     """The inverse depth (K,) [1/m] at which the rays of each match are nearest to each other for a robot's ``motion`` (3,),
     negative behind the camera, and its standard deviation (K,)."""
-    way = translation(pairs.position, motion)
-    return _nearness(pairs.first, pairs.second, pairs.first_noise, pairs.second_noise, way, float(motion[2]))
+    offset = translation(pairs.position, motion)
+    return _nearness(pairs.first, pairs.second, pairs.first_noise, pairs.second_noise, offset, float(motion[2]))
 
 
 @compiled(error_model="numpy")
 def _nearness(
-    first: Array, second: Array, first_noise: Array, second_noise: Array, way: Array, turn: float
+    first: Array, second: Array, first_noise: Array, second_noise: Array, offset: Array, turn: float
 ) -> tuple[Array, Array]:
     inverse_depth, sigma = np.empty(len(first)), np.empty(len(first))
-    c, s, x, y = math.cos(turn), math.sin(turn), way[0], way[1]
+    c, s, x, y = math.cos(turn), math.sin(turn), offset[0], offset[1]
     for k in range(len(first)):
         a, b = first[k], second[k]
         u, v, w = c * b[0] - s * b[1], s * b[0] + c * b[1], b[2]  # the second ray in the first frame
@@ -109,23 +109,23 @@ def _nearness(
 
 
 def from_epipole(pairs: RayPairs, motion: Array) -> Array:
-    """Distance (K,) of the nearer ray of each match from the epipole, in standard deviations of its pixel, for a robot's ``motion``
-    (3,). Sampson's first-order error is valid if it is large."""
+    """Distance (K,) of the nearer ray of each match from the epipole after a robot ``motion`` (3,), in standard deviations of its
+    pixel. Sampson's first-order error is valid if the distance is large."""
     x, y = translation(pairs.position, motion)
     c, s = math.cos(motion[2]), math.sin(motion[2])
-    found = []
-    for seen, noise, tx, ty in (
+    distances = []
+    for ray, noise, tx, ty in (
         (pairs.first, pairs.first_noise, x, y),
         (pairs.second, pairs.second_noise, c * x + s * y, c * y - s * x),
     ):
-        across = np.hypot(np.hypot(seen[:, 2] * ty, seen[:, 2] * tx), seen[:, 0] * ty - seen[:, 1] * tx)
+        across = np.hypot(np.hypot(ray[:, 2] * ty, ray[:, 2] * tx), ray[:, 0] * ty - ray[:, 1] * tx)
         sigma = np.sqrt(np.einsum("kij,kij->k", noise, noise) / 2.0)
-        found.append(across / (sigma * max(math.hypot(tx, ty), 1e-12)))
-    return np.asarray(np.minimum(*found))
+        distances.append(across / (sigma * max(math.hypot(tx, ty), 1e-12)))
+    return np.asarray(np.minimum(*distances))
 
 
 class VisualOdometryFactor:
-    """A relative pose of which some components are measured.
+    """A relative pose with measured components, possibly not all.
 
     ``delta`` (3,): the second pose in the frame of the first; ``information`` (3, 3): of its body-frame perturbation, of any rank.
     The values of the factor are the two poses (3,).

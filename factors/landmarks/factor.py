@@ -28,8 +28,8 @@ from factors.se2 import Array, Integers
 from factors.sighting import delayed
 from factors.update import CONVERGED, GATE, Correction
 
-NOTHING = np.zeros(0)  # values of constants, where none are estimated
-_NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # for a look without offset or without its covariance
+NOTHING = np.zeros(0)  # values of constants if the factor estimates none
+_NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # if there is no offset, or no covariance of it
 LEAST_TOLD = 1e-6  # minimum singular value of a Jacobian by a landmark, absolute [1/m] and relative to the largest one
 
 
@@ -61,9 +61,9 @@ class BearingRangeFactor:
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
         if not self.free:
-            held = values[1] if self.estimated else NOTHING
-            found = kernels.weighted(self.model.packed, self.look, values[0], held, self.places)
-            residual, by_pose, by_sensor = found
+            constants = values[1] if self.estimated else NOTHING
+            linear = kernels.weighted(self.model.packed, self.packed, values[0], constants, self.places)
+            residual, by_pose, by_sensor = linear
             return residual, [by_pose, by_sensor] if self.estimated else [by_pose]
         error, blocks = self.whitened(values)
         weight = np.sqrt(geman_mcclure_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
@@ -72,30 +72,30 @@ class BearingRangeFactor:
 
     @property
     def kind(self) -> Hashable:
-        """What looks have in common that are linearised together; None for one of a free landmark."""
+        """Equal for factors that are linearised together; None for a factor of a free landmark."""
         return None if self.free else (self.estimated, self.model)
 
     def stack(self, factors: Sequence[BearingRangeFactor], numbers: Sequence[int], column: int) -> BearingRangeStack:
-        """Looks of this kind as one: see :class:`~factors.graph.Stackable`."""
+        """Factors of this kind as one: see :class:`~factors.graph.Stackable`."""
         return BearingRangeStack(factors, numbers, column)
 
     def count_beyond(self, limit: float, pose: Array, covariance: Array) -> int:
         """How many of the landmarks of a factor on the pose only have a normalised innovation squared above ``limit`` at the
         predicted ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
-        spread = np.ascontiguousarray(covariance)
-        return int(kernels.beyond(self.model.packed, pose, self.look, spread, limit))
+        contiguous = np.ascontiguousarray(covariance)
+        return int(kernels.beyond(self.model.packed, pose, self.packed, contiguous, limit))
 
     @property
-    def look(self) -> kernels.Look:
-        """What was seen, for compiled code."""
-        offset, spread, twist, spreads = self.offset, self.offset_covariance, self.twist, self.point_covariances
+    def packed(self) -> kernels.Sighting:
+        """The measurement as arguments of compiled code."""
+        offset, drift, twist, surveys = self.offset, self.offset_covariance, self.twist, self.point_covariances
         return (
             *(self.points, self.ranges, self.bearings),
             *(offset is not None, _NOWHERE if offset is None else offset),
-            *(spread is not None, _EXACTLY if spread is None else spread),
+            *(drift is not None, _EXACTLY if drift is None else drift),
             float(len(self.ranges) if self.in_look is None else self.in_look),
             *(twist is not None, _NOWHERE if twist is None else twist),
-            EXACT if spreads is None else np.ascontiguousarray(spreads),
+            EXACT if surveys is None else np.ascontiguousarray(surveys),
         )
 
     @property
@@ -111,8 +111,8 @@ class BearingRangeFactor:
     def log_likelihood(self, poses: Array, parameters: Array | None = None) -> Array:
         """The log-likelihood (N,), up to a constant, of ``poses`` (N, 3) at the time of the measurement, each with its own
         ``parameters`` (N, 6) of the sensor; see :func:`~factors.landmarks.model.log_likelihood`."""
-        seen = self.points, self.ranges, self.bearings
-        return log_likelihood(self.model, poses, *seen, parameters, self.point_covariances)
+        measured = self.points, self.ranges, self.bearings
+        return log_likelihood(self.model, poses, *measured, parameters, self.point_covariances)
 
     def weight(self, squared: Array) -> Array:
         """The robust weight of squared whitened residuals."""
@@ -124,13 +124,13 @@ class BearingRangeFactor:
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
-        look, changes, count = self.look, np.zeros(len(PARAMETERS)), len(self.ranges)
+        packed, changes, count = self.packed, np.zeros(len(PARAMETERS)), len(self.ranges)
         if self.estimated:
             changes[list(self.estimated)] = values[1]
         if self.free:
-            look = (np.reshape(values[-1], (1, 2)), *look[1:])
+            packed = (np.reshape(values[-1], (1, 2)), *packed[1:])
         error, jacobian = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
-        kernels.linearize(self.model.packed, values[0], changes, look, error, jacobian)
+        kernels.linearize(self.model.packed, values[0], changes, packed, error, jacobian)
         blocks = [jacobian[..., :POINT]]
         if self.estimated:
             blocks.append(jacobian[..., CONSTANTS:][..., list(self.estimated)])
@@ -147,23 +147,23 @@ class BearingRangeFactor:
             changes = dict(zip(self.estimated, parameters[0].tolist(), strict=True))
             model = recalibrated(model, [changes.get(i, 0.0) for i in range(len(PARAMETERS))])
             offset = delayed(offset, self.twist, changes.get(TIME_OFFSET, 0.0))
-        spreads, seen = (self.offset_covariance, self.point_covariances), (self.ranges, self.bearings)
+        noises, measured = (self.offset_covariance, self.point_covariances), (self.ranges, self.bearings)
         points = self.points if point is None else point[None]
-        return BearingRangeFactor(model, points, *seen, offset, *spreads, twist=self.twist, in_look=self.in_look)
+        return BearingRangeFactor(model, points, *measured, offset, *noises, twist=self.twist, in_look=self.in_look)
 
     def dof(self) -> int:
         """Number of measured ranges and bearings."""
         return int(np.count_nonzero(~np.isnan(self.ranges)) + np.count_nonzero(~np.isnan(self.bearings)))
 
     def locate(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
-        """Position of the one landmark, whose range and bearing are measured, for a given pose and constants.
+        """Position of the one landmark from its range and bearing, given pose and constants.
 
         Returns its position (2,), the Jacobian (2, d) by each of ``values`` (which exclude the landmark), and its covariance (2, 2)
         from the measurement noise.
         """
-        here = self.fixed(values[1:], None)
-        at = values[0] if here.offset is None else se2.compose(values[0], here.offset)
-        point = se2.transform_from(at, located(here.model, self.ranges, self.bearings))[0]
+        on_pose = self.fixed(values[1:], None)
+        at = values[0] if on_pose.offset is None else se2.compose(values[0], on_pose.offset)
+        point = se2.transform_from(at, located(on_pose.model, self.ranges, self.bearings))[0]
         _, blocks = replace(self, free=True).whitened([*values, point])
         # the whitened residual stays zero: by_value dv + by_point dp = noise
         to_point = _raised_inverse(blocks[-1][0])
@@ -183,8 +183,8 @@ def landmark_update(
     numerically insufficient. ``constants`` (P,): those that are estimated, whose columns begin at ``first``."""
     if factor.free:
         return None
-    before = np.ascontiguousarray(covariance)  # for each other order in memory it would be compiled anew
-    known = factor.model.packed, factor.look, pose, before, constants, factor.places, first
+    contiguous = np.ascontiguousarray(covariance)  # each other memory order would compile the function again
+    known = factor.model.packed, factor.packed, pose, contiguous, constants, factor.places, first
     try:
         return Correction(*kernels.updated(*known, iterations, converged, GATE))
     except np.linalg.LinAlgError:
@@ -192,8 +192,8 @@ def landmark_update(
 
 
 class BearingRangeStack:
-    """Looks of one sensor: ``factors`` on the poses ``pose_of`` (L,) by number, of one model and with the same constants estimated,
-    which are the parameters from ``column`` on. None of them is of a free landmark."""
+    """Factors of one sensor with one model and the same estimated constants. ``factors`` (L) are on the poses ``pose_of`` (L,) by
+    number; the constants are the parameters from ``column`` on. None of the landmarks is free."""
 
     def __init__(self, factors: Sequence[BearingRangeFactor], pose_of: Sequence[int], column: int) -> None:
         first = factors[0]
@@ -207,13 +207,13 @@ class BearingRangeStack:
             np.concatenate([f.ranges for f in factors]),
             np.concatenate([f.bearings for f in factors]),
         )
-        parts = [f.look for f in factors]
-        spreads = [f.point_covariances for f in factors]
-        self._flags = np.array([(p[3], p[5], p[8], s is not None) for p, s in zip(parts, spreads, strict=True)])
+        parts = [f.packed for f in factors]
+        covariances = [f.point_covariances for f in factors]
+        self._flags = np.array([(p[3], p[5], p[8], s is not None) for p, s in zip(parts, covariances, strict=True)])
         self._offsets, self._covariances = np.array([p[4] for p in parts]), np.array([p[6] for p in parts])
         self._counts, self._twists = np.array([p[7] for p in parts]), np.array([p[9] for p in parts])
         none = [np.zeros((size, 2, 2)) for size in sizes.tolist()]
-        self._spreads = np.concatenate([n if s is None else s for n, s in zip(none, spreads, strict=True)])
+        self._spreads = np.concatenate([n if s is None else s for n, s in zip(none, covariances, strict=True)])
         self.rows = 2 * int(self._ends[-1])
 
     @property
@@ -238,10 +238,10 @@ class BearingRangeStack:
     def _whitened(self, poses: Array, parameters: Array) -> tuple[Array, Array]:
         changes, count = np.zeros(len(PARAMETERS)), self.rows // 2
         changes[self._estimated] = parameters[self._column : self._column + len(self._estimated)]
-        found = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
-        looks = self._flags, self._offsets, self._covariances, self._counts, self._twists, self._spreads
-        kernels.linearize_all(self._model, poses, self._pose_of, changes, self._ends, self._seen, *looks, *found)
-        return found
+        out = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
+        sightings = self._flags, self._offsets, self._covariances, self._counts, self._twists, self._spreads
+        kernels.linearize_all(self._model, poses, self._pose_of, changes, self._ends, self._seen, *sightings, *out)
+        return out
 
 
 @lru_cache(maxsize=64)

@@ -1,6 +1,5 @@
-"""Compiled linearisation of looks at landmarks, for graphs, and the Kalman update by them: that of
-:func:`factors.update.update_state`, by information. A filter makes a dozen small matrices of each look, for which NumPy is slow.
-"""
+"""Compiled linearisation of landmark measurements for graphs, and their Kalman update in information form: that of
+:func:`factors.update.update_state`. A filter computes a dozen small matrices per measurement, and NumPy is slow for these."""
 
 import math
 
@@ -29,15 +28,15 @@ from factors.update import corrected, normalised
 # points (K, 2), ranges (K,), bearings (K,); of the motion since the pose, each with whether there is one: the offset (3,), its
 # covariance (3, 3) with the number of landmarks that have it in common, the velocity (3,); and spreads of the points (K, 2, 2), or
 # (0, 2, 2)
-Look = tuple[Array, Array, Array, bool, Array, bool, Array, float, bool, Array, Array]
+Sighting = tuple[Array, Array, Array, bool, Array, bool, Array, float, bool, Array, Array]
 
 
 @compiled
-def linearize(model: Array, pose: Array, changes: Array, look: Look, error: Array, jacobian: Array) -> None:
-    """What :meth:`factors.landmarks.factor.BearingRangeFactor.whitened` returns of one look, with ``changes`` (6,) of the
-    constants: the whitened ``error`` (K, 2) and its ``jacobian`` (K, 2, WIDTH), which hold zeros. ``model``: ``packed`` of
-    a :class:`~factors.landmarks.model.BearingRangeModel`."""
-    points, ranges, bearings, displaced, offset, widened, covariance, count, moves, twist, spreads = look
+def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error: Array, jacobian: Array) -> None:
+    """Linearise one measurement as :meth:`factors.landmarks.factor.BearingRangeFactor.whitened` does, with ``changes`` (6,) of the
+    constants. Writes the whitened ``error`` (K, 2) and its ``jacobian`` (K, 2, WIDTH), which must be zero before. ``model``:
+    ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`."""
+    points, ranges, bearings, displaced, offset, widened, covariance, count, moves, twist, surveys = packed
     x, y, turned = offset[0], offset[1], offset[2]
     if moves and changes[TIME_OFFSET] != 0.0:
         later = changes[TIME_OFFSET]
@@ -66,10 +65,10 @@ def linearize(model: Array, pose: Array, changes: Array, look: Look, error: Arra
             for i in range(2):
                 row = jacobian[k, i]
                 row[CONSTANTS + TIME_OFFSET] = row[0] * twist[0] + row[1] * twist[1] + row[2] * twist[2]
-        if widened or len(spreads):
+        if widened or len(surveys):
             uu, uv, vv = 1.0, 0.0, 1.0
-            if len(spreads):
-                a, b, d = _carried(jacobian[k, :, POINT:CONSTANTS], spreads[k])
+            if len(surveys):
+                a, b, d = _carried(jacobian[k, :, POINT:CONSTANTS], surveys[k])
                 uu, uv, vv = uu + a, uv + b, vv + d
             if widened:
                 a, b, d = _carried(jacobian[k], covariance)
@@ -90,8 +89,8 @@ def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bea
     noise = model[3], model[RANGE_SIGMA], model[RELATIVE], model[2], model[BEARING_SIGMA]
     for n in range(len(poses)):
         row = slice(n, n + 1)
-        seen = points[row], ranges[row], bearings[row]
-        whitened_into(poses[n], mounted, noise, depth, model[4], *seen, error[row], jacobian[row])
+        measured = points[row], ranges[row], bearings[row]
+        whitened_into(poses[n], mounted, noise, depth, model[4], *measured, error[row], jacobian[row])
     return error, jacobian
 
 
@@ -134,12 +133,11 @@ def weigh(error: Array, jacobian: Array, robust: float) -> None:
 
 
 @compiled(error_model="numpy")
-def beyond(model: Array, pose: Array, look: Look, covariance: Array, limit: float) -> int:
-    """How many landmarks have a normalised innovation squared above ``limit``, seen from a pose with body-frame ``covariance``
-    (3, 3)."""
-    count = len(look[0])
-    error, by_pose, found = np.zeros((count, 2)), np.zeros((count, 2, WIDTH)), 0
-    linearize(model, pose, np.zeros(TIME_OFFSET + 1), look, error, by_pose)
+def beyond(model: Array, pose: Array, packed: Sighting, covariance: Array, limit: float) -> int:
+    """The number of landmarks whose normalised innovation squared exceeds ``limit``, with pose ``covariance`` (3, 3)."""
+    count = len(packed[0])
+    error, by_pose, outliers = np.zeros((count, 2)), np.zeros((count, 2, WIDTH)), 0
+    linearize(model, pose, np.zeros(TIME_OFFSET + 1), packed, error, by_pose)
     for k in range(count):
         a, b, c = 1.0, 0.0, 1.0
         for i in range(3):
@@ -150,8 +148,8 @@ def beyond(model: Array, pose: Array, look: Look, covariance: Array, limit: floa
         x, y = error[k, 0], error[k, 1]
         # rounding may take all of the difference, which is never less than that
         determinant = max(a * c - b * b, 0.5 * (a + c))
-        found += (c * x * x - 2.0 * b * x * y + a * y * y) / determinant > limit
-    return found
+        outliers += (c * x * x - 2.0 * b * x * y + a * y * y) / determinant > limit
+    return outliers
 
 
 @compiled
@@ -161,35 +159,35 @@ def linearize_all(
     pose_of: Integers,
     changes: Array,
     ends: Integers,
-    seen: tuple[Array, Array, Array],
+    measured: tuple[Array, Array, Array],
     flags: Array,
     offsets: Array,
     covariances: Array,
     counts: Array,
     twists: Array,
-    spreads: Array,
+    surveys: Array,
     error: Array,
     jacobian: Array,
 ) -> None:
-    """:func:`linearize` of L looks: that with the number l, at the pose ``pose_of`` (L,), is of the rows up to ``ends`` (L,).
+    """:func:`linearize` of L measurements. Each is at the pose number ``pose_of`` (L,) and has the rows up to ``ends`` (L,).
 
-    ``flags`` (L, 4): whether a look has an offset, a covariance of that, a velocity, and spreads of its points.
+    ``flags`` (L, 4): whether a measurement has an offset, its covariance, a velocity, and covariances of its points.
     """
-    points, ranges, bearings = seen
+    points, ranges, bearings = measured
     first = 0
     for i in range(len(ends)):
         rows = slice(first, ends[i])
         first = ends[i]
-        spread = spreads[rows] if flags[i, 3] else spreads[:0]
-        carried = flags[i, 0], offsets[i], flags[i, 1], covariances[i], counts[i], flags[i, 2], twists[i], spread
-        look = (points[rows], ranges[rows], bearings[rows], *carried)
-        linearize(model, poses[pose_of[i]], changes, look, error[rows], jacobian[rows])
+        own = surveys[rows] if flags[i, 3] else surveys[:0]
+        carried = flags[i, 0], offsets[i], flags[i, 1], covariances[i], counts[i], flags[i, 2], twists[i], own
+        packed = (points[rows], ranges[rows], bearings[rows], *carried)
+        linearize(model, poses[pose_of[i]], changes, packed, error[rows], jacobian[rows])
 
 
 @compiled(error_model="numpy")
 def updated(
     model: Array,
-    look: Look,
+    packed: Sighting,
     pose: Array,
     covariance: Array,
     values: Array,
@@ -206,18 +204,18 @@ def updated(
     are estimated; ``indices`` (P,): their places in :data:`~factors.landmarks.model.PARAMETERS`; ``first``: of their columns in
     the error state. ``gate``: beyond which a landmark's noise is widened.
     """
-    count, size = len(look[0]), len(covariance)
+    count, size = len(packed[0]), len(covariance)
     columns = np.empty(3 + len(values), np.int64)
     for j in range(len(columns)):
         columns[j] = j if j < 3 else first + j - 3
     residual, jacobian = np.empty((count, 2)), np.empty((count, 2, len(columns)))
-    _linearized(model, look, pose, values, indices, residual, jacobian)
+    _linearized(model, packed, pose, values, indices, residual, jacobian)
     measured = 0
     for k in range(count):
-        measured += (not math.isnan(look[1][k])) + (not math.isnan(look[2][k]))
-    before, weights = np.zeros(size), np.ones(count)
+        measured += (not math.isnan(packed[1][k])) + (not math.isnan(packed[2][k]))
+    previous, weights = np.zeros(size), np.ones(count)
     prior = invert_covariance(covariance)
-    delta, after, pull = corrected(prior, residual, jacobian, columns, weights, before)
+    delta, posterior, pull = corrected(prior, residual, jacobian, columns, weights, previous)
     nis, widest, squared = 0.0, 1.0, normalised(residual, jacobian, columns, covariance)
     for k in range(count):
         nis += residual[k, 0] ** 2 + residual[k, 1] ** 2
@@ -226,30 +224,32 @@ def updated(
         weights[k] = 1.0 / (widening * widening)
     for i in range(len(columns)):
         for j in range(len(columns)):
-            nis -= pull[i] * after[columns[i], columns[j]] * pull[j]
+            nis -= pull[i] * posterior[columns[i], columns[j]] * pull[j]
     if widest > 1.0:
-        delta, after, _ = corrected(prior, residual, jacobian, columns, weights, before)
+        delta, posterior, _ = corrected(prior, residual, jacobian, columns, weights, previous)
     now = residual.copy()
     for _ in range(iterations - 1):
-        if np.abs(delta - before).max() < converged:
+        if np.abs(delta - previous).max() < converged:
             break
-        before = delta
-        _linearized(model, look, moved(pose, delta), values + delta[columns[3:]], indices, now, jacobian)
+        previous = delta
+        _linearized(model, packed, moved(pose, delta), values + delta[columns[3:]], indices, now, jacobian)
         for k in range(count):
             weights[k] = geman_mcclure_weight(now[k, 0] ** 2 + now[k, 1] ** 2, model[ROBUST])
-        delta, after, _ = corrected(prior, now, jacobian, columns, weights, before)
-    if not (np.all(np.isfinite(delta)) and cholesky(after)[1]):
+        delta, posterior, _ = corrected(prior, now, jacobian, columns, weights, previous)
+    if not (np.all(np.isfinite(delta)) and cholesky(posterior)[1]):
         raise np.linalg.LinAlgError("an update is not finite, or not positive definite")
-    return delta, after, residual, max(0.0, nis), measured
+    return delta, posterior, residual, max(0.0, nis), measured
 
 
 @compiled(error_model="numpy")
-def weighted(model: Array, look: Look, pose: Array, values: Array, indices: Integers) -> tuple[Array, Array, Array]:
+def weighted(
+    model: Array, packed: Sighting, pose: Array, values: Array, indices: Integers
+) -> tuple[Array, Array, Array]:
     """Whitened, robustly weighted residual (2K,) and its Jacobians by the pose (2K, 3) and by the constants (2K, P); arguments as
     of :func:`updated`."""
-    count, wide = len(look[0]), len(indices)
+    count, wide = len(packed[0]), len(indices)
     residual, jacobian = np.empty((count, 2)), np.empty((count, 2, 3 + wide))
-    _linearized(model, look, pose, values, indices, residual, jacobian)
+    _linearized(model, packed, pose, values, indices, residual, jacobian)
     out, by_pose, by_values = np.empty(2 * count), np.empty((2 * count, 3)), np.empty((2 * count, wide))
     for k in range(count):
         root = math.sqrt(geman_mcclure_weight(residual[k, 0] ** 2 + residual[k, 1] ** 2, model[ROBUST]))
@@ -280,7 +280,7 @@ def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -
 
 @compiled(error_model="numpy")
 def _linearized(
-    model: Array, look: Look, pose: Array, values: Array, indices: Integers, residual: Array, jacobian: Array
+    model: Array, packed: Sighting, pose: Array, values: Array, indices: Integers, residual: Array, jacobian: Array
 ) -> None:
     """Whitened residuals (K, 2) at constants that differ by ``values``, and their Jacobian (K, 2, 3+P)."""
     count = len(residual)
@@ -288,7 +288,7 @@ def _linearized(
     for j in range(len(values)):
         changes[indices[j]] = values[j]
     by_all = np.zeros((count, 2, WIDTH))
-    linearize(model, pose, changes, look, residual, by_all)
+    linearize(model, pose, changes, packed, residual, by_all)
     for k in range(count):
         for i in range(2):
             for j in range(3):

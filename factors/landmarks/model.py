@@ -155,7 +155,7 @@ def whitened_into(
         dx, dy = points[k, 0] - pose[0], points[k, 1] - pose[1]
         px, py = c * dx + s * dy, c * dy - s * dx  # in the robot frame
         sx, sy = px - mounting[0], py - mounting[1]
-        error[k, 0], error[k, 1], distance, vx, vy, weight = _seen(
+        error[k, 0], error[k, 1], distance, vx, vy, weight = _whitened(
             sx, sy, mounting[2], model, depth, ahead_x, ahead_y, ranges[k], bearings[k]
         )
         ux, uy = sx / distance, sy / distance
@@ -178,7 +178,7 @@ def whitened_into(
 
 
 @compiled(error_model="numpy")
-def _seen(
+def _whitened(
     sx: float,
     sy: float,
     turn: float,
@@ -227,8 +227,8 @@ def log_likelihood(
         _squared(poses, constants, *sensor, points, ranges, bearings, EXACT, squared, np.empty((0, 0)))
         return -np.asarray(np.sum(geman_mcclure_loss(squared, model.robust), axis=-1))
     widths = np.empty_like(squared)
-    spreads = np.ascontiguousarray(point_covariances, dtype=float)
-    _squared(poses, constants, *sensor, points, ranges, bearings, spreads, squared, widths)
+    covariances = np.ascontiguousarray(point_covariances, dtype=float)
+    _squared(poses, constants, *sensor, points, ranges, bearings, covariances, squared, widths)
     return -np.asarray(np.sum(geman_mcclure_loss(squared, model.robust) + widths, axis=-1))
 
 
@@ -242,14 +242,14 @@ def _squared(
     points: Array,
     ranges: Array,
     bearings: Array,
-    spreads: Array,
+    covariances: Array,
     squared: Array,
     widths: Array,
 ) -> None:
     """Squared whitened residuals ``squared`` (N, K) of sensors with their own ``constants`` (N, 5).
 
-    For points with covariances ``spreads`` (K, 2, 2) the noise is widened, and ``widths`` (N, K) is the logarithm of the ratio of
-    the determinants' roots.
+    The ``covariances`` (K, 2, 2) of points are added to the noise; ``widths`` (N, K): logarithm of the ratio of the determinants'
+    roots.
     """
     range_sigma, range_sigma_relative, bearing_sigma = noise
     axis = ahead_x = ahead_y = 0.0
@@ -262,17 +262,17 @@ def _squared(
         for k in range(len(points)):
             dx, dy = points[k, 0] - poses[i, 0], points[k, 1] - poses[i, 1]
             sx, sy = c * dx + s * dy - x, c * dy - s * dx - y
-            range_error, bearing_error, distance, vx, vy, weight = _seen(
+            range_error, bearing_error, distance, vx, vy, weight = _whitened(
                 sx, sy, turn, model, depth, ahead_x, ahead_y, ranges[k], bearings[k]
             )
             squared[i, k] = range_error**2 + bearing_error**2
-            if len(spreads):
+            if len(covariances):
                 # by the point, in the robot's axes: the range grows along v, the bearing perpendicular to the line of sight
                 by_range = range_scale * weight
                 by_bearing = 0.0 if math.isnan(bearings[k]) else 1.0 / (distance * bearing_sigma)
                 ax, ay = by_range * (c * vx - s * vy), by_range * (s * vx + c * vy)
                 bx, by = by_bearing * (-s * sx - c * sy) / distance, by_bearing * (c * sx - s * sy) / distance
-                xx, xy, yy = spreads[k, 0, 0], spreads[k, 0, 1], spreads[k, 1, 1]
+                xx, xy, yy = covariances[k, 0, 0], covariances[k, 0, 1], covariances[k, 1, 1]
                 rr = 1.0 + ax * (xx * ax + xy * ay) + ay * (xy * ax + yy * ay)
                 rb = ax * (xx * bx + xy * by) + ay * (xy * bx + yy * by)
                 bb = 1.0 + bx * (xx * bx + xy * by) + by * (xy * bx + yy * by)

@@ -84,10 +84,10 @@ class LoopFactor:
 
     @cached_property
     def _whitener(self) -> Array:
-        """The whitener of the residual. What the odometry adds at one place has no known direction: the mean variance is added."""
-        spreads = [o.covariance for o in (self.offset, self.earlier_offset) if o is not None]
+        """The whitener of the residual. The direction of the odometry's error is unknown: the mean variance is added."""
+        covariances = [o.covariance for o in (self.offset, self.earlier_offset) if o is not None]
         if self.measured is None:
-            added = sum(float(np.trace(spread[:2, :2])) / 2.0 for spread in spreads)
+            added = sum(float(np.trace(covariance[:2, :2])) / 2.0 for covariance in covariances)
             return np.eye(2) / math.sqrt(float(self.sigmas[0]) ** 2 + added)
         noise = np.diag(np.asarray(self.sigmas, dtype=float) ** 2)
         if self.offset is not None:

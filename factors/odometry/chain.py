@@ -177,9 +177,9 @@ class OdometryChain:
     ) -> tuple[ChainState, Array, Array, Array, Array]:
         """Predict a Gaussian from ``start`` to ``t``: the state there, the pose (3,), the first rows (3, S) of the transition (the
         other rows are those of the identity), the covariance (3, 3) that the motion adds to the first three components, and the
-        covariance (S, S) of the error state, in which the columns of ``constants`` (P,) begin at ``first``."""
+        covariance (S, S) of the error state. The columns of ``constants`` (P,) in the error state begin at ``first``."""
         size = len(covariance)
-        at, transition, noise, after = np.empty(3), np.empty((3, size)), np.empty((3, 3)), np.empty((size, size))
+        at, transition, noise, out = np.empty(3), np.empty((3, size)), np.empty((3, 3)), np.empty((size, size))
         # into arrays that are there: each that compiled code returns takes longer than its arithmetic
         end = predicted_at(
             self._knots,
@@ -196,9 +196,9 @@ class OdometryChain:
             at,
             transition,
             noise,
-            after,
+            out,
         )
-        return ChainState(*end), at, transition, noise, after
+        return ChainState(*end), at, transition, noise, out
 
     def moved(
         self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array
@@ -206,8 +206,8 @@ class OdometryChain:
         """A pose (3,) with body-frame ``covariance`` (3, 3) at ``start``, moved to ``t``, for ``constants`` (P,): the pose, and its
         covariance in the body frame and in the world frame."""
         known = self._knots, self._count, self._constants, self._noise
-        before = np.ascontiguousarray(covariance)  # for each other order in memory it would be compiled anew
-        at, body, world = moved_to(*known, tuple(start), t, pose, before, constants, self._indices)
+        contiguous = np.ascontiguousarray(covariance)  # each other memory order would compile the function again
+        at, body, world = moved_to(*known, tuple(start), t, pose, contiguous, constants, self._indices)
         return at, body, world
 
     def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
@@ -308,13 +308,13 @@ def predicted_at(
     at: Array,
     transition: Array,
     added: Array,
-    after: Array,
+    out: Array,
 ) -> State:
     end = state_at(knots, count, t, chain)
-    delta, spread, duration, still = relative(noise, start, end)
+    delta, delta_noise, duration, still = relative(noise, start, end)
     for i in range(3):
-        copy(spread[i], added[i])
-    predicted(delta, spread, duration - still, pose, covariance, constants, indices, first, at, transition, after)
+        copy(delta_noise[i], added[i])
+    predicted(delta, delta_noise, duration - still, pose, covariance, constants, indices, first, at, transition, out)
     return end
 
 
@@ -331,11 +331,11 @@ def moved_to(
     constants: Array,
     indices: Integers,
 ) -> tuple[Array, Array, Array]:
-    delta, spread, duration, still = relative(noise, start, state_at(knots, count, t, chain))
+    delta, delta_noise, duration, still = relative(noise, start, state_at(knots, count, t, chain))
     if len(indices):
         delta = recalibrated(delta, duration - still, constants, indices)
     at = np.array(compose_scalars(pose[0], pose[1], pose[2], delta[0], delta[1], delta[2]))
-    body = carried(covariance, delta, spread)
+    body = carried(covariance, delta, delta_noise)
     return at, body, body_to_world_one(at, body)
 
 

@@ -30,7 +30,7 @@ def copy(row: Array, to: Array) -> None:
 
 @compiled
 def without_old(rows: Array, knots: Array, count: int, horizon: float) -> int:
-    """Forget old rows; returns the new count. Rarely, and many rows at once, because the remaining ones are moved to the front."""
+    """Drop old rows; returns the new count. Called rarely, for many rows, because the remaining ones move to the front."""
     newest = knots[count - 1, T]
     if newest - knots[0, T] <= 2.0 * horizon:
         return count
@@ -154,11 +154,11 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
     first = i - 1
     while first >= 0 and rows[first, 1] != INCREMENT:
         first -= 1
-    told = first >= 0 and t > knots[first, T]  # otherwise the start of the motion is unknown
+    known = first >= 0 and t > knots[first, T]  # otherwise the start of the motion is unknown
     first = max(first, 0)
     duration = t - knots[first, T]
     forward, sideways, turn, stands = 0.0, 0.0, 0.0, False
-    if told:
+    if known:
         forward, sideways, turn = a / duration - speed_bias, b / duration, phi / duration - heading_rate_bias
         stands = abs(forward) <= _REST and abs(sideways) <= _REST and abs(turn) <= _REST
         if stands:
@@ -166,7 +166,7 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
     ahead, aside = scale_distance * (c * forward - s * sideways), scale_distance * (s * forward + c * sideways)
     for k in range(first, i):
         knot, following = knots[k], knots[k + 1]
-        if told:
+        if known:
             knot[_STANDS], knot[_UX], knot[_UY] = stands, ahead, aside
             if t - knot[_GYRO_T] > duration + hold:
                 knot[_UW] = scale_rotation * turn + heading_drift * math.hypot(ahead, aside)

@@ -1,4 +1,4 @@
-"""Increments of odometry as factors of a graph, one by one and many at once."""
+"""Increments of odometry as factors of a graph, one by one or stacked."""
 
 import math
 from collections.abc import Hashable, Sequence
@@ -66,7 +66,7 @@ class OdometryFactor:
 
     @property
     def kind(self) -> Hashable:
-        """What increments have in common that are linearised together."""
+        """Equal for increments that are linearised together."""
         return self.estimated
 
     def stack(self, factors: Sequence["OdometryFactor"], numbers: Sequence[int], column: int) -> OdometryStack:
@@ -90,7 +90,7 @@ class OdometryFactor:
 
 
 class ScaleFreeOdometryFactor(OdometryFactor):
-    """An increment where the wheels alone tell the scale of what is estimated; its residual is in the unit that they report.
+    """An increment if only the wheels determine the scale of the estimates; the residual is in the unit of the wheels.
 
     A residual in metres becomes smaller as the world does, and nothing opposes that: the most probable world would be too small by
     ``n s^2``, where ``n`` increments are estimated and ``s`` is the standard deviation of the scale.
@@ -196,16 +196,16 @@ def linearize_all(
     for k in range(len(first)):
         start, end, row = poses[first[k]], poses[first[k] + 1], 3 * k
         if len(indices):
-            found = linearize_changed(start, end, twists[k], moving[k], constants, indices, whiteners[k])
+            linear = linearize_changed(start, end, twists[k], moving[k], constants, indices, whiteners[k])
             for i in range(3):
                 for j in range(len(indices)):
-                    jacobian[row + i, column + j] = found[3][i, j]
+                    jacobian[row + i, column + j] = linear[3][i, j]
         else:
-            found = linearize(start, end, deltas[k], np.zeros((3, 0)), whiteners[k])
+            linear = linearize(start, end, deltas[k], np.zeros((3, 0)), whiteners[k])
         for i in range(3):
-            residual[row + i] = found[0][i]
+            residual[row + i] = linear[0][i]
             for j in range(3):
-                jacobian[row + i, j], jacobian[row + i, 3 + j] = found[1][i, j], found[2][i, j]
+                jacobian[row + i, j], jacobian[row + i, 3 + j] = linear[1][i, j], linear[2][i, j]
 
 
 @compiled

@@ -50,7 +50,7 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
     # the start seen from the end, rotated by 90 degrees: displacement of the end by a heading change at the start
     c, s = math.cos(turned), math.sin(turned)
     nx, ny = s * x - c * y, c * x + s * y
-    # the mean heading on the way differs from that at the end by half the rotation
+    # the mean heading during the motion differs from the final one by half the rotation
     ahead, aside = math.cos(noise[0] - turned / 2.0), math.sin(noise[0] - turned / 2.0)
     covariance = np.empty((3, 3))
     covariance[0, 0] = ahead**2 * along + aside**2 * lateral + heading * nx * nx / 3.0 + noise[12]
@@ -113,11 +113,11 @@ def predicted(
     first: int,
     at: Array,
     transition: Array,
-    after: Array,
+    out: Array,
 ) -> None:
-    """Fill in the pose ``at`` (3,), the first rows ``transition`` (3, S), of which the others are those of the identity, and the
-    covariance ``after`` (S, S) a motion by ``delta`` (3,) with covariance ``noise`` (3, 3) and time ``moving``, under changed
-    ``constants`` (P,), whose places are ``indices`` (P,) and whose columns in the error state begin at ``first``."""
+    """Predict a motion by ``delta`` (3,) with covariance ``noise`` (3, 3) and time ``moving``, under changed ``constants`` (P,) at
+    the places ``indices`` (P,), with columns in the error state from ``first`` on. Writes the pose ``at`` (3,), the first rows
+    ``transition`` (3, S), whose other rows are those of the identity, and the covariance ``out`` (S, S)."""
     size, count = len(covariance), len(constants)
     columns = np.arange(3 + count)  # where the transition is not zero
     for j in range(3 * size):
@@ -143,12 +143,12 @@ def predicted(
                 moved[i, j] += transition[i, k] * covariance[k, j]
     for i in range(size):
         for j in range(3, size):
-            after[i, j] = after[j, i] = moved[i, j] if i < 3 else covariance[i, j]
+            out[i, j] = out[j, i] = moved[i, j] if i < 3 else covariance[i, j]
     for i in range(3):
         for j in range(3):
-            after[i, j] = noise[i, j]
+            out[i, j] = noise[i, j]
             for k in columns:
-                after[i, j] += moved[i, k] * transition[j, k]
+                out[i, j] += moved[i, k] * transition[j, k]
     c, s = math.cos(pose[2]), math.sin(pose[2])
     at[0], at[1], at[2] = pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrap_scalar(pose[2] + turned)
 
@@ -156,10 +156,10 @@ def predicted(
 @compiled(inline="always")
 def _widen(covariance: Array) -> None:
     """Keep a covariance (3, 3) invertible: see :data:`FAR`."""
-    spread = covariance[0, 0] + covariance[1, 1]
-    if spread > FAR:
-        covariance[0, 0] += ROUNDING * spread
-        covariance[1, 1] += ROUNDING * spread
+    variance = covariance[0, 0] + covariance[1, 1]
+    if variance > FAR:
+        covariance[0, 0] += ROUNDING * variance
+        covariance[1, 1] += ROUNDING * variance
 
 
 @compiled
@@ -176,16 +176,16 @@ def recalibrated(delta: Array, moving: float, constants: Array, indices: Integer
 def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Array]:
     """See :func:`factors.odometry.model.recalibrated`; ``twist`` (3,): log of the increment, ``moving``: its time in motion."""
     x, y, phi = twist[0], twist[1], twist[2]
-    way = math.hypot(x, y)
+    distance = math.hypot(x, y)
     cx, cy = x + changes[0] * x, y + changes[0] * y
-    turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * way
+    turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * distance
     p, q = arc_coefficients(turn)
     jacobian = right_jacobian_one(np.array((cx, cy, turn)))
     by_changes = np.zeros((3, 4))
     for i in range(3):
         by_changes[i, 0] = jacobian[i, 0] * x + jacobian[i, 1] * y
         by_changes[i, 1], by_changes[i, 2] = jacobian[i, 2] * phi, -jacobian[i, 2] * moving
-        by_changes[i, 3] = jacobian[i, 2] * way
+        by_changes[i, 3] = jacobian[i, 2] * distance
     return np.array((p * cx - q * cy, q * cx + p * cy, wrap_scalar(turn))), by_changes
 
 
@@ -202,7 +202,7 @@ def changed(twist: Array, moving: float, constants: Array, indices: Integers) ->
 
 @compiled
 def all_changes(constants: Array, indices: Integers) -> Array:
-    """The changes (4,) of all constants, of which those with ``indices`` (P,) change by ``constants`` (P,)."""
+    """The changes (4,) of all constants: ``constants`` (P,) at the places ``indices`` (P,), else zero."""
     changes = np.zeros(4)
     for i in range(len(indices)):
         changes[indices[i]] = constants[i]

@@ -105,15 +105,15 @@ def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) ->
 def slip(model: OdometryModel, increment: Increment, *, use_gyro: bool) -> tuple[Array, float]:
     """The covariance (3, 3) that an increment has more if its wheels slip, and minus the logarithm of how probable that is.
 
-    The error along the way, and that of the heading unless a gyro tells it, are then those of an unknown motion, with what they
-    displace the end by as in :func:`relative_motion`; sideways wheels are held.
+    The errors along the motion and of the heading are then those of an unknown motion, and displace the end as in
+    :func:`relative_motion`. A gyro still measures the heading; wheels do not slip sideways.
     """
     duration = max(increment.duration, SHORTEST)
     along, heading = model.unknown_distance**2 * duration, 0.0 if use_gyro else model.unknown_rotation**2 * duration
     x, y, turned = increment.delta.tolist()
     c, s, ahead = math.cos(turned), math.sin(turned), model.direction - turned / 2.0
-    way, lever = np.array((math.cos(ahead), math.sin(ahead), 0.0)), np.array((s * x - c * y, c * x + s * y, 0.0))
-    covariance = along * np.outer(way, way) + heading / 3.0 * np.outer(lever, lever)
+    direction, lever = np.array((math.cos(ahead), math.sin(ahead), 0.0)), np.array((s * x - c * y, c * x + s * y, 0.0))
+    covariance = along * np.outer(direction, direction) + heading / 3.0 * np.outer(lever, lever)
     covariance[2] = covariance[:, 2] = heading / 2.0 * lever
     covariance[2, 2] = heading
     return covariance, -math.log(-math.expm1(-SLIPS * duration))

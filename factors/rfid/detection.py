@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.rfid import kernels, tag_states, weighing
-from factors.rfid.index import MapTags, Seen, moved, tag_index
+from factors.rfid.index import Counts, MapTags, moved, tag_index
 from factors.rfid.model import Packed, RfidModel
 from factors.rfid.parameters import adjusted
 from factors.rfid.places import Places, RobotTables, antennas_of, in_reach, is_wide, robot_tables
@@ -37,7 +37,7 @@ class TagArray:
 
     @cached_property
     def normals(self) -> Array:
-        """The directions (T, 2) in which the tags face, zero if unknown."""
+        """The facing directions (T, 2) of the tags, zero if unknown."""
         known = np.isfinite(self.facing)
         angle = np.where(known, self.facing, 0.0)
         return np.where(known[:, None], np.column_stack((np.cos(angle), np.sin(angle))), 0.0)
@@ -52,8 +52,8 @@ class TagReadCounts:
     ``tags`` (C,): places in the map, ascending, of the tags that are listed; None, the default, if all of the map are.
     ``hits`` (K, C): number of rounds that read each of them; the others were not read.
     ``odds`` (C,): prior log-odds that each is dead or moved (:class:`~factors.rfid.tag_states.TagStates`), ``-inf`` for as
-    surveyed, the default; ``others``: those of the tags that are not listed. ``elsewhere`` (C,): tempered log-likelihood of what
-    was seen of the tag if so, relative to a silence out of reach; by default that of a dead tag: 0, or ``-inf`` if it was read.
+    surveyed, the default; ``unlisted_odds``: those of the other tags. ``elsewhere`` (C,): tempered log-likelihood of a tag's reads
+    and misses if it is dead or moved, relative to a silence out of reach; by default of a dead tag: 0, ``-inf`` if it was read.
     """
 
     offsets: Array
@@ -63,7 +63,7 @@ class TagReadCounts:
     odds: Array = field(default_factory=lambda: np.empty(0))
     elsewhere: Array = field(default_factory=lambda: np.empty(0))
     tags: Integers | None = None
-    others: float = -np.inf
+    unlisted_odds: float = -np.inf
     twists: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     def __post_init__(self) -> None:
@@ -75,10 +75,10 @@ class TagReadCounts:
             object.__setattr__(self, "twists", np.zeros(self.offsets.shape))
 
     @cached_property
-    def seen(self) -> Seen:
+    def packed(self) -> Counts:
         """The counts for compiled code."""
         counts = self.offsets, self.antennas, self.rounds, self.hits
-        return (*counts, self.odds, self.elsewhere, self.listed, self.others, self.twists)
+        return (*counts, self.odds, self.elsewhere, self.listed, self.unlisted_odds, self.twists)
 
     @cached_property
     def listed(self) -> Integers:
@@ -86,7 +86,7 @@ class TagReadCounts:
         return np.arange(self.hits.shape[1]) if self.tags is None else self.tags
 
     @property
-    def heard(self) -> Integers:
+    def read_tags(self) -> Integers:
         """Places in the map of the tags that were read, ascending."""
         return np.asarray(self.listed[self.hits.any(axis=0)])
 
@@ -94,7 +94,7 @@ class TagReadCounts:
         """The counts with ``tags`` (U,) listed too, which have these ``odds`` (U,) and ``elsewhere`` (U,)."""
         both = np.union1d(self.listed, tags)
         hits = np.zeros((len(self.hits), len(both)), dtype=np.int64)
-        all_odds, all_elsewhere = np.full(len(both), self.others), np.zeros(len(both))
+        all_odds, all_elsewhere = np.full(len(both), self.unlisted_odds), np.zeros(len(both))
         rows = (self.listed, self.odds, self.elsewhere), (tags, odds, elsewhere)
         hits[:, np.searchsorted(both, self.listed)] = self.hits
         for chosen, own_odds, own_elsewhere in rows:
@@ -107,14 +107,14 @@ class TagReadCounts:
         return replace(self, offsets=moved(offset, self.offsets))
 
 
-def together(parts: list[TagReadCounts]) -> TagReadCounts:
+def merged(parts: list[TagReadCounts]) -> TagReadCounts:
     """Merge counts relative to one pose, in order of time. The odds are those of the first that lists a tag; ``elsewhere`` is the
     sum of all."""
     first = parts[0]
     if len(parts) == 1:
         return first
     tags = first.listed if first.tags is None else np.unique(np.concatenate([p.listed for p in parts]))
-    odds, elsewhere, hits = np.full(len(tags), first.others), np.zeros(len(tags)), []
+    odds, elsewhere, hits = np.full(len(tags), first.unlisted_odds), np.zeros(len(tags)), []
     for part in reversed(parts):
         at, own = np.searchsorted(tags, part.listed), np.zeros((len(part.hits), len(tags)), dtype=np.int64)
         own[:, at] = part.hits
@@ -125,7 +125,7 @@ def together(parts: list[TagReadCounts]) -> TagReadCounts:
     offsets, antennas, rounds, twists = map(np.concatenate, rows)
     listed = None if first.tags is None else tags
     counts = offsets, antennas, rounds, np.concatenate(hits[::-1])
-    return TagReadCounts(*counts, odds, elsewhere, listed, first.others, twists)
+    return TagReadCounts(*counts, odds, elsewhere, listed, first.unlisted_odds, twists)
 
 
 class Score(NamedTuple):
@@ -146,8 +146,8 @@ class Score(NamedTuple):
 
 
 class ExpectedReads(NamedTuple):
-    """Of C tags, by their places in the map, and K looks: the ``hits``, the probability ``p`` of a read, and the ``distance`` [m]
-    in the plane from the antenna, (K, C) each."""
+    """Reads of C tags, by their places in the map, in K measurements: ``hits``, ``p``: probability of a read, and ``distance`` [m]
+    from the antenna in the plane, (K, C) each."""
 
     tags: Integers
     hits: Integers
@@ -205,45 +205,46 @@ class RfidLikelihood:
         return self._unadjusted.packed, self._unadjusted._map
 
     def joint_score(
-        self, pose: Array, parameters: Array, looks: TagReadCounts, estimated: Sequence[int] | None = None
+        self, pose: Array, parameters: Array, counts: TagReadCounts, estimated: Sequence[int] | None = None
     ) -> Score:
         """Likelihood, gradient (1, 3 + P) and information (1, 3 + P, 3 + P) at one pose (3,), by its body-frame perturbation and
         those of the ``parameters`` (Q,) that are ``estimated`` (P,), by default all."""
         places = np.array(range(len(parameters)) if estimated is None else estimated, dtype=np.int64)
         pose, alpha = np.ascontiguousarray(pose, dtype=float), float(self.model.tempering)
-        nll, gradient, information, *moments = kernels.score(*self.arrays, looks.seen, alpha, pose, parameters, places)
+        packed = *self.arrays, counts.packed
+        nll, gradient, information, *moments = kernels.score(*packed, alpha, pose, parameters, places)
         expected, variance = np.array(moments)[:, None]
         return Score(np.array((nll,)), gradient[None], information[None], expected, variance)
 
-    def score(self, poses: Array, looks: TagReadCounts) -> Score:
+    def score(self, poses: Array, counts: TagReadCounts) -> Score:
         """Likelihood, gradient and information at poses (N, 3)."""
         poses = np.ascontiguousarray(np.atleast_2d(poses), dtype=float)
         no_columns = np.full(len(self.parameters), -1, dtype=np.int64)
         alpha = float(self.model.tempering)
-        return Score(*kernels.scores(self.packed, self.arrays[1], looks.seen, alpha, poses, no_columns))
+        return Score(*kernels.scores(self.packed, self.arrays[1], counts.packed, alpha, poses, no_columns))
 
     def displaced(
-        self, poses: Array, looks: TagReadCounts, hypotheses: Array, margin: float, parameters: Array, odds: Array
+        self, poses: Array, counts: TagReadCounts, hypotheses: Array, margin: float, parameters: Array, odds: Array
     ) -> tuple[Integers, Array, NDArray[np.bool_]]:
         """The tags (U,) within a ``margin`` [m] of the reach from any of the poses (N, 3), or read, whose ``odds`` (T,) are not
         ``-inf``; the tempered log-likelihood (U, S) of the reads and misses of each for ``hypotheses`` (S, 4) of
         :mod:`factors.rfid.tag_states`, relative to a silence out of reach: the mean of the likelihood over the poses; and which
         of them were read. ``parameters``: (Q,)."""
         alpha = float(self.model.tempering)
-        return tag_states.displaced(*self._tabled, looks.seen, poses, margin, odds, hypotheses, alpha, parameters)
+        return tag_states.displaced(*self._tabled, counts.packed, poses, margin, odds, hypotheses, alpha, parameters)
 
-    def log_likelihood(self, poses: Array, looks: TagReadCounts, parameters: Array | None = None) -> Array:
+    def log_likelihood(self, poses: Array, counts: TagReadCounts, parameters: Array | None = None) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.weighing`, :mod:`factors.rfid.places`):
         for particles.
 
-        ``parameters`` (N, Q): at each pose, by default its own; where time offsets differ, all looks have the
-        velocity of the first.
+        ``parameters`` (N, Q): at each pose, by default its own; where time offsets differ, all measurements have
+        the velocity of the first.
         """
         poses = np.ascontiguousarray(poses, dtype=float)
-        if parameters is None and not looks.offsets.any() and is_wide(poses, self.reach):
-            return self._places.log_likelihood(poses, looks.seen, self.model.tempering)
+        if parameters is None and not counts.offsets.any() and is_wide(poses, self.reach):
+            return self._places.log_likelihood(poses, counts.packed, self.model.tempering)
         parameters = self.parameters[None] if parameters is None else np.ascontiguousarray(parameters)
-        return weighing.log_likelihood(*self._tabled, looks.seen, poses, float(self.model.tempering), parameters)
+        return weighing.log_likelihood(*self._tabled, counts.packed, poses, float(self.model.tempering), parameters)
 
     @cached_property
     def _tabled(self) -> tuple[Packed, Tables, MapTags]:
@@ -258,9 +259,9 @@ class RfidLikelihood:
     def _tables(self) -> Tables:
         return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
-    def work(self, looks: TagReadCounts) -> int:
-        """How many tags are looked at, by all antennas, to tell the likelihood of one pose among poses that are far apart."""
-        return self._unadjusted._places.work(looks.seen)
+    def work(self, counts: TagReadCounts) -> int:
+        """The mean number of tags, summed over antennas, that enter the likelihood of one pose if poses are far apart."""
+        return self._unadjusted._places.work(counts.packed)
 
     @property
     def reach(self) -> float:
@@ -297,18 +298,17 @@ class RfidLikelihood:
         antennas = antennas_of(self.packed, self._unadjusted._tables)
         return robot_tables(antennas, self.tags.points[:, 2], finest, facings if self.uses_facing else 0)
 
-    def by_tag(self, pose: Array, looks: TagReadCounts) -> tuple[Array, Array, Array]:
+    def by_tag(self, pose: Array, counts: TagReadCounts) -> tuple[Array, Array, Array]:
         """The contribution of each tag, all of the map being listed, at one pose (3,): tempered negative log-likelihood (T,),
         its gradient (T, 2) by the tag's position in the world, and information (T, 2, 2)."""
-        arrays, alpha = looks.seen[:4], self.model.tempering
+        arrays, alpha = counts.packed[:4], self.model.tempering
         pose = np.asarray(pose, dtype=float)
         nll, slope, curve = kernels.by_tag(self.packed, pose, self.tags.points, self.tags.normals, *arrays)
         return alpha * nll, alpha * slope[:, 3:], alpha * curve[:, 3:, 3:]
 
-    def expected(self, pose: Array, looks: TagReadCounts, parameters: Array) -> ExpectedReads:
-        """What was seen from a pose (3,) of the tags that are in reach of it or listed, and what is expected with ``parameters``
-        (Q,)."""
-        return ExpectedReads(*kernels.predicted(*self.arrays, looks.seen, pose, parameters))
+    def expected(self, pose: Array, counts: TagReadCounts, parameters: Array) -> ExpectedReads:
+        """Observed and expected reads at a pose (3,) with ``parameters`` (Q,), of the tags that are in reach or listed."""
+        return ExpectedReads(*kernels.predicted(*self.arrays, counts.packed, pose, parameters))
 
     def probabilities(self, poses: Array, antenna: int) -> Array:
         """Probability (N, T), floor included, that a round of an antenna reads each tag from poses (N, 3)."""

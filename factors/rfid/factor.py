@@ -16,7 +16,7 @@ from factors.graph import compressed
 from factors.odometry.kernels import FAR, ROUNDING
 from factors.rfid import kernels
 from factors.rfid.detection import RfidLikelihood, Score, TagReadCounts
-from factors.rfid.index import MapTags, Seen
+from factors.rfid.index import Counts, MapTags
 from factors.rfid.model import Packed
 from factors.rfid.signals import (
     PhaseLikelihood,
@@ -34,7 +34,7 @@ from factors.update import Correction
 
 ROWS = 4  # of the residual
 CONVERGED = 0.1  # of a standard deviation: a smaller step of a correction is the last one
-LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: the likelihood is evaluated anew after each step
+LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: the likelihood is evaluated again after each step
 LARGEST_CHANGE = 0.5  # of a parameter of a detection model
 ITERATIONS = 4
 RIDGE = 1e-9  # added to an information matrix that may be singular
@@ -44,16 +44,16 @@ NO_RESIDUAL = np.empty((0, 1))
 
 
 class TagLikelihood(Protocol):
-    """A likelihood of reads and misses, of strengths, or of phases, which were ``seen`` around a pose."""
+    """A likelihood of reads and misses, of strengths, or of phases, observed around a pose."""
 
     @property
     def model(self) -> Any:
         """Its model, with the exponent ``tempering``."""
 
-    def score(self, poses: Array, seen: Any, /) -> Score:
+    def score(self, poses: Array, reads: Any, /) -> Score:
         """Likelihood, gradient and information at poses (N, 3)."""
 
-    def log_likelihood(self, poses: Array, seen: Any, /) -> Array:
+    def log_likelihood(self, poses: Array, reads: Any, /) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3), for particles."""
 
 
@@ -62,7 +62,7 @@ class TagProblem(NamedTuple):
 
     packed: Packed
     of_map: MapTags
-    seen: Seen
+    counts: Counts
     tempering: float
     parameters: Array
     estimated: Integers
@@ -71,7 +71,7 @@ class TagProblem(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class RfidFactor:
     """A likelihood of reads on the one pose (3,) that they are placed around, in compressed Fisher form: whatever their number
-    there are four residuals, whose squares have the value, the gradient and the expected curvature of the likelihood. ``seen``:
+    there are four residuals, whose squares have the value, the gradient and the expected curvature of the likelihood. ``reads``:
     :class:`~factors.rfid.detection.TagReadCounts` for an :class:`~factors.rfid.detection.RfidLikelihood`, reads for the other two.
 
     ``estimated`` (P,): places of those parameters of the likelihood (:mod:`factors.rfid.parameters`) that are a second variable
@@ -79,7 +79,7 @@ class RfidFactor:
     """
 
     likelihood: TagLikelihood
-    seen: TagReadCounts | TagReads
+    reads: TagReadCounts | TagReads
     estimated: tuple[int, ...] = ()
 
     @property
@@ -90,9 +90,9 @@ class RfidFactor:
     @property
     def work(self) -> int:
         """About how many reads and misses are evaluated for the likelihood of one pose."""
-        if isinstance(self.likelihood, RfidLikelihood) and isinstance(self.seen, TagReadCounts):
-            return self.likelihood.work(self.seen)
-        return len(self.seen.antennas)
+        if isinstance(self.likelihood, RfidLikelihood) and isinstance(self.reads, TagReadCounts):
+            return self.likelihood.work(self.reads)
+        return len(self.reads.antennas)
 
     @property
     def is_phase(self) -> bool:
@@ -115,18 +115,18 @@ class RfidFactor:
     def score(self, values: Sequence[Array]) -> Score:
         """Of one pose (3,) and what is estimated (P,): gradient (1, 3 + P) and information (1, 3 + P, 3 + P) by both."""
         if not self.estimated:
-            return self.likelihood.score(values[0], self.seen)
+            return self.likelihood.score(values[0], self.reads)
         assert isinstance(self.likelihood, RfidLikelihood)
-        assert isinstance(self.seen, TagReadCounts)
-        return self.likelihood.joint_score(values[0], self._parameters(values[1]), self.seen, self.estimated)
+        assert isinstance(self.reads, TagReadCounts)
+        return self.likelihood.joint_score(values[0], self._parameters(values[1]), self.reads, self.estimated)
 
     def log_likelihood(self, poses: Array, values: Array | None = None) -> Array:
         """The tempered log-likelihood (N,) of poses (N, 3), with ``values`` (N, P) of what is estimated at each."""
         if values is None:
-            return self.likelihood.log_likelihood(poses, self.seen)
+            return self.likelihood.log_likelihood(poses, self.reads)
         assert isinstance(self.likelihood, RfidLikelihood)
-        assert isinstance(self.seen, TagReadCounts)
-        return self.likelihood.log_likelihood(poses, self.seen, self._parameters(values))
+        assert isinstance(self.reads, TagReadCounts)
+        return self.likelihood.log_likelihood(poses, self.reads, self._parameters(values))
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Residual (4 + P,) and its Jacobians (4 + P, 3) by the pose and, of P > 0, (4 + P, P)."""
@@ -149,23 +149,23 @@ class RfidFactor:
         pose, covariance = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
         problem = (*self._problems(), float(self.likelihood.model.tempering), pose, values)
         try:
-            delta, after, nis, dof, *rest = _corrected(*problem, covariance, iterations)
+            delta, posterior, nis, dof, *rest = _corrected(*problem, covariance, iterations)
         except np.linalg.LinAlgError:  # rounding made it singular
-            delta, after, nis, dof, *rest = _corrected(*problem, positive.nearest(covariance), iterations)
-        return Correction(delta, after, NO_RESIDUAL, nis, dof, *rest)
+            delta, posterior, nis, dof, *rest = _corrected(*problem, positive.nearest(covariance), iterations)
+        return Correction(delta, posterior, NO_RESIDUAL, nis, dof, *rest)
 
     def _problems(self) -> tuple[TagProblem | None, PhaseProblem | None, StrengthProblem | None]:
         """Likelihood and reads for compiled code: one of the three."""
-        match self.likelihood, self.seen:
+        match self.likelihood, self.reads:
             case RfidLikelihood() as detection, TagReadCounts() as counts:
                 estimated, alpha = np.array(self.estimated, dtype=np.int64), float(detection.model.tempering)
-                known = *detection.arrays, counts.seen, alpha, detection.parameters
+                known = *detection.arrays, counts.packed, alpha, detection.parameters
                 return TagProblem(*known, estimated), None, None
             case PhaseLikelihood() as phase, PhaseReads() as phases:
                 return None, phase.problem(phases), None
             case RssiLikelihood() as strength, RssiReads() as strengths:
                 return None, None, strength.problem(strengths)
-        raise TypeError(f"{type(self.likelihood).__name__} is not a likelihood of {type(self.seen).__name__}")
+        raise TypeError(f"{type(self.likelihood).__name__} is not a likelihood of {type(self.reads).__name__}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,7 @@ class RfidTagFactor:
 
     likelihood: RfidLikelihood
     tag: int
-    looks: TagReadCounts
+    counts: TagReadCounts
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Residual (6,) and its Jacobians (6, 3) by the pose and (6, 2) by the position."""
@@ -194,10 +194,10 @@ class RfidTagFactor:
     def score(self, values: Sequence[Array]) -> tuple[float, Array, Array]:
         """Tempered negative log-likelihood, its gradient (5,) and Fisher information (5, 5) by the body-frame perturbation of the
         pose and the position in the world."""
-        tags, looks, alpha = self.likelihood.tags, self.looks, self.likelihood.model.tempering
+        tags, counts, alpha = self.likelihood.tags, self.counts, self.likelihood.model.tempering
         point = np.array([(values[1][0], values[1][1], tags.points[self.tag, 2])])
-        hits = np.ascontiguousarray(looks.hits[:, self.tag : self.tag + 1])
-        arrays = point, tags.normals[self.tag : self.tag + 1], looks.offsets, looks.antennas, looks.rounds, hits
+        hits = np.ascontiguousarray(counts.hits[:, self.tag : self.tag + 1])
+        arrays = point, tags.normals[self.tag : self.tag + 1], counts.offsets, counts.antennas, counts.rounds, hits
         nll, slope, curve = kernels.by_tag(self.likelihood.packed, np.asarray(values[0], dtype=float), *arrays)
         return float(alpha * nll[0]), alpha * slope[0], alpha * curve[0]
 
@@ -212,7 +212,7 @@ def _score(
         parameters = tags.parameters.copy()
         for i in range(len(values)):
             parameters[tags.estimated[i]] = values[i]
-        return kernels.score(tags.packed, tags.of_map, tags.seen, tags.tempering, pose, parameters, tags.estimated)
+        return kernels.score(tags.packed, tags.of_map, tags.counts, tags.tempering, pose, parameters, tags.estimated)
     if phase is not None:
         nll, gradient, information = phase_scores(phase, pose.copy().reshape(1, 3), True)
         return nll[0], gradient[0], information[0], nll[0], 0.0
@@ -251,7 +251,7 @@ def _corrected(
         lower = False
         for _ in range(4):
             tried, tried_values = se2.moved(best, step), changed + step[3:]
-            nll, there, curve, _, _ = _score(tags, phase, strength, tried, tried_values)
+            nll, new_gradient, curve, _, _ = _score(tags, phase, strength, tried, tried_values)
             error, tried_cost = _difference(pose, values, tried, tried_values), nll
             for i in range(size):
                 for j in range(size):
@@ -259,7 +259,7 @@ def _corrected(
             lower = tried_cost <= cost
             if lower:
                 best, changed, cost, moved = tried, tried_values, tried_cost, error
-                gradient, information = there, curve
+                gradient, information = new_gradient, curve
                 break
             for i in range(size):
                 step[i] /= 2.0
@@ -270,10 +270,10 @@ def _corrected(
 
 
 @compiled
-def _difference(pose: Array, values: Array, other: Array, other_values: Array) -> Array:
+def _difference(pose: Array, values: Array, target: Array, other_values: Array) -> Array:
     """The step (3 + P,) from one pose and its values to another."""
     out = np.empty(3 + len(values))
-    out[0], out[1], out[2] = se2.twist_to(pose, other)
+    out[0], out[1], out[2] = se2.twist_to(pose, target)
     for i in range(len(values)):
         out[3 + i] = other_values[i] - values[i]
     return out
@@ -288,13 +288,13 @@ def _scoring_step(prior_information: Array, information: Array, gradient: Array,
         for j in range(size):
             both[i, j] += information[i, j]
             pull[i, 0] -= prior_information[i, j] * moved[j]
-    found, _ = solved(both, pull)
+    solution, _ = solved(both, pull)
     step, share = np.empty(size), 1.0
     for i in range(size):
         largest = LARGEST_STEP[i] if i < 3 else LARGEST_CHANGE
-        share = min(share, largest / max(abs(found[i, 0]), 1e-12))
+        share = min(share, largest / max(abs(solution[i, 0]), 1e-12))
     for i in range(size):
-        step[i] = share * found[i, 0]
+        step[i] = share * solution[i, 0]
     return step
 
 
@@ -305,36 +305,36 @@ def _posterior(prior_information: Array, information: Array) -> tuple[Array, flo
     for i in range(size):
         for j in range(size):
             both[i, j] += information[i, j]
-    posterior, after = solved(both, np.eye(size))
-    return posterior, solved(prior_information, np.empty((size, 0)))[1] - after
+    posterior, log_determinant = solved(both, np.eye(size))
+    return posterior, solved(prior_information, np.empty((size, 0)))[1] - log_determinant
 
 
 @compiled
 def _innovation(gradient: Array, information: Array, covariance: Array, tempering: float) -> tuple[float, int]:
     """Normalised square of a score, and its degrees of freedom."""
-    size, spread, pull = (
+    size, predicted, pull = (
         len(gradient),
         product(product(information, covariance), information),
         np.empty((len(gradient), 1)),
     )
     for i in range(size):
         pull[i, 0] = gradient[i]
-        spread[i, i] += RIDGE
+        predicted[i, i] += RIDGE
         for j in range(size):
-            spread[i, j] += tempering * information[i, j]
+            predicted[i, j] += tempering * information[i, j]
     if covariance[0, 0] + covariance[1, 1] > FAR:
         # of one direction so much more than of the others that these would be lost
         units = np.empty(size)
         for i in range(size):
-            units[i] = math.sqrt(spread[i, i])
+            units[i] = math.sqrt(predicted[i, i])
         for i in range(size):
             pull[i, 0] /= units[i]
             for j in range(size):
-                spread[i, j] /= units[i] * units[j]
-            spread[i, i] += ROUNDING
-    found, nis = solved(spread, pull)[0], 0.0
+                predicted[i, j] /= units[i] * units[j]
+            predicted[i, i] += ROUNDING
+    scaled, nis = solved(predicted, pull)[0], 0.0
     for i in range(size):
-        nis += pull[i, 0] * found[i, 0]
+        nis += pull[i, 0] * scaled[i, 0]
     return nis, _rank(information) if nis > 0.0 else 0
 
 

@@ -19,7 +19,7 @@ SPARE = 0.5  # m: tags are found in a box on a grid of this size, which neighbou
 Corner = tuple[float, float]
 MOST_CELLS = 1 << 20  # a map that is wider has larger cells
 # offsets, antennas, rounds, hits, odds and elsewhere; the places in the map that are listed, the odds of the others, and the twists
-Seen = tuple[Array, Integers, Integers, Integers, Array, Array, Integers, float, Array]
+Counts = tuple[Array, Integers, Integers, Integers, Array, Array, Integers, float, Array]
 
 
 class TagIndex(NamedTuple):
@@ -87,7 +87,7 @@ class MapTags(NamedTuple):
 
 
 class NearTags(NamedTuple):
-    """C tags that matter to some poses: places in the map, ascending, and what is known and seen of them."""
+    """C tags that matter to some poses: places in the map, ascending, with survey, reads and states."""
 
     tags: Integers
     points: Array
@@ -110,13 +110,13 @@ def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
 
 
 @compiled
-def near_tags(of_map: MapTags, seen: Seen, poses: Array, reach: float) -> NearTags:
-    """The tags within ``reach`` [m] of poses (N, 3), or in the same cells, and those that are listed in what was ``seen``
-    (:attr:`factors.rfid.detection.TagReadCounts.seen`)."""
-    _, _, _, hits, odds, elsewhere, listed, others, _ = seen
+def near_tags(of_map: MapTags, counts: Counts, poses: Array, reach: float) -> NearTags:
+    """The tags within ``reach`` [m] of poses (N, 3), or in the same cells, and those that are listed in what was ``counts``
+    (:attr:`factors.rfid.detection.TagReadCounts.packed`)."""
+    _, _, _, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
     low, high = _box(poses, reach)
     tags = union(within(of_map.cells, low, high), listed)
-    hits, odds, elsewhere = listing(listed, hits, odds, elsewhere, others, tags)
+    hits, odds, elsewhere = listing(listed, hits, odds, elsewhere, unlisted_odds, tags)
     points, normals = np.empty((len(tags), 3)), np.empty((len(tags), 2))
     for u in range(len(tags)):
         for i in range(3):
@@ -153,17 +153,17 @@ def delayed(poses: Array, twists: Array, delays: Array) -> Array:
 
 
 @compiled
-def union(some: Integers, others: Integers) -> Integers:
+def union(first: Integers, second: Integers) -> Integers:
     """All numbers of either, which are ascending both."""
-    out = np.empty(len(some) + len(others), np.int64)
+    out = np.empty(len(first) + len(second), np.int64)
     i = j = count = 0
-    while i < len(some) or j < len(others):
-        if j == len(others) or (i < len(some) and some[i] <= others[j]):
-            out[count] = some[i]
-            j += j < len(others) and some[i] == others[j]
+    while i < len(first) or j < len(second):
+        if j == len(second) or (i < len(first) and first[i] <= second[j]):
+            out[count] = first[i]
+            j += j < len(second) and first[i] == second[j]
             i += 1
         else:
-            out[count] = others[j]
+            out[count] = second[j]
             j += 1
         count += 1
     return out[:count]
@@ -171,11 +171,11 @@ def union(some: Integers, others: Integers) -> Integers:
 
 @compiled
 def listing(
-    listed: Integers, hits: Integers, odds: Array, elsewhere: Array, others: float, tags: Integers
+    listed: Integers, hits: Integers, odds: Array, elsewhere: Array, unlisted_odds: float, tags: Integers
 ) -> tuple[Integers, Array, Array]:
-    """Hits, odds and elsewhere of ``tags``, both ascending; those of tags that are not listed are no hits, ``others`` and 0."""
+    """Hits, odds and elsewhere of ``tags``, both ascending; tags that are not listed have 0 hits, ``unlisted_odds`` and 0."""
     new_hits = np.zeros((len(hits), len(tags)), np.int64)
-    new_odds, new_elsewhere = np.full(len(tags), others), np.zeros(len(tags))
+    new_odds, new_elsewhere = np.full(len(tags), unlisted_odds), np.zeros(len(tags))
     i = 0
     for u in range(len(tags)):
         while i < len(listed) and listed[i] < tags[u]:

@@ -12,19 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid.index import MapTags, Seen, delayed, moved, near_tags
+from factors.rfid.index import Counts, MapTags, delayed, moved, near_tags
 from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed, logit
 from factors.rfid.parameters import MOST_CERTAIN, adjusted
 from factors.se2 import Array, Integers
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}  # fast-math flags that keep infinities
 ROW = 8  # numbers of each row of placed antennas
-OF_READ, PLACE = 5, 7  # derivatives of one look at a tag, without and with those by the tag's position
-MOST_COLUMNS = 8  # of the pose and the parameters that one look depends on
+OF_READ, PLACE = 5, 7  # derivatives of one measurement of a tag, without and with those by its position
+MOST_COLUMNS = 8  # of the pose and the parameters that one measurement depends on
 
 
 @compiled(inline="always")
-def seen(
+def tag_logit(
     packed: Packed, antenna: int, p: float, q: float, height: float, c: float
 ) -> tuple[float, float, float, float, float]:
     """Logit of a tag at (p, q, height) from the antenna, in axes rotated by its yaw only, and derivatives by p, q, height, c."""
@@ -39,8 +39,8 @@ def seen(
 
 @compiled(inline="always")
 def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[float, float, float, float, float, float]:
-    """The antenna's x, y, cosine and sine of its heading in the world, for a robot at ``offset`` from ``pose``; and the cosine and
-    sine of the robot's heading."""
+    """The antenna's x, y, cosine and sine of its heading in the world, with the robot at ``offset`` (3,) from ``pose`` (3,); and
+    the cosine and sine of the robot's heading."""
     c0, s0 = math.cos(pose[2]), math.sin(pose[2])
     x, y = pose[0] + c0 * offset[0] - s0 * offset[1], pose[1] + s0 * offset[0] + c0 * offset[1]
     c, s = math.cos(pose[2] + offset[2]), math.sin(pose[2] + offset[2])
@@ -53,7 +53,7 @@ def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[fl
 def of_tag(
     packed: Packed, antenna: int, x: float, y: float, c: float, s: float, point: Array, normal: Array
 ) -> tuple[float, float, float, float, float]:
-    """Logit of one tag for an antenna at (x, y) that looks along (c, s), and its derivatives: by the tag's place along and across
+    """Logit of one tag for an antenna at (x, y) with boresight (c, s), and its derivatives: by the tag's place along and across
     the boresight, by the antenna's heading, and by the logarithm of the model's range. Beyond the reach it is constant."""
     ex, ey = point[0] - x, point[1] - y
     m = packed.which[antenna]
@@ -66,7 +66,7 @@ def of_tag(
     facing = -(nx * p + ny * q) / distance
     unit = 1.0 / packed.scale[m]
     height = point[2] - packed.antennas[antenna, 2]
-    value, by_p, by_q, _, by_c = seen(packed, antenna, unit * p, unit * q, height, facing)
+    value, by_p, by_q, _, by_c = tag_logit(packed, antenna, unit * p, unit * q, height, facing)
     by_p, by_q = unit * by_p, unit * by_q
     by_range = -(by_p * p + by_q * q)
     by_heading = by_p * q - by_q * p
@@ -88,13 +88,13 @@ def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, floa
 @compiled
 def reach_of(packed: Packed, offsets: Array) -> float:
     """How far [m] the antennas reach at most from the pose that measurements at ``offsets`` (K, 3) are relative to."""
-    way = farthest = 0.0
+    offset = farthest = 0.0
     for k in range(len(offsets)):
-        way = max(way, math.hypot(offsets[k, 0], offsets[k, 1]))
+        offset = max(offset, math.hypot(offsets[k, 0], offsets[k, 1]))
     for a in range(len(packed.which)):
         lever = math.hypot(packed.antennas[a, 0], packed.antennas[a, 1])
         farthest = max(farthest, packed.reach[packed.which[a]] + lever)
-    return way + farthest
+    return offset + farthest
 
 
 @compiled(inline="always")
@@ -117,25 +117,25 @@ def _place_antennas(packed: Packed, pose: Array, offsets: Array, antennas: NDArr
 
 @compiled(inline="always")
 def mixture(
-    odds: float, elsewhere: float, e: float, mean: float, spread: float, none: float, tempering: float
+    odds: float, elsewhere: float, e: float, mean: float, variance: float, none: float, tempering: float
 ) -> tuple[float, float, float, float]:
     """The factor of the derivatives of a tag that may be dead or moved (:mod:`factors.rfid.tag_states`), and its tempered negative
     log-likelihood with mean and variance.
 
-    ``e``, ``mean`` and ``spread``: the same, untempered, of a tag as surveyed; ``none``: the negative log-likelihood of misses
+    ``e``, ``mean`` and ``variance``: the same, untempered, of a tag as surveyed; ``none``: the negative log-likelihood of misses
     out of range. Reads of a tag that is not as surveyed are as likely as expected. The derivatives neglect the information lost by
     the unknown state (Louis, JRSS B 44(2), 1982, eq. 3.2').
     """
     if odds == -np.inf or elsewhere == -np.inf:
-        return tempering, tempering * e, tempering * mean, tempering * spread
-    surveyed, other = tempering * (none - e), odds + elsewhere
-    most = max(surveyed, other)
+        return tempering, tempering * e, tempering * mean, tempering * variance
+    surveyed, displaced = tempering * (none - e), odds + elsewhere
+    most = max(surveyed, displaced)
     own = math.exp(surveyed - most)
-    total = own + math.exp(other - most)
+    total = own + math.exp(displaced - most)
     nll = tempering * none - most - math.log(total) + max(odds, 0.0) + math.log1p(math.exp(-abs(odds)))
     usual = 1.0 / (1.0 + math.exp(odds))
     expected = usual * tempering * mean + (1.0 - usual) * (tempering * none - elsewhere)
-    return tempering * own / total, nll, expected, usual * tempering * spread
+    return tempering * own / total, nll, expected, usual * tempering * variance
 
 
 @compiled(inline="always")
@@ -192,8 +192,8 @@ def _add_tag(
         m = packed.which[antennas[k]]
         rate = packed.rate[m]
         q, by_z, by_rate = detection(packed, z, rate)
-        e, slope[k], curve[k], expected, spread = outcome(q, hits[k], rounds[k])
-        nll, mean, variance = nll + e, mean + expected, variance + spread
+        e, slope[k], curve[k], expected, own_variance = outcome(q, hits[k], rounds[k])
+        nll, mean, variance = nll + e, mean + expected, variance + own_variance
         # the antenna moves, the tag does not
         by[k, 0] = by_z * (at[k, 5] * by_q - at[k, 4] * by_p)
         by[k, 1] = -by_z * (at[k, 5] * by_p + at[k, 4] * by_q)
@@ -204,7 +204,7 @@ def _add_tag(
 
 
 @compiled
-def _add_look(
+def _add_measurement(
     packed: Packed,
     antenna: int,
     at: Array,
@@ -253,26 +253,26 @@ def _add_look(
 
 @compiled(error_model="numpy", fastmath=FAST)
 def scores(
-    packed: Packed, of_map: MapTags, seen: Seen, tempering: float, poses: Array, columns: Integers
+    packed: Packed, of_map: MapTags, counts: Counts, tempering: float, poses: Array, columns: Integers
 ) -> tuple[Array, Array, Array, Array, Array]:
     """The fields of a :class:`~factors.rfid.detection.Score` of poses (N, 3) for adjusted models. ``columns``: of the parameters in
     the derivatives, -1 for those that have none."""
-    antennas, rounds, twists = seen[1], seen[2], seen[8]
-    offsets = delayed(seen[0], twists, packed.delay)
-    count, looks, size = len(poses), len(antennas), 3
+    antennas, rounds, twists = counts[1], counts[2], counts[8]
+    offsets = delayed(counts[0], twists, packed.delay)
+    count, scans, size = len(poses), len(antennas), 3
     for i in range(len(columns)):
         size += columns[i] >= 0
     local = OF_READ if size > 3 else 3
-    near = near_tags(of_map, seen, poses, reach_of(packed, offsets))
+    near = near_tags(of_map, counts, poses, reach_of(packed, offsets))
     hits, tags = near.hits, len(near.tags)
-    heard, far, none = np.zeros(tags, np.int64), _unread(packed, rounds), np.zeros(3)
-    for k in range(looks):
+    reads, far, none = np.zeros(tags, np.int64), _unread(packed, rounds), np.zeros(3)
+    for k in range(scans):
         none += far[k]
-        heard += hits[k]
+        reads += hits[k]
     nll, expected, variance = np.empty(count), np.empty(count), np.empty(count)
     gradient, information = np.zeros((count, size)), np.zeros((count, size, size))
-    at, by, slope, curve = np.empty((looks, ROW)), np.empty((looks, PLACE)), np.empty(looks), np.empty(looks)
-    pulls, curves = np.empty((looks, OF_READ)), np.empty((looks, OF_READ, OF_READ))
+    at, by, slope, curve = np.empty((scans, ROW)), np.empty((scans, PLACE)), np.empty(scans), np.empty(scans)
+    pulls, curves = np.empty((scans, OF_READ)), np.empty((scans, OF_READ, OF_READ))
     for n in range(count):
         farthest = _place_antennas(packed, poses[n], offsets, antennas, at)
         # tags that are not listed are out of reach and not read
@@ -281,14 +281,14 @@ def scores(
         pulls[:], curves[:] = 0.0, 0.0
         for t in range(tags):
             dx, dy = near.points[t, 0] - poses[n, 0], near.points[t, 1] - poses[n, 1]
-            if heard[t] == 0 and dx * dx + dy * dy >= farthest * farthest:
+            if reads[t] == 0 and dx * dx + dy * dy >= farthest * farthest:
                 beyond += 1
                 continue
             point, normal = near.points[t], near.normals[t]
-            e, mean, spread = _add_tag(packed, at, antennas, rounds, hits[:, t], point, normal, far, by, slope, curve)
-            share, e, mean, spread = mixture(near.odds[t], near.elsewhere[t], e, mean, spread, none[0], tempering)
-            e_sum, mean_sum, variance_sum = e_sum + e, mean_sum + mean, variance_sum + spread
-            for k in range(looks):
+            e, mean, own = _add_tag(packed, at, antennas, rounds, hits[:, t], point, normal, far, by, slope, curve)
+            share, e, mean, own = mixture(near.odds[t], near.elsewhere[t], e, mean, own, none[0], tempering)
+            e_sum, mean_sum, variance_sum = e_sum + e, mean_sum + mean, variance_sum + own
+            for k in range(scans):
                 if curve[k] > 0.0:
                     for i in range(local):
                         pulls[k, i] += share * slope[k] * by[k, i]
@@ -297,8 +297,8 @@ def scores(
         nll[n] = e_sum + tempering * beyond * none[0]
         expected[n] = mean_sum + tempering * beyond * none[1]
         variance[n] = variance_sum + tempering * beyond * none[2]
-        for k in range(looks):
-            _add_look(
+        for k in range(scans):
+            _add_measurement(
                 packed,
                 antennas[k],
                 at[k],
@@ -315,16 +315,16 @@ def scores(
 
 @compiled
 def score(
-    packed: Packed, of_map: MapTags, seen: Seen, tempering: float, pose: Array, parameters: Array, estimated: Integers
+    packed: Packed, of_map: MapTags, counts: Counts, alpha: float, pose: Array, parameters: Array, estimated: Integers
 ) -> tuple[float, Array, Array, float, float]:
-    """Of one pose (3,) and models without adjustment, with their ``parameters``: negative log-likelihood; its gradient (3 + P,)
-    and information (3 + P, 3 + P) by the pose and the ``estimated`` (P,) parameters; mean and variance."""
+    """Score of one pose (3,) with tempering ``alpha`` and ``parameters`` of models without adjustment: negative log-likelihood;
+    gradient (3 + P,) and information (3 + P, 3 + P) by pose and ``estimated`` (P,) parameters; mean and variance."""
     columns = np.full(len(parameters), -1, np.int64)
     for i in range(len(estimated)):
         columns[estimated[i]] = 3 + i
     poses = pose.copy().reshape(1, 3)
-    found = scores(adjusted(packed, parameters), of_map, seen, tempering, poses, columns)
-    return found[0][0], found[1][0], found[2][0], found[3][0], found[4][0]
+    summed = scores(adjusted(packed, parameters), of_map, counts, alpha, poses, columns)
+    return summed[0][0], summed[1][0], summed[2][0], summed[3][0], summed[4][0]
 
 
 @compiled(error_model="numpy", fastmath=FAST)
@@ -340,14 +340,14 @@ def by_tag(
 ) -> tuple[Array, Array, Array]:
     """Of each of T tags as surveyed, at one pose (3,): negative log-likelihood (T,); gradient (T, 5) and information (T, 5, 5) by
     the pose and by the tag's position in the world."""
-    looks, tags, size = len(antennas), len(points), 5
+    scans, tags, size = len(antennas), len(points), 5
     nll, gradient, information = np.empty(tags), np.zeros((tags, size)), np.zeros((tags, size, size))
-    at, far, by = np.empty((looks, ROW)), _unread(packed, rounds), np.empty((looks, PLACE))
-    slope, curve, own = np.empty(looks), np.empty(looks), np.empty(size)
+    at, far, by = np.empty((scans, ROW)), _unread(packed, rounds), np.empty((scans, PLACE))
+    slope, curve, own = np.empty(scans), np.empty(scans), np.empty(size)
     _place_antennas(packed, pose, offsets, antennas, at)
     for t in range(tags):
         nll[t] = _add_tag(packed, at, antennas, rounds, hits[:, t], points[t], normals[t], far, by, slope, curve)[0]
-        for k in range(looks):
+        for k in range(scans):
             if curve[k] > 0.0:
                 own[0], own[1], own[3], own[4] = by[k, 0], by[k, 1], by[k, 5], by[k, 6]
                 own[2] = by[k, 2] - by[k, 0] * at[k, 7] + by[k, 1] * at[k, 6]
@@ -378,12 +378,12 @@ def probabilities(
 
 @compiled
 def predicted(
-    packed: Packed, of_map: MapTags, seen: Seen, pose: Array, parameters: Array
+    packed: Packed, of_map: MapTags, counts: Counts, pose: Array, parameters: Array
 ) -> tuple[Integers, Integers, Array, Array]:
     """With ``parameters`` of models without adjustment, of the tags near a pose (3,) or listed: their indices in the map (C,), and
     for each measurement the hits, the probability of a read and the distance [m] from the antenna, (K, C)."""
-    own, antennas = adjusted(packed, parameters), seen[1]
-    offsets = delayed(seen[0], seen[8], own.delay)
-    near = near_tags(of_map, seen, pose.copy().reshape(1, 3), reach_of(own, offsets))
+    own, antennas = adjusted(packed, parameters), counts[1]
+    offsets = delayed(counts[0], counts[8], own.delay)
+    near = near_tags(of_map, counts, pose.copy().reshape(1, 3), reach_of(own, offsets))
     p, distance = probabilities(own, antennas, moved(pose, offsets), near.points, near.normals)
     return near.tags, near.hits, p, distance

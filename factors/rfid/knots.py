@@ -1,4 +1,4 @@
-"""Interpolation between evenly spaced knots, as in :mod:`factors.rfid.model`, for many places at once."""
+"""Interpolation between evenly spaced knots, as in :mod:`factors.rfid.model`, at N places."""
 
 import numpy as np
 
@@ -30,9 +30,9 @@ def cubic(place: Array, count: int) -> tuple[Integers, Array]:
     return np.clip(below[:, None] + np.arange(-1, 3), 0, count - 1), np.column_stack(weights)
 
 
-def matrix(found: tuple[Integers, Array], count: int) -> Array:
+def matrix(places: tuple[Integers, Array], count: int) -> Array:
     """The matrix (N, ``count``) from values at knots to those at N places."""
-    knots, weights = found
+    knots, weights = places
     out = np.zeros((len(knots), count))
     np.add.at(out, (np.arange(len(knots))[:, None], knots), weights)
     return out

@@ -240,8 +240,8 @@ def bake(
     axis = cell * (np.arange(count) - (count - 1) / 2.0)
     cosines = np.linspace(-1.0, 1.0, facings) if facings > 1 else np.zeros(1)
     h, c, x, y = np.meshgrid(np.asarray(heights, dtype=float), cosines, axis, axis, indexing="ij")
-    found, _ = logits(model, np.stack((x, y, h), axis=-1).reshape(-1, 3), c.ravel())
-    return GridModel(found.reshape(h.shape), float(axis[0]), float(axis[0]), cell, np.asarray(heights, dtype=float))
+    sampled, _ = logits(model, np.stack((x, y, h), axis=-1).reshape(-1, 3), c.ravel())
+    return GridModel(sampled.reshape(h.shape), float(axis[0]), float(axis[0]), cell, np.asarray(heights, dtype=float))
 
 
 @compiled
@@ -255,8 +255,8 @@ def _logits(
     out: Array,
 ) -> None:
     for i in range(len(points)):
-        found = logit(kind, parameters, shape, knots, points[i, 0], points[i, 1], points[i, 2], facing[i])
-        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = found
+        values = logit(kind, parameters, shape, knots, points[i, 0], points[i, 1], points[i, 2], facing[i])
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = values
 
 
 @compiled

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid.index import MapTags, Seen, TagIndex, cells
+from factors.rfid.index import Counts, MapTags, TagIndex, cells
 from factors.rfid.kernels import FAST, reach_of
 from factors.rfid.model import LOGISTIC, Packed
 from factors.rfid.tables import CELL, LEVEL, NO_MATTER, Array32, Tables, logs_of, row_of
@@ -27,12 +27,12 @@ from factors.se2 import Array, Integers
 MOST = 1 << 25  # numbers in a table; cells are so large that there are no more
 WIDE = 2.0  # times the square that an antenna reaches: poses that touch more are evaluated one by one
 PLACED = 25  # work of a pose, besides that of its tags
-BY_ANTENNA = 7  # work of a tag for one antenna, where there are no tables of the robot frame
+BY_ANTENNA = 7  # work of a tag for one antenna, if tables of the robot frame are missing
 
 
 class RobotTables(NamedTuple):
     """The response of A antennas to a tag by its position in the robot frame: S x S cells of ``cell`` [m] in F layers, one for
-    each direction in which the tag faces and the last for an unknown or irrelevant one, for each of H heights.
+    each facing of the tag and the last for an unknown or irrelevant one, for each of H heights.
 
     ``gain`` (A, H, F, S, S): log q - log(1 - q); ``missed`` (A, H, F, S, S): log(1 - q) above that out of reach; ``level`` (T,):
     height of each tag; ``none`` (A, 2): log q and log(1 - q) out of reach.
@@ -59,9 +59,9 @@ class MissTable(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """``hits`` (K, W) in ``rounds`` (K,) of ``antennas`` (K,) of the W tags that are not as most are; ``number`` (T,): which of
-    these a tag of the index is, -1 for others. Log-odds ``odds`` (W,) and ``elsewhere`` (W,) of those, and the odds of the
-    ``others``, as in :mod:`factors.rfid.tag_states`."""
+    """``hits`` (K, W) in ``rounds`` (K,) of ``antennas`` (K,) of the W exceptional tags; ``number`` (T,): the place of a tag of the
+    index among these, -1 for the usual tags. ``odds`` (W,) and ``elsewhere`` (W,) of the exceptional tags and the ``unlisted_odds``
+    of the usual ones: see :class:`~factors.rfid.detection.TagReadCounts`."""
 
     antennas: Integers
     rounds: Integers
@@ -69,7 +69,7 @@ class Scan(NamedTuple):
     number: NDArray[np.int32]
     odds: Array
     elsewhere: Array
-    others: float
+    unlisted_odds: float
 
 
 class Antennas(NamedTuple):
@@ -130,8 +130,8 @@ def miss_table(tables: RobotTables, scan: Scan, tempering: float, reach: float) 
         total += np.float32(count) * tables.missed[antenna, :, 0]
     own: Array32 = np.float32(tempering) * total
     folded = own
-    if scan.others > -np.inf:
-        folded = (np.logaddexp(own, scan.others) - np.logaddexp(0.0, scan.others)).astype(np.float32)
+    if scan.unlisted_odds > -np.inf:
+        folded = (np.logaddexp(own, scan.unlisted_odds) - np.logaddexp(0.0, scan.unlisted_odds)).astype(np.float32)
     relevant = np.argwhere((np.abs(own) > NO_MATTER).any(axis=0)) - total.shape[1] // 2
     farthest = tables.cell * (float(np.max(np.hypot(*relevant.T), initial=0.0)) + 1.0)
     return MissTable(total, folded, tables.cell, min(farthest, reach))
@@ -162,17 +162,17 @@ class Places:
             antennas, tables, of_map.cells, points, normals, np.ascontiguousarray(antennas.tables.level[:, order])
         )
 
-    def work(self, seen: Seen) -> int:
+    def work(self, counts: Counts) -> int:
         """How many tags count for one pose, on average; one that was read counts as four."""
         near = in_reach(self.points[:, :2], self.antennas.reach)
-        _, antennas, _, hits, *_ = seen
+        _, antennas, _, hits, *_ = counts
         if not self.tables.gain.size:
             return PLACED + round(BY_ANTENNA * len(antennas) * near)
         return PLACED + round(near) + 4 * int(np.count_nonzero(hits.any(axis=0)))
 
-    def log_likelihood(self, poses: Array, seen: Seen, tempering: float) -> Array:
+    def log_likelihood(self, poses: Array, counts: Counts, tempering: float) -> Array:
         """Tempered log-likelihood (N,) at poses (N, 3)."""
-        scan = self._scan(seen)
+        scan = self._scan(counts)
         missed = float(scan.rounds @ self.tables.none[scan.antennas, 1])
         out = np.full(len(poses), tempering * len(self.points) * missed)
         of_tags, table = (self.points, self.normals, self.levels), self._missed(scan, tempering)
@@ -181,23 +181,23 @@ class Places:
 
     def _missed(self, scan: Scan, tempering: float) -> MissTable:
         """The table of misses for the odds that most tags have; that of the last scan is kept."""
-        key = (scan.antennas.tobytes(), scan.rounds.tobytes(), scan.others, tempering)
+        key = (scan.antennas.tobytes(), scan.rounds.tobytes(), scan.unlisted_odds, tempering)
         if key not in self._last:
             self._last.clear()
             self._last[key] = miss_table(self.tables, scan, tempering, self.antennas.reach)
         return self._last[key]
 
-    def _scan(self, seen: Seen) -> Scan:
-        """The reads, with the tags listed that are not as most are."""
-        _, antennas, rounds, hits, odds, elsewhere, listed, others, _ = seen
+    def _scan(self, counts: Counts) -> Scan:
+        """The counts of the exceptional tags: those that were read, or whose state is unusual."""
+        _, antennas, rounds, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
         rows = np.arange(len(odds))
         if len(odds) == len(self.points) > 0:
-            others = float(np.sort(odds)[len(odds) // 2])
-            rows = np.flatnonzero(hits.any(axis=0) | (odds != others) | (elsewhere != 0.0))
+            unlisted_odds = float(np.sort(odds)[len(odds) // 2])
+            rows = np.flatnonzero(hits.any(axis=0) | (odds != unlisted_odds) | (elsewhere != 0.0))
         number = np.full(len(self.points), -1, dtype=np.int32)
         number[listed[rows]] = np.arange(len(rows))
         of_rows = number[self.index.order], odds[rows], elsewhere[rows]
-        return Scan(antennas, rounds, np.ascontiguousarray(hits[:, rows]), *of_rows, others)
+        return Scan(antennas, rounds, np.ascontiguousarray(hits[:, rows]), *of_rows, unlisted_odds)
 
 
 @compiled(error_model="numpy", fastmath=FAST)
@@ -249,7 +249,7 @@ def _log_likelihood(
                     nx, ny = c * normals[t, 0] + s * normals[t, 1], c * normals[t, 1] - s * normals[t, 0]
                     own = _of_tag(model, scan, x, y, points[t, 2], nx, ny, levels[:, t], w)
                     if w < 0:
-                        total += mixed(tempering * own, scan.others, 0.0)
+                        total += mixed(tempering * own, scan.unlisted_odds, 0.0)
                         continue
                 total += mixed(tempering * own, scan.odds[w], scan.elsewhere[w]) - far[w]
         out[n] += total

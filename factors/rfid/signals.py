@@ -2,7 +2,7 @@
 
 **Phase** refines a pose known to decimetres to centimetres. A reader reports ``phi = offset - 4 pi d / lambda`` (mod 2 pi) for the
 distance d [m] to the tag, with an unknown offset of each antenna, tag and channel (Nikitin et al., IEEE RFID 2010, eq. 4). Many
-readers add pi at random, to which twice the phase is invariant: ``psi = 2 phi + 8 pi d / lambda`` is constant over the R reads of a
+readers add pi at random, which twice the phase removes: ``psi = 2 phi + 8 pi d / lambda`` is constant over the R reads of a
 group (one antenna, tag and channel in a window). With a von Mises density of concentration kappa and the most likely offset, the
 negative log-likelihood of a group is
 
@@ -185,8 +185,8 @@ class PhaseLikelihood:
         places = self._antennas[reads.antennas]
         points = self.tags.points[reads.tags]
         antennas = np.column_stack((se2.transform_from(at, places[:, :2]), places[:, 2]))
-        found = reads.chosen(np.linalg.norm(antennas - points, axis=1) < self.model.max_range)
-        return found.chosen(np.bincount(found.groups)[found.groups] >= self.model.min_reads)
+        nearby = reads.chosen(np.linalg.norm(antennas - points, axis=1) < self.model.max_range)
+        return nearby.chosen(np.bincount(nearby.groups)[nearby.groups] >= self.model.min_reads)
 
     def problem(self, reads: PhaseReads) -> PhaseProblem:
         """Model, map and reads for compiled code."""

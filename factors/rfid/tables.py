@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from factors import se2
 from factors.compiled import compiled
 from factors.rfid import knots
-from factors.rfid.kernels import placed, seen
+from factors.rfid.kernels import placed, tag_logit
 from factors.rfid.model import (
     GRID,
     LOGISTIC,
@@ -33,7 +33,7 @@ Tags = tuple[Array, Array, Integers, Integers]  # points, normals, tables (A, T)
 CELL = 0.05  # m
 COARSE = 8  # cells along each side of a block
 FACINGS = 9  # knots of the facing's cosine
-NEGLIGIBLE = 15.0  # log of the ratio of two likelihoods of which the smaller one does not count
+NEGLIGIBLE = 15.0  # log of the ratio of two likelihoods above which the smaller one is neglected
 NO_MATTER = 1e-3  # of a log-likelihood: a smaller difference from a miss out of reach is neglected
 SCATTERED = 2.0  # m: tags that may be anywhere in so wide a circle are evaluated pose by pose
 STEP, LEVEL = 0.01, 0.04  # of the logit, in the tables; m of height within which tags share a table
@@ -59,7 +59,7 @@ class Tables(NamedTuple):
 
 
 def logs_of(packed: Packed) -> Array32:
-    """Log q and log(1 - q), (M, Z, 2), of a model as it is adjusted, for the logits of :class:`Tables`."""
+    """Log q and log(1 - q), (M, Z, 2), of adjusted models at the logits of :class:`Tables`."""
     q = packed.false_read + packed.span * packed.rate[:, None] / (1.0 + np.exp(-_LOGITS))
     q = np.clip(q, 1e-12, 1.0 - 1e-12)
     return np.asarray(np.log(np.stack((q, 1.0 - q), axis=-1)), dtype=np.float32)
@@ -78,7 +78,7 @@ def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
         if packed.kinds[antenna.model] == LOGISTIC:
             continue
         steps, which = np.unique(np.rint((heights - antenna.z) / LEVEL).astype(np.int64), return_inverse=True)
-        found = np.zeros(len(steps), dtype=np.int64)
+        indices = np.zeros(len(steps), dtype=np.int64)
         for j, step in enumerate(steps.tolist()):
             key = (antenna.model, antenna.pitch, step)
             if key not in numbers:
@@ -93,8 +93,8 @@ def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
                     _fill(packed, i, step * LEVEL, half, table)
                 tables.append(table)
                 halves.append(half)
-            found[j] = numbers[key]
-        level[i] = found[which]
+            indices[j] = numbers[key]
+        level[i] = indices[which]
     sizes = np.array([t.size for t in tables], dtype=np.int64)
     rows = np.concatenate([t.ravel() for t in tables]) if tables else np.empty(0, np.uint16)
     blocks = [_blocks(t) for t in tables]
@@ -138,7 +138,7 @@ def _planes(packed: Packed, model: int, shape: tuple[int, ...]) -> Array:
 
 
 def _fill_level(planes: Array, packed: Packed, model: int, height: float, table: NDArray[np.uint16]) -> None:
-    """As :func:`_fill`, from the planes of a grid, for an antenna without pitch: cells lie in these at all heights."""
+    """As :func:`_fill` if the antenna has no pitch: all cells lie in the planes of a grid."""
     z0, step = packed.parameters[model, 3:5]
     levels, weights = knots.linear(np.array(((height - z0) / step,)), len(planes))
     z = sum(weight * planes[level] for level, weight in zip(levels[0], weights[0], strict=True) if weight > 0.0)
@@ -156,7 +156,7 @@ def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray
         c = 2.0 * f / (facings - 1) - 1.0 if facings > 1 else 0.0
         for i in range(2 * half + 1):
             for j in range(2 * half + 1):
-                z = seen(packed, antenna, (i - half) * CELL, (j - half) * CELL, height, c)[0]
+                z = tag_logit(packed, antenna, (i - half) * CELL, (j - half) * CELL, height, c)[0]
                 table[f, i, j] = logit_row(z)
 
 
@@ -192,19 +192,19 @@ def relevant(
     packed: Packed,
     tables: Tables,
     poses: Array,
-    looks: Measured,
+    measured: Measured,
     parameters: Array,
     tags: Tags,
     near: NDArray[np.bool_],
     tempering: float,
 ) -> NDArray[np.bool_]:
-    """Which measurements of which tags (K, T) matter to some of the poses (N, 3) with ``parameters`` (N or 1, Q). The yaw
+    """The measurements of tags (K, T) that matter to some of the poses (N, 3) with ``parameters`` (N or 1, Q). The yaw
     of antennas in ``packed`` is that of the first row.
 
     These are measurements of tags that are ``near`` (T,), and were read or, by the blocks of the tables, could have been. In a
     dense map most others do not matter.
     """
-    offsets, antennas, rounds = looks
+    offsets, antennas, rounds = measured
     points, _, levels, hits = tags
     out = np.zeros(hits.shape, np.bool_)
     low_x, high_x, low_y, high_y = poses[:, 0].min(), poses[:, 0].max(), poses[:, 1].min(), poses[:, 1].max()

@@ -11,9 +11,9 @@ if it is as surveyed, relative to a silence out of range, a tag's likelihood of 
  log p = log(exp(-E) + exp(odds + elsewhere)) - log(1 + exp(odds)),
 
 where ``elsewhere`` is the log-likelihood of the same reads and misses if the tag is not as surveyed: the mean over these states,
-weighted by their probabilities before the scan, at the predicted pose. It is no function of the pose, which bounds the cost of a
-pose by a tag. As E is tempered, so is the evidence on the state. The odds in a likelihood are those before its scan, so that no
-scan is used twice.
+weighted by their probabilities before the scan, at the predicted pose. It does not depend on the pose, so that the cost
+of a tag is bounded. E and the evidence on the state have the same tempering. The odds in a likelihood precede its scan, so that
+no scan is used twice.
 
 The share of moved tags is learnt as well, up to :data:`MOST_MOVED`: the more of the tags that were read have moved, the higher is
 the prior of the next one. The share has a beta prior with the mean of the rig.
@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 from factors import se2
 from factors.compiled import compiled
 from factors.gaussian import cholesky
-from factors.rfid.index import MapTags, Seen, delayed, near_tags
+from factors.rfid.index import Counts, MapTags, delayed, near_tags
 from factors.rfid.kernels import FAST, reach_of
 from factors.rfid.model import Packed
 from factors.rfid.parameters import adjusted
 from factors.rfid.tables import Tables
-from factors.rfid.weighing import FARTHEST_RATIO, fast_exp, mark_near, place_looks, tags_of_tables, weigh_tag
+from factors.rfid.weighing import FARTHEST_RATIO, fast_exp, mark_near, place_antennas, tags_of_tables, weigh_tag
 from factors.se2 import Array, Integers
 
 KEPT = 200.0  # s of evidence that can be taken back
@@ -41,7 +41,7 @@ BELIEVED = 0.5  # probability above which a tag is believed to be dead, weak or 
 LIMIT = math.log(BELIEVED / (1.0 - BELIEVED))
 PITCH, FARTHEST = 0.5, 1.5  # m: of the grid of displacements, and the largest of them
 WORTH = 20.0  # tags that were read: what the prior of the share of moved ones is worth
-# largest learnt share: a wrong pose or a wrong model is likelier than a map of which more tags have moved
+# largest learnt share: beyond it a wrong pose or model is likelier than so many moved tags
 MOST_MOVED = 0.15
 # weak tags: changes of the logarithm of the range and of the logit of the read rate, as of the parameters of a detection model
 # (:mod:`factors.rfid.parameters`), and their shares
@@ -85,13 +85,13 @@ class TagStates:
         self.odds: Array = np.full(count, self.prior)  # log-odds (T,) of not as surveyed against as surveyed
         self._doubtful: Integers | None = None  # not known
         # time, tags, and the log-likelihoods of their states
-        self._told: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
-        self._heard = -math.inf
+        self._evidence: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
+        self._last_read = -math.inf
 
     @property
-    def heard(self) -> float:
+    def last_read(self) -> float:
         """Time of the last read [s], ``-inf`` if there was none."""
-        return self._heard
+        return self._last_read
 
     @property
     def doubtful(self) -> Integers:
@@ -127,34 +127,34 @@ class TagStates:
             if _hear(self._weights, self.odds, tags):
                 self._doubtful = None
             self._raise_prior()
-            self._heard = max(self._heard, t)
+            self._last_read = max(self._last_read, t)
 
-    def expect(self, tags: Integers, told: Array) -> Array:
-        """The log-likelihood (U,) of a scan's reads and misses of U ``tags`` that are not as surveyed. ``told`` (U, S): the
+    def expect(self, tags: Integers, evidence: Array) -> Array:
+        """The log-likelihood (U,) of a scan's reads and misses of U ``tags`` that are not as surveyed. ``evidence`` (U, S): the
         log-likelihoods for each of the ``hypotheses``, relative to a silence out of range."""
-        return _expected(self._weights, tags, told)
+        return _expected(self._weights, tags, evidence)
 
-    def learn(self, t: float, tags: Integers, told: Array) -> None:
-        """Add the log-likelihoods ``told`` (U, S) of U ``tags`` at ``t``, see :meth:`expect`."""
+    def learn(self, t: float, tags: Integers, evidence: Array) -> None:
+        """Add the log-likelihoods ``evidence`` (U, S) of U ``tags`` at ``t``, see :meth:`expect`."""
         if len(tags):
-            self._told.append((t, tags, told.astype(np.float32)))
-            self._add(tags, self._told[-1][2], 1.0)
-        while self._told and self._told[0][0] < t - KEPT:
-            self._told.popleft()
+            self._evidence.append((t, tags, evidence.astype(np.float32)))
+            self._add(tags, self._evidence[-1][2], 1.0)
+        while self._evidence and self._evidence[0][0] < t - KEPT:
+            self._evidence.popleft()
 
     def forget(self, since: float) -> None:
         """Take back what was learnt since ``since``, at most :data:`KEPT` seconds: the robot was elsewhere, or it will be processed
         again. That a tag was read is kept."""
         kept: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
-        for row in self._told:
+        for row in self._evidence:
             if row[0] < since:
                 kept.append(row)
             else:
                 self._add(row[1], row[2], -1.0)
-        self._told = kept
+        self._evidence = kept
 
-    def _add(self, tags: Integers, told: NDArray[np.float32], sign: float) -> None:
-        if _learn(self._weights, self.odds, tags, told, sign):
+    def _add(self, tags: Integers, evidence: NDArray[np.float32], sign: float) -> None:
+        if _learn(self._weights, self.odds, tags, evidence, sign):
             self._doubtful = None
         self._raise_prior()
 
@@ -190,7 +190,7 @@ def displaced(
     packed: Packed,
     tables: Tables,
     of_map: MapTags,
-    seen: Seen,
+    counts: Counts,
     poses: Array,
     margin: float,
     odds: Array,
@@ -200,19 +200,19 @@ def displaced(
 ) -> tuple[Integers, Array, NDArray[np.bool_]]:
     """See :meth:`factors.rfid.detection.RfidLikelihood.displaced`."""
     placed = adjusted(packed, parameters)
-    looks = delayed(seen[0], seen[8], placed.delay), seen[1], seen[2]
-    reach = margin + reach_of(placed, looks[0])
-    near = near_tags(of_map, seen, poses, reach)
-    tags, heard = tags_of_tables(tables, near), np.zeros(len(near.tags), np.bool_)
-    for u in range(len(heard)):
-        for k in range(len(looks[1])):
-            heard[u] |= near.hits[k, u] > 0
-    kept = np.empty(len(heard), np.bool_)
+    measured = delayed(counts[0], counts[8], placed.delay), counts[1], counts[2]
+    reach = margin + reach_of(placed, measured[0])
+    near = near_tags(of_map, counts, poses, reach)
+    tags, read = tags_of_tables(tables, near), np.zeros(len(near.tags), np.bool_)
+    for u in range(len(read)):
+        for k in range(len(measured[1])):
+            read[u] |= near.hits[k, u] > 0
+    kept = np.empty(len(read), np.bool_)
     mark_near(poses, tags, reach, kept)
-    for u in range(len(heard)):
-        kept[u] = (kept[u] or heard[u]) and odds[near.tags[u]] > -np.inf
-    found = np.flatnonzero(kept)
-    out = np.empty((len(found), len(hypotheses)))
+    for u in range(len(read)):
+        kept[u] = (kept[u] or read[u]) and odds[near.tags[u]] > -np.inf
+    chosen = np.flatnonzero(kept)
+    out = np.empty((len(chosen), len(hypotheses)))
     each = len(poses)
     size = len(hypotheses) * each
     # reads of a tag that was moved are those of the map's tag from poses that were moved the other way
@@ -224,12 +224,12 @@ def displaced(
         for m in range(len(packed.kinds)):
             changed[i, 2 * m] += state[2]
             changed[i, 2 * m + 1] += state[3]
-    at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
+    at, models = np.empty((len(measured[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
     own, product, room = np.empty(size), np.empty(size), np.empty(size)
-    place_looks(placed, moved, looks, changed, parameters, at, models)
-    matters = np.ones(len(looks[1]), np.bool_)
-    for u in range(len(found)):
-        weigh_tag(packed, tables, at, models, size, looks, tags, found[u], matters, own, product, room)
+    place_antennas(placed, moved, measured, changed, parameters, at, models)
+    matters = np.ones(len(measured[1]), np.bool_)
+    for u in range(len(chosen)):
+        weigh_tag(packed, tables, at, models, size, measured, tags, chosen[u], matters, own, product, room)
         for i in range(len(hypotheses)):
             most = own[i * each]
             for n in range(i * each + 1, (i + 1) * each):
@@ -244,20 +244,20 @@ def displaced(
             for n in range(i * each, (i + 1) * each):
                 mean += own[n] / each
             out[u, i] += math.log(mean)
-    return near.tags[found], out, heard[found]
+    return near.tags[chosen], out, read[chosen]
 
 
 @compiled
-def _log_sum(weights: Array, told: Array) -> float:
-    """The logarithm of the sum of the exponentials of ``weights`` and ``told`` (N,)."""
+def _log_sum(weights: Array, evidence: Array) -> float:
+    """The logarithm of the sum of the exponentials of ``weights`` + ``evidence`` (N,)."""
     most = -math.inf
     for k in range(len(weights)):
-        most = max(most, weights[k] + told[k])
+        most = max(most, weights[k] + evidence[k])
     if most == -math.inf:
         return -math.inf
     total = 0.0
     for k in range(len(weights)):
-        total += math.exp(weights[k] + told[k] - most)
+        total += math.exp(weights[k] + evidence[k] - most)
     return float(most + math.log(total))
 
 
@@ -268,14 +268,14 @@ def _odds(weights: Array) -> float:
 
 
 @compiled
-def _expected(weights: Array, tags: Integers, told: Array) -> Array:
+def _expected(weights: Array, tags: Integers, evidence: Array) -> Array:
     out, added = np.empty(len(tags)), np.zeros(weights.shape[1] - DEAD)
     for u in range(len(tags)):
-        others = weights[tags[u], DEAD:]
+        unsurveyed = weights[tags[u], DEAD:]
         added[:] = 0.0
-        before = _log_sum(others, added)
-        added[1:] = told[u, 1:]
-        out[u] = -np.inf if before == -np.inf else _log_sum(others, added) - before
+        prior = _log_sum(unsurveyed, added)
+        added[1:] = evidence[u, 1:]
+        out[u] = -np.inf if prior == -np.inf else _log_sum(unsurveyed, added) - prior
     return out
 
 
@@ -286,21 +286,21 @@ def _hear(weights: Array, odds: Array, tags: Integers) -> bool:
     for t in tags:
         if weights[t, DEAD] > -np.inf:
             weights[t, DEAD] = -np.inf
-            before, odds[t] = odds[t], _odds(weights[t])
-            changed |= (before > LIMIT) != (odds[t] > LIMIT)
+            old_odds, odds[t] = odds[t], _odds(weights[t])
+            changed |= (old_odds > LIMIT) != (odds[t] > LIMIT)
     return changed
 
 
 @compiled
-def _learn(weights: Array, odds: Array, tags: Integers, told: NDArray[np.float32], sign: float) -> bool:
+def _learn(weights: Array, odds: Array, tags: Integers, evidence: NDArray[np.float32], sign: float) -> bool:
     """Add log-likelihoods. Returns whether another set of tags is doubtful."""
     changed = False
     for u in range(len(tags)):
-        of_tag, before = weights[tags[u]], odds[tags[u]]
-        for k in range(told.shape[1]):
-            of_tag[k if k < DEAD else k + 1] += sign * told[u, k]
+        of_tag, old_odds = weights[tags[u]], odds[tags[u]]
+        for k in range(evidence.shape[1]):
+            of_tag[k if k < DEAD else k + 1] += sign * evidence[u, k]
         odds[tags[u]] = _odds(of_tag)
-        changed |= (before > LIMIT) != (odds[tags[u]] > LIMIT)
+        changed |= (old_odds > LIMIT) != (odds[tags[u]] > LIMIT)
     return changed
 
 
@@ -311,7 +311,7 @@ def _all_odds(weights: Array) -> Array:
 
 @compiled
 def _raised(weights: Array, odds: Array, moved: float, raised: float) -> float:
-    """The logarithm by which the prior of moved tags rises, by the share of moved ones among the tags that were read.
+    """The increase of the log prior of moved tags, from the share of moved tags among those that were read.
 
     More tags are believed to have moved with a higher prior. The result is the lowest prior that explains itself, which depends on
     the evidence only, not on its order. ``weights`` (T, W) and ``odds`` (T,) are those with a prior that has risen by ``raised``.
@@ -333,10 +333,10 @@ def _raised(weights: Array, odds: Array, moved: float, raised: float) -> float:
             candidates += 1
     out = 0.0
     while True:
-        found = 0
+        moved_tags = 0
         for i in range(candidates):
-            found += unraised[i] + out > LIMIT
-        share = min((WORTH * moved + found) / (WORTH + read), most)
+            moved_tags += unraised[i] + out > LIMIT
+        share = min((WORTH * moved + moved_tags) / (WORTH + read), most)
         higher = math.log(max(share / moved, 1.0))
         if higher <= out:
             return out

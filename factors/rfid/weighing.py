@@ -1,6 +1,6 @@
 """Likelihoods of reads and misses for many poses that are near each other, as particles, from tables.
 
-The looks of all antennas at a tag are the factors of one product, of which only the whole has a logarithm. The inner loops run over
+The logarithm is taken once per tag, of the product over the measurements of all antennas. The inner loops run over
 poses, which access nearby cells of a table for one tag, and use vector registers: also for logarithms and exponentials, which the
 library computes one by one.
 """
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
-from factors.rfid.index import MapTags, NearTags, Seen, delayed, near_tags
+from factors.rfid.index import Counts, MapTags, NearTags, delayed, near_tags
 from factors.rfid.kernels import FAST, reach_of
 from factors.rfid.model import LOGISTIC, NEGLIGIBLE_LOGIT, Packed
 from factors.rfid.parameters import MOST_CERTAIN, adjusted
@@ -19,11 +19,11 @@ from factors.rfid.tables import CELL, NEGLIGIBLE, Measured, Tables, Tags, releva
 from factors.se2 import Array, Integers
 
 BLOCK = 512  # poses at a time, so that what is needed of them stays in the cache
-FARTHEST_RATIO = 20.0  # log of the ratio of two likelihoods of which the smaller one does not count
+FARTHEST_RATIO = 20.0  # log of the ratio of two likelihoods above which the smaller one is neglected
 LEAST = 1e-12  # probability of a read, and of a miss
-PRODUCT = 20  # factors of at least LEAST, of which a product is no underflow
-SHIFT = 0.05  # of the logit of a model's peak, to which it is rounded, as in tables of places
-MIXED = 500  # factors up to two, of which a product is no overflow
+PRODUCT = 20  # factors of at least LEAST: their product does not underflow
+SHIFT = 0.05  # rounding of the logit of a model's peak, as in tables of places
+MIXED = 500  # factors up to two: their product does not overflow
 
 _MANTISSA, _HALF = 0x000FFFFFFFFFFFFF, 0x3FE0000000000000  # bits of a number, and of 0.5
 
@@ -33,27 +33,27 @@ def log_likelihood(
     packed: Packed,
     tables: Tables,
     of_map: MapTags,
-    seen: Seen,
+    counts: Counts,
     poses: Array,
     tempering: float,
     parameters: Array,
 ) -> Array:
-    """The tempered log-likelihood (N,) of what was ``seen`` of a map's tags, for poses (N, 3) with ``parameters`` (N or 1, Q)."""
+    """The tempered log-likelihood (N,) of what was ``counts`` of a map's tags, for poses (N, 3) with ``parameters`` (N or 1, Q)."""
     first_row = adjusted(packed, parameters[0])
-    looks = delayed(seen[0], seen[8], first_row.delay), seen[1], seen[2]
+    measured = delayed(counts[0], counts[8], first_row.delay), counts[1], counts[2]
     widest = parameters[0].copy()
     for n in range(1, len(parameters)):
         for i in range(len(widest)):
             widest[i] = max(widest[i], parameters[n, i])
-    reach = reach_of(adjusted(packed, widest), looks[0])
+    reach = reach_of(adjusted(packed, widest), measured[0])
     if len(parameters) > 1:
-        poses = delayed(poses, seen[8], parameters[:, -1] - parameters[0, -1])
-    near = near_tags(of_map, seen, poses, reach)
+        poses = delayed(poses, counts[8], parameters[:, -1] - parameters[0, -1])
+    near = near_tags(of_map, counts, poses, reach)
     tags, odds, elsewhere = tags_of_tables(tables, near), near.odds, near.elsewhere
     near_enough = np.empty(len(odds), np.bool_)
     mark_near(poses, tags, reach, near_enough)
-    matters = relevant(first_row, tables, poses, looks, parameters, tags, near_enough, tempering)
-    base = tempering * len(of_map.points) * _silence(packed, looks[2])
+    matters = relevant(first_row, tables, poses, measured, parameters, tags, near_enough, tempering)
+    base = tempering * len(of_map.points) * _silence(packed, measured[2])
     none = packed.false_read + packed.span / (1.0 + math.exp(-NEGLIGIBLE_LOGIT))
     for t in range(len(odds)):
         hits = near.hits[:, t].sum()
@@ -61,33 +61,33 @@ def log_likelihood(
             base += mixed(tempering * hits * (math.log(none) - math.log1p(-none)), odds[t], elsewhere[t])
     out = np.full(len(poses), base)
     size = min(BLOCK, len(poses))
-    at, models = np.empty((len(looks[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
+    at, models = np.empty((len(measured[1]), 4, size)), np.empty((len(packed.kinds), 2, size))
     own, product, room, ratios = np.empty(size), np.empty(size), np.empty(size), np.ones(size)
     for first in range(0, len(poses), size):
         count = min(size, len(poses) - first)
-        found = out[first : first + count]
+        sums = out[first : first + count]
         own_parameters = parameters[first : first + count] if len(parameters) > 1 else parameters
-        place_looks(first_row, poses[first : first + count], looks, own_parameters, parameters[0], at, models)
+        place_antennas(first_row, poses[first : first + count], measured, own_parameters, parameters[0], at, models)
         factors = 0
         for t in range(len(odds)):
             if not near_enough[t]:
                 continue
-            weigh_tag(packed, tables, at, models, count, looks, tags, t, matters[:, t], own, product, room)
+            weigh_tag(packed, tables, at, models, count, measured, tags, t, matters[:, t], own, product, room)
             if odds[t] == -np.inf or elsewhere[t] == -np.inf:
                 for n in range(count):
-                    found[n] += tempering * own[n]
+                    sums[n] += tempering * own[n]
                 continue
-            other = odds[t] + elsewhere[t]
+            displaced = odds[t] + elsewhere[t]
             both = max(odds[t], 0.0) + math.log1p(math.exp(-abs(odds[t])))
             for n in range(count):
                 surveyed = tempering * own[n]
-                found[n] += max(surveyed, other) - both
-                ratios[n] *= 1.0 + fast_exp(-min(abs(surveyed - other), FARTHEST_RATIO))
+                sums[n] += max(surveyed, displaced) - both
+                ratios[n] *= 1.0 + fast_exp(-min(abs(surveyed - displaced), FARTHEST_RATIO))
             factors += 1
             if factors == MIXED:
-                _add_logs(ratios, count, found)
+                _add_logs(ratios, count, sums)
                 factors = 0
-        _add_logs(ratios, count, found)
+        _add_logs(ratios, count, sums)
     return out
 
 
@@ -96,16 +96,16 @@ def mixed(own: float, odds: float, elsewhere: float) -> float:
     """Log-likelihood of a tag that may be dead or moved; ``own``: that of the tag as surveyed."""
     if odds == -np.inf or elsewhere == -np.inf:
         return own
-    other = odds + elsewhere
+    displaced = odds + elsewhere
     both = max(odds, 0.0) + math.log1p(math.exp(-abs(odds)))
-    if abs(own - other) > NEGLIGIBLE:
-        return max(own, other) - both
-    return own + math.log1p(math.exp(other - own)) - both
+    if abs(own - displaced) > NEGLIGIBLE:
+        return max(own, displaced) - both
+    return own + math.log1p(math.exp(displaced - own)) - both
 
 
 @compiled
 def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
-    """What tables are needed of tags."""
+    """The rows of the tables that the near tags need."""
     levels = np.empty((len(tables.level), len(near.tags)), np.int64)
     for a in range(len(levels)):
         for u in range(len(near.tags)):
@@ -129,13 +129,13 @@ def mark_near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) ->
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def place_looks(
-    packed: Packed, poses: Array, looks: Measured, parameters: Array, placed: Array, at: Array, models: Array
+def place_antennas(
+    packed: Packed, poses: Array, measured: Measured, parameters: Array, placed: Array, at: Array, models: Array
 ) -> None:
-    """For each look ``at`` (K, 4, N): place of the antenna, cosine and sine of its heading; and for each of ``models`` (M, 2, N):
-    one over the scale of the range, and rate of the probabilities, at poses (N, 3) with ``parameters`` (N or 1, Q). ``placed``
-    (Q,): those of the mounting in ``packed``; others differ from it by half a radian at most."""
-    offsets, antennas, _ = looks
+    """Fill ``at`` (K, 4, N): x, y, cosine and sine of the heading of each measurement's antenna; and ``models`` (M, 2, N): inverse
+    range scale and rate of the probabilities. Poses (N, 3) have ``parameters`` (N or 1, Q). ``placed`` (Q,): the mounting in
+    ``packed``; yaws may differ from it by half a radian at most."""
+    offsets, antennas, _ = measured
     cosine, sine, yaw = np.empty(len(poses)), np.empty(len(poses)), 2 * len(models)
     for n in range(len(poses)):
         cosine[n], sine[n] = math.cos(poses[n, 2]), math.sin(poses[n, 2])
@@ -155,9 +155,9 @@ def place_looks(
             x[n], y[n] = poses[n, 0] + cosine[n] * dx - sine[n] * dy, poses[n, 1] + sine[n] * dx + cosine[n] * dy
             c[n], s[n] = cosine[n] * c1 - sine[n] * s1, sine[n] * c1 + cosine[n] * s1
         if len(parameters) == len(poses):
-            own, other = yaw + 1 + antennas[k], placed[yaw] + placed[yaw + 1 + antennas[k]]
+            own, reference = yaw + 1 + antennas[k], placed[yaw] + placed[yaw + 1 + antennas[k]]
             for n in range(len(poses)):
-                d = parameters[n, yaw] + parameters[n, own] - other
+                d = parameters[n, yaw] + parameters[n, own] - reference
                 c2 = 1.0 - d * d / 2.0 * (1.0 - d * d / 12.0)
                 s2 = d * (1.0 - d * d / 6.0 * (1.0 - d * d / 20.0))
                 c[n], s[n] = c2 * c[n] - s2 * s[n], s2 * c[n] + c2 * s[n]
@@ -179,7 +179,7 @@ def weigh_tag(
     at: Array,
     models: Array,
     count: int,
-    looks: Measured,
+    measured: Measured,
     tags: Tags,
     t: int,
     matters: NDArray[np.bool_],
@@ -187,9 +187,9 @@ def weigh_tag(
     product: Array,
     room: Array,
 ) -> None:
-    """The log-likelihood ``own`` (N,) of one tag above that of a silence out of reach, by those looks that matter (K,)."""
+    """The log-likelihood ``own`` (N,) of one tag relative to a silence out of reach, from the measurements that matter (K,)."""
     points, normals, levels, hits = tags
-    _, antennas, rounds = looks
+    _, antennas, rounds = measured
     silent, factors = -_silence(packed, rounds[matters]), 0
     for n in range(count):
         own[n], product[n] = silent, 1.0

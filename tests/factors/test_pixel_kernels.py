@@ -91,4 +91,4 @@ def test_pixels_of_uncertain_points_scatter_with_both(rng):
     factor, pose = seen(rng, inexact=True)
     _, _, by_point = reprojection.linearize_in_space(MODEL, *camera_pose(MODEL, pose), factor.points)
     expected = MODEL.sigma**2 * np.eye(2) + by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
-    np.testing.assert_allclose(pixel_kernels.spread(by_point, factor.point_covariances, MODEL.sigma), expected)
+    np.testing.assert_allclose(pixel_kernels.pixel_noise(by_point, factor.point_covariances, MODEL.sigma), expected)

@@ -33,7 +33,7 @@ def test_it_is_gtsam_s_factor_of_a_robot_in_space(error, tilt):
     loss = gtsam.noiseModel.mEstimator.Huber.Create(MODEL.robust)
     noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(2, MODEL.sigma))
     mounted = gtsam.Pose3(gtsam.Rot3(MODEL.rotation), MODEL.position)
-    theirs = gtsam.GenericProjectionFactorCal3DS2(factor.seen, noise, 0, 1, MODEL.calibration(), mounted)
+    theirs = gtsam.GenericProjectionFactorCal3DS2(factor.pixel, noise, 0, 1, MODEL.calibration(), mounted)
     values = gtsam.Values()
     values.insert(0, robot)
     values.insert(1, POINT)
@@ -56,7 +56,7 @@ def test_its_jacobians_are_the_numerical_ones(estimated):
 @pytest.mark.parametrize("estimated", [(), ESTIMATED])
 def test_many_are_linearised_as_each_by_itself(estimated):
     rng = np.random.default_rng(0)
-    pixels = seen().seen + rng.normal(0.0, 5.0, (4, 2))
+    pixels = seen().pixel + rng.normal(0.0, 5.0, (4, 2))
     factors = [
         PointFactor(MODEL, lens_of(MODEL), pixel, estimated, (1.0 + i) * TWIST) for i, pixel in enumerate(pixels)
     ]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts, together
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts, merged
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, RfidModel
 
@@ -29,7 +29,7 @@ def scene(seed=0):
     whole = TagReadCounts(offsets, np.arange(len(ANTENNAS)), rounds, hits, odds, elsewhere)
     tags = np.flatnonzero(hits.any(axis=0) | (odds != PRIOR))
     listed = {"hits": np.ascontiguousarray(hits[:, tags]), "odds": odds[tags], "elsewhere": elsewhere[tags]}
-    return likelihood, whole, replace(whole, **listed, tags=tags, others=PRIOR)
+    return likelihood, whole, replace(whole, **listed, tags=tags, unlisted_odds=PRIOR)
 
 
 def displaced(likelihood, poses, looks):
@@ -102,10 +102,10 @@ def test_merged_counts_list_what_any_of_them_lists():
     _, whole, some = scene(0)
     _, other, fewer = scene(1)
     fewer = replace(fewer, odds=np.full(len(fewer.listed), 3.0))
-    whole_of_two, of_two = together([whole, other]), together([some, fewer])
+    whole_of_two, of_two = merged([whole, other]), merged([some, fewer])
     assert set(of_two.listed) == set(some.listed) | set(fewer.listed)
     at = np.searchsorted(of_two.listed, some.listed)
     assert np.array_equal(of_two.odds[at], some.odds)
     assert np.array_equal(of_two.hits, whole_of_two.hits[:, of_two.listed])
     assert of_two.elsewhere == pytest.approx(whole_of_two.elsewhere[of_two.listed])
-    assert set(of_two.heard) == set(np.flatnonzero(whole_of_two.hits.any(axis=0)))
+    assert set(of_two.read_tags) == set(np.flatnonzero(whole_of_two.hits.any(axis=0)))

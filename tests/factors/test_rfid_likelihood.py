@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numerical import by_pose
 
 from factors import se2
-from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts, together
+from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts, merged
 from factors.rfid.factor import RfidFactor
 from factors.rfid.model import Antenna, BeamModel, DetectionModel, LogisticModel, RfidModel, bake, probability
 
@@ -138,7 +138,7 @@ def test_one_read_and_one_silence_by_hand() -> None:
 def test_looks_around_one_pose_add_up() -> None:
     likelihood, looks = scene(BeamModel())
     moved = looks.moved(np.array((0.2, 0.0, 0.1)))
-    both = likelihood.score(POSE, together([looks, moved])).nll[0]
+    both = likelihood.score(POSE, merged([looks, moved])).nll[0]
     apart = likelihood.score(POSE, looks).nll[0] + likelihood.score(se2.compose(POSE, (0.2, 0.0, 0.1)), looks).nll[0]
     assert both == pytest.approx(apart, rel=1e-12)
 

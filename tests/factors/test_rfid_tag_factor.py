@@ -53,7 +53,7 @@ def test_it_says_of_the_pose_and_of_the_place_what_the_likelihood_says_of_each(s
     subject, (pose, place) = factor(LOGISTIC, seed)
     nll, gradient, information = subject.score([pose, place])
     one = TagReadCounts(
-        subject.looks.offsets, subject.looks.antennas, subject.looks.rounds, subject.looks.hits[:, 1:2].copy()
+        subject.counts.offsets, subject.counts.antennas, subject.counts.rounds, subject.counts.hits[:, 1:2].copy()
     )
     tags = subject.likelihood.tags
     there = TagArray(np.array([[*place, tags.points[1, 2]]]), tags.facing[1:2])

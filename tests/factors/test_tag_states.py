@@ -65,7 +65,7 @@ def test_a_tag_that_was_read_is_not_dead_but_may_be_weak_or_have_moved() -> None
     assert not states.were_read(TAG)[0]
     states.hear(4.0, TAG)
     assert states.were_read(TAG)[0]
-    assert states.heard == 4.0
+    assert states.last_read == 4.0
     assert np.exp(states.odds) == pytest.approx(0.2 / 0.5)
     states.learn(4.0, TAG, told(-7.0, -7.0, -1.0))
     assert list(states.suspects["moved"]) == [0]

@@ -294,7 +294,7 @@ def _agreeing(here: ReprojectionFactor, camera: CameraPose, focal: float) -> Tru
         spreads[:, (0, 1), (0, 1)] = model.sigma**2
     else:
         _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, here.points)
-        spreads = pixel_kernels.spread(by_point, here.point_covariances, float(model.sigma))
+        spreads = pixel_kernels.pixel_noise(by_point, here.point_covariances, float(model.sigma))
     if focal > 0.0:
         away = focal * (here.pixels - (model.cx, model.cy))
         spreads = spreads + away[:, :, None] * away[:, None, :]

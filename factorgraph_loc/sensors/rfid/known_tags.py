@@ -230,7 +230,7 @@ class KnownTags:
 
     def silent(self) -> None:
         """Take back what was learnt since the last read, because the reader or all tags have failed."""
-        self.forget(math.nextafter(self.states.heard, math.inf))
+        self.forget(math.nextafter(self.states.last_read, math.inf))
 
     def _tell(self) -> None:
         for state, tags in self.states.suspects.items():

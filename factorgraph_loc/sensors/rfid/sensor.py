@@ -28,7 +28,7 @@ from factorgraph_loc.sensors.rfid.monitor import (
 from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factors import positive
 from factors.graph import Factor
-from factors.rfid.detection import RfidLikelihood, TagReadCounts, together
+from factors.rfid.detection import RfidLikelihood, TagReadCounts, merged
 from factors.rfid.factor import ITERATIONS, NO_VALUES, RfidFactor
 from factors.se2 import Array
 from factors.update import Correction
@@ -66,15 +66,15 @@ class TagObservation:
     @property
     def things(self) -> frozenset[Hashable]:
         """The tags that were read, by index in the map."""
-        looks = self.factor.seen
-        return frozenset(looks.heard.tolist()) if isinstance(looks, TagReadCounts) else frozenset()
+        looks = self.factor.reads
+        return frozenset(looks.read_tags.tolist()) if isinstance(looks, TagReadCounts) else frozenset()
 
     def at_its_time(self) -> Self | None:
         """The reads and misses at their own time; None for strength and phase, whose likelihoods are multimodal."""
         if self.here is None:
             return None
         likelihood = self.factor.likelihood if self.settled is None else self.settled
-        return replace(self, factor=replace(self.factor, likelihood=likelihood, seen=self.here))
+        return replace(self, factor=replace(self.factor, likelihood=likelihood, reads=self.here))
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -207,8 +207,8 @@ class TagSensor(Sensor):
     def _count(self, observation: TagObservation, view: View) -> None:
         """Count reads and misses against what is expected of them, temper by how they go together, and doubt the models."""
         assert self.tags.likelihood is not None
-        assert isinstance(observation.factor.seen, TagReadCounts)
-        t, looks, states = observation.t, observation.factor.seen, self.tags.states
+        assert isinstance(observation.factor.reads, TagReadCounts)
+        t, looks, states = observation.t, observation.factor.reads, self.tags.states
         reads = self.tags.likelihood.expected(view.pose, looks, self._estimated(view))
         surveyed = states.odds[reads.tags] <= 0.0
         self._bursts.add(t, looks, reads, surveyed)
@@ -282,15 +282,15 @@ class TagSensor(Sensor):
         terms: list[Term] = []
         for observation in observations:
             factor = observation.factor
-            if isinstance(factor.seen, TagReadCounts):
-                counts.append(factor.seen)
+            if isinstance(factor.reads, TagReadCounts):
+                counts.append(factor.reads)
             else:
                 terms.append(Term(factor, (), factor.rows))
         if counts and self.tags.likelihood is not None:
-            factor, blocks = RfidFactor(self.tags.likelihood, together(counts), self.constants.indices), self._blocks
+            factor, blocks = RfidFactor(self.tags.likelihood, merged(counts), self.constants.indices), self._blocks
             fixed = next((o.factor for o in observations if o.is_judged and not o.blocks), None)
             if blocks and fixed is not None:
-                factor, blocks = replace(fixed, seen=factor.seen), ()
+                factor, blocks = replace(fixed, reads=factor.reads), ()
             terms.append(Term(factor, blocks, factor.rows))
         return terms
 
@@ -300,9 +300,9 @@ class TagSensor(Sensor):
         factor = cast(RfidFactor, factor)
         if width > 1.0 and factor.is_phase:
             return None
-        if not isinstance(factor.seen, TagReadCounts):
+        if not isinstance(factor.reads, TagReadCounts):
             return factor
-        return replace(factor, seen=self.tags.without_doubtful(factor.seen))
+        return replace(factor, reads=self.tags.without_doubtful(factor.reads))
 
     def rewind(self, t: float) -> None:
         self.tags.forget(math.nextafter(t, math.inf))

@@ -69,7 +69,7 @@ def test_a_window_is_a_factor_of_the_reads_that_are_near():
     window = kept.phases(offsets, np.zeros(3))
     assert window is not None
     assert window.is_phase
-    assert len(window.seen.phase) == 6
+    assert len(window.reads.phase) == 6
     assert kept.phases(offsets, np.array((5.0, 5.0, 0.0))) is None
 
 
