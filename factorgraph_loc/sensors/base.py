@@ -57,7 +57,7 @@ class Observation(Protocol):
     def found(self) -> int: ...
     @property
     def work(self) -> int:
-        """How many things are looked at to tell the likelihood of one pose, about."""
+        """The approximate number of elements that enter the likelihood of one pose."""
 
     @property
     def things(self) -> frozenset[Hashable]:
@@ -142,7 +142,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Binding:
-    """What a sensor is bound to: a run, the robot's ``motion`` and the diagnostics.
+    """The context of a sensor: a run, the robot's ``motion`` and the diagnostics.
 
     ``name``: of the sensor, "" for its modality. ``use``: how landmarks of the map are used, ``points``: how its points are
     used; ``calibration``: which uncertain constants the estimator learns.
@@ -200,7 +200,7 @@ class View(Protocol):
 
 
 class Finder(Protocol):
-    """Finds the pose from the measurements of one sensor without a prediction, for an unknown start or a kidnapped robot.
+    """Finds the pose from the measurements of one sensor without a prediction: at an unknown start or after a kidnapping.
 
     ``start``: the known start position if only the heading is sought. ``at_once``: whether one measurement may be enough.
     """
@@ -249,12 +249,12 @@ class Sensor:
     ``modality``: of its measurements; ``name``: of this sensor, by default the modality. ``constants``: those that are
     estimated, as a block with this name; ``follows_constants``: whether their covariance is needed during the run.
     ``finder``: localizes without a prediction. ``bounds`` (2, 2) [m]: lower and upper corner of the area where the robot may
-    be, for a sensor that can only weigh poses. ``work``: of taking a measurement into a graph, about, where that of a tag is
+    be, if the sensor can only weigh poses. ``work``: approximate cost of adding a measurement to a graph, where a tag costs
     1. ``evidence_every`` [s]: interval of informative measurements in a search. ``lost``: reason why a track is given up.
 
     For graphs: ``keyframe_every`` [s]: interval between keyframes; ``gathers``: whether the observations on a pose are merged
     when the next pose begins; ``solve_every`` [s]: longest delay of a solver update; ``links``: whether its factors are on two
-    poses (:class:`Link`), of which many may be false.
+    poses (:class:`Link`); many of these may be false.
     """
 
     modality: ClassVar[str]
@@ -372,10 +372,10 @@ class ResidualObservation:
             parts = []
             for term, factor in zip(self.terms, self.factors, strict=True):
                 moved = [values[name] + delta[columns[name]] for name in term.blocks]
-                residual, (by_pose, *others) = factor.whitened([at, *moved])
+                residual, (by_pose, *by_values) = factor.whitened([at, *moved])
                 jacobian = np.zeros((*residual.shape, size))
                 jacobian[..., :3] = by_pose
-                for name, block in zip(term.blocks, others, strict=True):
+                for name, block in zip(term.blocks, by_values, strict=True):
                     jacobian[..., columns[name]] = block
                 parts.append((residual, jacobian))
             return np.concatenate([r for r, _ in parts]), np.concatenate([j for _, j in parts])

@@ -1,4 +1,4 @@
-"""What functions of sensors take and return: the use of a sensor in a run, its summary for ``fgloc info``, what is drawn of it,
+"""Arguments and results of the functions of sensors: the use of a sensor in a run, its summary for ``fgloc info``, its drawings,
 simulated drives, and the expected information along a planned path."""
 
 from collections.abc import Callable, Collection, Container, Mapping, Sequence
@@ -34,8 +34,8 @@ Places = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Use:
-    """A run of a log. ``sensors``: names of usable channels; ``estimator``: its name, with ``settings``, of which ``given`` are by
-    the user; ``modalities``: of measurements that it uses; ``estimates_points``: whether it may estimate points that are not in the
+    """A run of a log. ``sensors``: names of usable channels; ``estimator``: its name, with ``settings``; ``given``: those of the
+    user; ``modalities``: of measurements that it uses; ``estimates_points``: whether it may estimate points that are not in the
     map; ``warnings``: one line each."""
 
     log: Log
@@ -61,7 +61,7 @@ class Ending:
 
 @dataclass(frozen=True)
 class Review:
-    """What a sensor says of a run that has ended: ``warnings``, one line each, and the ``reliability`` of its model."""
+    """The review of a finished run by a sensor: ``warnings``, one line each, and the ``reliability`` of its model."""
 
     warnings: tuple[str, ...] = ()
     reliability: Reliability | None = None
@@ -73,7 +73,7 @@ def lacking_section(rig: Rig, sensor: str) -> str:
     if known is None or not known.section or getattr(rig, known.section, None) is not None:
         return ""
     fields = load(sensor_of(sensor).settings[known.section].kind).model_fields.values()
-    return known.section if any(one.is_required() for one in fields) else ""
+    return known.section if any(required.is_required() for required in fields) else ""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A start with known position and unknown heading, for the search of the pose.
+"""A start with known position and unknown heading, used by the search of the pose.
 
 The prior is Gaussian in the position and uniform in the heading. Propagated along the odometry, it is one more constraint on the
 current pose and generates hypotheses.
@@ -67,10 +67,10 @@ class KnownPosition:
         poses = se2.compose(np.column_stack((positions, headings)), moved.delta)
         return se2.compose(poses, se2.exp(positive.draws(moved.covariance, count, rng)))
 
-    def loss(self, poses: Array, now: ChainState, spread: Array | None = None) -> Array:
-        """Half the squared Mahalanobis distance (N,) of current poses (N, 3) from the start. ``spread`` (3, 3): body-frame
+    def loss(self, poses: Array, now: ChainState, noise: Array | None = None) -> Array:
+        """Half the squared Mahalanobis distance (N,) of current poses (N, 3) from the start. ``noise`` (3, 3): body-frame
         covariance of the current poses."""
-        error, _, covariance = self._linearized(poses, now, spread)
+        error, _, covariance = self._linearized(poses, now, noise)
         return np.asarray(0.5 * np.einsum("ni,ni->n", error, positive.solve(covariance, error[..., None])[..., 0]))
 
     def log_density(self, poses: Array, now: ChainState) -> Array:
@@ -79,9 +79,9 @@ class KnownPosition:
         normaliser = 0.5 * np.linalg.slogdet(2.0 * math.pi * covariance)[1] + math.log(2.0 * math.pi)
         return np.asarray(-self.loss(poses, now) - normaliser)
 
-    def normal_equations(self, poses: Array, now: ChainState, spread: Array | None = None) -> tuple[Array, Array]:
+    def normal_equations(self, poses: Array, now: ChainState, noise: Array | None = None) -> tuple[Array, Array]:
         """Information (N, 3, 3) and gradient (N, 3) of the loss by the body-frame perturbation of current poses (N, 3)."""
-        error, jacobian, covariance = self._linearized(poses, now, spread)
+        error, jacobian, covariance = self._linearized(poses, now, noise)
         weighted = positive.solve(covariance, jacobian).transpose(0, 2, 1)
         return weighted @ jacobian, (weighted @ error[..., None])[..., 0]
 
@@ -93,7 +93,7 @@ class KnownPosition:
         moved = self.motion.relative(self.odometry, now)
         return np.linalg.solve(root, error[0]), np.linalg.solve(root, jacobian[0]), moved.covariance
 
-    def _linearized(self, poses: Array, now: ChainState, spread: Array | None) -> tuple[Array, Array, Array]:
+    def _linearized(self, poses: Array, now: ChainState, noise: Array | None) -> tuple[Array, Array, Array]:
         """Start positions of poses (N, 3) minus the mean (N, 2), their Jacobian (N, 2, 3), and covariance (N, 2, 2)."""
         moved = self.motion.relative(self.odometry, now)
         back = se2.inverse(moved.delta)
@@ -101,5 +101,5 @@ class KnownPosition:
         c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
         turn: Array = np.array(((c, -s), (s, c))).transpose(2, 0, 1)
         jacobian = turn @ np.array(((1.0, 0.0, -back[1]), (0.0, 1.0, back[0])))
-        drift = moved.covariance if spread is None else moved.covariance + spread
+        drift = moved.covariance if noise is None else moved.covariance + noise
         return error, jacobian, self.prior.covariance[:2, :2] + jacobian @ drift @ jacobian.transpose(0, 2, 1)

@@ -132,9 +132,9 @@ class Motion(OdometryChain):
         if not self.constants.names:
             return deltas
         changes, moved, later = self.constants.full(constants, len(PARAMETERS)), se2.log(deltas), t - start.t
-        ways, moving = np.sign(later) * np.hypot(moved[:, 0], moved[:, 1]), later - (states[:, 7] - start.still)
+        distances, moving = np.sign(later) * np.hypot(moved[:, 0], moved[:, 1]), later - (states[:, 7] - start.still)
         moved[:, :2] *= 1.0 + changes[0]
-        moved[:, 2] += changes[1] * moved[:, 2] - changes[2] * moving + changes[3] * ways
+        moved[:, 2] += changes[1] * moved[:, 2] - changes[2] * moving + changes[3] * distances
         return np.asarray(se2.exp(moved))
 
     def slip(self, increment: Increment) -> tuple[Array, float]:

@@ -107,7 +107,7 @@ def sections_of(sensor: SensorType) -> dict[str, list[Setting]]:
 
 
 def about(name: str) -> str:
-    """The first sentence of what a sensor's package says of itself."""
+    """The first sentence of the docstring of a sensor's package."""
     return first_sentence(load(SENSORS.place(name).partition(":")[0]))
 
 
@@ -135,7 +135,7 @@ def moving(names: Iterable[str], rank: int = 0) -> tuple[str, ...]:
 
 
 def parent_of(channel: str) -> str:
-    """The channel of which ``channel`` is an optional column, or ""."""
+    """The channel with ``channel`` as an optional column, or ""."""
     known = channels().get(channel)
     return "" if known is None or known.streams else sensor_of(channel).channels[0].name
 

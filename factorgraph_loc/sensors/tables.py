@@ -59,7 +59,7 @@ def tables_of(channel: Channel) -> tuple[Table, ...]:
 def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
     """The channel and the descriptions of each table of a log, by table name."""
     return {
-        table.name: (channel, tuple(other for other in tables_of(channel) if other.name == table.name))
+        table.name: (channel, tuple(candidate for candidate in tables_of(channel) if candidate.name == table.name))
         for channel in channels().values()
         for table in tables_of(channel)
     }
@@ -124,7 +124,7 @@ def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[str]) ->
 
 
 def _all_empty(columns: Sequence[Array]) -> NDArray[np.bool_]:
-    """The rows (N,) in which no column has a number."""
+    """Whether each row (N,) has no number in any column."""
     return np.asarray(np.isnan(columns).all(axis=0))
 
 
@@ -163,7 +163,7 @@ M = TypeVar("M", bound=Measurement)
 
 
 class Intake:
-    """What a channel does with measurements that a program pushes, one after the other."""
+    """A channel's processing of measurements that a program pushes one by one."""
 
     def measured(self, m: Measurement) -> Measurement:
         """The measurement that estimators take, such as the features of an image. Called in any thread."""
@@ -182,7 +182,7 @@ def kinds() -> Mapping[type[Any], Channel]:
 def channel_of(kind: type[Any]) -> Channel:
     """The channel of a measurement's class; InputError if it is not one."""
     if kind not in kinds():
-        known = ", ".join(one.__name__ for one in kinds())
+        known = ", ".join(each.__name__ for each in kinds())
         raise InputError(f"{kind.__name__} is not a measurement, expected one of {known}")
     return kinds()[kind]
 
@@ -202,8 +202,8 @@ def checked(m: M) -> M:
     where = f"{type(m).__name__} at {t:.3f} s"
     if not isinstance(m.source, str):
         raise bad_field(where, "source", m.source, "the name of a sensor")
-    found = load(channel.check)(m, where) if channel.check else dict(_described(m, where, channel))
-    copy: M = replace(m, t=t, **found)  # type: ignore[type-var]
+    values = load(channel.check)(m, where) if channel.check else dict(_described(m, where, channel))
+    copy: M = replace(m, t=t, **values)  # type: ignore[type-var]
     return copy
 
 
@@ -227,8 +227,8 @@ def _described(m: Measurement, where: str, channel: Channel) -> Iterator[tuple[s
     count: int | None = None
     for column in table.columns[1:]:
         if column.kind == "name":
-            yield f"{column.name}s", (found := names(where, f"{column.name}s", getattr(m, f"{column.name}s")))
-            count = len(found)
+            yield f"{column.name}s", (values := names(where, f"{column.name}s", getattr(m, f"{column.name}s")))
+            count = len(values)
         else:
             value = getattr(m, column.measured.name)
             if count is None and table.rows_of_one_stamp == "one measurement":
@@ -238,9 +238,9 @@ def _described(m: Measurement, where: str, channel: Channel) -> Iterator[tuple[s
 
 @cache
 def _table_of(kind: type[Any], channel: Channel) -> Table:
-    there = {field.name for field in fields(kind)}
+    members = {field.name for field in fields(kind)}
     return next(
         table
         for table in tables_of(channel)
-        if all((f"{c.name}s" if c.kind == "name" else c.measured.name) in there for c in table.columns[1:])
+        if all((f"{c.name}s" if c.kind == "name" else c.measured.name) in members for c in table.columns[1:])
     )

@@ -85,11 +85,11 @@ def with_features(
     kept = FeatureCache(cache_folder())
     images = _features(stream.file, settings, (camera.width, camera.height), kept, progress or (lambda _: None))
     _require_calibrated(log, images, camera)
-    found = [image.found or _nothing(settings) for image in images]
-    tracks = _tracks(stream, images, found, settings, camera, kept)
+    features = [image.found or _nothing(settings) for image in images]
+    tracks = _tracks(stream, images, features, settings, camera, kept)
     frames = [
         CameraFrame(t, settings.feature, f.pixels, f.sizes, f.descriptors, numbers)
-        for t, f, numbers in zip(stream.t.tolist(), found, tracks, strict=True)
+        for t, f, numbers in zip(stream.t.tolist(), features, tracks, strict=True)
     ]
     streams = dict(log.streams) | {"camera": FeatureStream(stream.t, frames)}
     unkept = (f"features are not cached, {kept.fault}",) if kept.fault else ()
@@ -139,12 +139,12 @@ def _computed(files: list[Path], settings: FrontendSettings, size: Size) -> Iter
     parts = [files[i : i + PART] for i in range(0, len(files), PART)]
     early: dict[int, list[bytes | _ImageFile]] = {}  # results of tasks that finished out of order
     due = 0
-    for at, found in run_each(partial(_find_all, settings, size), parts, processes, lasting=True):
-        if isinstance(found, ProcessDiedError):
+    for at, result in run_each(partial(_find_all, settings, size), parts, processes, lasting=True):
+        if isinstance(result, ProcessDiedError):
             raise RunFailedError("a process died during feature detection")
-        if isinstance(found, Exception):
-            raise found
-        early[at] = found
+        if isinstance(result, Exception):
+            raise result
+        early[at] = result
         while due in early:
             yield from early.pop(due)
             due += 1
@@ -182,7 +182,7 @@ def _nothing(settings: FrontendSettings) -> ImageFeatures:
 def _tracks(
     stream: ImageStream,
     images: list[_ImageFile],
-    found: list[ImageFeatures],
+    features: list[ImageFeatures],
     settings: FrontendSettings,
     camera: CameraModel,
     kept: FeatureCache,
@@ -193,13 +193,13 @@ def _tracks(
     key = hashlib.sha256(
         (about + " ".join(images[i].key if images[i].found else "-" for i in order)).encode()
     ).hexdigest()
-    counts = [len(found[i].pixels) for i in order]
+    counts = [len(features[i].pixels) for i in order]
     stored = kept.read(key)
     if stored is not None and len(stored) == 4 * sum(counts):
         numbers = np.frombuffer(stored, dtype="<i4").astype(np.int64)
     else:
         tracker = FeatureTracker(camera, binary=_extractor(settings).binary)
-        lists = [tracker.follow(found[i].pixels, found[i].descriptors) for i in order]
+        lists = [tracker.follow(features[i].pixels, features[i].descriptors) for i in order]
         numbers = np.concatenate([*lists, np.empty(0, dtype=np.int64)])
         kept.write(key, numbers.astype("<i4").tobytes())
     tracks: list[Integers] = [numbers[:0]] * len(order)
@@ -265,11 +265,11 @@ def with_markers(log: Log, family: MarkerFamily) -> Log:
     faults: list[str] = []
     for stamp, file in zip(stream.t.tolist(), stream.file, strict=True):
         try:
-            seen = _marked(file, family, kept)
+            markers = _marked(file, family, kept)
         except InputError as error:
             faults.append(str(error))
             continue
-        for number, corners in seen:
+        for number, corners in markers:
             names += corner_names(f"{family}-{number}")
             pixels += corners
             t += [stamp] * len(corners)
@@ -293,9 +293,9 @@ def _marked(file: Path, family: MarkerFamily, kept: FeatureCache) -> Marked:
     stored = kept.read(key)
     if stored is not None:
         return [(int(number), corners) for number, corners in json.loads(stored)]
-    seen = [(number, corners.tolist()) for number, corners in find_markers(read_image(file), family)]
-    kept.write(key, json.dumps(seen).encode())
-    return seen
+    markers = [(number, corners.tolist()) for number, corners in find_markers(read_image(file), family)]
+    kept.write(key, json.dumps(markers).encode())
+    return markers
 
 
 class LiveFrontend:
@@ -316,6 +316,6 @@ class LiveFrontend:
         if (width, height) != (self._camera.width, self._camera.height):
             expected = f"{self._camera.width} x {self._camera.height}"
             raise InputError(f"CameraImage at {t:.3f} s: has {width} x {height} px, expected {expected}")
-        found = decode(encode(*self._extractor.detectAndCompute(pixels)))
-        numbers = self._tracker.follow(found.pixels, found.descriptors)
-        return CameraFrame(t, self._feature, found.pixels, found.sizes, found.descriptors, numbers)
+        features = decode(encode(*self._extractor.detectAndCompute(pixels)))
+        numbers = self._tracker.follow(features.pixels, features.descriptors)
+        return CameraFrame(t, self._feature, features.pixels, features.sizes, features.descriptors, numbers)

@@ -103,17 +103,17 @@ class KnownPoints:
         return TIME_OFFSET in self._estimated.indices
 
     def inexact(self, m: Pixels) -> dict[str, tuple[list[str], Array]]:
-        """What is seen that was surveyed with an error. By name, of a point or of a marker, that of each of its points and the
+        """The detected points whose survey is inexact. For each point or marker by name: the names of its points and the
         covariance (3, 3) of their common displacement."""
-        found: dict[str, tuple[list[str], Array]] = {}
+        inexact: dict[str, tuple[list[str], Array]] = {}
         if not isinstance(m, PixelSightings) or not self._inexact.any():
-            return found
+            return inexact
         for name in dict.fromkeys(m.points):
             place = self.map.index.get(name, -1)
             if place >= 0 and self._inexact[place]:
-                names, _ = found.setdefault(marker_of(name) or name, ([], self.map.covariances[place]))
+                names, _ = inexact.setdefault(marker_of(name) or name, ([], self.map.covariances[place]))
                 names.append(name)
-        return found
+        return inexact
 
     def named(self, m: PixelSightings) -> ReprojectionFactor | None:
         """All named points of the map without outlier rejection, on the pose at their time."""
@@ -147,33 +147,33 @@ class KnownPoints:
         moved = np.zeros_like(factor.points)
         if displaced:
             assert factor.point_covariances is not None
-            spreads = factor.point_covariances.copy()
+            covariances = factor.point_covariances.copy()
             for row, name in enumerate(self.names):
-                moved[row], spreads[row] = displaced.get(name, (moved[row], spreads[row]))
-            factor = replace(factor, point_covariances=spreads)
+                moved[row], covariances[row] = displaced.get(name, (moved[row], covariances[row]))
+            factor = replace(factor, point_covariances=covariances)
         if offset is not None:
             factor = replace(factor, offset=offset.delta, offset_covariance=offset.covariance)
         if self._estimated.indices:
             factor = replace(factor, estimated=self._estimated.indices, twist=twist)
-        here = factor.fixed([] if predicted.constants is None else [predicted.constants], moved)
-        camera = self._camera(here, predicted)
+        expected = factor.fixed([] if predicted.constants is None else [predicted.constants], moved)
+        camera = self._camera(expected, predicted)
         focal = 0.0
         if predicted.spread is not None and FOCAL in self._estimated.indices:
             place = self._estimated.indices.index(FOCAL)
             focal = math.sqrt(predicted.spread[place, place])
         if isinstance(m, CameraFrame):
-            found = self._found(m, factor, here.model, camera, focal)
+            found = self._found(m, factor, expected.model, camera, focal)
             return None if found is None else self._levelled(found, found, predicted)
-        right = _agreeing(here, camera, focal)
+        right = _agreeing(expected, camera, focal)
         agreed = int(np.count_nonzero(right))
-        seen = self._levelled(rows_of(factor, right), rows_of(here, right), predicted) if agreed else None
-        if seen is None:
+        levelled = self._levelled(rows_of(factor, right), rows_of(expected, right), predicted) if agreed else None
+        if levelled is None:
             right, agreed = np.zeros_like(right), 0
         self.missed = agreed < FEW_SHARE * len(right)
         if agreed < len(right):
             self._diagnostics.reject(DISAGREES, len(right) - agreed)
             self.names = tuple(self.names[row] for row in np.flatnonzero(right).tolist())
-        return seen
+        return levelled
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
         """The pose of an image without a prediction, or None, and the number of points that it seemed to show."""
@@ -183,20 +183,20 @@ class KnownPoints:
         if isinstance(m, PixelSightings):
             rows = [i for i, name in enumerate(m.points) if name in self.map.index]
             points = np.array([self.map.index[m.points[i]] for i in rows], dtype=np.int64)
-            spreads = self.map.covariances[points] if self._map_matters else None
-            return found_on_floor(model, self.map.positions[points], m.pixels[rows], spreads), len(rows)
-        found = None if self.associator is None else self.associator.relocalized(m)
-        if found is None:
+            covariances = self.map.covariances[points] if self._map_matters else None
+            return found_on_floor(model, self.map.positions[points], m.pixels[rows], covariances), len(rows)
+        relocated = None if self.associator is None else self.associator.relocalized(m)
+        if relocated is None:
             return None, 0
-        position, rotation, covariance, seen = found
-        spreads = self.map.covariances[seen.points] if self._map_matters else None
-        pixels = np.asarray(m.pixels[seen.features], dtype=float)
+        position, rotation, covariance, matches = relocated
+        covariances = self.map.covariances[matches.points] if self._map_matters else None
+        pixels = np.asarray(m.pixels[matches.features], dtype=float)
         camera = CameraPose(position, rotation, covariance)
-        return on_floor(model, camera, self.map.positions[seen.points], pixels, spreads), seen.expected
+        return on_floor(model, camera, self.map.positions[matches.points], pixels, covariances), matches.expected
 
     def _factor(self, model: CameraModel, points: list[int], pixels: Array) -> ReprojectionFactor:
-        spreads = self.map.covariances[points] if self._map_matters else None
-        return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=spreads)
+        covariances = self.map.covariances[points] if self._map_matters else None
+        return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=covariances)
 
     def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
         """A factor without points yet; None if features cannot be matched with the map."""
@@ -215,55 +215,55 @@ class KnownPoints:
     ) -> ReprojectionFactor | None:
         """The factor of the points matched in a frame."""
         assert self.associator is not None
-        seen = self.associator.guided(m, camera.position, camera.rotation, camera.covariance, model, focal)
-        self.used = seen.features
+        matches = self.associator.guided(m, camera.position, camera.rotation, camera.covariance, model, focal)
+        self.used = matches.features
         unsure = float(np.trace(camera.covariance[3:, 3:])) > UNSURE**2
-        self.missed = len(seen) < FEW and (unsure or min(seen.expected, len(m.pixels)) >= MANY)
-        if seen.rejected:
-            self._diagnostics.reject(DISAGREES, seen.rejected)
-        if len(seen) == 0:
+        self.missed = len(matches) < FEW and (unsure or min(matches.expected, len(m.pixels)) >= MANY)
+        if matches.rejected:
+            self._diagnostics.reject(DISAGREES, matches.rejected)
+        if len(matches) == 0:
             return None
-        pixels = np.asarray(m.pixels[seen.features], dtype=float)
+        pixels = np.asarray(m.pixels[matches.features], dtype=float)
         chosen = spread_out(pixels, MOST) if len(pixels) > MOST else np.arange(len(pixels))
-        points = seen.points[chosen]
-        spreads = self.map.covariances[points] if self._map_matters else None
-        return replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=spreads)
+        points = matches.points[chosen]
+        covariances = self.map.covariances[points] if self._map_matters else None
+        return replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=covariances)
 
     def _levelled(
-        self, factor: ReprojectionFactor, here: ReprojectionFactor, predicted: Predicted
+        self, factor: ReprojectionFactor, expected: ReprojectionFactor, predicted: Predicted
     ) -> ReprojectionFactor | None:
-        """The factor with what is known of the tilt of the robot; ``here``: with the constants that are expected.
+        """The factor with the learnt scale of the robot's tilt; ``expected``: the factor at the expected constants.
 
         None if only a robot that tilts by more than :data:`STEEPEST` sees the points where they are, which is not believed.
         """
-        if here.estimated:  # constants that nothing is known of would explain it
+        if expected.estimated:  # unknown constants would explain the tilt
             return factor
         pose, covariance = (np.ascontiguousarray(part, dtype=float) for part in (predicted.pose, predicted.covariance))
-        tilt, spread = pixel_kernels.leaning(here.packed(), pose, covariance)
+        tilt, noise = pixel_kernels.leaning(expected.packed(), pose, covariance)
         if math.hypot(*tilt) > STEEPEST:
             return None
-        self.floor, sigma = self.floor.learnt(tilt, spread, float(here.model.tilt))
+        self.floor, sigma = self.floor.learnt(tilt, noise, float(expected.model.tilt))
         return replace(factor, model=replace(factor.model, tilt=sigma))
 
-    def _camera(self, here: ReprojectionFactor, predicted: Predicted) -> CameraPose:
+    def _camera(self, expected: ReprojectionFactor, predicted: Predicted) -> CameraPose:
         """The pose of the camera for an image, including the uncertainty of its constants."""
         pose, covariance = predicted.pose, predicted.covariance
-        if here.offset is not None:
-            noise = np.zeros((3, 3)) if here.offset_covariance is None else here.offset_covariance
-            since = Increment(here.offset, noise, 0.0)
-            pose, covariance = se2.compose(pose, here.offset), propagate(covariance, since)
-        camera = lifted(here.model, pose, covariance)
+        if expected.offset is not None:
+            noise = np.zeros((3, 3)) if expected.offset_covariance is None else expected.offset_covariance
+            since = Increment(expected.offset, noise, 0.0)
+            pose, covariance = se2.compose(pose, expected.offset), propagate(covariance, since)
+        camera = lifted(expected.model, pose, covariance)
         if predicted.spread is None:
             return camera
-        model = here.model
+        model = expected.model
         full = np.zeros((6, len(predicted.spread)))
         for column, place in enumerate(self._estimated.indices):
             if place < 3:
                 full[3:, column] = model.rotation[place]
             elif place < FOCAL:
                 full[:3, column] = model.rotation[place - 3]
-            elif place == TIME_OFFSET and here.twist is not None:
-                full[:, column] = _lift(model) @ here.twist
+            elif place == TIME_OFFSET and expected.twist is not None:
+                full[:, column] = _lift(model) @ expected.twist
         return replace(camera, covariance=camera.covariance + full @ predicted.spread @ full.T)
 
 
@@ -283,25 +283,25 @@ def _lift(model: CameraModel) -> Array:
     return lift
 
 
-def _agreeing(here: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
-    """Inliers near the prediction; all points if too few are seen to tell. ``focal``: standard deviation of the logarithm of the
+def _agreeing(expected: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
+    """Inliers near the prediction; all points if these are too few to decide. ``focal``: standard deviation of the logarithm of the
     focal length."""
-    model, count = here.model, len(here.pixels)
+    model, count = expected.model, len(expected.pixels)
     if count < FEWEST:
         return np.ones(count, dtype=bool)
-    if here.point_covariances is None:
-        spreads = np.zeros((count, 2, 2))
-        spreads[:, (0, 1), (0, 1)] = model.sigma**2
+    if expected.point_covariances is None:
+        covariances = np.zeros((count, 2, 2))
+        covariances[:, (0, 1), (0, 1)] = model.sigma**2
     else:
-        _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, here.points)
-        spreads = pixel_kernels.pixel_noise(by_point, here.point_covariances, float(model.sigma))
+        _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, expected.points)
+        covariances = pixel_kernels.pixel_noise(by_point, expected.point_covariances, float(model.sigma))
     if focal > 0.0:
-        away = focal * (here.pixels - (model.cx, model.cy))
-        spreads = spreads + away[:, :, None] * away[:, None, :]
-    return agreeing(model, camera, here.points, here.pixels, spreads)
+        away = focal * (expected.pixels - (model.cx, model.cy))
+        covariances = covariances + away[:, :, None] * away[:, None, :]
+    return agreeing(model, camera, expected.points, expected.pixels, covariances)
 
 
 def rows_of(factor: ReprojectionFactor, rows: Truths) -> ReprojectionFactor:
     """The factor of some of its points."""
-    spreads = None if factor.point_covariances is None else factor.point_covariances[rows]
-    return replace(factor, points=factor.points[rows], pixels=factor.pixels[rows], point_covariances=spreads)
+    covariances = None if factor.point_covariances is None else factor.point_covariances[rows]
+    return replace(factor, points=factor.points[rows], pixels=factor.pixels[rows], point_covariances=covariances)

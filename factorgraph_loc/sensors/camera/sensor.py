@@ -1,6 +1,6 @@
 """The camera sensor of a run: points of the map, by name or matched by appearance; and localization from images alone.
 
-For an unknown or wrong start, and for a kidnapped robot, an image with enough inliers gives the pose by itself; otherwise
+For an unknown or wrong start, and for a kidnapped robot, one image with enough inliers gives the pose; otherwise
 several images must agree along the odometry. A track is suspicious if points of the map are persistently not found where they
 are predicted. If the start position is known, an image must agree with it.
 """
@@ -33,7 +33,7 @@ from factors.motion import ChainState, propagate
 from factors.se2 import Array
 from factors.update import Correction
 
-PASS = 10.0  # s: looks within it have the error of a point's survey in common, where that is not estimated
+PASS = 10.0  # s: sightings within it share the error of a point's survey, if that is not estimated
 SOLVE_EVERY = 0.45  # s between solver updates; in between, images only update the newest pose, as in a filter
 
 
@@ -64,27 +64,27 @@ class PixelObservation(ResidualObservation):
             size = 3 + len(self.held[0])
             both = np.zeros((size, size))
             both[:3, :3], both[3:, 3:] = covariance, self.held[1]
-            found = image_update(self.seen, pose, both, iterations, self.settled, self.held[:1], (slice(3, size),))
-            return replace(found, delta=found.delta[:3], covariance=found.covariance[:3, :3])
+            update = image_update(self.seen, pose, both, iterations, self.settled, self.held[:1], (slice(3, size),))
+            return replace(update, delta=update.delta[:3], covariance=update.covariance[:3, :3])
         at, places = [values[name] for name in self.blocks], [columns[name] for name in self.blocks]
         return image_update(self.seen, pose, covariance, iterations, self.settled, at, places)
 
     def log_likelihood(self, poses: Array, values: Blocks) -> Array:
-        factor, spreads = self.seen, None
+        factor, covariances = self.seen, None
         _, by_pose, by_point, by_constants = reprojection.linearize(factor.model, self.expected, factor.points)
         tilts = reprojection.by_tilt(factor.model, by_constants)
         if factor.point_covariances is not None or self.held is not None:
-            spreads = np.broadcast_to(factor.model.sigma**2 * np.eye(2), (len(by_point), 2, 2))
+            covariances = np.broadcast_to(factor.model.sigma**2 * np.eye(2), (len(by_point), 2, 2))
             if factor.point_covariances is not None:
-                spreads = spreads + by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
+                covariances = covariances + by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
             if self.held is not None:
                 if factor.twist is not None:
                     by_constants[..., TIME_OFFSET] = by_pose @ factor.twist
                 by_constants = by_constants[..., list(factor.estimated)]
                 # the error of the constants is common to all pixels, so it must not average out
                 common = by_constants @ self.held[1] @ by_constants.transpose(0, 2, 1)
-                spreads = spreads + len(common) * common
-        return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, tilts, spreads)
+                covariances = covariances + len(common) * common
+        return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, tilts, covariances)
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
         """The observation on the pose only; the uncertainty of the camera's constants and of points is added to the noise."""
@@ -97,7 +97,7 @@ class PixelObservation(ResidualObservation):
             assert seen.point_covariances is not None
             points, noise = seen.points.copy(), seen.point_covariances.copy()
             for row, which in enumerate(seen.moved_by):
-                if which >= 0:  # several points with one displacement tell no more of it than one
+                if which >= 0:  # several points inform a common displacement no more than one
                     points[row] += values[blocks[which]]
                     noise[row] = seen.moved_by.count(which) * spreads[blocks[which]]
             seen = replace(seen, points=points, point_covariances=noise, moved_by=())
@@ -121,7 +121,7 @@ class CameraSensor(Sensor):
         self._check = TurnCheck(self.points.model, motion, self._diagnostics, constants)
         # times [s] of recent looks at what was surveyed with an error and is not estimated
         self._looks: dict[str, list[float]] = defaultdict(list)
-        self._before: deque[tuple[float, TiltScale]] = deque()  # what was known of the floor before an image
+        self._before: deque[tuple[float, TiltScale]] = deque()  # the filter of the floor before each image
         self._shared = (self.name,) if constants.names else ()
         if len(self.points.map):
             self.finder = PixelFinder(self.points, motion)
@@ -164,18 +164,18 @@ class CameraSensor(Sensor):
         moving = tuple(dict.fromkeys(filter(None, names)))
         if moving:
             factor = displaced_by(factor, [moving.index(name) if name else -1 for name in names])
-        seen = PixelObservation.of(m.t, factor, (*self._shared, *moving), view.pose)
-        yield seen if self.constants.names or moving else seen.on_pose(values, spreads)
+        observation = PixelObservation.of(m.t, factor, (*self._shared, *moving), view.pose)
+        yield observation if self.constants.names or moving else observation.on_pose(values, spreads)
 
     def _looks_now(self, name: str, t: float) -> int:
         """Add a look at a point or marker; how many there were within :data:`PASS`, with the error of its survey in common."""
-        looks = [*(one for one in self._looks[name] if one > t - PASS), t]
-        self._looks[name] = looks
-        return len(looks)
+        times = [*(earlier for earlier in self._looks[name] if earlier > t - PASS), t]
+        self._looks[name] = times
+        return len(times)
 
     def rewind(self, t: float) -> None:
-        for name, looks in self._looks.items():
-            self._looks[name] = [one for one in looks if one <= t]
+        for name, times in self._looks.items():
+            self._looks[name] = [earlier for earlier in times if earlier <= t]
         while self._before and self._before[-1][0] > t:
             _, self.points.floor = self._before.pop()
 
@@ -192,10 +192,10 @@ class CameraSensor(Sensor):
 
 def displaced_by(factor: ReprojectionFactor, which: list[int]) -> ReprojectionFactor:
     """The factor on displacements too: the number of that of each point, or -1, ``which`` has its covariance in the state."""
-    spreads = factor.point_covariances
-    if spreads is not None:
-        spreads = np.where(np.array(which)[:, None, None] < 0, spreads, 0.0)
-    return replace(factor, point_covariances=spreads, moved_by=tuple(which))
+    covariances = factor.point_covariances
+    if covariances is not None:
+        covariances = np.where(np.array(which)[:, None, None] < 0, covariances, 0.0)
+    return replace(factor, point_covariances=covariances, moved_by=tuple(which))
 
 
 def bind(binding: Binding) -> CameraSensor | None:
@@ -269,7 +269,7 @@ class PixelFinder:
         return poor[-1] if enough else None
 
     def follow(self, observation: object, odometry: ChainState, view: object) -> None:
-        """Nothing to record: missing points tell whether the track is lost."""
+        """Nothing to record: missing points show whether the track is lost."""
 
     def refuted_since(self, m: Pixels, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
         """The time since which the track must have been wrong, after an image was processed at its ``pose`` (3,): points have
@@ -295,16 +295,16 @@ class PixelFinder:
         if not self._fixes and m.t < self._fruitless + SEARCH_INTERVAL and m.t >= self._fruitless:
             return False
         self._fixes = [f for f in self._fixes if m.t - KEPT <= f.odometry.t < m.t]
-        found, seen = self._points.find(m)
-        if found is None:
+        pose, seen = self._points.find(m)
+        if pose is None:
             self._fruitless = m.t
             return False
-        if self.start is not None and self._is_not_from(self.start, found, odometry):
+        if self.start is not None and self._is_not_from(self.start, pose, odometry):
             self._fruitless = m.t
             return False
-        count = int(np.count_nonzero(found.inliers))
+        count = int(np.count_nonzero(pose.inliers))
         clear = count >= CLEAR and count >= CLEAR_SHARE * seen
-        self._fixes.append(_Fix(odometry, found.pose, found.covariance, clear))
+        self._fixes.append(_Fix(odometry, pose.pose, pose.covariance, clear))
         return True
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
@@ -318,8 +318,8 @@ class PixelFinder:
         self._fixes, self._stamps = [], []
 
     @staticmethod
-    def _is_not_from(start: KnownPosition, found: FoundOnFloor, now: ChainState) -> bool:
-        return bool(2.0 * start.loss(found.pose[None], now, found.covariance + LEAST)[0] > APART)
+    def _is_not_from(start: KnownPosition, fix: FoundOnFloor, now: ChainState) -> bool:
+        return bool(2.0 * start.loss(fix.pose[None], now, fix.covariance + LEAST)[0] > APART)
 
     def _agree(self) -> bool:
         """Whether the last images agree along the odometry."""

@@ -26,8 +26,8 @@ def simulate(ride: Ride) -> Simulated:
         return Simulated()
     settings, camera = ride.settings.pixels, ride.rig.of(CameraSettings)
     times = ride.times(settings.rate)
-    seen = pixel_stream(camera.model(), ride.world, times, ride.truth.at(times), settings, ride.rng("points"))
-    return Simulated({"sightings": replace(seen, t=seen.t - camera.time_offset)})
+    detected = pixel_stream(camera.model(), ride.world, times, ride.truth.at(times), settings, ride.rng("points"))
+    return Simulated({"sightings": replace(detected, t=detected.t - camera.time_offset)})
 
 
 def looks(settings: Any) -> dict[str, float]:
@@ -56,14 +56,14 @@ def pixel_stream(
         columns.append(k)
         pixels.append(uv[k])
     n, k, uv = np.concatenate(rows), np.concatenate(columns), np.concatenate(pixels)
-    seen = ~crosses(world, cameras[n, :2], positions[k, :2])
-    n, k, uv = n[seen], k[seen], uv[seen]
+    visible = ~crosses(world, cameras[n, :2], positions[k, :2])
+    n, k, uv = n[visible], k[visible], uv[visible]
     chosen = _at_most(settings.max_points, n, rng)
     n, k = n[chosen], k[chosen]
     uv = uv[chosen] + model.sigma * rng.standard_normal((len(n), 2))
     wrong = rng.random(len(n)) < settings.wrong
-    anywhere = rng.uniform((-0.5, -0.5), (model.width - 0.5, model.height - 0.5), (len(n), 2))
-    uv = np.where(wrong[:, None], anywhere, uv)
+    outliers = rng.uniform((-0.5, -0.5), (model.width - 0.5, model.height - 0.5), (len(n), 2))
+    uv = np.where(wrong[:, None], outliers, uv)
     return SightingStream(times[n], [points.names[j] for j in k.tolist()], uv[:, 0], uv[:, 1])
 
 
@@ -106,8 +106,8 @@ class CameraForecast:
 
     def information(self, poses: Array, ways: Array) -> Array:
         """Information of the visible points."""
-        looks = (self.looks_per_metre * ways)[:, None, None]
-        return np.asarray(looks * np.array([self._of_image(pose) for pose in poses]).reshape(-1, 3, 3))
+        images = (self.looks_per_metre * ways)[:, None, None]
+        return np.asarray(images * np.array([self._of_image(pose) for pose in poses]).reshape(-1, 3, 3))
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
         """Nothing."""
@@ -120,9 +120,9 @@ class CameraForecast:
         near = np.flatnonzero((depth > 0.0) & (depth <= self.settings.max_depth) & model.contains(pixels))
         eye, _ = reprojection.camera_pose(model, pose)
         ends = points.positions[near, :2]
-        seen = near[~crosses(self.world, np.broadcast_to(eye[:2], (len(near), 2)), ends)]
-        _, by_pose, _, _ = reprojection.linearize(model, pose, points.positions[seen])
-        share = min(1.0, self.settings.max_points / max(len(seen), 1))
+        visible = near[~crosses(self.world, np.broadcast_to(eye[:2], (len(near), 2)), ends)]
+        _, by_pose, _, _ = reprojection.linearize(model, pose, points.positions[visible])
+        share = min(1.0, self.settings.max_points / max(len(visible), 1))
         weight = share * model.tempering / model.sigma**2
         return np.asarray(weight * np.einsum("kia,kib->ab", by_pose, by_pose))
 

@@ -1,8 +1,8 @@
 """Summary of a log's images and named points, with warnings, and their pictures.
 
 A check of the mounting: a robot that turns by an angle about the vertical rotates a camera by that angle times the vertical part
-of its optical axis about that axis, and the image by the opposite. So images of a camera that looks at the floor turn as the
-robot does, those of one that looks ahead only shift.
+of its optical axis about that axis, and the image by the opposite. So images of a floor camera turn with the robot,
+and those of a forward camera only shift.
 """
 
 import math
@@ -123,8 +123,8 @@ def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary 
     """Warnings about images and named points."""
     out = []
     if log.rig.find(CameraSettings) is None:
-        there = [name for name, found in (("images", images), ("identified pixels", pixels)) if found is not None]
-        out += [f"the log has {name}, but its rig has no [camera]: they are not used" for name in there]
+        streams = [name for name, summary in (("images", images), ("identified pixels", pixels)) if summary is not None]
+        out += [f"the log has {name}, but its rig has no [camera]: they are not used" for name in streams]
     if images is not None:
         if images.fault is not None:
             lost = images.looked_at - images.readable
@@ -157,29 +157,29 @@ def _calibration(log: Log, images: ImageSummary) -> list[str]:
     if camera is None or not images.sizes:
         return []
     size = f"{camera.width}x{camera.height}"
-    other = [s for s in images.sizes if s != size]
-    if len(other) == len(images.sizes):
-        return [f"the camera is calibrated for images of {size} px, those of the log have {other[0]} px"]
+    sizes = [s for s in images.sizes if s != size]
+    if len(sizes) == len(images.sizes):
+        return [f"the camera is calibrated for images of {size} px, those of the log have {sizes[0]} px"]
     return []
 
 
-PAIRS, FEWEST_PAIRS = 12, 5  # of images that are compared, those between which the robot turns most; fewer tell nothing
+PAIRS, FEWEST_PAIRS = 12, 5  # of compared images, with the largest turns of the robot; fewer are not enough
 TURNS = (0.03, 0.6)  # rad between two images, least and most
 FEATURE, COUNT, FEWEST_MATCHES = "orb", 400, 12
-APART = 0.5  # difference of the vertical parts of the optical axis that is told
+APART = 0.5  # least reported difference of the vertical parts of the optical axis
 
 
 def mounting_problems(log: Log) -> list[str]:
     """A line if the images turn with the robot in another way than the mounting in the rig explains; none without a reference
-    with headings, without a camera in the rig, or where too few images tell."""
+    with headings, without a camera in the rig, or with too few usable images."""
     stream, camera = log.streams.get("camera"), log.rig.find(CameraSettings)
     if not isinstance(stream, ImageStream) or camera is None or log.reference is None or not log.reference.has_heading:
         return []
     model = camera.model()
-    found = [turned / turn for turn, turned in _turns(log, stream)]
-    if len(found) < FEWEST_PAIRS:
+    ratios = [turned / turn for turn, turned in _turns(log, stream)]
+    if len(ratios) < FEWEST_PAIRS:
         return []
-    share = float(np.clip(np.median(found), -1.0, 1.0))  # of a camera that looks straight down: 1
+    share = float(np.clip(np.median(ratios), -1.0, 1.0))  # 1 if the camera points straight down
     expected = -float(model.rotation[2, 2])
     if abs(share - expected) <= APART:
         return []
@@ -191,7 +191,7 @@ def mounting_problems(log: Log) -> list[str]:
 
 
 def _turns(log: Log, stream: ImageStream) -> Iterator[tuple[float, float]]:
-    """How far the robot and the image turn [rad] from one image to the next, where both can be told."""
+    """The turns [rad] of robot and image between consecutive images, if both can be estimated."""
     assert log.reference is not None
     headings = log.reference.at(stream.t + log.rig.time_offset("camera"))[:, 2]
     turns = se2.wrap(np.diff(headings))
@@ -203,20 +203,20 @@ def _turns(log: Log, stream: ImageStream) -> Iterator[tuple[float, float]]:
 
 
 def _turned(files: Sequence[Path]) -> float | None:
-    """The angle [rad] by which an image is turned against the one before, from right to down, or None if it cannot be told."""
+    """The rotation [rad] of an image relative to the previous one, from right to down; None if it cannot be estimated."""
     finder = extractor(FEATURE, COUNT)
-    seen = []
+    features = []
     for file in files:
         try:
-            seen.append(finder.detectAndCompute(read_image(file)))
+            features.append(finder.detectAndCompute(read_image(file)))
         except InputError:
             return None
-    (first, of_first), (second, of_second) = seen
+    (first, of_first), (second, of_second) = features
     pairs = match(of_first, of_second, binary=finder.binary).indices
     if len(pairs) < FEWEST_MATCHES:
         return None
-    before, after = (keypoints.points[pairs[:, k]] for k, keypoints in enumerate((first, second)))
-    motion, inliers = cv2.estimateAffinePartial2D(before, after, ransacReprojThreshold=3.0)
+    start, end = (keypoints.points[pairs[:, k]] for k, keypoints in enumerate((first, second)))
+    motion, inliers = cv2.estimateAffinePartial2D(start, end, ransacReprojThreshold=3.0)
     if motion is None or np.count_nonzero(inliers) < FEWEST_MATCHES:
         return None
     return math.atan2(motion[1, 0], motion[0, 0])
@@ -253,9 +253,9 @@ def sightings(log: Log) -> Iterator[tuple[float, tuple[str, ...], Array]]:
     stream = log.streams.get("sightings")
     if not isinstance(stream, SightingStream):
         return
-    for seen in stream.measurements(log.rig.time_offset("sightings")):
-        assert isinstance(seen, PixelSightings)
-        yield seen.t, seen.points, seen.pixels
+    for measurement in stream.measurements(log.rig.time_offset("sightings")):
+        assert isinstance(measurement, PixelSightings)
+        yield measurement.t, measurement.points, measurement.pixels
 
 
 def _jpeg(file: Path) -> bytes:

@@ -1,6 +1,6 @@
 """A camera in a run: checks of the settings, preparation of images, and detection of a wrong time offset or focal length.
 
-Features followed from one image to the next tell by how much the camera turned between them. The odometry's rotation depends on
+Features followed from one image to the next measure how much the camera turned between them. The odometry's rotation depends on
 the time of the images: of a grid of time offsets one fits best (compare Kelly, Sukhatme, International Journal of Robotics
 Research 33(12), 2014). Noise and slip of the wheels are the same at each offset. The ratio of both rotations is unknown, so it
 does not determine the focal length. But when a camera turns, features at the edges of the image move faster than in its middle,
@@ -57,8 +57,8 @@ def check(use: Use) -> Use:
     if "landmarks" in use.given or not unmapped or any(name not in (*NAMES, *motion) for name in use.sensors):
         return use
     settings = use.settings.model_copy(update={"landmarks": "unknown"})
-    told = f"the map has nothing that the camera could find: it is estimated ({use.estimator}.landmarks=unknown)"
-    return replace(use, settings=settings, warnings=(*use.warnings, f"{use.log.name}: {told}"))
+    warning = f"the map has nothing that the camera could find: it is estimated ({use.estimator}.landmarks=unknown)"
+    return replace(use, settings=settings, warnings=(*use.warnings, f"{use.log.name}: {warning}"))
 
 
 def review(use: Use, _ending: Ending) -> Review:
@@ -71,10 +71,10 @@ def _doubts(use: Use) -> Iterator[str]:
     landmarks = getattr(use.settings, "landmarks", "known")
     if _has_points(use):
         if landmarks == "unknown" and not use.estimates_points:
-            yield f"{use.log.name}: {use.estimator} does not estimate points: those of the map are used as they are"
+            yield f"{use.log.name}: {use.estimator} does not estimate points: those of the map are used unchanged"
     elif _looks(use) and not _follows(use) and not (use.estimates_points and landmarks != "known"):
-        others = f", or {use.estimator}.landmarks=unknown" if use.estimates_points else ""
-        yield f"{use.log.name}: the map has no points that a camera could find: give --world{others}"
+        alternative = f", or {use.estimator}.landmarks=unknown" if use.estimates_points else ""
+        yield f"{use.log.name}: the map has no points that a camera could find: give --world{alternative}"
 
 
 def _looks(use: Use) -> bool:
@@ -82,7 +82,7 @@ def _looks(use: Use) -> bool:
 
 
 def _follows(use: Use) -> bool:
-    """Whether features that are no points tell the motion."""
+    """Whether features that are no points inform the motion."""
     return getattr(use.settings, "visual_odometry", False) is True
 
 
@@ -135,8 +135,8 @@ def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
     from factorgraph_loc.sensors.camera.frontend import with_features  # noqa: PLC0415 - runs without images need no OpenCV
 
     started = perf_counter()
-    found, warnings = with_features(log, frontend_of(log.rig, log.world), progress)
-    return PreparedLog(found, warnings, len(stream.t), perf_counter() - started)
+    replaced, warnings = with_features(log, frontend_of(log.rig, log.world), progress)
+    return PreparedLog(replaced, warnings, len(stream.t), perf_counter() - started)
 
 
 def _set_aside(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
@@ -145,9 +145,9 @@ def _set_aside(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
         0.0, "", np.empty((0, 2)), np.empty(0), np.empty((0, 0), dtype=np.uint8), np.empty(0, dtype=np.int64)
     )
     frames = FeatureStream(stream.t, [nothing] * len(stream.t))
-    told = (f"{log.name}: {estimator} does not use images: all {len(stream.t)} are ignored",)
+    warning = (f"{log.name}: {estimator} does not use images: all {len(stream.t)} are ignored",)
     by_name = estimator == "dead_reckoning"  # obvious from its name
-    return PreparedLog(replace(log, streams={**log.streams, "camera": frames}), () if by_name else told)
+    return PreparedLog(replace(log, streams={**log.streams, "camera": frames}), () if by_name else warning)
 
 
 class CameraIntake(Intake):
@@ -184,11 +184,11 @@ class CameraIntake(Intake):
 OFFSETS = np.linspace(-0.3, 0.3, 31)  # s that are tried
 SHORTEST, LONGEST = 0.15, 1.0  # s between images that are compared
 TURNED, CHANGED = 0.05, 0.02  # rad: least turn between them, or least change of it by a fifth of a second
-# rad, and relative: largest standard deviations of what two images tell of turn and focal length
+# rad, and relative: largest standard deviations of turn and focal length from two images
 SHARP, CLEAR = 0.003, 0.1
 SLIPPED = 5.0  # standard deviations from what the wheels say at any offset
 FEWEST, MOST = 40, 200  # pairs of images: what is right until then stays so
-LATE, WRONG = 0.03, 0.01  # s, and relative: what is not told
+LATE, WRONG = 0.03, 0.01  # s, and relative: smaller errors are not reported
 SIGNIFICANT = 5.0  # standard deviations beyond that
 
 
@@ -199,7 +199,7 @@ class _Image(NamedTuple):
 
 
 class TurnCheck:
-    """Tells each constant that is wrong once, as an event; see the module. ``estimated``: constants that are not checked. Without a
+    """Reports each wrong constant once, as an event; see the module. ``estimated``: constants that are not checked. Without a
     ``model`` nothing is."""
 
     def __init__(
@@ -235,20 +235,20 @@ class TurnCheck:
         """Compare the turn between two images with those of the wheels at all offsets."""
         motion, middle = self._motion, len(OFFSETS) // 2
         begin, constants = motion.state(first.t), np.zeros(len(motion.constants.names))
-        before, after = (motion.poses_at(begin, image.t + OFFSETS, constants)[:, 2] for image in (first, second))
-        turns = se2.wrap(after - before)
+        start, end = (motion.poses_at(begin, image.t + OFFSETS, constants)[:, 2] for image in (first, second))
+        turns = se2.wrap(end - start)
         if abs(turns[middle]) < TURNED and abs(turns[middle + 5] - turns[middle - 5]) < CHANGED:
             return
         self._left -= 1
-        _, rows, others = np.intersect1d(first.names, second.names, return_indices=True)
+        _, rows, columns = np.intersect1d(first.names, second.names, return_indices=True)
         step = motion.relative(begin, motion.state(second.t))
         starts = [np.append(step.delta[:2], turn) for turn in turns[::5].tolist()]
-        found = turned(model, first.pixels[rows], second.pixels[others], starts)
-        if found is None:
+        turn_focal = turned(model, first.pixels[rows], second.pixels[columns], starts)
+        if turn_focal is None:
             return
-        (turn, sigma), (focal, spread) = found
-        if spread < CLEAR:
-            self._focal += np.array((spread**2, 1.0, focal, focal**2)) / spread**2
+        (turn, sigma), (focal, focal_sigma) = turn_focal
+        if focal_sigma < CLEAR:
+            self._focal += np.array((focal_sigma**2, 1.0, focal, focal**2)) / focal_sigma**2
             self._tell_focal(second.t)
         variance = float(step.covariance[2, 2]) + SHARP**2
         if sigma < SHARP and np.min(np.abs(turn - turns)) < SLIPPED * math.sqrt(variance):
@@ -273,8 +273,8 @@ class TurnCheck:
         error = first / weight
         sigma = math.sqrt(max(1.0, (second - first * error) / count) / weight)
         if FOCAL in self._open and count >= FEWEST and abs(error) > WRONG + SIGNIFICANT * sigma:
-            way = "longer" if error > 0.0 else "shorter"
-            what = f"the focal length seems to be {100.0 * abs(error):.0f} % {way} than the rig says (fx, fy)"
+            comparison = "longer" if error > 0.0 else "shorter"
+            what = f"the focal length seems to be {100.0 * abs(error):.0f} % {comparison} than the rig says (fx, fy)"
             self._tell(FOCAL, t, what)
 
     def _tell(self, constant: int, t: float, what: str) -> None:

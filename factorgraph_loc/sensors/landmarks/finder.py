@@ -1,4 +1,4 @@
-"""Localization from identified landmarks alone, for an unknown start and a kidnapped robot; and detection of a lost track.
+"""Localization from identified landmarks alone, at an unknown start or after a kidnapping; and detection of a lost track.
 
 The sightings of the last minute are related to the present pose by odometry. Candidate poses are generated from few of them (one
 landmark: a circle around it; two: the alignment of two points) and scored against all sightings by the robust likelihood; the
@@ -99,18 +99,18 @@ class LandmarkFinder:
         return self._monitor.suspicious_since
 
     def look(self, m: BearingRange, odometry: ChainState) -> bool:
-        seen = self._factor(m)
-        if seen is None:
+        factor = self._factor(m)
+        if factor is None:
             return False
-        self.add(odometry, seen)
+        self.add(odometry, factor)
         self.search()
         self.newest = odometry
         return True
 
     def follow(self, observation: Any, odometry: ChainState, view: View) -> None:
-        seen = observation.on_pose({name: np.asarray(view.value(name)) for name in observation.blocks}, {}).measured
-        self.add(odometry, seen)
-        self._monitor.add(observation.t, seen, view.pose, view.covariance)
+        factor = observation.on_pose({name: np.asarray(view.value(name)) for name in observation.blocks}, {}).measured
+        self.add(odometry, factor)
+        self._monitor.add(observation.t, factor, view.pose, view.covariance)
 
     def refuted_since(self, m: BearingRange, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
         since = self._monitor.suspicious_since
@@ -124,39 +124,39 @@ class LandmarkFinder:
     def clear(self) -> None:
         self._monitor.clear()
 
-    def add(self, odometry: ChainState, seen: BearingRangeFactor) -> None:
+    def add(self, odometry: ChainState, factor: BearingRangeFactor) -> None:
         """Add landmarks seen at ``odometry``; late and repeated sightings are accepted."""
-        self._model = seen.model
-        places, values = seen.points.tolist(), zip(seen.ranges.tolist(), seen.bearings.tolist(), strict=True)
-        for point, (x, y), (distance, bearing) in zip(seen.points, places, values, strict=True):
+        self._model = factor.model
+        places, values = factor.points.tolist(), zip(factor.ranges.tolist(), factor.bearings.tolist(), strict=True)
+        for point, (x, y), (distance, bearing) in zip(factor.points, places, values, strict=True):
             _insert(self._sightings.setdefault((x, y), []), Sighting(odometry, point, distance, bearing))
         self.forget(odometry.t - DURATION)
 
-    def forget(self, before: float) -> None:
-        """Drop the sightings older than ``before`` [s]."""
-        old = [(key, rows) for key, rows in self._sightings.items() if rows[0].odometry.t < before]
+    def forget(self, oldest: float) -> None:
+        """Drop the sightings older than ``oldest`` [s]."""
+        old = [(key, rows) for key, rows in self._sightings.items() if rows[0].odometry.t < oldest]
         for key, rows in old:
-            del rows[: bisect.bisect_left(rows, before, key=_time)]
+            del rows[: bisect.bisect_left(rows, oldest, key=_time)]
             if not rows:
                 del self._sightings[key]
 
     def search(self) -> None:
         """Find the hypotheses at the time of the last sighting."""
         rows = sorted((r for rows in self._sightings.values() for r in rows), key=lambda r: r.odometry.t)[-ROWS:]
-        earlier, before = self.hypotheses, self._window
+        earlier, previous = self.hypotheses, self._window
         self.hypotheses, self.best, self._window = (), None, None
         if not rows:
             return
         window = self._window = SightingWindow(self._model, rows, self._motion, self.start)
         poses = np.concatenate((window.starts(), window.alignments(), window.circles()))
-        if before is not None and earlier:
-            since = self._motion.relative(before.now, window.now).delta
+        if previous is not None and earlier:
+            since = self._motion.relative(previous.now, window.now).delta
             poses = np.concatenate((se2.compose(np.array([h.pose for h in earlier]), since), poses))
         grain = window.grain()
         coarse, fine = window.whitener(grain), window.whitener()
         losses = window.losses(poses, coarse, grain)
         poses = poses[_apart(poses, losses, np.sqrt(np.diag(grain)), REFINED)]
-        poses, _ = window.refined(poses, coarse, iterations=4, spread=grain)
+        poses, _ = window.refined(poses, coarse, iterations=4, noise=grain)
         poses, covariances = window.refined(poses, fine, iterations=6)
         squared = window.squared(poses, fine)
         logs = -geman_mcclure_loss(squared, self._model.robust).sum(axis=1) + self._log_prior(
@@ -189,8 +189,8 @@ class LandmarkFinder:
             return False
         window, scale = self._window, self._model.robust
         track = geman_mcclure_loss(window.squared(pose[None], window.whitener(covariance)), scale).sum()
-        other = geman_mcclure_loss(window.squared(self.best.pose[None], window.whitener()), scale).sum()
-        return bool(track - other > REFUTED * 0.5 * scale**2 * len(window.points))
+        best = geman_mcclure_loss(window.squared(self.best.pose[None], window.whitener()), scale).sum()
+        return bool(track - best > REFUTED * 0.5 * scale**2 * len(window.points))
 
     def _log_prior(self, window: SightingWindow, poses: Array, covariances: Array) -> Array:
         """Log prior probability (N,) of modes with body-frame covariances (N, 3, 3)."""
@@ -284,9 +284,9 @@ def _apart(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.
     return np.array(kept, dtype=np.int64)
 
 
-def _distance(pose: Array, other: Array, covariance: Array) -> float:
+def _distance(pose: Array, mean: Array, covariance: Array) -> float:
     """Squared Mahalanobis distance between poses (3,) with covariance (3, 3) in the world frame."""
-    difference = pose - other
+    difference = pose - mean
     difference[2] = se2.wrap_scalar(difference[2])
     return float(positive.squared(difference, covariance))
 
@@ -301,13 +301,13 @@ class TrackMonitor:
         self._stamps: list[tuple[float, int, int]] = []
         self.suspicious_since: float | None = None  # s, since which most landmarks are outside
 
-    def add(self, t: float, seen: BearingRangeFactor, pose: Array, covariance: Array) -> None:
+    def add(self, t: float, factor: BearingRangeFactor, pose: Array, covariance: Array) -> None:
         """Add the landmarks of a timestamp, with the predicted ``pose`` (3,) and its body-frame ``covariance`` (3, 3)."""
-        beyond = seen.count_beyond(BEYOND * GATE, pose, covariance)
+        beyond = factor.count_beyond(BEYOND * GATE, pose, covariance)
         while self._stamps and self._stamps[-1][0] >= t:
             self._stamps.pop()
         del self._stamps[:-KEPT]
-        self._stamps.append((t, beyond, len(seen.points)))
+        self._stamps.append((t, beyond, len(factor.points)))
         counts = tuple(zip(*self._last(), strict=True))
         share = sum(counts[1]) / max(1, sum(counts[2])) if counts else 0.0
         lasts = share > SHARE or (self.suspicious_since is not None and share >= SHARE / 2.0)

@@ -193,7 +193,7 @@ def read_layer(content: Any, source: object, folder: Path) -> Any:
 
 
 def read_landmarks(path: Path, mapping: ColumnMapping) -> dict[str, Landmark]:
-    """Read a foreign table with the fields landmark, x, y and optionally sigma, or sigma_x and sigma_y, of which the larger one is
+    """Read a foreign table with the fields landmark, x, y and optionally sigma, or sigma_x and sigma_y; the larger one is
     used. InputError names file, row and field of an invalid value, or of a duplicate name."""
     position = ("landmark", "x", "y")
     mapped = read_mapped(path, mapping, (position, (*position, "sigma"), (*position, "sigma_x", "sigma_y")))

@@ -49,8 +49,8 @@ class KnownLandmarks:
         landmarks = {} if use == "unknown" else world.landmarks
         self._positions = {name: np.array((m.x, m.y)) for name, m in landmarks.items()}
         limit = 2.0 * (settings.exact_survey * settings.range_sigma) ** 2
-        spreads = {name: m.spread() for name, m in landmarks.items()}
-        self._surveys = {name: spread for name, spread in spreads.items() if np.trace(spread) > limit}
+        surveys = {name: m.spread() for name, m in landmarks.items()}
+        self._surveys = {name: survey for name, survey in surveys.items() if np.trace(survey) > limit}
         self._carries = carries
         self._maps_others = use != "known"
         self._estimated = estimated
@@ -77,8 +77,8 @@ class KnownLandmarks:
         points = np.array([self._positions[m.landmarks[i]] for i in rows])
         factor = self._of_rows(m, rows, points, offset, twist)
         if self._surveys and any(m.landmarks[i] in self._surveys for i in rows):
-            spreads = np.array([self._surveys.get(m.landmarks[i], np.zeros((2, 2))) for i in rows])
-            factor = replace(factor, point_covariances=spreads)
+            surveys = np.array([self._surveys.get(m.landmarks[i], np.zeros((2, 2))) for i in rows])
+            factor = replace(factor, point_covariances=surveys)
         return factor
 
     def surveyed(
@@ -99,15 +99,15 @@ class KnownLandmarks:
         self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
     ) -> list[tuple[str, BearingRangeFactor]]:
         """The landmarks to be estimated by name, each with a factor on the pose and its position (the last value)."""
-        found = []
+        free = []
         for i, name in enumerate(m.landmarks) if self._maps_others else ():
             if name in self._positions:
                 continue
             if np.isnan(m.range[i]) or np.isnan(m.bearing[i]):
                 self._diagnostics.ignore("unknown landmark without range and bearing")
             else:
-                found.append((name, self._free(m, i, offset, twist)))
-        return found
+                free.append((name, self._free(m, i, offset, twist)))
+        return free
 
     def _free(self, m: BearingRange, row: int, offset: Increment | None, twist: Array | None) -> BearingRangeFactor:
         """The factor of one landmark on the pose and its position."""
@@ -147,8 +147,8 @@ def _measured(m: BearingRange) -> list[bool]:
 
 def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
     """Merge the factors of one measurement on one pose."""
-    first, *others = factors
-    if not others:
+    first, *rest = factors
+    if not rest:
         return first
     covariances = [
         np.zeros((len(f.points), 2, 2)) if f.point_covariances is None else f.point_covariances for f in factors
@@ -163,7 +163,7 @@ def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
 
 
 SURVEYED_ITERATIONS = 4
-WORK = 8  # of a landmark, for one of many poses that are weighed by a compiled call
+WORK = 8  # of a landmark, per pose, if a compiled call weighs many poses
 SMALL = 40  # size of error states whose matrices are inverted by compiled code
 MAX_PENDING = 5  # sightings per landmark that wait for another to agree
 
@@ -195,9 +195,9 @@ class LandmarkObservation(ResidualObservation):
         if len(self.terms) == 1 and len(covariance) <= SMALL:
             held, first = (values[term.blocks[0]], columns[term.blocks[0]].start) if term.blocks else (np.zeros(0), 3)
             factor = cast(BearingRangeFactor, term.factor)
-            found = landmark_update(factor, pose, covariance, held, first, iterations, self.settled)
-            if found is not None:
-                return found
+            update = landmark_update(factor, pose, covariance, held, first, iterations, self.settled)
+            if update is not None:
+                return update
         return super().correct(pose, covariance, values, columns, iterations)
 
     def log_likelihood(self, poses: Array, values: Blocks) -> Array:
@@ -260,10 +260,10 @@ class NewLandmarks:
         """Add a sighting that puts the landmark at ``point`` (2,) with ``covariance`` (2, 2). Returns the new pending sightings,
         and an earlier sighting that agrees, or None."""
         waiting = self.pending.get(name, ())
-        for earlier, spread, candidate in reversed(waiting):
+        for earlier, noise, candidate in reversed(waiting):
             apart = point - earlier
-            if positive.squared(apart, spread + covariance) < GATE:
-                return NewLandmarks({other: rows for other, rows in self.pending.items() if other != name}), candidate
+            if positive.squared(apart, noise + covariance) < GATE:
+                return NewLandmarks({key: rows for key, rows in self.pending.items() if key != name}), candidate
         return NewLandmarks({**self.pending, name: (*waiting, (point, covariance, sighting))[-MAX_PENDING:]}), None
 
 
@@ -297,8 +297,8 @@ class LandmarkSensor(Sensor):
             if view.value(block) is None:
                 yield NewVariable(block, position, np.zeros((2, 3)), {}, spread, ())
             if view.value(block) is None:  # the estimator does not estimate it
-                here = replace(factor, points=position[None], point_covariances=spread[None], free=False)
-                terms.append(Term(here, self._shared, 2))
+                prior = replace(factor, points=position[None], point_covariances=spread[None], free=False)
+                terms.append(Term(prior, self._shared, 2))
             else:
                 terms.append(Term(factor, (*self._shared, block), 2))
         surveyed = any(term.blocks != self._shared for term in terms)
@@ -320,15 +320,15 @@ class LandmarkSensor(Sensor):
     def _proposed(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
         """A new landmark if an earlier sighting agrees with this one, with its position from this sighting."""
         shared = [value for name in self._shared if (value := view.value(name)) is not None]
-        point, (by_pose, *others), noise = cast(BearingRangeFactor, term.factor).locate([view.pose, *shared])
-        here = (view.t, LandmarkObservation(t, (term,)))
-        new = NewVariable(block, point, by_pose, dict(zip(self._shared, others, strict=True)), noise, (here,))
-        _, spread = new.joint(*view.joint())
+        point, (by_pose, *by_shared), noise = cast(BearingRangeFactor, term.factor).locate([view.pose, *shared])
+        current = (view.t, LandmarkObservation(t, (term,)))
+        new = NewVariable(block, point, by_pose, dict(zip(self._shared, by_shared, strict=True)), noise, (current,))
+        _, widened = new.joint(*view.joint())
         self._before.append((t, self._new))
         while self._before[0][0] < t - GOING_BACK:
             self._before.popleft()
-        self._new, earlier = self._new.propose(block, point, spread, here)
-        return None if earlier is None else replace(new, sightings=(earlier, here))
+        self._new, earlier = self._new.propose(block, point, widened, current)
+        return None if earlier is None else replace(new, sightings=(earlier, current))
 
     def judge(self, observation: LandmarkObservation, correction: Correction, view: View) -> bool:
         factor = observation.measured
@@ -347,8 +347,8 @@ class LandmarkSensor(Sensor):
             self._finder.clear()
 
     def evidence(self, m: BearingRange) -> LandmarkObservation | None:
-        seen = self._sought.factor(m)
-        return None if seen is None else LandmarkObservation(m.t, (Term(seen, (), 2 * len(seen.points)),))
+        factor = self._sought.factor(m)
+        return None if factor is None else LandmarkObservation(m.t, (Term(factor, (), 2 * len(factor.points)),))
 
     def at_end(self, factor: Factor, width: float) -> Factor:
         return cast(BearingRangeFactor, factor).widened(width)

@@ -98,8 +98,8 @@ class SimulatedSightings:
 
     def measure(self, t: float, pose: Array) -> BearingRange:
         """The sightings at ``t``."""
-        seen = sighting_stream(self.model, self.world, np.array((t,)), pose[None], self.settings, self.rng)
-        return BearingRange(t, tuple(seen.landmark), seen.range, seen.bearing)
+        sightings = sighting_stream(self.model, self.world, np.array((t,)), pose[None], self.settings, self.rng)
+        return BearingRange(t, tuple(sightings.landmark), sightings.range, sightings.bearing)
 
 
 def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedSightings | None:
@@ -111,8 +111,8 @@ def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) ->
 
 @dataclass(frozen=True, eq=False)
 class LandmarkForecast:
-    """A :class:`~factorgraph_loc.sensors.interfaces.Forecast` for landmarks, ``looks_per_metre``; ``settings`` tell which are
-    visible."""
+    """A :class:`~factorgraph_loc.sensors.interfaces.Forecast` for landmarks, ``looks_per_metre``; ``settings`` determine
+    which are visible."""
 
     world: World
     model: BearingRangeModel
@@ -124,15 +124,15 @@ class LandmarkForecast:
         """Information of the visible landmarks."""
         points = self.world.positions()
         n, k = in_sight(self.model, self.world, poses, self.settings)
-        seen = poses[n], points[k], *bearing_range.predict(self.model, poses[n], points[k])
-        whitened = linearize_each(self.model.packed, *seen)[1][..., : bearing_range.POINT]
+        pairs = poses[n], points[k], *bearing_range.predict(self.model, poses[n], points[k])
+        whitened = linearize_each(self.model.packed, *pairs)[1][..., : bearing_range.POINT]
         out = np.zeros((len(poses), 3, 3))
         np.add.at(out, n, np.swapaxes(whitened, 1, 2) @ whitened)
         return np.asarray((self.looks_per_metre * ways)[:, None, None] * out)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
         """Weigh particles by simulated sightings."""
-        looks, scans = metres * self.looks_per_metre / len(poses), len(out)
+        sightings, scans = metres * self.looks_per_metre / len(poses), len(out)
         points = self.world.positions()
         for s in range(len(poses)):
             j, k = in_sight(self.model, self.world, poses[s, :scans], self.settings)
@@ -141,7 +141,7 @@ class LandmarkForecast:
             if not len(j):
                 continue
             ranges, bearings = bearing_range.predict(self.model, poses[s][:, None], points[None])
-            sigmas = bearing_range.sigmas(self.model, ranges[j, k]) / math.sqrt(looks)
+            sigmas = bearing_range.sigmas(self.model, ranges[j, k]) / math.sqrt(sightings)
             normals = np.random.default_rng((int(seed), s)).standard_normal((scans, len(points), 2))
             noise = sigmas * normals[j, k]
             measured = np.column_stack((ranges[j, k] + noise[:, 0], bearings[j, k] + noise[:, 1]))

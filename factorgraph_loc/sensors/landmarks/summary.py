@@ -65,22 +65,22 @@ def summarize(log: Log) -> Summary:
         *(f"landmark {name} is not in the map: {count} sightings" for name, count in unknown.items()),
         *map(str, suspects),
     ]
-    found = {"unseen": unseen, "unknown": unknown, "suspects": suspects}
-    return Summary(found, {"landmarks": len(log.world.landmarks)}, problems)
+    entries = {"unseen": unseen, "unknown": unknown, "suspects": suspects}
+    return Summary(entries, {"landmarks": len(log.world.landmarks)}, problems)
 
 
 def find_suspects(log: Log) -> tuple[Suspect, ...]:
     """The landmarks whose position from sightings at reference poses differs from the map by more than ``MIN_OFFSET`` and five
     standard errors; none without a reference."""
     implied: dict[str, tuple[Array, int]] = {}
-    for name, seen in _seen_from_reference(log).items():
-        passes = len(np.unique(seen.t // PASS))
-        if len(seen.t) < MIN_SIGHTINGS or passes < MIN_PASSES:
+    for name, sightings in _seen_from_reference(log).items():
+        passes = len(np.unique(sightings.t // PASS))
+        if len(sightings.t) < MIN_SIGHTINGS or passes < MIN_PASSES:
             continue
         place = _place(log.world, name)
-        position, spread = _by_range_and_bearing(seen) if seen.has_bearing else _by_range(seen, place)
-        if _distance(position, place) > max(MIN_OFFSET, 5.0 * spread / np.sqrt(passes)):
-            implied[name] = (position, len(seen.t))
+        position, scatter = _by_range_and_bearing(sightings) if sightings.has_bearing else _by_range(sightings, place)
+        if _distance(position, place) > max(MIN_OFFSET, 5.0 * scatter / np.sqrt(passes)):
+            implied[name] = (position, len(sightings.t))
     return tuple(
         Suspect(name, position - _place(log.world, name), count, _partner(log.world, name, implied))
         for name, (position, count) in implied.items()
@@ -126,41 +126,41 @@ def _seen_from_reference(log: Log) -> dict[str, _Seen]:
     return out
 
 
-def _by_range_and_bearing(seen: _Seen) -> tuple[Array, float]:
+def _by_range_and_bearing(sightings: _Seen) -> tuple[Array, float]:
     """Median of the positions from the sightings, and their robust standard deviation [m]."""
-    rows = np.isfinite(seen.bearings)
-    direction = seen.sensors[rows, 2] + seen.bearings[rows]
-    points = seen.sensors[rows, :2] + seen.ranges[rows, None] * np.stack(
+    rows = np.isfinite(sightings.bearings)
+    direction = sightings.sensors[rows, 2] + sightings.bearings[rows]
+    points = sightings.sensors[rows, :2] + sightings.ranges[rows, None] * np.stack(
         (np.cos(direction), np.sin(direction)), axis=-1
     )
     centre = np.median(points, axis=0)
     return centre, MAD_TO_SIGMA * float(np.median(np.hypot(*(points - centre).T)))
 
 
-def _by_range(seen: _Seen, place: Array) -> tuple[Array, float]:
+def _by_range(sightings: _Seen, place: Array) -> tuple[Array, float]:
     """Robust trilateration from the map's position, and the spread [m], whose standard error is the spread over sqrt(passes)."""
 
     def residual(point: Array) -> Array:
-        away: Array = seen.sensors[:, :2] - point
-        return np.hypot(away[:, 0], away[:, 1]) - seen.ranges
+        away: Array = sightings.sensors[:, :2] - point
+        return np.hypot(away[:, 0], away[:, 1]) - sightings.ranges
 
     scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual(place)))), 1e-3)
     fit = scipy.optimize.least_squares(residual, place, loss="soft_l1", f_scale=scale)
     scale = max(MAD_TO_SIGMA * float(np.median(np.abs(fit.fun))), 1e-3)
     fit = scipy.optimize.least_squares(residual, fit.x, loss="cauchy", f_scale=scale)
-    information = fit.jac.T @ fit.jac / len(seen.t)
+    information = fit.jac.T @ fit.jac / len(sightings.t)
     weakest = max(float(np.linalg.eigvalsh(information)[0]), 1e-9)
     return fit.x, MAD_TO_SIGMA * float(np.median(np.abs(fit.fun))) / np.sqrt(weakest)
 
 
 def _partner(world: World, name: str, implied: Mapping[str, tuple[Array, int]]) -> str | None:
     """The other suspect if each of the two is nearer to the other's map position than to its own."""
-    for other in implied:
-        if other != name:
-            mine, theirs = _place(world, name), _place(world, other)
-            at, other_at = implied[name][0], implied[other][0]
+    for candidate in implied:
+        if candidate != name:
+            mine, theirs = _place(world, name), _place(world, candidate)
+            at, other_at = implied[name][0], implied[candidate][0]
             if _distance(at, theirs) < _distance(at, mine) and _distance(other_at, mine) < _distance(other_at, theirs):
-                return other
+                return candidate
     return None
 
 
@@ -204,8 +204,8 @@ def _shifted(log: Log) -> list[str]:
         off = [np.abs(stream.range[rows] - ranges) / model.range_sigma]
         if reference.has_heading:
             off.append(np.abs(se2.wrap(stream.bearing[rows] - bearings)) / model.bearing_sigma)
-        told = [kept for one in off if len(kept := one[np.isfinite(one)]) >= FEWEST // 2]
-        costs.append(sum(float(np.median(one)) for one in told) if told else np.inf)
+        usable = [kept for residuals in off if len(kept := residuals[np.isfinite(residuals)]) >= FEWEST // 2]
+        costs.append(sum(float(np.median(residuals)) for residuals in usable) if usable else np.inf)
     best = int(np.argmin(costs))
     if abs(shifts[best]) < LARGE or not costs[best] < BETTER * costs[len(SHIFTS) // 2]:
         return []
@@ -239,10 +239,10 @@ def draw(log: Log) -> Marks:
     places = log.world.positions()
     positions = np.column_stack((places, np.zeros(len(places))))
     stream = log.streams.get("bearing_range")
-    t, seen = np.empty(0), tuple[str, ...]()
+    t, names = np.empty(0), tuple[str, ...]()
     if isinstance(stream, BearingRangeStream):
-        t, seen = stream.t + log.rig.time_offset("bearing_range"), tuple(stream.landmark)
-    return Marks("landmarks", tuple(log.world.landmarks), positions, t, seen, marker="^", size=7.0, order=4.0)
+        t, names = stream.t + log.rig.time_offset("bearing_range"), tuple(stream.landmark)
+    return Marks("landmarks", tuple(log.world.landmarks), positions, t, names, marker="^", size=7.0, order=4.0)
 
 
 def require_mappable(log: Log) -> None:
@@ -272,7 +272,7 @@ class LocatedLandmark(NamedTuple):
 
 
 def located_landmarks(log: Log, sensors: Collection[str], names: Collection[str]) -> list[LocatedLandmark]:
-    """The landmarks in ``names`` for which range and bearing were measured at once; empty if the log's sightings are not among
+    """The landmarks in ``names`` with range and bearing in one measurement; empty if the log's sightings are not among
     ``sensors``, or its rig lacks the sensor."""
     stream, settings = log.streams.get("bearing_range"), log.rig.find(BearingRangeSettings)
     if "bearing_range" not in sensors or not isinstance(stream, BearingRangeStream) or settings is None:
@@ -282,10 +282,10 @@ def located_landmarks(log: Log, sensors: Collection[str], names: Collection[str]
     rows = [i for i in whole.tolist() if stream.landmark[i] in names]
     ranges, bearings = stream.range[rows], stream.bearing[rows]
     points = located(model, ranges, bearings)
-    spreads = sigmas(model, ranges)
+    deviations = sigmas(model, ranges)
     t = (stream.t[rows] + log.rig.time_offset("bearing_range")).tolist()
     by_range = (located(model, ranges + DELTA, bearings) - points) / DELTA
     by_bearing = (located(model, ranges, bearings + DELTA) - points) / DELTA
-    jacobians = np.stack((by_range, by_bearing), axis=-1) * spreads[:, None, :]
+    jacobians = np.stack((by_range, by_bearing), axis=-1) * deviations[:, None, :]
     covariances = jacobians @ np.swapaxes(jacobians, 1, 2)
     return [LocatedLandmark(t[k], stream.landmark[i], points[k], covariances[k]) for k, i in enumerate(rows)]

@@ -85,20 +85,20 @@ class SightingWindow:
     def _placed(self, k: int, headings: Array, ranges: Array, bearings: Array) -> Array:
         """Present poses (N, 3) that had headings (N,) at a sighting, with its landmark at ranges and bearings (N,)."""
         turned = np.column_stack((np.zeros((len(headings), 2)), headings))
-        there = se2.transform_from(turned, located(self._model, ranges, bearings))
-        return se2.compose(np.column_stack((self.points[k] - there, headings)), self._forth[k])
+        relative = se2.transform_from(turned, located(self._model, ranges, bearings))
+        return se2.compose(np.column_stack((self.points[k] - relative, headings)), self._forth[k])
 
     def alignments(self) -> Array:
         """Present poses (N, 3) that align two landmarks with range and bearing with the map."""
         full = [k for k in self._recent() if not self._missing[k].any()]
         pairs = np.array(list(combinations(full, 2)), dtype=int).reshape(-1, 2)
-        there, here = self.points[pairs], self._from_present()[pairs]
-        for_world, for_robot = there[:, 1] - there[:, 0], here[:, 1] - here[:, 0]
+        mapped, observed = self.points[pairs], self._from_present()[pairs]
+        for_world, for_robot = mapped[:, 1] - mapped[:, 0], observed[:, 1] - observed[:, 0]
         wide = np.minimum(np.hypot(*for_world.T), np.hypot(*for_robot.T)) > BASELINE
         heading = np.arctan2(for_world[:, 1], for_world[:, 0]) - np.arctan2(for_robot[:, 1], for_robot[:, 0])
         turned = np.column_stack((np.zeros((len(pairs), 2)), heading))
-        middle = se2.transform_from(turned, here.mean(axis=1))
-        poses = np.column_stack((there.mean(axis=1) - middle, se2.wrap(heading)))
+        middle = se2.transform_from(turned, observed.mean(axis=1))
+        poses = np.column_stack((mapped.mean(axis=1) - middle, se2.wrap(heading)))
         return np.asarray(poses[wide])
 
     def grain(self) -> Array:
@@ -108,14 +108,14 @@ class SightingWindow:
         position = 0.1 + 0.05 * float(np.median(distances) if len(distances) else RADII[-1])
         return np.diag(np.square((position, position, heading)))
 
-    def whitener(self, spread: Array | None = None) -> Array:
+    def whitener(self, noise: Array | None = None) -> Array:
         """Whitening matrices (K, 2, 2) of the residuals for the sensor noise, the odometry error, and the error of the present
-        pose with body-frame covariance ``spread`` (3, 3), all linearised at the measured range and bearing."""
+        pose with body-frame covariance ``noise`` (3, 3), all linearised at the measured range and bearing."""
         error = self._drift
-        if spread is not None:
-            error = error + self._carried @ spread @ self._carried.transpose(0, 2, 1)
-        seen = np.zeros((len(self.points), 3)), self._from_robot(), self._ranges, self._bearings
-        jacobian = linearize_each(self._model.packed, *seen)[1][..., :POINT]
+        if noise is not None:
+            error = error + self._carried @ noise @ self._carried.transpose(0, 2, 1)
+        sightings = np.zeros((len(self.points), 3)), self._from_robot(), self._ranges, self._bearings
+        jacobian = linearize_each(self._model.packed, *sightings)[1][..., :POINT]
         covariance = np.eye(2) + jacobian @ error @ jacobian.transpose(0, 2, 1)
         # without a bearing the direction of the range is unknown: use the worst case
         worst = np.linalg.eigvalsh(error[:, :2, :2])[:, -1] / self._sigmas[:, 0] ** 2
@@ -126,25 +126,25 @@ class SightingWindow:
         """Squared whitened residuals (N, K) at present poses (N, 3)."""
         return np.asarray(np.sum((whitener @ self._residuals(poses)[..., None])[..., 0] ** 2, axis=-1))
 
-    def losses(self, poses: Array, whitener: Array, spread: Array | None = None) -> Array:
+    def losses(self, poses: Array, whitener: Array, noise: Array | None = None) -> Array:
         """Losses (N,) of present poses (N, 3): robust losses of the sightings plus the loss of the start."""
-        found: Array = geman_mcclure_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
-        return found if self._start is None else found + self._start.loss(poses, self.now, spread)
+        loss: Array = geman_mcclure_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
+        return loss if self._start is None else loss + self._start.loss(poses, self.now, noise)
 
     def refined(
-        self, poses: Array, whitener: Array, iterations: int, spread: Array | None = None
+        self, poses: Array, whitener: Array, iterations: int, noise: Array | None = None
     ) -> tuple[Array, Array]:
         """Poses (N, 3) after Levenberg-Marquardt iterations on the losses, with body-frame covariances (N, 3, 3)."""
 
         def at(poses: Array, _: Integers) -> tuple[Array, Array, Array]:
-            information, gradient = self._normal_equations(poses, whitener, spread)
-            return self.losses(poses, whitener, spread), gradient, information
+            information, gradient = self._normal_equations(poses, whitener, noise)
+            return self.losses(poses, whitener, noise), gradient, information
 
         def moved(poses: Array, steps: Array) -> Array:
             return se2.compose(poses, se2.exp(steps))
 
-        found = minima(at, poses, iterations, CONVERGED, moved=moved, largest=1.0)
-        return found.states, np.asarray(np.linalg.inv(found.curvatures))
+        optima = minima(at, poses, iterations, CONVERGED, moved=moved, largest=1.0)
+        return optima.states, np.asarray(np.linalg.inv(optima.curvatures))
 
     def fused(self, pose: Array, whitener: Array, iterations: int) -> tuple[Array, Array]:
         """A hypothesis (3,) after Gauss-Newton with correlated odometry errors, and its body-frame covariance (3, 3). The path is
@@ -162,8 +162,8 @@ class SightingWindow:
             root = np.sqrt(np.maximum(weight, 1e-6))
             error, jacobian = (part[0] for part in self._linearized(pose[None]))
             if self._start is not None:
-                told, by_pose, _ = self._start.whitened(pose, self.now)
-                jacobian, error = np.concatenate((by_pose[None], jacobian)), np.concatenate((told[None], error))
+                residual, by_pose, _ = self._start.whitened(pose, self.now)
+                jacobian, error = np.concatenate((by_pose[None], jacobian)), np.concatenate((residual[None], error))
             jacobian, error = root[:, None, None] * jacobian, (root[:, None] * error).ravel()
             drift = np.einsum("iab,ijbc,jdc->iajd", jacobian, common, jacobian, optimize=True)
             jacobian = jacobian.reshape(-1, 3)
@@ -198,12 +198,12 @@ class SightingWindow:
     def _linearized(self, poses: Array) -> tuple[Array, Array]:
         """Residuals (N, K, 2) at present poses (N, 3), and their Jacobians (N, K, 2, 3) by the perturbation of these."""
         at, count = se2.compose(poses[:, None], self._back), len(poses)
-        seen = np.tile(self.points, (count, 1)), np.tile(self._ranges, count), np.tile(self._bearings, count)
-        error, jacobian = linearize_each(self._model.packed, at.reshape(-1, 3), *seen)
+        sightings = np.tile(self.points, (count, 1)), np.tile(self._ranges, count), np.tile(self._bearings, count)
+        error, jacobian = linearize_each(self._model.packed, at.reshape(-1, 3), *sightings)
         jacobian = jacobian[..., :POINT].reshape(*at.shape[:2], 2, 3) @ self._carried
         return error.reshape(*at.shape[:2], 2), jacobian
 
-    def _normal_equations(self, poses: Array, whitener: Array, spread: Array | None) -> tuple[Array, Array]:
+    def _normal_equations(self, poses: Array, whitener: Array, noise: Array | None) -> tuple[Array, Array]:
         """Robustly weighted information (N, 3, 3), including that of a nearly flat prior or the start, and gradient (N, 3)."""
         error, jacobian = self._linearized(poses)
         error, jacobian = (whitener @ error[..., None])[..., 0], whitener @ jacobian
@@ -212,5 +212,5 @@ class SightingWindow:
         information, gradient = np.sum(weighted @ jacobian, axis=1) + FLAT, np.sum(weighted @ error[..., None], axis=1)
         if self._start is None:
             return information, gradient[..., 0]
-        more, by_start = self._start.normal_equations(poses, self.now, spread)
+        more, by_start = self._start.normal_equations(poses, self.now, noise)
         return information + more, gradient[..., 0] + by_start

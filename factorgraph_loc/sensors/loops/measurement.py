@@ -143,8 +143,8 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
 def check(m: Loops, where: str) -> dict[str, Any]:
     """The validated fields of a pushed measurement, copied; InputError names the first invalid one."""
     count = numbers(where, "age", m.age).size
-    found = {name: within(where, LOOPS[name], getattr(m, name), (count,)) for name in ("age", *POSE, "score")}
-    known = np.isfinite([found[name] for name in POSE])
+    values = {name: within(where, LOOPS[name], getattr(m, name), (count,)) for name in ("age", *POSE, "score")}
+    known = np.isfinite([values[name] for name in POSE])
     if (known.any(axis=0) & ~known.all(axis=0)).any():
         raise InputError(f"{where}: a loop has a part of a relative pose, expected x, y and heading, or none of them")
-    return found
+    return values

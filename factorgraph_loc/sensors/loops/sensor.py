@@ -75,16 +75,16 @@ def summarize(log: Log) -> Summary:
     if not isinstance(stream, LoopStream) or not len(stream.t):
         return Summary()
     placed = int(np.count_nonzero(np.isfinite(stream.x)))
-    found: dict[str, float] = {"count": len(stream.t), "with_pose": placed}
+    entries: dict[str, float] = {"count": len(stream.t), "with_pose": placed}
     line = f"{len(stream.t)} loops, {placed} of them with a relative pose"
     if log.reference is not None:
         t = stream.t + log.rig.time_offset("loops")
-        here, there = (log.reference.at(at, max_gap=GAP)[:, :2] for at in (t, t - stream.age))
-        apart = np.linalg.norm(here - there, axis=1)
-        told = np.hypot(np.nan_to_num(stream.x), np.nan_to_num(stream.y))
+        later, earlier = (log.reference.at(at, max_gap=GAP)[:, :2] for at in (t, t - stream.age))
+        apart = np.linalg.norm(later - earlier, axis=1)
+        distance = np.hypot(np.nan_to_num(stream.x), np.nan_to_num(stream.y))
         known = np.isfinite(apart)
-        near = np.abs(apart[known] - told[known]) < NEAR
-        found |= {"compared": int(np.count_nonzero(known)), "near": int(np.count_nonzero(near))}
+        near = np.abs(apart[known] - distance[known]) < NEAR
+        entries |= {"compared": int(np.count_nonzero(known)), "near": int(np.count_nonzero(near))}
         if known.any():
             line += f"; of {len(near)} within the reference {np.mean(near):.0%} are right to {NEAR:g} m"
-    return Summary({"loops": found}, text=[Paragraph(line)])
+    return Summary({"loops": entries}, text=[Paragraph(line)])

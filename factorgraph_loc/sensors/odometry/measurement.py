@@ -165,7 +165,7 @@ WAYS = Table(
     ),
     "one each",
 )
-# wheels of which speeds or turns are told, which are converted to velocities or increments
+# measured speeds or turns of wheels, which are converted to velocities or increments
 WHEELS = Table(
     "odometry",
     (
@@ -180,9 +180,9 @@ WHEELS = Table(
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
     """The stream of velocities or increments; rows with equal timestamps are merged."""
-    told = rows["odometry"]
-    if "dx" not in told.numbers:
-        return stream_of(VELOCITIES, told, reading.t0_ns, reading.warnings)
-    moves = np.column_stack([told.numbers[column.name] for column in INCREMENTS.columns[1:]])
-    t_ns, moves = checks.increments_in_order(told.path, told.rows, told.t_ns, moves, reading.warnings)
+    table = rows["odometry"]
+    if "dx" not in table.numbers:
+        return stream_of(VELOCITIES, table, reading.t0_ns, reading.warnings)
+    moves = np.column_stack([table.numbers[column.name] for column in INCREMENTS.columns[1:]])
+    t_ns, moves = checks.increments_in_order(table.path, table.rows, table.t_ns, moves, reading.warnings)
     return IncrementStream(checks.seconds(t_ns, reading.t0_ns), *np.ascontiguousarray(moves.T))

@@ -48,11 +48,11 @@ class OdometryUncertainty(FileModel):
 
 
 class DifferentialDrive(FileModel):
-    """Two wheels, by whose turns or ways a log tells the motion. ``scale_distance`` and ``scale_rotation`` correct what these
+    """Two wheels; a log contains their turns or distances. ``scale_distance`` and ``scale_rotation`` correct what these
     values give: see :meth:`corrected`."""
 
     radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")] | None = None
-    """radius of the wheels; not needed where the log tells the ways that they roll"""
+    """radius of the wheels; not needed if the log contains rolled distances"""
     track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")]
     """distance between the wheels"""
 
@@ -91,7 +91,7 @@ class OdometrySettings(SensorSettings):
     unknown_rotation: Annotated[Noise, InUnit("rad per sqrt(s)")] = 0.2
     """growth of the error of the heading while the motion is unknown"""
     wheels: DifferentialDrive | None = None
-    """two wheels, for logs that tell how these turn"""
+    """two wheels, if the log contains their turns"""
     noise: OdometryNoise = OdometryNoise()
     """growth of the error of the odometry"""
     uncertainty: OdometryUncertainty = OdometryUncertainty()

@@ -46,8 +46,8 @@ def summarize(log: Log) -> Summary:
     text = [
         Paragraph(f"the reference {what} {ratio:.3f} times as much as the odometry") for what, ratio in ratios.items()
     ]
-    found = {f"odometry.{what}_ratio": ratio for what, ratio in ratios.items()}
-    return Summary(found=found, problems=problems or _doubtful(ratios), text=text)
+    entries = {f"odometry.{what}_ratio": ratio for what, ratio in ratios.items()}
+    return Summary(found=entries, problems=problems or _doubtful(ratios), text=text)
 
 
 def against_reference(log: Log) -> tuple[dict[str, float], list[str]]:
@@ -78,7 +78,7 @@ def _ratio(theirs: Array, ours: Array) -> float | None:
 
 
 def _doubtful(ratios: Mapping[str, float]) -> list[str]:
-    """Warnings about scales that differ; a sign or a unit that is wrong is told by the rates."""
+    """Warnings about scales that differ; wrong signs and units are detected from the rates."""
     keys = {"travels": "scale_distance", "turns": "scale_rotation"}
     return [
         f"the reference {what} {ratio:.2f} times as much as the odometry ({keys[what]}, or fgloc calibrate)"
@@ -112,12 +112,12 @@ def motion_problems(log: Log) -> list[str]:
     begin, end = _longest(stream.t)
     t = np.arange(begin, end, STEP) + log.rig.time_offset("odometry")
     states = integrated(log, odometry_model(log.rig)).states(t)
-    heading, way = states[:, 3], states[:, 4]
+    heading, distance = states[:, 3], states[:, 4]
     gyro = log.streams.get("imu")
     if isinstance(gyro, YawRateStream) and len(gyro.t) > 1:
         turned = np.append(0.0, np.cumsum(gyro.w[:-1] * np.diff(gyro.t)))
-        told = np.interp(t, gyro.t + log.rig.time_offset("imu"), turned, left=np.nan, right=np.nan)
-        lines += _compared("imu", "the gyro", match(_rates(heading, WINDOW), _rates(told, WINDOW)))
+        angles = np.interp(t, gyro.t + log.rig.time_offset("imu"), turned, left=np.nan, right=np.nan)
+        lines += _compared("imu", "the gyro", match(_rates(heading, WINDOW), _rates(angles, WINDOW)))
     reference = log.reference
     pause = np.inf if reference is None or len(reference.t) < 2 else float(np.median(np.diff(reference.t)))
     if reference is None or pause > SLOWEST:
@@ -125,12 +125,12 @@ def motion_problems(log: Log) -> list[str]:
     window, poses = max(WINDOW, 2.0 * pause), reference.at(t, max_gap=3.0 * pause)
     if reference.has_heading:
         known = np.isfinite(poses[:, 2])
-        told = np.full(len(t), np.nan)
-        told[known] = np.unwrap(poses[known, 2])
-        lines += _compared("odometry", "the reference", match(_rates(heading, window), _rates(told, window)))
+        angles = np.full(len(t), np.nan)
+        angles[known] = np.unwrap(poses[known, 2])
+        lines += _compared("odometry", "the reference", match(_rates(heading, window), _rates(angles, window)))
     else:
-        found = match(_rates(way, window), _speeds(poses[:, :2], window))
-        lines += _compared("odometry", "the reference", found and RateMatch(found.shift, 1.0))
+        agreed = match(_rates(distance, window), _speeds(poses[:, :2], window))
+        lines += _compared("odometry", "the reference", agreed and RateMatch(agreed.shift, 1.0))
     return lines
 
 
@@ -141,21 +141,21 @@ def _longest(t: Array) -> tuple[float, float]:
     return float(longest[0]), float(longest[-1])
 
 
-def match(rates: Array, others: Array) -> RateMatch | None:
-    """Delay of ``others`` (N,) relative to ``rates`` (N,), sampled every ``STEP``; None if they are uncorrelated.
+def match(rates: Array, delayed: Array) -> RateMatch | None:
+    """Delay of ``delayed`` (N,) relative to ``rates`` (N,), sampled every ``STEP``; None if they are uncorrelated.
 
     The slope is negative if the signs differ. A shift that hardly improves the correlation is set to zero.
     """
-    if np.count_nonzero(np.isfinite(rates) & np.isfinite(others)) < FEWEST:
+    if np.count_nonzero(np.isfinite(rates) & np.isfinite(delayed)) < FEWEST:
         return None
-    found = np.array([_correlation(rates, others, int(k)) for k in SHIFTS])
-    best, none = int(np.argmax(np.abs(found[:, 0]))), len(SHIFTS) // 2
-    if abs(found[best, 0]) < ALIKE:
+    fits = np.array([_correlation(rates, delayed, int(k)) for k in SHIFTS])
+    best, none = int(np.argmax(np.abs(fits[:, 0]))), len(SHIFTS) // 2
+    if abs(fits[best, 0]) < ALIKE:
         return None
-    left = 1.0 - found[:, 0] ** 2
+    left = 1.0 - fits[:, 0] ** 2
     if abs(SHIFTS[best]) * STEP < LARGE or left[best] > BETTER * left[none]:
         best = none
-    return RateMatch(float(SHIFTS[best] * STEP), float(found[best, 1])) if abs(found[best, 0]) >= ALIKE else None
+    return RateMatch(float(SHIFTS[best] * STEP), float(fits[best, 1])) if abs(fits[best, 0]) >= ALIKE else None
 
 
 def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 All antennas of a robot measure from one pose, so a table holds the result of all antennas for each tag position in the robot
 frame, and a tag is looked up once. Only reads need the individual antennas, and they are few: log p(z | x) = sum of log(1 - q) over
 all tags in range + sum of logit(q) over the reads. Both are relative to the floor of false reads, so that tags out of range
-contribute nothing. False reads of tags out of range are not simulated, nor are walls.
+contribute nothing. Walls and false reads of tags out of range are not simulated.
 """
 
 import math
@@ -74,7 +74,7 @@ def _uniform(seed: np.uint64, number: int) -> float:
 
 @compiled(error_model="numpy", fastmath=FAST)
 def _cells(tables: ScanTables, t: int, poses: Array, turns: Array32, out: NDArray[np.int32]) -> None:
-    """The cells in which a tag is seen from poses (M, 3); ``turns`` (2, M): cosine and sine of their headings."""
+    """The table cells of a tag relative to poses (M, 3); ``turns`` (2, M): cosine and sine of their headings."""
     size = np.int32(tables.size)
     ends, middle = np.int32(size - 1), np.float32(size // 2 + 0.5)
     first = np.int32(tables.first[t] + (tables.layers - 1) * size * size)
@@ -111,14 +111,14 @@ def log_weights(
 
     ``poses`` (S, M, 3): measurement poses; ``rounds`` (S,); ``stops`` (M,): number of measurements of each particle.
     """
-    looks, count, _ = poses.shape
+    steps, count, _ = poses.shape
     tags = len(tables.points)
     missed = tables.missed
-    cells = np.empty((looks, tags, count), np.int32)
+    cells = np.empty((steps, tags, count), np.int32)
     # log-likelihood of no reads at all, cumulated over the measurements
-    silence = np.zeros((looks + 1, count), np.float32)
+    silence = np.zeros((steps + 1, count), np.float32)
     turns = np.empty((2, count), np.float32)
-    for k in range(looks):
+    for k in range(steps):
         for i in range(count):
             turns[0, i], turns[1, i] = math.cos(poses[k, i, 2]), math.sin(poses[k, i, 2])
         for t in range(tags):
@@ -141,12 +141,12 @@ def _add_reads(
     tables: ScanTables, cells: NDArray[np.int32], rounds: Places, stops: Places, seed: np.uint64, out: Array32
 ) -> None:
     """Draw the reads of each scan, and add their log-likelihood."""
-    looks, tags, count = cells.shape
+    steps, tags, count = cells.shape
     antennas = tables.read.shape[1]
     gain = tables.gain
     row = np.empty((antennas, count), np.float32)
     filled = np.zeros(antennas, np.bool_)
-    for k in range(looks):
+    for k in range(steps):
         for t in range(tags):
             filled[:] = False
             for n in range(len(stops)):
@@ -206,17 +206,17 @@ class RfidForecast:
         count = len(self.likelihood.model.antennas)
         hits = np.zeros((count, len(self.likelihood.tags.points)), dtype=np.int64)
         one_round = TagReadCounts(np.zeros((count, 3)), np.arange(count), np.ones(count, dtype=np.int64), hits)
-        found = self.likelihood.score(poses, one_round).information
-        return np.asarray((self.rounds_per_metre * ways)[:, None, None] * found)
+        score = self.likelihood.score(poses, one_round).information
+        return np.asarray((self.rounds_per_metre * ways)[:, None, None] * score)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
         """Weigh particles by simulated scans, with the path's rounds distributed over the poses."""
-        looks, total = len(poses), round(metres * self.rounds_per_metre)
-        rounds = np.diff(np.arange(looks + 1) * total // looks).astype(np.int64)
-        found = np.empty_like(out)
+        steps, total = len(poses), round(metres * self.rounds_per_metre)
+        rounds = np.diff(np.arange(steps + 1) * total // steps).astype(np.int64)
+        added = np.empty_like(out)
         tempering = self.likelihood.model.tempering
-        log_weights(self._tables, poses, rounds, stops, len(out), seed, tempering, found)
-        out += found
+        log_weights(self._tables, poses, rounds, stops, len(out), seed, tempering, added)
+        out += added
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> RfidForecast | None:

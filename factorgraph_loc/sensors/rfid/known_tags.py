@@ -35,7 +35,7 @@ CONFIRMED = (
     1.0  # s until a read counts as evidence on the state of its tag: a track that it contradicts may be doubted by then
 )
 CLEAR = math.log(0.99 / 0.01)  # log-odds of a tag that is clearly not as surveyed
-WIDENED = 4.0  # times the standard deviations of the pose for what scans tell of tags: scans in a row have its error in common
+WIDENED = 4.0  # factor of the pose's sigmas for evidence on tags, because consecutive scans share the pose error
 STANDING = np.zeros(3)  # velocity
 EXACT = 0.2  # a survey is exact if its sigma is below this share of `pass_sigma`
 
@@ -94,7 +94,7 @@ def whole_scans(log: Log) -> list[RfidScan]:
 
 @dataclass(frozen=True, eq=False)
 class TagEvidence:
-    """What a scan tells of the states of U ``tags`` (U,), see :meth:`~factors.rfid.tag_states.TagStates.expect`; ``heard`` (U,):
+    """The evidence of a scan on the states of U ``tags``, see :meth:`~factors.rfid.tag_states.TagStates.expect`; ``heard`` (U,):
     whether it read them."""
 
     tags: Integers
@@ -105,8 +105,8 @@ class TagEvidence:
 class KnownTags:
     """Turns scans into read counts of the map's tags. Tags and antennas that map or rig lack are counted as ignored.
 
-    It also tracks the ``states`` of the tags: reads show at once that a tag is not dead; else a scan tells of them only with a
-    known pose (:meth:`told`, :meth:`learn`). Tags that are believed dead or moved are listed in the diagnostics.
+    It also tracks the ``states`` of the tags. A read shows that a tag is not dead; other evidence of a scan requires a known
+    pose (:meth:`told`, :meth:`learn`). Tags that are believed dead or moved are listed in the diagnostics.
     """
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
@@ -125,7 +125,7 @@ class KnownTags:
             shares = settings.dead_tags, settings.weak_tags, settings.moved_tags
         self.states = TagStates(len(self.map.names), *shares)
         self._excluded: set[int | None] = set()  # antennas that are dead
-        self._waiting: deque[tuple[float, Integers, Array]] = deque()  # what reads told since `CONFIRMED` ago
+        self._waiting: deque[tuple[float, Integers, Array]] = deque()  # evidence of reads since `CONFIRMED` ago
 
     @property
     def antennas(self) -> Sequence[str]:
@@ -155,9 +155,9 @@ class KnownTags:
             diagnostics.ignore("rfid", len(m.antennas))
             return None
         if self._excluded:
-            heard = {self._antennas.get(m.antennas[i]) for i in set(m.antenna.tolist())}
-            if not self._excluded.isdisjoint(heard):
-                self._excluded, self._rounds = self._excluded - heard, {}
+            active = {self._antennas.get(m.antennas[i]) for i in set(m.antenna.tolist())}
+            if not self._excluded.isdisjoint(active):
+                self._excluded, self._rounds = self._excluded - active, {}
         rows, used, rounds = self._listening(m.antennas)
         if -1 in rows:
             lacking = sum(name not in self._antennas for name in m.antennas)
@@ -185,39 +185,39 @@ class KnownTags:
         hits = np.zeros((len(used), len(tags)), dtype=np.int64)
         np.add.at(hits, (at, np.searchsorted(tags, places)), 1)
         odds = self.states.odds[tags]
-        # what is read of a tag that is believed to have moved tells nothing of an unknown pose
+        # reads of a tag that has probably moved do not inform an unknown pose
         elsewhere = np.where(hits.any(axis=0) & (odds <= 0.0), -np.inf, 0.0)
         prior = self.states.prior
         twists = np.tile(twist, (len(used), 1))
         return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere, tags, prior, twists)
 
     def told(self, looks: TagReadCounts, pose: Array, covariance: Array, parameters: Array) -> TagEvidence:
-        """What looks tell of the tags in reach at a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3); ``parameters``
-        (Q,): those of the likelihood, as they are estimated to be."""
+        """The evidence of counts on tags in reach at a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3);
+        ``parameters`` (Q,): estimated parameters of the likelihood."""
         assert self.likelihood is not None
         poses = sigma_poses(pose, np.ascontiguousarray(covariance), WIDENED * math.sqrt(3.0))
         places = self.states.hypotheses, FARTHEST, parameters, self.states.odds
         return TagEvidence(*self.likelihood.displaced(poses, looks, *places))
 
     def with_states(self, looks: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
-        """The looks at tags that may be dead or moved, of which they tell ``evidence``."""
+        """The counts with the states of tags that may be dead or moved, given their ``evidence``."""
         elsewhere = self.states.expect(evidence.tags, evidence.told)
         return looks.with_states(evidence.tags, self.states.odds[evidence.tags], elsewhere)
 
-    def without_doubtful(self, looks: TagReadCounts) -> TagReadCounts:
-        """The looks, in which a tag that is clearly not as surveyed by now does not inform the pose."""
-        clear = self.states.odds[looks.listed] > CLEAR
+    def without_doubtful(self, reads: TagReadCounts) -> TagReadCounts:
+        """The counts, in which a tag that is clearly not as surveyed does not inform the pose."""
+        clear = self.states.odds[reads.listed] > CLEAR
         if not clear.any():
-            return looks
+            return reads
         return replace(
-            looks, odds=np.where(clear, -math.log(1e-12), looks.odds), elsewhere=np.where(clear, 0.0, looks.elsewhere)
+            reads, odds=np.where(clear, -math.log(1e-12), reads.odds), elsewhere=np.where(clear, 0.0, reads.elsewhere)
         )
 
     def learn(self, t: float, evidence: TagEvidence) -> None:
         """Learn of the tags that were not read at ``t``, and of those that were read :data:`CONFIRMED` ago."""
-        heard, tags, told = evidence.heard, evidence.tags, evidence.told
-        self.states.learn(t, tags[~heard], told[~heard])
-        self._waiting.append((t, tags[heard], told[heard]))
+        is_read, tags, told = evidence.heard, evidence.tags, evidence.told
+        self.states.learn(t, tags[~is_read], told[~is_read])
+        self._waiting.append((t, tags[is_read], told[is_read]))
         while self._waiting[0][0] < t - CONFIRMED:
             self.states.learn(*self._waiting.popleft())
         self._tell()
@@ -302,8 +302,8 @@ class TagSignals:
         if self.phase is None:
             return False
         antennas, tags = self._tags.places(m)
-        told = (antennas >= 0) & (tags >= 0) & np.isfinite(m.phase) & np.isfinite(m.frequency)
-        for i in np.flatnonzero(told).tolist():
+        complete = (antennas >= 0) & (tags >= 0) & np.isfinite(m.phase) & np.isfinite(m.frequency)
+        for i in np.flatnonzero(complete).tolist():
             t = m.t - float(m.age[i])
             self._rows.append((m.t, (t, int(antennas[i]), int(tags[i]), float(m.phase[i]), float(m.frequency[i]))))
         while self._rows and self._rows[0][0] < m.t - self._window - GOING_BACK:

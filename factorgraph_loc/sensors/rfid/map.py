@@ -50,8 +50,8 @@ class Tag(FileModel):
 
 
 class TagsFile(ColumnMapping):
-    """A foreign table of tags with the fields epc, x, y and optionally z, facing, sigma. ``epc_case``: letter case in which EPCs
-    are compared with the reads."""
+    """A foreign table of tags with the fields epc, x, y and optionally z, facing, sigma. ``epc_case``: letter case of EPCs in
+    comparisons with the reads."""
 
     epc_case: EpcCase = "as written"
 

@@ -18,8 +18,8 @@ KEPT = 60.0  # s
 SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations; thresholds at which a suspicion begins and ends
 SCANS = 4  # minimum number
 CHANGED = 0.05  # of a parameter of a detection model
-BLOCK, POSSIBLE = 10.0, 0.01  # s in which reads are counted; least probability of one that is
-INDEPENDENT = 1.5  # ratio of variances up to which reads are taken to be independent
+BLOCK, POSSIBLE = 10.0, 0.01  # s of counting; least probability of a counted read
+INDEPENDENT = 1.5  # largest ratio of variances of independent reads
 PRIOR = 50.0  # variance of independent reads that is believed beforehand
 REMEMBERED = 0.95  # share of what was counted that still counts a block later
 NO_TAGS = np.empty(0, dtype=np.int64)
@@ -47,8 +47,8 @@ class SilenceMonitor:
 class ScanMonitor:
     """Detects that scans are much less likely than they would be on a correct track.
 
-    That is only a suspicion, because dead tags and a wrong map look the same. The search tells whether there is a better
-    pose.
+    That is only a suspicion, because dead tags and a wrong map have the same effect. The search decides whether there is a
+    better pose.
     """
 
     def __init__(self) -> None:
@@ -64,8 +64,8 @@ class ScanMonitor:
         self._scans.append((t, surprise, variance))
         while self._scans[0][0] < t - KEPT:
             self._scans.popleft()
-        excess, spread, count = self._sums()
-        z = (excess - count * self._usual) / math.sqrt(spread + 1e-9) if count >= SCANS else 0.0
+        excess, noise, count = self._sums()
+        z = (excess - count * self._usual) / math.sqrt(noise + 1e-9) if count >= SCANS else 0.0
         if z > SUSPICIOUS or (self.suspicious_since is not None and z > CALM):
             self.suspicious_since = self._beginning()
         else:
@@ -103,12 +103,12 @@ class ScanMonitor:
 
 
 class BurstMonitor:
-    """How many rounds tell as much as one. Reads and misses that go together, behind a person or a shelf, scatter more in blocks of
-    time than independent ones; the ratio of the variances is their worth (McCullagh and Nelder, "Generalized linear models", 1989,
-    section 4.5). Counted for each of A antennas and T tags."""
+    """The number of rounds that inform as much as one independent round. Correlated reads and misses, behind a person or a shelf,
+    scatter more in blocks of time. The number is the ratio of the variances (McCullagh and Nelder, "Generalized linear models",
+    1989, section 4.5). Counted for each of A antennas and T tags."""
 
     def __init__(self, antennas: int, tags: int) -> None:
-        # reads less expected ones, and their variance, in this block; and the tags of which there are some
+        # reads minus expected reads and their variance in this block; and the tags with any
         self._cells = np.zeros((tags, 2, antennas))
         self._tags = NO_TAGS
         self._sums = np.full(2, PRIOR)  # of the squares, and of the variances, of all blocks
@@ -118,11 +118,11 @@ class BurstMonitor:
     @property
     def together(self) -> float:
         """The ratio, 1 where a right model may have it by chance."""
-        found = float(self._sums[0] / self._sums[1])
-        return found if found > INDEPENDENT else 1.0
+        ratio = float(self._sums[0] / self._sums[1])
+        return ratio if ratio > INDEPENDENT else 1.0
 
-    def add(self, t: float, looks: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_]) -> None:
-        """Add what was read in looks, once; ``counts`` (C,): which of the tags are counted."""
+    def add(self, t: float, measured: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_]) -> None:
+        """Add the reads of a scan once; ``counts`` (C,): whether each tag is counted."""
         if t <= self._last:
             return
         self._last = t
@@ -130,7 +130,7 @@ class BurstMonitor:
             squares, variances = _taken(self._cells, self._tags)
             self._sums = REMEMBERED * self._sums + (squares, variances)
             self._tags, self._begun = NO_TAGS, t
-        _count(self._cells, looks.antennas, looks.rounds, reads.tags, reads.hits, reads.p, counts)
+        _count(self._cells, measured.antennas, measured.rounds, reads.tags, reads.hits, reads.p, counts)
         self._tags = np.union1d(self._tags, reads.tags)
 
     def clear(self) -> None:
@@ -170,8 +170,8 @@ def _taken(cells: Array, tags: Integers) -> tuple[float, float]:
 
 
 class SettledParameters:
-    """The parameters (P,) of detection models as they were estimated some seconds ago: a track that is wrong spoils them before it
-    is found out. They are held until they have changed clearly, as each value needs tables of its own in a search."""
+    """The estimated parameters (P,) of detection models some seconds ago, because a wrong track spoils them before it is
+    detected. They are constant until they have changed clearly, as each value needs tables of its own in a search."""
 
     def __init__(self, count: int) -> None:
         self._waiting: deque[tuple[float, Array]] = deque()
@@ -195,14 +195,14 @@ class SettledParameters:
 
 
 BAND, BANDS = 1.0, 50  # m of distance, and how many bands; the last one has no end
-FEWEST = 30.0  # predicted reads of a group that is told
+FEWEST = 30.0  # least predicted reads of a reported group
 SHOWN = 4  # groups that are named
-DIFFERENT = 0.15  # share of the predicted reads by which a model that is doubted is off
+DIFFERENT = 0.15  # least relative error of the predicted reads of a doubted model
 TINY = 1e-9  # reads: none of them has no logarithm
-WINDOW = 15.0  # s in which what was counted comes to count for 1 / e
+WINDOW = 15.0  # s after which counts have the weight 1 / e
 DOUBTED, TRUSTED = 1e-5, 1e-3  # probability of such counts with a right model at which doubts begin, and end
 MANY, NEARLY_NONE = 12.0, 0.05  # predicted reads of an antenna that may be dead, and the share of these that it reads
-KNOWN = BAND / 4.0  # m: standard deviation of the position up to which a scan tells of the model
+KNOWN = BAND / 4.0  # m: largest standard deviation of the position with which a scan informs the model
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +226,7 @@ class ReadGroups:
         return np.flatnonzero(self.sums[1, :count] >= fewest)
 
     def names(self, groups: Integers) -> list[str]:
-        """What groups are called."""
+        """The names of groups."""
         bands = [f"{b * BAND:g} to {(b + 1) * BAND:g} m" for b in range(BANDS)]
         return [(bands + [f"antenna {name}" for name in self.antennas])[g] for g in groups.tolist()]
 
@@ -241,8 +241,8 @@ class ReadGroups:
 class ConsistencyMonitor:
     """Whether reads are as the detection models predict, in a window that forgets.
 
-    The bands of distance and the antennas have a chi-square each, where ``together`` rounds tell as much as one; groups of
-    which few reads are predicted are merged, far bands with nearer ones: there are the reads if a range is too short. The model is
+    The bands of distance and the antennas have a chi-square each, where ``together`` rounds count as one; groups with
+    few predicted reads are merged, far bands with nearer ones: there are the reads if a range is too short. The model is
     doubted while one of them is beyond chance, and more than :data:`DIFFERENT` of the predicted reads are missing or too many.
     That may come of a wrong pose: ``suspicious_since`` is the time [s] since which they were not as by chance; None without doubts,
     and once the pose is accepted.
@@ -258,24 +258,24 @@ class ConsistencyMonitor:
         self.suspicious_since: float | None = None
 
     def add(
-        self, t: float, looks: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_], together: float
+        self, t: float, measured: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_], together: float
     ) -> None:
-        """Add what was read in looks, once; ``counts`` (K, C): which of it is counted."""
+        """Add the reads of a scan once; ``counts`` (K, C): whether each read is counted."""
         if t <= self._last:
             return
         forgotten = math.exp((self._last - t) / WINDOW)
         self._last = t
         self._groups.sums[:2] *= forgotten
         self._groups.sums[2] *= forgotten**2
-        _add(self._groups.sums, looks.antennas, looks.rounds, reads.hits, reads.p, reads.distance, counts)
+        _add(self._groups.sums, measured.antennas, measured.rounds, reads.hits, reads.p, reads.distance, counts)
         by_distance, by_antenna = self._chance(slice(0, BANDS), together), self._chance(slice(BANDS, None), together)
         chance = min(by_distance, by_antenna)
         if chance >= TRUSTED:
             self._odd_since = None
         elif self._odd_since is None:
             self._odd_since = t
-        before, self.doubted = self.doubted, chance < (TRUSTED if self.doubted else DOUBTED)
-        if self.doubted != before:
+        was_doubted, self.doubted = self.doubted, chance < (TRUSTED if self.doubted else DOUBTED)
+        if self.doubted != was_doubted:
             self.suspicious_since = self._odd_since if self.doubted else None
 
     def _chance(self, groups: slice, together: float) -> float:
@@ -291,8 +291,8 @@ class ConsistencyMonitor:
     @property
     def shares(self) -> str:
         """Reads over predicted reads of the groups that are off most."""
-        told = self._groups.told()
-        return self._groups.shares(told if len(told) else self._groups.told(1.0))
+        groups = self._groups.told()
+        return self._groups.shares(groups if len(groups) else self._groups.told(1.0))
 
     def dead_antennas(self, together: float) -> list[int]:
         """The antennas that read nothing, or nearly so, although :data:`MANY` independent reads were predicted of each."""

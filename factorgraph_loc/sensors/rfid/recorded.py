@@ -41,7 +41,7 @@ class RecordedLooks:
     tree: cKDTree
 
     def carried_by(self, rig: Rig) -> Rig:
-        """A rig with the recorded antennas, for a world without survey errors."""
+        """A rig with the recorded antennas in a world without survey errors."""
         return rig.model_copy(update={"rfid": self.rfid, "survey": SurveySettings()})
 
     def outcomes(self, tags: TagArray, poses: Array, rng: np.random.Generator) -> Array:
@@ -53,10 +53,10 @@ class RecordedLooks:
         antennas = self.rfid.all_antennas()
         out = np.zeros((len(poses), len(antennas), len(tags.points)))
         for a, antenna in enumerate(antennas.values()):
-            seen = _features(antenna, tags, poses)
-            jitter = JITTER * rng.standard_normal(seen.shape[1:])
-            near = seen[..., 0] * SCALES[0] <= self.reach
-            _, donors = self.tree.query((seen + jitter)[near], k=DONORS)
+            features = _features(antenna, tags, poses)
+            jitter = JITTER * rng.standard_normal(features.shape[1:])
+            near = features[..., 0] * SCALES[0] <= self.reach
+            _, donors = self.tree.query((features + jitter)[near], k=DONORS)
             chosen = rng.integers(DONORS, size=len(donors))
             out[:, a][near] = self.read[donors[np.arange(len(donors)), chosen]]
         return out
@@ -64,8 +64,8 @@ class RecordedLooks:
     def unmatched(self, tags: TagArray, poses: Array) -> float:
         """Share of the rounds within range that have no donor within :data:`FAR` scales."""
         antennas = self.rfid.all_antennas().values()
-        seen = np.concatenate([_features(antenna, tags, poses).reshape(-1, 4) for antenna in antennas])
-        near = seen[seen[:, 0] * SCALES[0] <= self.reach]
+        features = np.concatenate([_features(antenna, tags, poses).reshape(-1, 4) for antenna in antennas])
+        near = features[features[:, 0] * SCALES[0] <= self.reach]
         if not len(near):
             return 0.0
         distance, _ = self.tree.query(near, k=1)
@@ -107,12 +107,12 @@ def _looks(log: Log) -> tuple[Array, Array]:
             for k, listening in enumerate(scan.antennas):
                 if listening == name:
                     rows.append(i)
-                    found = {
+                    read = {
                         tags.index[scan.tags[j]]
                         for j in np.flatnonzero(scan.antenna == k)
                         if scan.tags[j] in tags.index
                     }
-                    hits.append([float(t in found) for t in range(len(tags.names))])
+                    hits.append([float(t in read) for t in range(len(tags.names))])
         if rows:
             features.append(_features(antenna, tags.tags, poses[rows]).reshape(-1, 4))
             reads.append(np.array(hits).ravel())

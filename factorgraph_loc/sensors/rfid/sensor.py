@@ -33,7 +33,7 @@ from factors.rfid.factor import ITERATIONS, NO_VALUES, RfidFactor
 from factors.se2 import Array
 from factors.update import Correction
 
-PLACED = 5.0  # m: standard deviation of the position, above which a scan tells nothing of single tags
+PLACED = 5.0  # m: standard deviation of the position, above which a scan does not inform single tags
 SCAN = 50  # work of a scan, besides that of the tags in reach
 
 
@@ -66,8 +66,8 @@ class TagObservation:
     @property
     def things(self) -> frozenset[Hashable]:
         """The tags that were read, by index in the map."""
-        looks = self.factor.reads
-        return frozenset(looks.read_tags.tolist()) if isinstance(looks, TagReadCounts) else frozenset()
+        reads = self.factor.reads
+        return frozenset(reads.read_tags.tolist()) if isinstance(reads, TagReadCounts) else frozenset()
 
     def at_its_time(self) -> Self | None:
         """The reads and misses at their own time; None for strength and phase, whose likelihoods are multimodal."""
@@ -89,22 +89,22 @@ class TagObservation:
         iterations: int = 1,
     ) -> Correction:
         """The most likely pose and parameters, by Fisher scoring; what else is in the state follows by correlation."""
-        at, before = [0, 1, 2], NO_VALUES
+        at, prior = [0, 1, 2], NO_VALUES
         for name in self.blocks:  # at most one
-            at, before = [*at, *range(columns[name].start, columns[name].stop)], np.array(values[name])
+            at, prior = [*at, *range(columns[name].start, columns[name].stop)], np.array(values[name])
         own = np.ascontiguousarray(covariance[np.ix_(at, at)])
-        found = self.factor.correct(pose, own, before, iterations)
+        correction = self.factor.correct(pose, own, prior, iterations)
         if len(covariance) == len(at):
-            return found
+            return correction
         gain = positive.solve(own, covariance[at]).T
-        after = covariance - gain @ (own - found.covariance) @ gain.T
-        return replace(found, delta=gain @ found.delta, covariance=after)
+        posterior = covariance - gain @ (own - correction.covariance) @ gain.T
+        return replace(correction, delta=gain @ correction.delta, covariance=posterior)
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
         return self.factor.log_likelihood(poses, *(values[name] for name in self.blocks))
 
     def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
-        """The same with the detection models as they are estimated to be; how exactly is left out."""
+        """The same with the estimated detection models; their uncertainty is neglected."""
         if not self.blocks:
             return self
         return replace(self, factor=self.factor.fixed(values[self.blocks[0]]), blocks=())
@@ -144,32 +144,32 @@ class TagSensor(Sensor):
         self._settled = SettledParameters(0 if self.tags.likelihood is None else len(self.tags.likelihood.parameters))
         self._for_search = self.tags.likelihood
         self._heard = -math.inf  # last scan that was checked for silence
-        self._confirmed = -math.inf  # time [s] from which on a new track is believed, and models are learnt on it
+        self._confirmed = -math.inf  # time [s] after which a new track is accepted and models are learnt
 
     def observe(self, m: RfidScan, view: View) -> Iterator[TagObservation]:
         is_late = "time_offset" in self.constants.names
         twist = self._wheels.twist(m.t) if is_late and self._wheels is not None else STANDING
-        looks, likelihood = self.tags.looks(m, twist), self.tags.likelihood
-        if looks is None or likelihood is None:
+        counts, likelihood = self.tags.looks(m, twist), self.tags.likelihood
+        if counts is None or likelihood is None:
             return
-        here = looks if view.offset is None else looks.moved(view.offset.delta)
-        told = None
+        relative = counts if view.offset is None else counts.moved(view.offset.delta)
+        evidence = None
         if view.localized:
             estimated = self._estimated(view)
             if view.newest and self.suspicious_since is None and self._settled.add(m.t, estimated):
                 self._for_search = likelihood.adjusted(self._settled.values)
             if np.trace(view.covariance[:2, :2]) < PLACED**2:
-                told = self.tags.told(here, view.pose, view.covariance, estimated)
-                looks = self.tags.with_states(looks, told)
-                here = looks if view.offset is None else looks.moved(view.offset.delta)
-        found = replace(self._detection(m, here, looks), told=told, settled=self._for_search)
-        yield found if not view.localized or self._learns(m.t) else found.on_pose(self._values(view), {})
+                evidence = self.tags.told(relative, view.pose, view.covariance, estimated)
+                counts = self.tags.with_states(counts, evidence)
+                relative = counts if view.offset is None else counts.moved(view.offset.delta)
+        observation = replace(self._detection(m, relative, counts), told=evidence, settled=self._for_search)
+        yield observation if not view.localized or self._learns(m.t) else observation.on_pose(self._values(view), {})
         if self._silence.lasts and view.newest:
             return
         strengths = self._signals.strengths(m)
         if strengths is not None and self._signals.strength is not None:
             yield TagObservation(
-                m.t, RfidFactor(self._signals.strength, strengths.moved(here.offsets[0])), len(strengths.rssi)
+                m.t, RfidFactor(self._signals.strength, strengths.moved(relative.offsets[0])), len(strengths.rssi)
             )
         if view.newest and view.localized:
             self._signals.forget(m.t)
@@ -184,10 +184,10 @@ class TagSensor(Sensor):
         slips = self._wheels is not None and self._wheels.is_slipping
         return not slips and self.suspicious_since is None and t >= self._confirmed
 
-    def _detection(self, m: RfidScan, moved: TagReadCounts, looks: TagReadCounts) -> TagObservation:
+    def _detection(self, m: RfidScan, moved: TagReadCounts, counts: TagReadCounts) -> TagObservation:
         assert self.tags.likelihood is not None
         factor = RfidFactor(self.tags.likelihood, moved, self.constants.indices)
-        return TagObservation(m.t, factor, int(looks.hits.sum()), looks, len(m.antennas), self._blocks)
+        return TagObservation(m.t, factor, int(counts.hits.sum()), counts, len(m.antennas), self._blocks)
 
     def judge(self, observation: TagObservation, correction: Correction, view: View) -> bool:
         t = observation.t
@@ -217,10 +217,10 @@ class TagSensor(Sensor):
         if np.trace(view.covariance[:2, :2]) < KNOWN**2:
             # not without those that are believed to have moved: with a wrong model most tags seem to
             counts = (reads.p > POSSIBLE) & (surveyed | states.were_read(reads.tags))
-            together = 1.0 / self.tags.likelihood.model.tempering
+            overdispersion = 1.0 / self.tags.likelihood.model.tempering
             doubted = self._consistency.doubted
-            self._consistency.add(t, looks, reads, counts, together)
-            for antenna in self._consistency.dead_antennas(together):
+            self._consistency.add(t, looks, reads, counts, overdispersion)
+            for antenna in self._consistency.dead_antennas(overdispersion):
                 name = self.tags.exclude(antenna)
                 self._diagnostics.event(t, f"antenna {name} reads no tag where it should: it is ignored until it does")
                 self._consistency.clear()
@@ -229,11 +229,11 @@ class TagSensor(Sensor):
 
     def _values(self, view: View) -> dict[str, Array]:
         """The parameters (P,) of the detection models that are estimated, by block."""
-        found = {name: view.value(name) for name in self._blocks}
-        return {name: value for name, value in found.items() if value is not None}
+        values = {name: view.value(name) for name in self._blocks}
+        return {name: value for name, value in values.items() if value is not None}
 
     def _estimated(self, view: View) -> Array:
-        """The parameters (Q,) of the likelihood as they are estimated to be."""
+        """The estimated parameters (Q,) of the likelihood."""
         assert self.tags.likelihood is not None
         out = self.tags.likelihood.parameters.copy()
         for value in self._values(view).values():
@@ -251,11 +251,11 @@ class TagSensor(Sensor):
         return not self._silence.lasts
 
     def evidence(self, m: RfidScan) -> TagObservation | None:
-        looks = self.tags.looks(m, count=False)
-        if looks is None or self.tags.likelihood is None:
+        counts = self.tags.looks(m, count=False)
+        if counts is None or self.tags.likelihood is None:
             return None
-        found = self._detection(m, looks, looks)  # with the models of the rig
-        return replace(found, factor=replace(found.factor, estimated=()), blocks=())
+        observation = self._detection(m, counts, counts)  # with the models of the rig
+        return replace(observation, factor=replace(observation.factor, estimated=()), blocks=())
 
     @property
     def suspicious_since(self) -> float | None:

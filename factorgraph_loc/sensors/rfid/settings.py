@@ -326,11 +326,11 @@ LARGEST = 20.0  # of a logit; the probability is 0 or 1 to nine digits
 
 def read_grid(path: str | Path) -> GridModel:
     """Read a grid; infinite logits are clipped. InputError names what is missing or has a wrong shape."""
-    found = _read_arrays(Path(path))
-    logits, origin, heights = found["logits"], found["origin"], np.atleast_1d(found["heights"])
+    arrays = _read_arrays(Path(path))
+    logits, origin, heights = arrays["logits"], arrays["origin"], np.atleast_1d(arrays["heights"])
     if logits.ndim != 4 or min(logits.shape[2:]) < 2 or min(logits.shape) < 1 or logits.shape[0] != len(heights):
         raise bad_field(path, "logits", f"an array of shape {logits.shape}", "(heights, facings, x, y)")
-    cell = found["cell"]
+    cell = arrays["cell"]
     if origin.shape != (2,) or not np.all(np.abs(origin) <= FARTHEST):
         raise bad_field(path, "origin", origin.tolist(), f"two numbers in {-FARTHEST:g} to {FARTHEST:g} m")
     if cell.size != 1 or not FINEST <= cell.item() <= FARTHEST:

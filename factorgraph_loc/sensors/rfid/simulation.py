@@ -80,7 +80,7 @@ class ClockJump(FileModel):
 
 
 class Silence(FileModel):
-    """A while in which no tag is read."""
+    """An interval without reads."""
 
     time: Duration
     """begin of it"""

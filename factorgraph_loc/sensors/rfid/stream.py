@@ -176,8 +176,8 @@ def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> Rfi
 
 
 def _rounds(where: str, t: float, names: tuple[str, ...], reads: Sequence[RfidRead]) -> NDArray[np.int64]:
-    """The round of each read (R,). If a read does not name it: the first round of its antenna in which the tag was not read yet, in
-    order of time, or the last round."""
+    """The round of each read (R,). If a read does not name it: the first round of its antenna without a read of the tag, in order
+    of time, or the last round."""
     out = np.full(len(reads), -1, dtype=np.int64)
     for i, read in enumerate(reads):
         if not isinstance(read.antenna, str) or read.antenna not in names:

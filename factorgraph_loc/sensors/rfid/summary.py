@@ -64,10 +64,10 @@ class RfidSummary:
 
 def summarize(log: Log) -> Summary:
     """``rfid``: a :class:`RfidSummary`, or None if the log lacks the stream."""
-    found, in_map = summarize_rfid(log), {"tags": len(log.world.tags)}
-    if found is None:
+    summary, in_map = summarize_rfid(log), {"tags": len(log.world.tags)}
+    if summary is None:
         return Summary({"rfid": None}, in_map)
-    return Summary({"rfid": found}, in_map, rfid_problems(log, found), (_paragraph(found),))
+    return Summary({"rfid": summary}, in_map, rfid_problems(log, summary), (_paragraph(summary),))
 
 
 def _paragraph(found: RfidSummary) -> Paragraph:
@@ -209,13 +209,13 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
 
 def suspected(tags: Mapping[str, float]) -> str:
     """Tags with their probabilities, the surest first."""
-    found = sorted(tags.items(), key=lambda row: -row[1])
-    names = ", ".join(f"{name} ({_percent(probability)})" for name, probability in found[:SHOWN])
-    return names + (f" and {len(found) - SHOWN} more" if len(found) > SHOWN else "")
+    ranked = sorted(tags.items(), key=lambda row: -row[1])
+    names = ", ".join(f"{name} ({_percent(probability)})" for name, probability in ranked[:SHOWN])
+    return names + (f" and {len(ranked) - SHOWN} more" if len(ranked) > SHOWN else "")
 
 
 def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
-    """What was learnt of the antennas' models and is clearly not what the rig says."""
+    """The learnt parameters of the antennas' models that clearly differ from the rig."""
     names = settings.parameter_names()
     for name, parameters in names.items():
         peak = min(settings.models[name].model().peak, MOST_CERTAIN)
@@ -225,9 +225,9 @@ def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
         if abs(ranges[0]) > CLEARLY * ranges[1] and abs(factor - 1.0) > CHANGED:
             more = f"{100.0 * abs(factor - 1.0):.0f} % {'farther' if factor > 1.0 else 'less far'}"
             yield f"{of} reach {more} than the rig says"
-        found = peak * rate_of(peak, rate[0])
-        if abs(rate[0]) > CLEARLY * rate[1] and abs(found - peak) > CHANGED:
-            yield f"{of} read {100.0 * found:.0f} % of the tags next to them, where the rig says {100.0 * peak:.0f} %"
+        share = peak * rate_of(peak, rate[0])
+        if abs(rate[0]) > CLEARLY * rate[1] and abs(share - peak) > CHANGED:
+            yield f"{of} read {100.0 * share:.0f} % of the tags next to them, where the rig says {100.0 * peak:.0f} %"
     yield from _mounting(settings, learnt)
 
 
@@ -240,10 +240,10 @@ def _mounting(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
         if abs(turn) > max(CLEARLY * math.hypot(common[1], own[1]), TURNED):
             turned[name] = turn
     if turned:
-        told = ", ".join(f"{name} by {math.degrees(turn):+.1f} degrees" for name, turn in turned.items())
+        turns = ", ".join(f"{name} by {math.degrees(turn):+.1f} degrees" for name, turn in turned.items())
         yaws = {name: wrap_scalar(settings.all_antennas()[name].yaw + turn) for name, turn in turned.items()}
         lines = ", ".join(f"rfid.antennas.{name}.yaw = {yaw:.3f}" for name, yaw in yaws.items())
-        yield f"antennas are turned from the yaw in the rig ({told}): set {lines} in the rig"
+        yield f"antennas are turned from the yaw in the rig ({turns}): set {lines} in the rig"
     later, sigma = learnt.values.get("rfid.time_offset", (0.0, 0.0))
     if abs(later) > max(CLEARLY * sigma, LATE):
         yield line("rfid", -later, "the odometry", "rfid", settings.time_offset + later)
@@ -255,7 +255,7 @@ def _percent(probability: float) -> str:
 
 MOST_ROUNDS = 6000  # of a long log so many are looked at, evenly spread
 OFF = 4.0  # standard deviations above which a group that is off is doubted
-TOGETHER = 2.0  # rounds that count as one: more is told, as estimators take `1 / tempering` for it
+TOGETHER = 2.0  # rounds that count as one: larger ratios to `1 / tempering` are reported
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +274,7 @@ class _Looks:
 def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Trajectory) -> Reliability | None:
     """The reliability of the detection models with what was learnt of them; None without reads, antennas or covariances.
 
-    Tags that are believed dead are left out, and times in which nothing was read. Tags that seem to have moved count, because many
+    Probably dead tags and times without reads are left out. Tags that seem to have moved count, because many
     seem to where the model is wrong.
     """
     log, settings = use.log, use.log.rig.find(RfidSettings)
@@ -298,18 +298,18 @@ def _looks(
     log, tags = use.log, tag_map(use.log.world, use.log.rig.of(SurveySettings), kept)
     likelihood = RfidLikelihood(settings.model(), tags.tags)
     estimated = settings.estimated()
-    found = np.array([learnt.values.get(f"rfid.{name}", (0.0, 0.0))[0] for name in estimated.names])
-    likelihood = likelihood.adjusted(estimated.full(found, len(likelihood.parameters)))
+    changes = np.array([learnt.values.get(f"rfid.{name}", (0.0, 0.0))[0] for name in estimated.names])
+    likelihood = likelihood.adjusted(estimated.full(changes, len(likelihood.parameters)))
     first, inverse = np.unique(np.rec.fromarrays((stream.t, stream.round)), return_index=True, return_inverse=True)[1:]
     t = stream.t[first] + log.rig.time_offset("rfid") + likelihood.packed.delay[0]
     block = ((t - t.min()) // BLOCK).astype(np.int64)
     read = np.array([epc in tags.index for epc in stream.epc], dtype=bool)
-    heard = np.zeros(int(block.max()) + 1, dtype=bool)
-    heard[block[inverse[read]]] = True
+    is_read = np.zeros(int(block.max()) + 1, dtype=bool)
+    is_read[block[inverse[read]]] = True
     numbers = {name: i for i, name in enumerate(settings.all_antennas())}
     antenna = np.array([numbers.get(stream.antenna[i], -1) for i in first.tolist()], dtype=np.int64)
     poses = possible_poses(final, t, REFERENCE_GAP)
-    used = np.isfinite(poses[:, 0]) & (antenna >= 0) & heard[block]
+    used = np.isfinite(poses[:, 0]) & (antenna >= 0) & is_read[block]
     used[np.flatnonzero(used)[_left_out(int(used.sum()))]] = False
     rows = np.flatnonzero(read)
     place = np.array([tags.index[stream.epc[i]] for i in rows.tolist()], dtype=np.int64)
@@ -344,26 +344,26 @@ def _told(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Rel
     if looks.p.sum() < FEWEST:
         return None
     groups = ReadGroups(antennas)
-    one = np.ones(len(looks.p), dtype=np.int64)
+    ones = np.ones(len(looks.p), dtype=np.int64)
     reads = ExpectedReads(looks.tag, looks.hit.astype(np.int64)[:, None], looks.p[:, None], looks.distance[:, None])
-    groups.add(looks.antenna, one, reads, one[:, None] > 0)
-    together, told = _together(looks, (looks.distance // BAND).astype(np.int64)), groups.told()
-    if not len(told):
+    groups.add(looks.antenna, ones, reads, ones[:, None] > 0)
+    together, chosen = _together(looks, (looks.distance // BAND).astype(np.int64)), groups.told()
+    if not len(chosen):
         return None
-    observed, predicted, variance = groups.sums[:, told]
+    observed, predicted, variance = groups.sums[:, chosen]
     # what the estimators take successive rounds for is no reason to doubt the model either
-    spread = np.sqrt(max(together, 1.0 / tempering) * variance)
-    off = (np.abs(observed - predicted) > OFF * spread) & (np.abs(observed / predicted - 1.0) > DIFFERENT)
+    sigma = np.sqrt(max(together, 1.0 / tempering) * variance)
+    off = (np.abs(observed - predicted) > OFF * sigma) & (np.abs(observed / predicted - 1.0) > DIFFERENT)
     doubts = []
     if np.any(off):
-        shares = groups.shares(told[off])
+        shares = groups.shares(chosen[off])
         doubts.append(f"{log}: reads over those that the detection models predict, by distance and antenna: {shares}")
     if together * tempering > TOGETHER:
         doubts.append(
-            f"{log}: reads and misses come in bursts, {together:.0f} rounds tell as much as one; the tempering in the rig is "
+            f"{log}: reads and misses come in bursts, {together:.0f} rounds inform as much as one; the tempering in the rig is "
             f"{tempering:g}"
         )
-    return Reliability("reads", groups.names(told), observed, predicted, spread, together, tuple(doubts))
+    return Reliability("reads", groups.names(chosen), observed, predicted, sigma, together, tuple(doubts))
 
 
 def _together(looks: _Looks, band: Integers) -> float:
@@ -385,9 +385,9 @@ def draw(log: Log) -> Marks:
     """The tags of the map, corrected by the rig's survey transform, and the times of their reads."""
     known = tag_map(log.world, log.rig.of(SurveySettings))
     stream = log.streams.get("rfid")
-    t, seen = np.empty(0), tuple[str, ...]()
+    t, names = np.empty(0), tuple[str, ...]()
     if isinstance(stream, RfidStream):
         rows = [i for i, epc in enumerate(stream.epc) if epc]
         t = (stream.t - stream.age + log.rig.time_offset("rfid"))[rows]
-        seen = tuple(stream.epc[i] for i in rows)
-    return Marks("tags", known.names, known.tags.points, t, seen, marker="s", size=5.0, order=2.0)
+        names = tuple(stream.epc[i] for i in rows)
+    return Marks("tags", known.names, known.tags.points, t, names, marker="s", size=5.0, order=2.0)

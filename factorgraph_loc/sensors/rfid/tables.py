@@ -48,10 +48,10 @@ def rounds_from_inventories(
         if not len(mine):
             continue
         mine = mine[np.argsort(end_ns[mine], kind="stable")]
-        found = np.searchsorted(end_ns[mine], t_ns[reads], side="left")
-        inventory = mine[np.minimum(found, len(mine) - 1)]
+        nearest = np.searchsorted(end_ns[mine], t_ns[reads], side="left")
+        inventory = mine[np.minimum(nearest, len(mine) - 1)]
         begin = end_ns[inventory] - duration_ns[inventory]
-        holds = (found < len(mine)) & (t_ns[reads] >= begin)
+        holds = (nearest < len(mine)) & (t_ns[reads] >= begin)
         out[reads[holds]] = inventory[holds]
     return out
 
