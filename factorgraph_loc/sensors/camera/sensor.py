@@ -295,16 +295,16 @@ class PixelFinder:
         if not self._fixes and m.t < self._fruitless + SEARCH_INTERVAL and m.t >= self._fruitless:
             return False
         self._fixes = [f for f in self._fixes if m.t - KEPT <= f.odometry.t < m.t]
-        pose, seen = self._points.find(m)
-        if pose is None:
+        fix, expected = self._points.find(m)
+        if fix is None:
             self._fruitless = m.t
             return False
-        if self.start is not None and self._is_not_from(self.start, pose, odometry):
+        if self.start is not None and self._is_not_from(self.start, fix, odometry):
             self._fruitless = m.t
             return False
-        count = int(np.count_nonzero(pose.inliers))
-        clear = count >= CLEAR and count >= CLEAR_SHARE * seen
-        self._fixes.append(_Fix(odometry, pose.pose, pose.covariance, clear))
+        count = int(np.count_nonzero(fix.inliers))
+        clear = count >= CLEAR and count >= CLEAR_SHARE * expected
+        self._fixes.append(_Fix(odometry, fix.pose, fix.covariance, clear))
         return True
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:

@@ -64,8 +64,8 @@ class ScanMonitor:
         self._scans.append((t, surprise, variance))
         while self._scans[0][0] < t - KEPT:
             self._scans.popleft()
-        excess, noise, count = self._sums()
-        z = (excess - count * self._usual) / math.sqrt(noise + 1e-9) if count >= SCANS else 0.0
+        excess, total, count = self._sums()
+        z = (excess - count * self._usual) / math.sqrt(total + 1e-9) if count >= SCANS else 0.0
         if z > SUSPICIOUS or (self.suspicious_since is not None and z > CALM):
             self.suspicious_since = self._beginning()
         else:
