@@ -162,7 +162,7 @@ class KnownPoints:
             place = self._estimated.indices.index(FOCAL)
             focal = math.sqrt(predicted.spread[place, place])
         if isinstance(m, CameraFrame):
-            found = self._found(m, factor, expected.model, camera, focal)
+            found = self._matched(m, factor, expected.model, camera, focal)
             return None if found is None else self._levelled(found, found, predicted)
         right = _agreeing(expected, camera, focal)
         agreed = int(np.count_nonzero(right))
@@ -210,7 +210,7 @@ class KnownPoints:
             return None
         return self._factor(replace(self.model, tempering=self._tempering), [], np.empty((0, 2)))
 
-    def _found(
+    def _matched(
         self, m: CameraFrame, factor: ReprojectionFactor, model: CameraModel, camera: CameraPose, focal: float
     ) -> ReprojectionFactor | None:
         """The factor of the points matched in a frame."""

@@ -134,8 +134,8 @@ class PixelSettings(FileModel):
     rate: Hertz = 5.0
     """observations per second"""
     max_points: Annotated[int, Field(ge=1, le=10_000)] = 20
-    """most points at once, chosen at random among the visible ones"""
+    """most points per image, chosen at random among the visible ones"""
     max_depth: Metres = 10.0
-    """distance ahead to which points are seen"""
+    """largest distance ahead of visible points"""
     wrong: Share = 0.0
     """share of points that are reported at a random pixel"""

@@ -53,7 +53,7 @@ def check(use: Use) -> Use:
     """The run, with points estimated where the map has none and no other sensor needs a map, unless the user's settings say what is
     done."""
     motion = moving(use.sensors, TURN)
-    unmapped = use.estimates_points and _looks(use) and not _has_points(use) and not _follows(use)
+    unmapped = use.estimates_points and _uses_camera(use) and not _has_points(use) and not _follows(use)
     if "landmarks" in use.given or not unmapped or any(name not in (*NAMES, *motion) for name in use.sensors):
         return use
     settings = use.settings.model_copy(update={"landmarks": "unknown"})
@@ -72,12 +72,12 @@ def _doubts(use: Use) -> Iterator[str]:
     if _has_points(use):
         if landmarks == "unknown" and not use.estimates_points:
             yield f"{use.log.name}: {use.estimator} does not estimate points: those of the map are used unchanged"
-    elif _looks(use) and not _follows(use) and not (use.estimates_points and landmarks != "known"):
+    elif _uses_camera(use) and not _follows(use) and not (use.estimates_points and landmarks != "known"):
         alternative = f", or {use.estimator}.landmarks=unknown" if use.estimates_points else ""
         yield f"{use.log.name}: the map has no points that a camera could find: give --world{alternative}"
 
 
-def _looks(use: Use) -> bool:
+def _uses_camera(use: Use) -> bool:
     return "camera" in use.modalities and any(name in use.sensors for name in NAMES)
 
 
@@ -89,7 +89,7 @@ def _follows(use: Use) -> bool:
 def _has_points(use: Use) -> bool:
     """Whether the camera is used, and the map has points that it could find."""
     points = use.log.world.points
-    if points is None or not _looks(use):
+    if points is None or not _uses_camera(use):
         return False
     return bool(len(points) if "sightings" in use.sensors else len(points.owners))
 

@@ -150,7 +150,7 @@ class SightingSettings(FileModel):
     rate: Hertz = 2.0
     """measurements per second"""
     max_range: Metres = 6.0
-    """distance up to which landmarks are seen"""
+    """largest distance of visible landmarks"""
     field_of_view: Annotated[float, Field(ge=0.01, le=6.3), InUnit("rad")] = 6.3
     """angle about the sensor's axis within which they are seen"""
 

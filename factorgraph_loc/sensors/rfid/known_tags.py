@@ -205,7 +205,7 @@ class KnownTags:
         return looks.with_states(evidence.tags, self.states.odds[evidence.tags], elsewhere)
 
     def without_doubtful(self, reads: TagReadCounts) -> TagReadCounts:
-        """The counts, in which a tag that is clearly not as surveyed does not inform the pose."""
+        """The counts with the effect of tags removed that are clearly not as surveyed."""
         clear = self.states.odds[reads.listed] > CLEAR
         if not clear.any():
             return reads

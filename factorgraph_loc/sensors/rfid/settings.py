@@ -45,7 +45,7 @@ class RfidUncertainty(FileModel):
     yaw: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] | None = None
     """standard deviation of the yaw of all antennas in common; by default 0.35 times range_scale"""
     antenna_yaw: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] | None = None
-    """standard deviation of the yaw of each antenna in addition, where there are several; by default 0.25 times range_scale"""
+    """standard deviation of the yaw of each antenna in addition, if there are several; by default 0.25 times range_scale"""
     time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] | None = None
     """standard deviation of the time offset; by default 0.4 times range_scale"""
 
@@ -124,7 +124,7 @@ class AntennaSettings(FileModel):
     z: Offset = 0.0
     """height of the antenna"""
     yaw: Angle = 0.0
-    """direction that it looks in; left is positive"""
+    """direction of its boresight; left is positive"""
     pitch: Annotated[float, Field(ge=-1.6, le=1.6), InUnit("rad")] = 0.0
     """elevation of that direction; up is positive"""
     model: str = "default"
@@ -161,7 +161,7 @@ class PhaseSettings(FileModel):
     min_reads: Annotated[int, Field(ge=2, le=1000)] = 3
     """smallest number of reads in a window"""
     window: Annotated[float, Field(ge=1e-3, le=60.0), InUnit("s")] = 2.0
-    """length of the windows in which phases of one antenna and tag are compared"""
+    """length of the windows for comparisons of phases of one antenna and tag"""
     step: Annotated[float, Field(ge=1e-3, le=60.0), InUnit("s")] = 1.0
     """time between the beginnings of two windows"""
 
@@ -227,9 +227,9 @@ class RfidSettings(SensorSettings):
     uncertainty: RfidUncertainty = Field(default_factory=RfidUncertainty)
     """standard deviations of the antennas' yaw and of the time offset"""
     rssi: RssiSettings | None = None
-    """model of the strength of a read, for the sensor rssi"""
+    """model of the strength of a read; used by the sensor rssi"""
     phase: PhaseSettings | None = None
-    """model of the phase of a read, for the sensor phase"""
+    """model of the phase of a read; used by the sensor phase"""
 
     @model_validator(mode="after")
     def _is_complete(self) -> RfidSettings:
@@ -277,7 +277,7 @@ class RfidSettings(SensorSettings):
         return {name: share * largest for name, share in BY_RANGE.items()} | given
 
     def parameter_names(self) -> dict[str, tuple[str, ...]]:
-        """The names of the parameters of each model that an antenna has; with the model's name where there are several."""
+        """The names of the parameters of each model that an antenna has; with the model's name if there are several."""
         used = {antenna.model for antenna in self.all_antennas().values()}
         prefixes = {model: "" if len(used) == 1 else f"{model}." for model in self.models if model in used}
         return {model: tuple(prefix + name for name in OF_MODEL) for model, prefix in prefixes.items()}

@@ -65,7 +65,7 @@ class AntennaStop(FileModel):
     antenna: str
     """name of the antenna"""
     time: Duration
-    """time from which on it reads nothing"""
+    """time of its failure"""
     rounds_go_on: bool = False
     """whether its rounds go on, without reads, as with a broken cable"""
 

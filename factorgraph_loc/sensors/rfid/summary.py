@@ -285,14 +285,14 @@ def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Traje
         return None
     dead = diagnostics.doubted.get("dead_tags", {})
     kept = [name for name in log.world.tags if name not in dead]
-    looks = _looks(use, stream, settings, learnt, final, kept)
+    looks = _observed(use, stream, settings, learnt, final, kept)
     if looks is None:
         return None
     names = list(settings.all_antennas())
-    return _told(log.name, looks, names, settings.tempering)
+    return _counted(log.name, looks, names, settings.tempering)
 
 
-def _looks(
+def _observed(
     use: Use, stream: RfidStream, settings: RfidSettings, learnt: Learnt, final: Trajectory, kept: list[str]
 ) -> _Looks | None:
     log, tags = use.log, tag_map(use.log.world, use.log.rig.of(SurveySettings), kept)
@@ -339,7 +339,7 @@ def _left_out(count: int) -> Integers:
     return np.setdiff1d(np.arange(count), kept)
 
 
-def _told(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Reliability | None:
+def _counted(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Reliability | None:
     """The counts by bands of distance and by antennas, None if there are too few."""
     if looks.p.sum() < FEWEST:
         return None
@@ -347,7 +347,7 @@ def _told(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Rel
     ones = np.ones(len(looks.p), dtype=np.int64)
     reads = ExpectedReads(looks.tag, looks.hit.astype(np.int64)[:, None], looks.p[:, None], looks.distance[:, None])
     groups.add(looks.antenna, ones, reads, ones[:, None] > 0)
-    together, chosen = _together(looks, (looks.distance // BAND).astype(np.int64)), groups.told()
+    together, chosen = _overdispersion(looks, (looks.distance // BAND).astype(np.int64)), groups.told()
     if not len(chosen):
         return None
     observed, predicted, variance = groups.sums[:, chosen]
@@ -366,7 +366,7 @@ def _told(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Rel
     return Reliability("reads", groups.names(chosen), observed, predicted, sigma, together, tuple(doubts))
 
 
-def _together(looks: _Looks, band: Integers) -> float:
+def _overdispersion(looks: _Looks, band: Integers) -> float:
     """How many rounds are worth an independent one, at least 1: by the scatter of each tag's reads by each antenna in blocks of
     time, about the share of the predicted reads that the band has."""
     share = np.ones(int(band.max(initial=0)) + 1)

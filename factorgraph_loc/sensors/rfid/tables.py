@@ -162,7 +162,7 @@ def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings:
         none = np.zeros(0, dtype=np.int64)
         return ReadsByRound(none, none, [], (nothing, nothing, nothing), end_ns, antenna)
     if "inventory" in reads.numbers:
-        number = _told(reads, end_ns, antenna)
+        number = _named_rounds(reads, end_ns, antenna)
     else:
         duration_ns = np.rint(duration * 1e9).astype(np.int64)
         number = rounds_from_inventories(reads.t_ns, reads.names["antenna"], end_ns, antenna, duration_ns)
@@ -172,7 +172,7 @@ def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings:
     return _rounds(reads, keep, number[keep], end_ns, antenna)
 
 
-def _told(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Integers:
+def _named_rounds(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Integers:
     """The rounds (N,) that the reads name, as row numbers of the other table, from 1."""
     named = reads.numbers["inventory"]
     with np.errstate(invalid="ignore"):
