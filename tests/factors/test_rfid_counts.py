@@ -33,8 +33,8 @@ def scene(seed=0):
 
 
 def displaced(likelihood, poses, looks):
-    shifts, odds = np.array(((0.0, 0.0), (1.0, -0.5))), np.zeros(len(likelihood.tags.points))
-    return likelihood.displaced(poses, looks, shifts, 1.5, likelihood.parameters, odds)
+    hypotheses, odds = np.array(((0.0, 0.0, 0.0, 0.0), (1.0, -0.5, 0.0, 0.0))), np.zeros(len(likelihood.tags.points))
+    return likelihood.displaced(poses, looks, hypotheses, 1.5, likelihood.parameters, odds)
 
 
 def test_few_tags_are_looked_at():
