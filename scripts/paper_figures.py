@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend, styles
-from factorgraph_loc.evaluation.figures import Track, way, with_pauses
+from factorgraph_loc.evaluation.figures import Track, gapped_path, with_pauses
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
@@ -32,7 +32,7 @@ def fusion(log: Log, tracks: Mapping[str, Track]) -> Figure:
         label = f"{name} (final)" if track.causal is None else name
         if not len(trajectory):
             continue
-        axes["map"].plot(*way(trajectory).T, label=label, linewidth=1.3, zorder=3, **style)
+        axes["map"].plot(*gapped_path(trajectory).T, label=label, linewidth=1.3, zorder=3, **style)
         if log.reference is not None:
             e = errors(trajectory, log.reference, track.max_gap)
             t, error = with_pauses(e.t, np.maximum(e.position, 1e-4))
@@ -51,7 +51,7 @@ def _map(axis: Axes, log: Log) -> None:
     if len(tags):
         axis.plot(*tags[:, :2].T, "s", color=COLOURS[-1], markersize=5, markerfacecolor="none", label="tags", zorder=2)
     if log.reference is not None:
-        axis.plot(*way(log.reference).T, color="0.75", linewidth=4.0, label="reference", zorder=1)
+        axis.plot(*gapped_path(log.reference).T, color="0.75", linewidth=4.0, label="reference", zorder=1)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel("x [m]")
     axis.set_ylabel("y [m]")
