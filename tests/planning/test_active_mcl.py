@@ -97,7 +97,7 @@ def test_a_corridor_tells_the_heading_and_leaves_both_its_directions():
     robot.pose = np.array((1.5, 7.0, math.pi / 2.0))
     population, now = estimator._search._population, estimator._motion.state(0.0)
     for _ in range(3):
-        population.add(now, LengthsSeen(robot.proximity, robot.look()))
+        population.add(now, LengthsSeen(robot.proximity, robot.read_proximity()))
         population.advance()
     poses, weights = population.particles
     # along some corridor: those across are in the crossbar, where the robot would look along x
@@ -111,7 +111,7 @@ def test_a_corridor_tells_the_heading_and_leaves_both_its_directions():
 
 def test_what_is_seen_before_the_first_scan_is_left():
     estimator, robot, _ = made()
-    estimator.see(robot.proximity, robot.look())
+    estimator.see(robot.proximity, robot.read_proximity())
     assert estimator.belief().particles is None
 
 

@@ -33,7 +33,7 @@ def test_a_right_model_is_not_doubted():
     """All groups within four standard deviations: one in a thousand logs would fail by chance."""
     found, warnings = told(office())
     assert not warnings
-    assert found.together < 1.3
+    assert found.overdispersion < 1.3
     assert np.all(np.abs(found.observed - found.predicted) < 4.0 * found.sigma)
     assert {"1 to 2 m", "4 to 5 m", "antenna 1", "antenna 8"} <= {*found.groups}
 
@@ -55,7 +55,7 @@ def test_a_rate_that_is_too_high_shows_everywhere():
 
 def test_bursts_are_counted_as_few():
     found, warnings = told(office(0.4), p0=0.6)
-    assert found.together > 2.5
+    assert found.overdispersion > 2.5
     assert any("come in bursts" in line for line in warnings)
     tempered = office(0.4).rig.of(RfidSettings).model_copy(update={"tempering": 0.2})
     log = replace(office(0.4), rig=office(0.4).rig.model_copy(update={"rfid": tempered}))
