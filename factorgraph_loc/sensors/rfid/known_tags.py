@@ -106,7 +106,7 @@ class KnownTags:
     """Turns scans into read counts of the map's tags. Tags and antennas that map or rig lack are counted as ignored.
 
     It also tracks the ``states`` of the tags. A read shows that a tag is not dead; other evidence of a scan requires a known
-    pose (:meth:`told`, :meth:`learn`). Tags that are believed dead or moved are listed in the diagnostics.
+    pose (:meth:`told`, :meth:`learn`). Tags that are believed dead, weak or moved are listed in the diagnostics.
     """
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:

@@ -40,12 +40,12 @@ def scan(t: float, tags: Sequence[str] = ("aside",)) -> RfidScan:
 @pytest.mark.parametrize("estimator", ["smoother", "particle_filter", "switching"])
 def test_a_tag_is_given_up_and_taken_back(estimator: str) -> None:
     live = robot(estimator)
-    for i in range(1, 8):
+    for i in range(1, 14):
         live.push(scan(0.1 * i))
-    # seven silences of 0.1 each, from odds of 3 to 97; a weak tag, or one that has moved, may be silent as well
+    # 13 silences of 0.1 each, from odds of 3 to 97; a weak tag, or one that has moved, may be silent as well
     assert live.diagnostics().doubted["dead_tags"].keys() == {"ahead"}
-    assert live.diagnostics().doubted["dead_tags"]["ahead"] > 0.8
-    live.push(scan(0.8, ("aside", "ahead")))
+    assert live.diagnostics().doubted["dead_tags"]["ahead"] > 0.9
+    live.push(scan(1.4, ("aside", "ahead")))
     assert not live.diagnostics().doubted["dead_tags"]
 
 
