@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ValidationError
 
@@ -32,42 +32,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.model.log import Log
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "numba")
-PACKAGE = __name__.partition(".")[0]
-# the files and folders of the package that a run imports, from its log to its scores; tests compare them with the imports
-COUNTED = (
-    "builtin.py",
-    "errors.py",
-    "evaluation/metrics.py",
-    "evaluation/pairing.py",
-    "evaluation/scores.py",
-    "evaluation/trajectories/association.py",
-    "evaluation/trajectories/score.py",
-    "evaluation/warned.py",
-    "experiments/causal_run.py",
-    "experiments/doubts.py",
-    "experiments/log_source.py",
-    "experiments/output.py",
-    "experiments/preparation.py",
-    "experiments/run.py",
-    "files/",
-    "fitting/",
-    "fusion/",
-    "io/",
-    "mapping/point_maps.py",
-    "maps/",
-    "model/",
-    "plugins.py",
-    "processes.py",
-    "sensors/",
-    "simulation/",
-    "slam/",
-    "text.py",
-    "threads.py",
-    "version.py",
-    "vision/",
-)
-NOT_COUNTED = "sensors/rfid/calibration/"  # learns a rig before a run
-Kept = TypeVar("Kept", bound=BaseModel)
+PACKAGES = (__name__.partition(".")[0], "factors")
 _UNSETTLED = 2.0  # s: a younger file may change again without a new modification time
 
 
@@ -78,29 +43,21 @@ def digest_of(content: Any) -> str:
 
 @lru_cache
 def code_version() -> str:
-    """A digest of the source files that runs use."""
+    """A digest of the source files of this project."""
     return digest_of_code(Path(__file__).parents[2])
 
 
 def digest_of_code(root: Path) -> str:
-    """The digest of the source files of runs, of the packages in the folder ``root``.
-
-    They are all of ``factors``, the parts :data:`COUNTED` of ``factorgraph_loc``, and the shipped descriptions of readers.
-    """
+    """The digest of the source files of the packages in the folder ``root``, and of the shipped descriptions of readers."""
     total = hashlib.sha256()
-    for package in (root / PACKAGE, root / "factors"):
-        for file in sorted(package.rglob("*")):
-            name = file.relative_to(package).as_posix()
-            if file.suffix in (".py", ".npz") and (package.name != PACKAGE or is_counted(name)):
-                total.update(f"{package.name}/{name}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
+    for package in PACKAGES:
+        for file in sorted((root / package).rglob("*")):
+            if file.suffix in (".py", ".npz"):
+                name = file.relative_to(root).as_posix()
+                total.update(f"{name}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
     for name, file in readers().items():
         total.update(f"{name}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
     return total.hexdigest()
-
-
-def is_counted(name: str) -> bool:
-    """Whether a file of ``factorgraph_loc``, by its path in the package, is among those that runs use."""
-    return name.startswith(COUNTED) and not name.startswith(NOT_COUNTED)
 
 
 @lru_cache
@@ -121,71 +78,6 @@ def run_key(log_digest: str, config: Mapping[str, Any]) -> str:
     )
 
 
-def read_cache(file: Path, kind: type[Kept]) -> Kept | None:
-    """Read a cache; None if it is missing or damaged."""
-    try:
-        return kind.model_validate_json(bounded.read_bytes(file, bounded.DATA))
-    except (InputError, ValidationError):
-        return None
-
-
-def write_cache(file: Path, content: BaseModel) -> None:
-    """Write a cache; errors are ignored."""
-    with suppress(OSError):
-        write_text(file, json.dumps(content.model_dump()))
-
-
-class _Digests(BaseModel):
-    """By path: size, modification time and sha256."""
-
-    files: dict[str, tuple[int, int, str]] = {}
-
-
-class FileDigests:
-    """The sha256 of files; with ``cache``, a JSON file, keyed by path, size and modification time, so that a file is read once."""
-
-    def __init__(self, cache: Path | None) -> None:
-        self._cache = cache
-        self._new = False
-        self._known = ((cache and read_cache(cache, _Digests)) or _Digests()).files
-
-    def of_source(self, source: LogSource) -> str:
-        """The digest of a log's source. Raises InputError if a file is missing."""
-        try:
-            paths = source.files()
-        except OSError as error:  # a folder that must not be read
-            raise InputError(f"{plain(error.filename)}: cannot be read: {error.strerror}") from error
-        files = {name: self.of_file(path) for name, path in paths.items()}
-        return digest_of({"identity": source.identity(), "files": files})
-
-    def of_file(self, path: Path) -> str:
-        """The sha256 of a file. Raises InputError if it cannot be read."""
-        try:
-            stat = path.stat()
-            known = self._known.get(str(path))
-            if known is not None and known[:2] == (stat.st_size, stat.st_mtime_ns):
-                return known[2]
-            with path.open("rb") as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-        if time.time() - stat.st_mtime > _UNSETTLED:
-            self._known[str(path)] = (stat.st_size, stat.st_mtime_ns, digest)
-            self._new = True
-        return digest
-
-    def save(self) -> None:
-        """Save new digests."""
-        if self._new and self._cache is not None:
-            write_cache(self._cache, _Digests(files=self._known))
-            self._new = False
-
-
-def source_digest(source: LogSource) -> str:
-    """The digest of a log's source, with every file read. Raises InputError if one is missing."""
-    return FileDigests(None).of_source(source)
-
-
 class VanishedError(InputError):
     """A log disappeared, or differs from the planned one."""
 
@@ -194,7 +86,7 @@ class VanishedError(InputError):
 def load_planned(source: LogSource, digest: str) -> Log:
     """The log of a source that has the ``digest`` of the plan; cached, as consecutive runs use the same log."""
     try:
-        now = source_digest(source)
+        now = Facts().digest(source)
     except InputError as error:
         raise VanishedError(f"the log has vanished: {error}") from error
     if now != digest:
@@ -220,22 +112,47 @@ class EstimatorFacts:
 
 
 class _Kept(BaseModel):
-    """Facts obtained with code and libraries of this ``version``: ``logs`` by digest, ``estimators`` by name and settings."""
+    """Facts obtained with code and libraries of this ``version``: size, modification time and sha256 of ``files`` by path,
+    ``logs`` by digest, ``estimators`` by name and settings."""
 
-    version: str
+    version: str = ""
+    files: dict[str, tuple[int, int, str]] = {}
     logs: dict[str, list[LogFacts]] = {}
     estimators: dict[str, EstimatorFacts] = {}
 
 
 class Facts:
-    """Facts with a file ``cache``, valid for unchanged code and libraries."""
+    """Digests of files, and facts about logs and estimators. A JSON file ``cache`` keeps them for unchanged files, code and
+    libraries, so that each file is read once."""
 
-    def __init__(self, cache: Path) -> None:
-        self._cache = cache
-        version = digest_of([code_version(), library_versions()])
-        kept = read_cache(cache, _Kept)
-        self._known = kept if kept is not None and kept.version == version else _Kept(version=version)
-        self._new = False
+    def __init__(self, cache: Path | None = None) -> None:
+        self._cache, self._new = cache, False
+        self._known = _Kept() if cache is None else _kept(cache)
+
+    def digest(self, source: LogSource) -> str:
+        """The digest of a log's source. Raises InputError if a file is missing."""
+        try:
+            paths = source.files()
+        except OSError as error:  # a folder that must not be read
+            raise InputError(f"{plain(error.filename)}: cannot be read: {error.strerror}") from error
+        files = {name: self._of_file(path) for name, path in paths.items()}
+        return digest_of({"identity": source.identity(), "files": files})
+
+    def _of_file(self, path: Path) -> str:
+        """The sha256 of a file. Raises InputError if it cannot be read."""
+        try:
+            stat = path.stat()
+            known = self._known.files.get(str(path))
+            if known is not None and known[:2] == (stat.st_size, stat.st_mtime_ns):
+                return known[2]
+            with path.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        if time.time() - stat.st_mtime > _UNSETTLED:
+            self._known.files[str(path)] = (stat.st_size, stat.st_mtime_ns, digest)
+            self._new = True
+        return digest
 
     def logs(self, source: LogSource, digest: str) -> list[LogFacts]:
         """Facts of all logs of a source. Raises InputError as the reader or the simulation's settings do."""
@@ -255,10 +172,21 @@ class Facts:
         return self._known.estimators[key]
 
     def save(self) -> None:
-        """Save new facts."""
-        if self._new:
-            write_cache(self._cache, self._known)
+        """Write new facts to the cache; errors are ignored."""
+        if self._new and self._cache is not None:
+            with suppress(OSError):
+                write_text(self._cache, json.dumps(self._known.model_dump()))
             self._new = False
+
+
+def _kept(cache: Path) -> _Kept:
+    """The content of a cache; empty if it is missing, damaged, or of other code or libraries."""
+    version = digest_of([code_version(), library_versions()])
+    with suppress(InputError, ValidationError):
+        kept = _Kept.model_validate_json(bounded.read_bytes(cache, bounded.DATA))
+        if kept.version == version:
+            return kept
+    return _Kept(version=version)
 
 
 def _facts(log: Any) -> LogFacts:

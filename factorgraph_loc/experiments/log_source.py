@@ -4,7 +4,6 @@ Nothing numerical is imported until a log is loaded, so that an experiment with 
 
 from __future__ import annotations
 
-import fnmatch
 import itertools
 import json
 import os
@@ -16,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.bounded import kind
+from factorgraph_loc.files.bounded import foreign, kind
 from factorgraph_loc.files.data_root import RUN_FILE, find_data_root, named_path
-from factorgraph_loc.files.models import DEEPEST, read_toml
+from factorgraph_loc.files.models import read_toml
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.files.yaml import read_yaml
 from factorgraph_loc.text import quoted
@@ -26,8 +25,6 @@ from factorgraph_loc.text import quoted
 if TYPE_CHECKING:
     from factorgraph_loc.model.log import Log
 
-VISITED = 100_000  # maximum number of files and folders visited for a pattern
-ANY_DEPTH = "**"
 _MAGIC = re.compile(r"[*?[]")
 NAMING = {".toml": read_toml, ".yaml": read_yaml, ".yml": read_yaml}  # files that name others
 
@@ -37,44 +34,12 @@ def is_pattern(name: str) -> bool:
 
 
 def matching(pattern: str, folder: Path, source: object) -> list[Path]:
-    """The sorted paths that match ``pattern`` relative to ``folder``: ``*``, ``?`` and ``[...]`` within a name, ``**`` for any
-    folders except links. Raises InputError for an invalid pattern, or one that visits more than :data:`VISITED` files and
-    folders."""
+    """The sorted paths that match a ``pattern`` of :meth:`pathlib.Path.glob`, relative to ``folder``. Raises InputError for an
+    invalid pattern."""
     path = Path(pattern)
-    parts = path.parts[1:] if path.anchor else path.parts
-    if len(parts) > DEEPEST:
-        raise InputError(f"{source}: {quoted(pattern)} has {len(parts)} parts, expected at most {DEEPEST}")
-    if wrong := [part for part in parts if ANY_DEPTH in part and part != ANY_DEPTH]:
-        raise InputError(f"{source}: {quoted(pattern)} has {quoted(wrong[0])}, expected {ANY_DEPTH} to be a whole part")
-    paths = [Path(path.anchor) if path.anchor else folder]
-    visited = 0
-
-    def entries(place: Path) -> list[os.DirEntry[str]]:
-        """The entries of a folder; none if it is not a readable folder."""
-        nonlocal visited
-        try:
-            with os.scandir(place) as every:
-                some = list(itertools.islice(every, VISITED + 1 - visited))
-        except OSError:
-            return []
-        visited += len(some)
-        if visited > VISITED:
-            raise InputError(
-                f"{source}: {quoted(pattern)} visits more than {VISITED:,} files and folders, expected a narrower one"
-            )
-        return some
-
-    for part in parts:
-        if part == ANY_DEPTH:
-            for parent in paths:  # which grows meanwhile
-                paths += [Path(entry.path) for entry in entries(parent) if entry.is_dir(follow_symlinks=False)]
-        elif is_pattern(part):
-            fits = re.compile(fnmatch.translate(part)).match
-            paths = [Path(entry.path) for place in paths for entry in entries(place) if fits(entry.name)]
-        else:
-            paths = [place / part for place in paths]
-        paths = list(dict.fromkeys(paths))
-    return sorted(candidate for candidate in paths if os.path.lexists(candidate))
+    root = Path(path.anchor) if path.anchor else folder
+    with foreign(source, f"{quoted(pattern)} is not a pattern of paths"):
+        return sorted(root.glob(str(path.relative_to(path.anchor))))
 
 
 def _fixed_part(pattern: str) -> str:

@@ -20,7 +20,7 @@ from factorgraph_loc.experiments.experiment_file import (
     Sweep,
     canonical,
 )
-from factorgraph_loc.experiments.keys import Facts, FileDigests, load_planned, run_key
+from factorgraph_loc.experiments.keys import Facts, load_planned, run_key
 from factorgraph_loc.experiments.log_source import LogSource, RecordedSource, SimulatedSource, recorded_sources
 from factorgraph_loc.files.data_root import named_path
 from factorgraph_loc.files.models import nearest, set_key
@@ -96,7 +96,7 @@ def plan(
     :data:`MOST_SECONDS`, or with more observations than :data:`MOST_OBSERVATIONS`, raise InputError. Before anything runs, raises
     InputError for an unreadable log, two logs of one name, invalid settings or prior, or a sensor that no log has.
     """
-    digests, facts = FileDigests(cache / "digests.json"), Facts(cache / "facts.json")
+    facts = Facts(cache / "facts.json")
     experiment = _placed(experiment, folder, data_root)
     sweep = experiment.sweep
     check_prior(experiment.prior)
@@ -109,11 +109,10 @@ def plan(
     for entry in experiment.estimators:
         for swept in sweep.points(entry.shown, entry.name):
             facts.estimator(entry.name, _settings(entry, swept))  # report a wrong setting before logs are read
-    _check_simulated(experiment, digests, facts)
+    _check_simulated(experiment, facts)
     try:
-        runs = _all_runs(experiment, recorded, digests, facts, most)
+        runs = _all_runs(experiment, recorded, facts, most)
     finally:  # keep what was looked up, even if interrupted
-        digests.save()
         facts.save()
     return runs
 
@@ -121,7 +120,6 @@ def plan(
 def _all_runs(
     experiment: Experiment,
     recorded: Mapping[int, Sequence[LogSource]],
-    digests: FileDigests,
     facts: Facts,
     most: int,
 ) -> list[PlannedRun]:
@@ -129,13 +127,13 @@ def _all_runs(
     of_others = {entry.shown: sweep.points(entry.shown, entry.name) for entry in experiment.estimators}
     of_simulated = {entry.shown: _by_simulation(sweep, entry) for entry in experiment.estimators}
     runs: dict[str, PlannedRun] = {}
-    of_recorded = {place: [*_logs(sources, digests, facts)] for place, sources in recorded.items()}
+    of_recorded = {place: [*_logs(sources, facts)] for place, sources in recorded.items()}
     for number, point in enumerate(sweep.points(SIMULATION)):
         simulated = tuple(point.values())
         logs = [
             log
             for place, entry in enumerate(experiment.logs)
-            for log in (of_recorded[place] if place in of_recorded else _logs(_simulated(entry, point), digests, facts))
+            for log in (of_recorded[place] if place in of_recorded else _logs(_simulated(entry, point), facts))
         ]
         _check(logs, experiment.sensors)
         for log in (
@@ -168,14 +166,14 @@ def _check_count(count: int, most: int) -> None:
         raise TooManyRunsError(f"plans {shown} runs, more than {most:,}")
 
 
-def _check_simulated(experiment: Experiment, digests: FileDigests, facts: Facts) -> None:
+def _check_simulated(experiment: Experiment, facts: Facts) -> None:
     """Raise InputError if the simulations exceed the limits."""
     seconds, observations = 0.0, 0.0
     for point in experiment.sweep.points(SIMULATION):
         for entry in experiment.logs:
             if entry.simulate is not None:
                 sources = _simulated(entry, point)
-                new = sum(not facts.has_facts(digests.of_source(source)) for source in sources)
+                new = sum(not facts.has_facts(facts.digest(source)) for source in sources)
                 size = sources[0].size() if new else (0.0, 0.0)
                 seconds, observations = seconds + new * size[0], observations + new * size[1]
                 if seconds > MOST_SECONDS or observations > MOST_OBSERVATIONS:
@@ -266,11 +264,11 @@ def _simulated(entry: LogEntry, point: Mapping[str, Any]) -> list[SimulatedSourc
     return [SimulatedSource(entry.simulate, canonical(settings), seed) for seed in entry.seeds]
 
 
-def _logs(sources: Sequence[LogSource], digests: FileDigests, facts: Facts) -> Iterator[_PlannedLog]:
+def _logs(sources: Sequence[LogSource], facts: Facts) -> Iterator[_PlannedLog]:
     for first in sources:
-        for number, log in enumerate(facts.logs(first, digests.of_source(first))):
+        for number, log in enumerate(facts.logs(first, facts.digest(first))):
             source = RecordedSource(**vars(first) | {"number": number}) if isinstance(first, RecordedSource) else first
-            yield _PlannedLog(source, digests.of_source(source), log.name, log.duration, log.sensors)
+            yield _PlannedLog(source, facts.digest(source), log.name, log.duration, log.sensors)
 
 
 def _settings(entry: EstimatorEntry, point: Mapping[str, Any]) -> dict[str, Any]:

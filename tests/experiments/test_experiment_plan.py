@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from factorgraph_loc import InputError, write_native
-from factorgraph_loc.experiments import keys, log_source
+from factorgraph_loc.experiments import keys
 from factorgraph_loc.experiments import plan as plan_module
 from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.plan import MOST_RUNS, TooManyRunsError, plan
@@ -93,15 +93,6 @@ def test_an_experiment_may_name_logs_below_the_data_folder(planned, logs, outsid
         with pytest.raises(InputError, match="leaves its folder"):  # the glob begins above the data folder
             planned(logs=[entry.replace("outside/", "")])
     assert [run.log for run in planned(logs=[entry.format(outside=outside)])] == ["two"]
-
-
-def test_a_glob_visits_a_bounded_number_of_files(planned, logs, monkeypatch):
-    monkeypatch.setattr(log_source, "VISITED", 20)
-    for i in range(30):
-        (logs / f"x{i}").mkdir()
-    with pytest.raises(InputError, match="visits more than"):
-        planned(logs=["**/nothing"])
-    assert len(planned(logs=["one"])) == 1
 
 
 @pytest.mark.parametrize(
