@@ -1,17 +1,17 @@
-"""Estimators against what is known in closed form."""
+"""Estimators against what is known in closed form: poses, and constants of odometry and sensor."""
 
 import numpy as np
 import pytest
+from by_hand import made
 
 from factorgraph_loc import BearingRange, IncrementOdometry, Landmark, Rig, Tick, World
-from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeUncertainty
 from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,
     OdometryNoise,
     OdometrySettings,
+    OdometryUncertainty,
 )
 from factors import se2
 from factors.landmarks.model import log_likelihood
@@ -20,17 +20,15 @@ from factors.landmarks.model import log_likelihood
 FAR = World(landmarks={"far": Landmark(x=1e4, y=0.0)})
 ALONG = GrowthSettings(per_distance=0.1)
 STIFF = GrowthSettings(per_distance=1e-6)
-LINEAR = Rig(
-    odometry=OdometrySettings(noise=OdometryNoise(along=ALONG, lateral=STIFF, heading=STIFF)),
-    bearing_range=BearingRangeSettings(range_sigma=0.3, bearing_sigma=0.5, robust=100.0),
-)
-STEPS = 30
+WHEELS = OdometrySettings(noise=OdometryNoise(along=ALONG, lateral=STIFF, heading=STIFF))
+SENSOR = BearingRangeSettings(range_sigma=0.3, bearing_sigma=0.5, robust=100.0)
+LINEAR = Rig(odometry=WHEELS, bearing_range=SENSOR)
+STEPS, SENSORS = 30, ("odometry", "bearing_range")
 PRIOR_SIGMAS = np.array((0.2, 1e-4, 1e-5))
-
-
-def make(name, rig, world, **settings):
-    setup = Setup(rig, world, ("odometry", "bearing_range"), np.random.default_rng(7))
-    return create(name, setup, settings_of(name, settings))
+SCALE, AHEAD = (
+    0.1,
+    0.4,
+)  # standard deviations of the wheels' scale, and of the sensor's place ahead of the robot's centre [m]
 
 
 def drive(estimator, ranges):
@@ -66,17 +64,22 @@ def kalman(ranges):
     return np.array(filtered), np.array(smoothed)
 
 
+def measured(seed, step=0.5):
+    """Ranges to the far landmark of a robot that moves by ``step`` [m] at a time, with noise."""
+    rng = np.random.default_rng(seed)
+    truth = np.cumsum(step + rng.normal(scale=0.1 * np.sqrt(0.5), size=STEPS))
+    return 1e4 - truth + rng.normal(scale=0.3, size=STEPS)
+
+
 @pytest.fixture
 def ranges():
-    rng = np.random.default_rng(3)
-    truth = np.cumsum(0.5 + rng.normal(scale=0.1 * np.sqrt(0.5), size=STEPS))
-    return 1e4 - truth + rng.normal(scale=0.3, size=STEPS)
+    return measured(3)
 
 
 @pytest.mark.parametrize("name", ["ekf", "smoother", "smoother with a long window", "batch"])
 def test_a_linear_gaussian_run_is_that_of_the_kalman_filter_and_smoother(name, ranges):
     filtered, smoothed = kalman(ranges)
-    estimator = make(name.split()[0], LINEAR, FAR, **({"lag": 100.0} if "window" in name else {}))
+    estimator = made(name.split()[0], LINEAR, FAR, SENSORS, **({"lag": 100.0} if "window" in name else {}))
     causal = drive(estimator, ranges)
     if name != "batch":  # which has no causal result
         np.testing.assert_allclose(causal[:, 0], filtered[:, 0], atol=2e-3)
@@ -89,8 +92,15 @@ def test_a_linear_gaussian_run_is_that_of_the_kalman_filter_and_smoother(name, r
 def test_a_particle_filter_comes_near_the_kalman_filter_and_smoother(ranges):
     ranges = ranges[:15]
     filtered, smoothed = kalman(ranges)
-    estimator = make(
-        "particle_filter", LINEAR, FAR, particles=10_000, smoothing_interval=0.5, smoothing_trajectories=1000
+    estimator = made(
+        "particle_filter",
+        LINEAR,
+        FAR,
+        SENSORS,
+        7,
+        particles=10_000,
+        smoothing_interval=0.5,
+        smoothing_trajectories=1000,
     )
     causal = drive(estimator, ranges)
     # the mean of N particles of spread s is off by s / sqrt(N_eff): 6 sigma of 2,000 effective ones, below 1e-7 of false alarms
@@ -102,11 +112,42 @@ def test_a_particle_filter_comes_near_the_kalman_filter_and_smoother(ranges):
     np.testing.assert_allclose(final.covariances[:, 0, 0], smoothed[:, 1], rtol=0.3)
 
 
+def least_squares(ranges):
+    """Mean and covariance of the scale, the sensor's place and all positions along x: rows of a Jacobian and what they measure."""
+    rows = [np.eye(STEPS + 3)[i] / sigma for i, sigma in enumerate((SCALE, AHEAD, PRIOR_SIGMAS[0]))]
+    values, wheels = [0.0, 0.0, 0.0], 0.1 * np.sqrt(0.5)
+    for i, seen in enumerate(ranges, start=1):
+        moved, looked = np.zeros((2, STEPS + 3))
+        moved[2 + i], moved[1 + i], moved[0] = 1.0, -1.0, -0.5
+        looked[2 + i], looked[1] = 1.0, 1.0
+        rows += [moved / wheels, looked / 0.3]
+        values += [0.5 / wheels, (1e4 - seen) / 0.3]
+    mean, *_ = np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)
+    return mean, np.linalg.inv(np.array(rows).T @ np.array(rows))
+
+
+@pytest.mark.parametrize("name", ["ekf", "smoother", "batch"])
+def test_constants_that_are_estimated_on_the_way_are_those_of_least_squares(name):
+    ranges = measured(5, step=1.08 * 0.5) - 0.3
+    mean, covariance = least_squares(ranges)
+    wheels = WHEELS.model_copy(update={"uncertainty": OdometryUncertainty(scale_distance=SCALE)})
+    sensor = SENSOR.model_copy(update={"uncertainty": BearingRangeUncertainty(x=AHEAD)})
+    estimator = made(name, Rig(odometry=wheels, bearing_range=sensor), FAR, SENSORS)
+    drive(estimator, ranges)
+    final, learnt = estimator.trajectory(), estimator.learnt().values
+    np.testing.assert_allclose(final.poses[:, 0], mean[3:], atol=2e-3)
+    np.testing.assert_allclose(final.covariances[:, 0, 0], np.diag(covariance)[3:], rtol=2e-2)
+    for i, constant in enumerate(("scale_distance", "bearing_range.x")):
+        value, sigma = learnt[constant]
+        assert value == pytest.approx(mean[i], abs=2e-3)
+        assert sigma == pytest.approx(np.sqrt(covariance[i, i]), rel=2e-2)
+
+
 def test_particles_match_the_grid_posterior_of_one_beacon():
     """One range to one beacon from a wide prior: a ring, far from Gaussian; the particles must have the grid's moments."""
     world = World(landmarks={"beacon": Landmark(x=1.0, y=0.5)})
     rig = Rig(bearing_range=BearingRangeSettings(range_sigma=0.2, robust=3.0))
-    estimator = make("particle_filter", rig, world, particles=100_000, resample_below=1e-6 + 0.0)
+    estimator = made("particle_filter", rig, world, SENSORS, 7, particles=100_000, resample_below=1e-6 + 0.0)
     sigmas = np.array((1.0, 0.8, 0.3))
     estimator.initialize(PosePrior(0.0, np.zeros(3), np.diag(sigmas**2)))
     estimator.process(BearingRange(0.0, ("beacon",), np.array([1.5]), np.array([np.nan])))
@@ -139,7 +180,7 @@ def test_one_look_is_no_better_than_the_map(name):
     places = 4.0 * np.column_stack((np.cos(angles), np.sin(angles)))
     landmarks = {f"l{i}": Landmark(x=x, y=y, sigma=0.3) for i, (x, y) in enumerate(places.tolist())}
     rig = Rig(bearing_range=BearingRangeSettings(range_sigma=0.03, bearing_sigma=0.01, robust=100.0))
-    estimator = make(name, rig, World(landmarks=landmarks))
+    estimator = made(name, rig, World(landmarks=landmarks), SENSORS, 7)
     estimator.initialize(PosePrior(0.0, np.zeros(3), np.diag((1.0, 1.0, 0.3)) ** 2))
     estimator.process(IncrementOdometry(0.0, 0.0, 0.0, 0.0))
     estimator.process(BearingRange(0.0, tuple(landmarks), np.full(5, 4.0), se2.wrap(angles)))

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
+from by_hand import made
 
 from factorgraph_loc.experiments.preparation import resolve_prior
-from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.measurement import Tick
-from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.simulation import named_settings, simulate
 
 CASES = [
@@ -43,7 +42,7 @@ def driven(log):
 
 def drive(log, name, sensors, settings, forget):
     """An estimator after a log with late measurements, which forgets what is older than ``forget`` seconds."""
-    estimator = create(name, Setup(log.rig, log.world, sensors, np.random.default_rng(1)), settings_of(name, settings))
+    estimator = made(name, log.rig, log.world, sensors, 1, **settings)
     prior, _ = resolve_prior(log, None)
     estimator.initialize(prior)
     held, causal = None, []

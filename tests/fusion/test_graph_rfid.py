@@ -5,13 +5,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from by_hand import made
 
 from factorgraph_loc import IncrementOdometry, IncrementStream, Log, RfidScan, Tick
 from factorgraph_loc.evaluation.metrics import errors as evaluated
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion import registry
-from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.simulation import preset, simulate
@@ -78,8 +77,7 @@ def test_without_a_map_it_is_told_that_reads_are_of_no_use() -> None:
 def test_belief_while_it_seeks_has_particles_that_move_with_the_odometry() -> None:
     log = office()
     sensors = ("odometry", "rfid")
-    setup = model_setup.Setup(log.rig, log.world, sensors, np.random.default_rng(1))
-    smoother = registry.create("smoother", setup, registry.settings_of("smoother", {}))
+    smoother = made("smoother", log.rig, log.world, sensors, 1)
     assert smoother.belief().particles is None
     scans = 0
     for m in log.measurements(sensors):

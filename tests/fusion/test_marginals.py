@@ -1,4 +1,5 @@
-"""Covariances of graphs that are hardly determined, optima next to values without a cost, and what a user is told of failures."""
+"""Covariances of graphs that are hardly determined, optima next to values without a cost, solvers that fail, and what a user is
+told of failures."""
 
 import gtsam
 import numpy as np
@@ -128,3 +129,40 @@ def test_a_batch_without_covariances_says_so_in_one_line(monkeypatch):
     monkeypatch.setattr(Problem, "covariances", failing)
     with pytest.raises(RunFailedError, match=r"cannot be solved at 3\.000 s: .* do not determine the pose at 0\.88"):
         run(simulate(seconds=3.0), RunConfig("batch"))
+
+
+@pytest.fixture(scope="module")
+def log():
+    return simulate(seconds=6.0, rate=3.0)
+
+
+def failing_marginals(times, monkeypatch):
+    """The marginals of a smoother fail from 3 s on so many times."""
+    marginal, failures = isam.Incremental._marginal, []
+
+    def failing(self, key, *known, **where):
+        if self._graph.t >= 3.0 and len(failures) < times:
+            failures.append(key)
+            raise RuntimeError("made to fail")
+        return marginal(self, key, *known, **where)
+
+    monkeypatch.setattr(isam.Incremental, "_marginal", failing)
+
+
+@pytest.mark.parametrize("lag", [None, 2.0, "all"])
+def test_a_solver_that_fails_is_built_anew(lag, log, monkeypatch):
+    config = RunConfig("smoother", {"lag": lag})
+    expected = run(log, config)
+    failing_marginals(1, monkeypatch)
+    result = run(log, config)
+    assert [what for _, what in result.diagnostics.events] == ["solver rebuilt: made to fail"]
+    assert set(result.status) == {"localized"}
+    assert np.abs(result.poses - expected.poses)[:, :2].max() < 0.02
+    assert np.abs(result.final.poses - expected.final.poses)[:, :2].max() < 0.02
+
+
+@pytest.mark.parametrize("lag", [None, 2.0])
+def test_a_solver_that_fails_twice_ends_the_run(lag, log, monkeypatch):
+    failing_marginals(2, monkeypatch)
+    with pytest.raises(RunFailedError, match=r"the graph cannot be solved at 3\.\d+ s: made to fail"):
+        run(log, RunConfig("smoother", {"lag": lag}))

@@ -4,12 +4,11 @@ from functools import cache
 
 import numpy as np
 import pytest
+from by_hand import made, scan
 from short_logs import SIGNALS, with_signals
 
-from factorgraph_loc import RfidScan, Rig, Tag, VelocityOdometry, World
-from factorgraph_loc.fusion import registry
+from factorgraph_loc import Rig, Tag, VelocityOdometry, World
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, BeamSettings, PriorSettings, RfidSettings
 from factorgraph_loc.simulation import preset, simulate
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
@@ -18,20 +17,13 @@ FREQUENCY = 9.2e8  # Hz
 AHEAD = {"ahead": AntennaSettings()}
 
 
-def scan(t, *reads, antennas=("ahead",), rssi=np.nan, phase=np.nan):
-    zero, full = np.zeros(len(reads)), np.ones(len(reads))
-    return RfidScan(t, antennas, zero.astype(np.int64), reads, zero, rssi * full, phase * full, FREQUENCY * full)
-
-
 def alone(tag, covariance, particles=500, rfid=None, **settings):
     """The filter with one antenna and one tag, from a start near the origin."""
     rig, world = Rig(rfid=rfid or RfidSettings(antennas=AHEAD)), World(tags={"a": tag})
     sensors = ("odometry", "rfid", *(("rssi", "phase") if rig.rfid.phase else ()))
-    setup = Setup(rig, world, sensors, np.random.default_rng(1))
-    settings = registry.settings_of("particle_filter", {"particles": particles, "smooth": False, **settings})
-    made = registry.create("particle_filter", setup, settings)
-    made.initialize(PosePrior(0.0, np.zeros(3), covariance))
-    return made
+    filter = made("particle_filter", rig, world, sensors, 1, particles=particles, smooth=False, **settings)
+    filter.initialize(PosePrior(0.0, np.zeros(3), covariance))
+    return filter
 
 
 def with_phase(**phase):

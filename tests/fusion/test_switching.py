@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from by_hand import made, scan
 
-from factorgraph_loc import RfidScan, Tick, YawRate
+from factorgraph_loc import Tick, YawRate
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion import registry
-from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation import simulate as simulate_office
@@ -30,15 +29,13 @@ def switched(office):
     return run(office, RunConfig("switching", {"particles": 500}, sensors=BOTH))
 
 
-def scan(t, *tags):
-    count = len(tags)
-    nothing = np.full(count, np.nan)
-    return RfidScan(t, ("1",), np.zeros(count, dtype=np.int64), tags, np.zeros(count), nothing, nothing, nothing)
+def switching(log, sensors=BOTH):
+    return made("switching", log.rig, log.world, sensors)
 
 
-def made(log, sensors=BOTH, **settings):
-    setup = model_setup.Setup(log.rig, log.world, sensors, np.random.default_rng(0))
-    return registry.create("switching", setup, registry.settings_of("switching", settings))
+def heard(t, *tags):
+    """A scan of the first antenna of the office's rig."""
+    return scan(t, *tags, antennas=("1",))
 
 
 def test_without_scans_it_is_the_ekf(office):
@@ -62,20 +59,20 @@ def test_while_tags_are_read_it_is_the_particle_filter(office, switched):
 
 
 def test_it_hands_over_mean_and_covariance(office):
-    estimator = made(office)
+    estimator = switching(office)
     tag = next(iter(office.world.tags))
     start = PosePrior(0.0, office.reference.poses[0], np.diag((0.1, 0.2, 0.05)) ** 2)
     estimator.initialize(start)
     estimator.process(Tick(0.0))
     before = estimator.estimate()
-    estimator.process(scan(0.0))  # nothing was read: the EKF goes on
+    estimator.process(heard(0.0))  # nothing was read: the EKF goes on
     after = estimator.estimate()
     np.testing.assert_allclose(after.pose, before.pose, atol=1e-12)
     np.testing.assert_allclose(after.covariance, before.covariance, atol=1e-6)
     assert estimator.belief().particles is None
-    estimator.process(scan(0.1, tag))
+    estimator.process(heard(0.1, tag))
     assert estimator.belief().particles is not None
-    estimator.process(scan(0.2, "not in the map"))
+    estimator.process(heard(0.2, "not in the map"))
     assert estimator.belief().particles is None
 
 
@@ -88,28 +85,28 @@ def test_what_the_other_filter_would_take_is_counted(office, switched):
 
 
 def test_rows_that_neither_filter_uses_are_counted_once(office):
-    estimator = made(office)
+    estimator = switching(office)
     estimator.initialize(PosePrior(0.0, office.reference.poses[0], np.eye(3)))
     estimator.process(YawRate(0.1, 0.2))
     assert estimator.diagnostics.ignored == {"yaw rate": 1}
 
 
 def test_an_unknown_start_needs_tags(office):
-    assert made(office, BOTH).supports_unknown_start
-    assert not made(office, SIGHT).supports_unknown_start
+    assert switching(office, BOTH).supports_unknown_start
+    assert not switching(office, SIGHT).supports_unknown_start
 
 
 def test_what_one_filter_takes_back_the_other_keeps(office):
     # a landmark that comes late, after the word went to and fro, takes none of the scans' innovations away
-    estimator = made(office)
+    estimator = switching(office)
     read = next(m for m in office.measurements(("rfid",)) if m.tags)
     landmark = next(iter(office.measurements(("bearing_range",))))
     start = PosePrior(0.0, office.reference.poses[0], np.diag((0.1, 0.2, 0.05)) ** 2)
     estimator.initialize(start)
-    estimator.process(scan(0.0))
+    estimator.process(heard(0.0))
     estimator.process(Tick(0.0))
     estimator.process(replace(read, t=0.1))
-    estimator.process(scan(0.2))
+    estimator.process(heard(0.2))
     innovations = list(estimator.diagnostics.nis["rfid"])
     for t in (0.3, 0.25):
         estimator.process(replace(landmark, t=t))

@@ -5,14 +5,13 @@ from dataclasses import replace
 import camera_world
 import numpy as np
 import pytest
+from by_hand import made
 from scipy.stats import chi2
 
 from factorgraph_loc import BearingRange, Localizer, PixelSightings, Rig, VelocityOdometry, World
 from factorgraph_loc.fusion.ekf import MOST
-from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.maps.markers import Marker, corner_names, corner_points
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factorgraph_loc.sensors.rfid.known_tags import trust
@@ -123,12 +122,10 @@ def test_a_state_of_many_points_is_bounded():
     points = camera_world.room(160, 1)
     spread = np.broadcast_to(0.05**2 * np.eye(3), (len(points), 3, 3))
     log = camera_world.simulate(1, 12.0, rate=2.0, points=points, limit=60)
-    setup = Setup(
-        log.rig, World(points=replace(points, covariances=spread)), ("odometry", "sightings"), np.random.default_rng(1)
-    )
-    ekf = create("ekf", setup, settings_of("ekf", {}))
+    sensors = ("odometry", "sightings")
+    ekf = made("ekf", log.rig, World(points=replace(points, covariances=spread)), sensors)
     ekf.initialize(PosePrior(0.0, log.reference.poses[0], 0.01 * np.eye(3)))
-    for m in log.measurements(setup.sensors):
+    for m in log.measurements(sensors):
         ekf.process(m)
     assert MOST <= len(ekf._state.covariance) < MOST + 3
 

@@ -4,15 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from by_hand import made
 from scipy.stats import chi2
 
 from factorgraph_loc import IncrementOdometry, PixelSightings, PointMap, Rig, Tick, World
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import cut
-from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factorgraph_loc.simulation import preset, simulate
 from factorgraph_loc.slam.monoslam_state import Innovation
@@ -88,9 +87,7 @@ FAR_POINT = np.array((4.0, 2.5, 1.4))
 
 
 def started(world, sensors=SENSORS, **settings):
-    estimator = create(
-        "monoslam", Setup(RIG, world, sensors, np.random.default_rng(1)), settings_of("monoslam", settings)
-    )
+    estimator = made("monoslam", RIG, world, sensors, **settings)
     estimator.initialize(PosePrior(0.0, np.zeros(3), 1e-8 * np.eye(3)))
     estimator.process(IncrementOdometry(0.0, 0.0, 0.0, 0.0))
     return estimator
@@ -128,9 +125,7 @@ def test_a_late_image_is_put_in_at_its_time(drive):
     log = cut(drive(6, seconds=12.0), 0.0, 10.0)
     held: list[float] = []
     for shuffled in (False, True):
-        estimator = create(
-            "monoslam", Setup(log.rig, log.world, SENSORS, np.random.default_rng(0)), settings_of("monoslam", {})
-        )
+        estimator = made("monoslam", log.rig, log.world, SENSORS)
         estimator.initialize(PosePrior(0.0, log.reference.poses[0], 1e-4 * np.eye(3)))
         measurements = list(log.measurements(SENSORS))
         images = [i for i, m in enumerate(measurements) if isinstance(m, PixelSightings)]

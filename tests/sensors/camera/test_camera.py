@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from by_hand import made
 from camera_world import CAMERA, frame, room, simulate, with_views
 
 from factorgraph_loc import CameraFrame, IncrementOdometry, PixelSightings, PointMap, Rig, Tick, World
-from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.model.setup import Setup
-from factorgraph_loc.sensors.camera.known_points import ITERATIONS, SETTLED, KnownPoints, Predicted, lifted
+from factorgraph_loc.sensors.camera.known_points import ITERATIONS, SETTLED, KnownPoints, Predicted
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factors import se2
 from factors.camera import model as reprojection
@@ -51,13 +51,9 @@ def side_camera():
 def test_a_linear_gaussian_run_is_that_of_the_kalman_filter_and_smoother(name):
     rig, points = side_camera(), PointMap.of(tuple(f"p{i}" for i in range(9)), FAR)
     model, rng = rig.camera.model(), np.random.default_rng(4)
-    setup = Setup(rig, World(points=points), rig.sensors, np.random.default_rng(7))
-    settings = (
-        {"particles": 5000, "smoothing_interval": 0.5, "smoothing_trajectories": 300}
-        if name == "particle_filter"
-        else {}
-    )
-    estimator = create(name, setup, settings_of(name, settings))
+    many = {"particles": 5000, "smoothing_interval": 0.5, "smoothing_trajectories": 300}
+    settings = many if name == "particle_filter" else {}
+    estimator = made(name, rig, World(points=points), rig.sensors, 7, **settings)
     estimator.initialize(PosePrior(0.0, np.zeros(3), np.diag(SIGMAS**2)))
     estimator.process(IncrementOdometry(0.0, 0.0, 0.0, 0.0))
     x, mean, variance = 0.1, 0.0, SIGMAS[0] ** 2
@@ -97,23 +93,8 @@ def test_a_linear_gaussian_run_is_that_of_the_kalman_filter_and_smoother(name):
     np.testing.assert_allclose(final.covariances[:, 0, 0], smoothed[:, 1], rtol=1e-2)
 
 
-def test_the_camera_moves_with_the_robot():
-    model, pose = replace(CAMERA.model(), tilt=0.0), np.array((0.3, -0.4, 0.9))
-    step = 1e-6
-    camera = lifted(model, pose, np.zeros((3, 3)))
-    for i, d in enumerate(step * np.eye(3)):
-        moved = lifted(model, se2.compose(pose, se2.exp(d)), np.zeros((3, 3)))
-        turn = (camera.rotation.T @ moved.rotation - np.eye(3)) / step
-        shift = camera.rotation.T @ (moved.position - camera.position) / step
-        found = np.array((turn[2, 1], turn[0, 2], turn[1, 0], *shift))
-        spread = lifted(model, pose, np.diag(np.eye(3)[i])).covariance
-        np.testing.assert_allclose(spread, np.outer(found, found), atol=1e-5)
-
-
 def test_images_that_are_too_late_are_counted(log):
-    estimator = create(
-        "ekf", Setup(log.rig, log.world, log.rig.sensors, np.random.default_rng(0)), settings_of("ekf", {})
-    )
+    estimator = made("ekf", log.rig, log.world, log.rig.sensors)
     estimator.initialize(PosePrior(0.0, np.array((1.0, -1.0, 0.0)), 0.01 * np.eye(3)))
     estimator.process(Tick(3.0))
     estimator.process(PixelSightings(1.0, ("p0", "p1"), np.zeros((2, 2))))

@@ -1,13 +1,13 @@
 """Dead tags, as a robot can know of them: by the way it goes, not by the whole log."""
 
-from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 import pytest
+from by_hand import scan
 
 import factorgraph_loc as fgloc
-from factorgraph_loc import Log, RfidScan, Rig, Tag, VelocityOdometry, World
+from factorgraph_loc import Log, Rig, Tag, VelocityOdometry, World
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.simulation import preset, simulate
 
@@ -31,21 +31,15 @@ def robot(estimator: str, **settings: float) -> fgloc.Localizer:
     return out
 
 
-def scan(t: float, tags: Sequence[str] = ("aside",)) -> RfidScan:
-    count = len(tags)
-    nan = np.full(count, np.nan)
-    return RfidScan(t, ("ahead",), np.zeros(count, np.int64), tuple(tags), np.zeros(count), nan, nan, nan)
-
-
 @pytest.mark.parametrize("estimator", ["smoother", "particle_filter", "switching"])
 def test_a_tag_is_given_up_and_taken_back(estimator: str) -> None:
     live = robot(estimator)
     for i in range(1, 14):
-        live.push(scan(0.1 * i))
+        live.push(scan(0.1 * i, "aside"))
     # 13 silences of 0.1 each, from odds of 3 to 97; a weak tag, or one that has moved, may be silent as well
     assert live.diagnostics().doubted["dead_tags"].keys() == {"ahead"}
     assert live.diagnostics().doubted["dead_tags"]["ahead"] > 0.9
-    live.push(scan(1.4, ("aside", "ahead")))
+    live.push(scan(1.4, "aside", "ahead"))
     assert not live.diagnostics().doubted["dead_tags"]
 
 
@@ -54,11 +48,11 @@ def test_a_tag_that_comes_back_is_no_reason_to_doubt_the_place(estimator: str) -
     live = robot(estimator)
     for i in range(1, 40):
         live.push(VelocityOdometry(0.1 * i, 0.0, 0.0))
-        live.push(scan(0.1 * i))
+        live.push(scan(0.1 * i, "aside"))
     assert live.diagnostics().doubted["dead_tags"].keys() == {"ahead"}
     for i in range(40, 50):
         live.push(VelocityOdometry(0.1 * i, 0.0, 0.0))
-        live.push(scan(0.1 * i, ("aside", "ahead")))
+        live.push(scan(0.1 * i, "aside", "ahead"))
         assert live.estimate().status == "localized"
 
 
@@ -68,9 +62,9 @@ def test_a_late_scan_counts_once(estimator: str) -> None:
     in_time, late = robot(estimator), robot(estimator)
     stamps = [0.05 * k for k in range(1, 7)]
     for t in stamps:
-        in_time.push(scan(t))
+        in_time.push(scan(t, "aside"))
     for k in (1, 0, 3, 2, 5, 4):
-        late.push(scan(stamps[k]))
+        late.push(scan(stamps[k], "aside"))
     expected = in_time.diagnostics().doubted["dead_tags"]["ahead"]
     assert late.diagnostics().doubted["dead_tags"]["ahead"] == pytest.approx(expected, abs=0.02)
     assert not late.diagnostics().late

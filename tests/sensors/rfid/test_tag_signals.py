@@ -5,8 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from by_hand import scan as scan_by_hand
 
-from factorgraph_loc import InputError, RfidScan, Rig, Tag, World
+from factorgraph_loc import InputError, Rig, Tag, World
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
@@ -28,10 +29,7 @@ def signals(sensors=SENSORS):
 
 
 def scan(t, *reads, rssi=-50.0, phase=1.0):
-    count = len(reads)
-    full = np.full(count, 1.0)
-    ages = np.linspace(0.0, 0.05, count)
-    return RfidScan(t, ("ahead",), np.zeros(count, np.int64), reads, ages, rssi * full, phase * full, 9.2e8 * full)
+    return scan_by_hand(t, *reads, ages=np.linspace(0.0, 0.05, len(reads)), rssi=rssi, phase=phase)
 
 
 def test_windows_end_a_step_apart_and_are_as_long_as_the_rig_says():

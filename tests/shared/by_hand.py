@@ -1,0 +1,18 @@
+"""What tests need to feed an estimator by hand: one for a rig and a map, and scans of tags."""
+
+import numpy as np
+
+from factorgraph_loc import RfidScan
+from factorgraph_loc.fusion.registry import create, settings_of
+from factorgraph_loc.model.setup import Setup
+
+
+def made(name, rig, world, sensors, seed=0, **settings):
+    """An estimator, as a run makes it."""
+    return create(name, Setup(rig, world, sensors, np.random.default_rng(seed)), settings_of(name, settings))
+
+
+def scan(t, *tags, antennas=("ahead",), ages=0.0, rssi=np.nan, phase=np.nan, frequency=9.2e8):
+    """A scan of which the first antenna read all ``tags``."""
+    full, none = np.ones(len(tags)), np.zeros(len(tags), np.int64)
+    return RfidScan(t, antennas, none, tags, ages * full, rssi * full, phase * full, frequency * full)
