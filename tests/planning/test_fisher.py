@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numerical import by_pose as numerical
 
-from factorgraph_loc import Landmark, PointMap, Rig, Tag, World
+from factorgraph_loc import Landmark, Rig, Tag, World
 from factorgraph_loc.planning.information import (
     FINEST,
     expected_covariance,
@@ -18,12 +18,9 @@ from factorgraph_loc.planning.information import (
 )
 from factorgraph_loc.planning.paths import Path, primitives
 from factorgraph_loc.planning.sensors import Sensors
-from factorgraph_loc.sensors.camera.settings import PixelSettings
-from factorgraph_loc.sensors.camera.simulation import CameraForecast
 from factorgraph_loc.sensors.landmarks.simulation import LandmarkForecast
 from factorgraph_loc.simulation.settings import RACKHAM_RIG
 from factors import se2
-from factors.camera import model as reprojection
 from factors.landmarks import model as bearing_range
 from factors.motion import ChainState
 from factors.odometry.model import Growth, OdometryModel, relative_motion
@@ -59,21 +56,6 @@ def test_one_look_at_a_landmark_is_one_update_of_a_kalman_filter():
     gain = body @ jacobian.T @ np.linalg.inv(jacobian @ body @ jacobian.T + noise)
     expected = se2.body_to_world(end, (np.eye(3) - gain @ jacobian) @ body)
     np.testing.assert_allclose(expected_covariance(MEAN, COVARIANCE, STEP, sensors), expected, rtol=1e-4, atol=1e-7)
-
-
-def test_points_in_view_of_a_camera_tell_what_their_pixels_do():
-    model = RIG.camera.model()
-    points = np.array(((4.0, 2.2, 1.0), (4.0, 1.5, 1.4), (-4.0, 2.0, 1.0)))  # the last is behind the robot
-    world = World(points=PointMap.of(["a", "b", "c"], points))
-    pose = np.array((0.0, 2.0, 0.0))
-    camera = CameraForecast(world, model, 2.0)
-    jacobian = numerical(lambda p: reprojection.predict(model, p, points[:2])[0].ravel(), pose)
-    expected = 2.0 * model.tempering * jacobian.T @ jacobian / model.sigma**2
-    np.testing.assert_allclose(camera.information(pose[None], np.ones(1))[0], expected, rtol=1e-4)
-    hidden = world.model_copy(update={"walls": ((2.0, -5.0, 2.0, 9.0),)})
-    assert not replace(camera, world=hidden).information(pose[None], np.ones(1)).any()
-    one_of_two = replace(camera, settings=PixelSettings(max_points=1))
-    np.testing.assert_allclose(one_of_two.information(pose[None], np.ones(1))[0], expected / 2.0, rtol=1e-4)
 
 
 def test_no_landmark_is_seen_through_a_wall():

@@ -51,5 +51,4 @@ SENSOR = SensorType(
     },
     simulate="factorgraph_loc.sensors.camera.simulation:simulate",
     looks="factorgraph_loc.sensors.camera.simulation:looks",
-    forecast="factorgraph_loc.sensors.camera.simulation:forecast",
 )
