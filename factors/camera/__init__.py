@@ -1,7 +1,6 @@
 """Pixels of points in space: model, kernels, factors."""
 
 __all__ = [
-    "bundle_kernels",
     "factor",
     "inverse_depth",
     "kernels",

@@ -5,15 +5,15 @@ import numpy as np
 
 from factorgraph_loc.fusion.graph.graph import Keyframe
 from factorgraph_loc.fusion.graph.problem import Problem
-from factorgraph_loc.slam.local_bundle import bundled
+from factorgraph_loc.slam.local_bundle import LocalBundle, bundled
 from factorgraph_loc.slam.new_points import sightings_of
-from factors import positive, se2
+from factors import se2
 from factors.camera import model as reprojection
-from factors.camera.bundle_kernels import adjusted
 from factors.camera.point import PointFactor
 from factors.graph import PriorFactor, VectorPriorFactor, point_key, pose_key, tilt_key
+from factors.least_squares import descended
 from factors.motion import ChainState, Increment
-from factors.odometry.factor import OdometryFactor
+from factors.odometry.factor import OdometryFactor, OdometryStack
 
 MODEL = camera_world.CAMERA.model()
 TURN = 0.015  # rad, that the odometry is off by from one keyframe to the next
@@ -110,13 +110,10 @@ def test_it_ends_where_the_general_solver_does():
             at = reprojection.camera_pose(MODEL, truth[k], tilts[k])
             pixels.append(reprojection.linearize_in_space(MODEL, *at, point[None])[0][0] + rng.standard_normal(2))
             factors.append((PointFactor(MODEL, lens, pixels[-1]), (pose_key(k), tilt_key(k), point_key(p))))
-    poses, found, _ = adjusted(
-        *(lens, MODEL.position, MODEL.rotation, np.array(guess), points, frames, starts, np.array(pixels)),
-        np.array((MODEL.sigma, MODEL.robust, MODEL.tilt)),
-        np.array([step.delta for step in steps]),
-        positive.whitener(np.array([step.covariance for step in steps])),
-        50,
-    )
+    odometry = OdometryStack([OdometryFactor(step) for step in steps], range(len(steps)), 0)
+    owners = np.repeat(np.arange(len(names)), np.diff(starts))
+    local = LocalBundle(MODEL, odometry, frames, owners, np.array(pixels))
+    (poses, found, _), _, _ = descended(local.cost, local.moved, (np.array(guess), np.zeros((len(truth), 2)), points))
     solved = Problem(factors).solve(values).values
     np.testing.assert_allclose(poses, [solved[pose_key(k)] for k in range(len(truth))], atol=1e-4)
     np.testing.assert_allclose(found, [solved[tilt_key(k)] for k in range(len(truth))], atol=1e-4)
