@@ -64,16 +64,15 @@ def build_map(
     rig: RigLike | None = None,
     world: WorldLike | None = None,
     overwrite: bool = False,
-    stages: maps.Stages = maps.silent,
+    progress: maps.Progress = lambda _share: None,
 ) -> maps.MadeMap:
     """Estimate a map of landmarks, RFID tags or points from a log. Writes ``out`` (``NAME.world.toml``) and a picture next to it.
 
-    For the arguments see :class:`~factorgraph_loc.experiments.maps.MapOptions`; for ``stages``, which shows the progress, see
-    :func:`~factorgraph_loc.experiments.maps.make_map`.
+    For the arguments see :class:`~factorgraph_loc.experiments.maps.MapOptions`. ``progress`` is called with the fraction done.
     """
     maps.plot_path(Path(out), overwrite=overwrite)
     options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead, points or {})
-    made = maps.make_map(read_log(log, rig=rig, world=world), options, stages)
+    made = maps.make_map(read_log(log, rig=rig, world=world), options, progress)
     made.write(Path(out), overwrite=overwrite)
     return made
 

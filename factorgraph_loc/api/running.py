@@ -1,23 +1,29 @@
 """``fgloc run`` as a function."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
+from factorgraph_loc.calibration.learn import Knowledge
+from factorgraph_loc.calibration.turns import TURNS, learn_by_turns
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.evaluation.plots import write_plots
 from factorgraph_loc.experiments import output
 from factorgraph_loc.experiments import run as running
 from factorgraph_loc.experiments.compare import summary_text
-from factorgraph_loc.experiments.learning import run_and_learn
-from factorgraph_loc.files.temporary import require_free
+from factorgraph_loc.experiments.preparation import used_sensors
+from factorgraph_loc.files.temporary import of_system, require_free, temporary_folder
 from factorgraph_loc.fitting.posterior import FittedConstant
 from factorgraph_loc.fusion.registry import for_final_only
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, read_log
 from factorgraph_loc.io.results import FILES
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment, RunConfig
+
+SMOOTHER = "smoother"
 
 
 @dataclass(frozen=True)
@@ -67,8 +73,8 @@ def run(
     config = RunConfig(estimator, chosen, None if sensors is None else tuple(sensors), prior, seed, max_gap, tick_gap)
     learnt: tuple[FittedConstant, ...] = ()
     if learn:
-        learning = run_and_learn(loaded, config, progress)
-        result, learnt = learning.result, tuple(learning.knowledge.constants)
+        result, knowledge = run_and_learn(loaded, config, progress)
+        learnt = tuple(knowledge.constants)
     else:
         result = running.run(loaded, config, progress)
     if out is None:
@@ -76,3 +82,41 @@ def run(
     scores = output.save_run(result, loaded, Path(out), align=align, overwrite=overwrite)
     write_plots(result, loaded, Path(out))
     return Run(result, scores, learnt)
+
+
+def run_and_learn(
+    log: Log, config: RunConfig, progress: Callable[[float], None] | None = None
+) -> tuple[RunResult, Knowledge]:
+    """Run an estimator on a log, learn the rig from the log by turns with the smoother, and compute the final trajectory with it.
+
+    The learnt rig depends on the whole log. Causal estimates therefore use the given rig, as all else in the result but the final
+    trajectory. ``progress`` is called with the fraction done. The effective configuration of the result has the ``learnt_rig``
+    too. Raises InputError if the log has too little information, and the errors of
+    :func:`~factorgraph_loc.experiments.run.run`.
+    """
+    report = progress or (lambda _share: None)
+    runs = TURNS + 2
+    given = running.run(log, config, lambda share: report(share / runs))
+    settings = config.settings if config.estimator == SMOOTHER else {}
+    smoothing = replace(config, estimator=SMOOTHER, settings=settings)
+    start = log.rig.model_copy(update={"sensors": used_sensors(log, config.sensors)})
+    started = perf_counter()
+    with temporary_folder(of_system("grids")) as folder:
+        knowledge = learn_by_turns(
+            [log],
+            start,
+            lambda learnt_log: running.run(replace(log, rig=learnt_log.rig), smoothing),
+            folder / "learnt",
+            lambda done, _all: report((1.0 + done) / runs),
+        )
+        rig = knowledge.rig
+        again = running.run(replace(log, rig=rig), config)
+    report(1.0)
+    learnt = replace(
+        given,
+        config={**given.config, "learnt_rig": rig.model_dump(mode="json", exclude_none=True)},
+        final=again.final,
+        timings=replace(given.timings, final_seconds=perf_counter() - started),
+        warnings=(*given.warnings, *knowledge.notes),
+    )
+    return learnt, knowledge

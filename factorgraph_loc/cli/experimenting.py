@@ -24,7 +24,7 @@ from factorgraph_loc.cli.options import (
     takes_options,
 )
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.seeds import parse_seeds
+from factorgraph_loc.model.scoring import parse_seeds
 from factorgraph_loc.plugins import ACTIVE_ESTIMATORS, POLICIES
 
 if TYPE_CHECKING:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -121,14 +120,15 @@ def map_(
     picture = maps.plot_path(out, overwrite=options.overwrite)  # before the log is read
     loaded = source.load_one(log)
     settings = parse_settings(set_ or (), [options.estimator], [maps.POINTS])
-    made = learning.build_map(
-        loaded,
-        out,
-        settings=settings[options.estimator],
-        points=settings[maps.POINTS],
-        stages=partial(show.progress, counted=False),
-        **vars(options),
-    )
+    with show.progress("mapping", counted=False) as report:
+        made = learning.build_map(
+            loaded,
+            out,
+            settings=settings[options.estimator],
+            points=settings[maps.POINTS],
+            progress=lambda share: report(share, 1.0),
+            **vars(options),
+        )
     show.warnings(made.warnings)
     if json:
         files = {"map": str(out), "picture": str(picture)}

@@ -25,8 +25,7 @@ from factorgraph_loc.cli.options import (
     takes_options,
 )
 from factorgraph_loc.evaluation.scores import ACCURACY, metric_of
-from factorgraph_loc.experiments.seeds import parse_seeds
-from factorgraph_loc.model.scoring import KINDS
+from factorgraph_loc.model.scoring import KINDS, parse_seeds
 from factorgraph_loc.text import number
 
 if TYPE_CHECKING:

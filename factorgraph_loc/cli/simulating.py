@@ -11,7 +11,7 @@ import typer
 from factorgraph_loc.cli import completion, show
 from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, nested_changes, takes_options
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.experiments.seeds import parse_seeds
+from factorgraph_loc.model.scoring import parse_seeds
 from factorgraph_loc.plugins import PRESETS
 
 OutFolder = Annotated[

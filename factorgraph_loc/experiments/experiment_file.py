@@ -5,23 +5,29 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import os
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.scores import SUMMARY
 from factorgraph_loc.evaluation.warned import SIMULATION
-from factorgraph_loc.experiments.seeds import LARGEST_SEED, MOST_SEEDS, parse_seeds
 from factorgraph_loc.files.models import FileModel, check_content, flattened, nearest, parse_model, read_toml, set_key
-from factorgraph_loc.model.scoring import LONGEST, MAX_GAP, SHORTEST, TICK_GAP, Alignment
+from factorgraph_loc.model.scoring import (
+    LARGEST_SEED,
+    LONGEST,
+    MAX_GAP,
+    MOST_SEEDS,
+    SHORTEST,
+    TICK_GAP,
+    Alignment,
+    parse_seeds,
+)
 from factorgraph_loc.text import listed, plain, quoted
 
-PATH, PART = 1000, 255  # maximum bytes of a path, and of a name within it
 LONGEST_NAME = 200  # maximum characters of the experiment's name, which is a folder name
 MOST = 1000  # maximum number of logs, estimators, sets of sensors and metrics in a file; globs and seeds may expand to more
 NO_TIME_LIMIT = 1e9  # s: no limit of a run
@@ -35,16 +41,6 @@ Scalar = str | int | float | bool
 
 def _is_scalar(value: Any) -> bool:
     return isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value))
-
-
-def _path(text: str) -> str:
-    parts = [os.fsencode(part) for part in Path(text).parts]
-    if "\0" in text or len(os.fsencode(text)) > PATH or any(len(part) > PART for part in parts):
-        raise ValueError("expected a path that a file can have")
-    return text
-
-
-PathName = Annotated[Name, AfterValidator(_path)]
 
 
 def _seeds(value: Any) -> Any:
@@ -67,12 +63,12 @@ class LogEntry(FileModel):
     with changed ``settings``; each of its ``seeds`` makes a log.
     """
 
-    log: PathName | None = None
+    log: Name | None = None
     reader: Name | None = None
     options: dict[str, Any] = Field(default_factory=dict)
-    rig: PathName | None = None
-    world: PathName | None = None
-    simulate: PathName | None = None
+    rig: Name | None = None
+    world: Name | None = None
+    simulate: Name | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
     seeds: Seeds = (0,)
 
@@ -175,7 +171,7 @@ class Experiment(FileModel):
     measurements; ``align``: also score after this alignment with the reference."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$", max_length=LONGEST_NAME)]
-    out: PathName | None = None
+    out: Name | None = None
     logs: Annotated[tuple[LogEntry, ...], Field(min_length=1, max_length=MOST, fail_fast=True)]
     estimators: Annotated[tuple[EstimatorEntry, ...], Field(min_length=1, max_length=MOST, fail_fast=True)]
     sensors: Annotated[

@@ -160,10 +160,6 @@ class Facts:
             self._known.logs[digest], self._new = [_facts(log) for log in source.load_all()], True
         return self._known.logs[digest]
 
-    def has_facts(self, digest: str) -> bool:
-        """Whether the logs of that digest are cached."""
-        return digest in self._known.logs
-
     def estimator(self, name: str, settings: Mapping[str, Any]) -> EstimatorFacts:
         """Facts of an estimator with these settings. Raises InputError for an unknown estimator or invalid settings."""
         key = f"{name} {canonical(settings)}"

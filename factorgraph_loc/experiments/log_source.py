@@ -132,14 +132,6 @@ class SimulatedSource:
 
         return [simulate(named_settings(self.preset, json.loads(self.settings)), self.seed)]
 
-    def size(self) -> tuple[float, float]:
-        """The duration of the drive [s] and the number of simulated observations, from the settings only. Raises InputError for
-        invalid settings."""
-        from factorgraph_loc.simulation import named_settings  # noqa: PLC0415
-
-        settings = named_settings(self.preset, json.loads(self.settings))
-        return settings.drive.duration, sum(settings.observation_counts().values())
-
     def load(self) -> Log:
         """The log."""
         return self.load_all()[0]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -49,13 +48,7 @@ OF_REFERENCE = "that of the reference"
 BY_RUN = "fgloc run -e smoother --set smoother.landmarks=unknown makes a map of points without one"
 SOURCES = {"log": "the log's start", "reference": "its reference"}
 
-Stages = Callable[[str], AbstractContextManager[Callable[[float, float], None]]]
-
-
-@contextmanager
-def silent(_: str) -> Iterator[Callable[[float, float], None]]:
-    """A stage without progress output."""
-    yield lambda _done, _total: None
+Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -115,19 +108,19 @@ def plot_path(out: Path, *, overwrite: bool) -> Path:
     return with_ending(out, SUFFIX, ".map.png", overwrite=overwrite)
 
 
-def make_map(log: Log, options: MapOptions | None = None, stages: Stages = silent) -> MadeMap:
+def make_map(log: Log, options: MapOptions | None = None, progress: Progress = lambda _share: None) -> MadeMap:
     """Make a map from a log. An existing map of the log is compared, or extended.
 
-    ``stages`` is called with the name of each stage, and yields its progress function. Raises InputError for options that do not
-    fit together or the log, RunFailedError if nothing could be located.
+    ``progress`` is called with the fraction done. Raises InputError for options that do not fit together or the log,
+    RunFailedError if nothing could be located.
     """
     options = options or MapOptions()
     if options.drop_dead:
-        return _without_dead(log, options, stages)
+        return _without_dead(log, options, progress)
     what = _mapped_kind(log, options)
     if what == "points":
-        return _of_points(log, options, stages)
-    return _of_tags(log, options, stages) if what == "tags" else _of_landmarks(log, options, stages)
+        return _of_points(log, options, progress)
+    return _of_tags(log, options, progress) if what == "tags" else _of_landmarks(log, options, progress)
 
 
 def _mapped_kind(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points"]:
@@ -166,7 +159,7 @@ def _mappable(log: Log) -> dict[str, str]:
     }
 
 
-def _of_landmarks(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
+def _of_landmarks(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
     estimator, settings = options.estimator, dict(options.settings)
     if estimator not in MAP_ESTIMATORS:
         raise InputError(
@@ -183,8 +176,7 @@ def _of_landmarks(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     else:
         started, source = _started_exactly(log, options.prior)
         config = RunConfig(estimator, settings | {"landmarks": "unknown"}, prior="log")
-    with stages(estimator) as report:
-        result = run(started, config, lambda share: report(share, 1.0))
+    result = run(started, config, progress)
     made = mapping.make_map(log, result.learnt.landmarks, extend=options.extend)
     trajectory = se2.compose(made.frame, result.final.poses)
     frame = "that of the given map" if options.extend or made.judged else f"that of the start: {source}"
@@ -192,7 +184,7 @@ def _of_landmarks(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     return MadeMap(made.world, frame, made, result.warnings, draw)
 
 
-def _of_tags(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
+def _of_tags(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
     uses_reference = _uses_reference(options, has_reference=log.reference is not None)
     height = options.tag_height
     if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
@@ -200,28 +192,20 @@ def _of_tags(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     if options.extend and not log.world.tags:
         raise InputError(f"{log.name}: has no map of tags that could be extended; leave --extend out")
     prior, frame = (None, OF_REFERENCE) if uses_reference else _start_of_tags(log, options)
-    with stages("tags") as report:
-        made = tag_mapping.map_tags(
-            log,
-            "reference" if uses_reference else "odometry",
-            prior,
-            extend=options.extend,
-            height=height,
-            progress=lambda share: report(share, 1.0),
-        )
+    poses: tag_mapping.Poses = "reference" if uses_reference else "odometry"
+    made = tag_mapping.map_tags(log, poses, prior, extend=options.extend, height=height, progress=progress)
     if options.extend or (not uses_reference and made.made.judged):
         frame = "that of the given map"
     return MadeMap(made.world, frame, made, log.warnings, partial(map_figure.tag_figure, log.name, made))
 
 
-def _without_dead(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
+def _without_dead(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
     """The map without tags that were not read where the smoother expects them to be."""
     if options != MapOptions(drop_dead=True, prior=options.prior):
         raise InputError("--drop-dead edits the log's map and maps nothing, expected no other option but --prior")
     if "tags" not in _mappable(log) or not log.world.tags:
         raise InputError(f"{log.name}: has no reads, or no map of tags, expected both to find tags that are dead")
-    with stages("smoother") as report:
-        result = run(log, RunConfig("smoother", prior=options.prior), lambda share: report(share, 1.0))
+    result = run(log, RunConfig("smoother", prior=options.prior), progress)
     dead = dict(sorted(result.diagnostics.doubted.get("dead_tags", {}).items(), key=lambda row: -row[1]))
     world = log.world.model_copy(update={"tags": {n: tag for n, tag in log.world.tags.items() if n not in dead}})
     details = DroppedTags(dead, len(world.tags))
@@ -231,7 +215,7 @@ def _without_dead(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     return MadeMap(world, "that of the given map", details, result.warnings, draw)
 
 
-def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
+def _of_points(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
     camera = log.rig.find(CameraSettings)
     if camera is None:
         raise InputError(f"{log.name}: its rig {log.rig.name} has no [camera], so that its images cannot be mapped")
@@ -244,11 +228,9 @@ def _of_points(log: Log, options: MapOptions, stages: Stages) -> MadeMap:
     settings = parse_model(PointSettings, options.points, "--set points")
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference that says where its images were taken: {BY_RUN}")
-    with stages("features") as report:
-        observed, doubts = with_features(log, camera.frontend, lambda share: report(share, 1.0))
-    with stages("points") as report:
-        posed = posed_frames(observed)
-        made = map_points(camera.model(), posed, settings, progress=lambda share: report(share, 1.0))
+    observed, doubts = with_features(log, camera.frontend, lambda share: progress(share / 2.0))
+    posed = posed_frames(observed)
+    made = map_points(camera.model(), posed, settings, progress=lambda share: progress((1.0 + share) / 2.0))
     points, fused = made.points, 0
     if options.extend and log.world.points is not None:
         points, fused = merged(log.world.points, points)

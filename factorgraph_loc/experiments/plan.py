@@ -28,9 +28,6 @@ from factorgraph_loc.model.scoring import RunConfig, check_prior
 from factorgraph_loc.text import quoted
 
 MOST_RUNS = 100_000
-# limits of what is simulated before the first run, each about a quarter of an hour of computing
-MOST_SECONDS = 2_000_000  # of simulated driving
-MOST_OBSERVATIONS = 2_000_000_000  # simulated observations of tags, landmarks and points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,9 +89,8 @@ def plan(
 
     Estimators are run once for values of a sweep that do not apply to them, deterministic ones with the first seed only.
 
-    Before any log is read, raises TooManyRunsError for more than ``most`` runs. Simulated logs with a total length above
-    :data:`MOST_SECONDS`, or with more observations than :data:`MOST_OBSERVATIONS`, raise InputError. Before anything runs, raises
-    InputError for an unreadable log, two logs of one name, invalid settings or prior, or a sensor that no log has.
+    Before any log is read, raises TooManyRunsError for more than ``most`` runs. Before anything runs, raises InputError for an
+    unreadable log, two logs of one name, invalid settings or prior, or a sensor that no log has.
     """
     facts = Facts(cache / "facts.json")
     experiment = _placed(experiment, folder, data_root)
@@ -109,7 +105,6 @@ def plan(
     for entry in experiment.estimators:
         for swept in sweep.points(entry.shown, entry.name):
             facts.estimator(entry.name, _settings(entry, swept))  # report a wrong setting before logs are read
-    _check_simulated(experiment, facts)
     try:
         runs = _all_runs(experiment, recorded, facts, most)
     finally:  # keep what was looked up, even if interrupted
@@ -164,22 +159,6 @@ def _check_count(count: int, most: int) -> None:
     if count > most:
         shown = f"{count:,}" if count < 10**12 else f"{count:.1g}"
         raise TooManyRunsError(f"plans {shown} runs, more than {most:,}")
-
-
-def _check_simulated(experiment: Experiment, facts: Facts) -> None:
-    """Raise InputError if the simulations exceed the limits."""
-    seconds, observations = 0.0, 0.0
-    for point in experiment.sweep.points(SIMULATION):
-        for entry in experiment.logs:
-            if entry.simulate is not None:
-                sources = _simulated(entry, point)
-                new = sum(not facts.has_facts(facts.digest(source)) for source in sources)
-                size = sources[0].size() if new else (0.0, 0.0)
-                seconds, observations = seconds + new * size[0], observations + new * size[1]
-                if seconds > MOST_SECONDS or observations > MOST_OBSERVATIONS:
-                    what = f"{seconds:,.0f} s and {observations:,.0f} observations of tags, landmarks and points"
-                    expected = f"{MOST_SECONDS:,} s and {MOST_OBSERVATIONS:,} observations"
-                    raise InputError(f"has to simulate drives of {what} or more, expected at most {expected}")
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:

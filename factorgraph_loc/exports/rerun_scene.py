@@ -7,9 +7,10 @@ optional: without it these modules cannot be imported.
 
 from __future__ import annotations
 
+import itertools
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,18 +19,23 @@ import rerun.blueprint as rrb
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
-from factorgraph_loc.exports.rerun_camera import TIMELINE, WORLD, camera_path, record_camera, times
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK, open_viewer
 from factorgraph_loc.exports.runs import StoredRun
-from factorgraph_loc.exports.scene import DARK, DETECTION, REFERENCE, Colour, colours
+from factorgraph_loc.exports.scene import DARK, DETECTION, GAP, REFERENCE, SIGHTING, Colour, colours
 from factorgraph_loc.files.models import replacing
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.camera import summary as pictures_of
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.summary import has_pictures
+from factors.camera import model as reprojection
 from factors.se2 import Array
 
+TIMELINE = "log_time"
+WORLD, CAMERA = "/world", "/camera"  # the latter without a robot pose
+FRUSTUM = 0.4  # m from the camera to its image
+BATCH = 16  # images per message
+NEAREST = 300  # map points drawn into an image
 PLOTS, EVENTS = "/plots", "/events"
 LINE, POINT = 0.02, 0.06  # m: radii
 ARROW = 0.6  # m
@@ -73,7 +79,7 @@ def _record(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
         _robot(recording, f"{WORLD}/reference/robot", log.reference, REFERENCE)
     for run, colour in zip(runs, colours(), strict=False):
         _run(recording, run, colour)
-    record_camera(recording, log, runs)
+    _camera(recording, log, runs)
 
 
 def _map(recording: rr.RecordingStream, log: Log) -> None:
@@ -101,7 +107,7 @@ def _lamps(recording: rr.RecordingStream, what: str, positions: Mapping[str, Arr
         flat = [name for names in lit for name in names]
         columns = rr.Points3D.columns(positions=np.array([positions[name] for name in flat]), labels=flat)
         columns = columns.partition([len(names) for names in lit])
-        recording.send_columns(f"{WORLD}/{what}/lit", times(lights.t), columns)
+        recording.send_columns(f"{WORLD}/{what}/lit", _times(lights.t), columns)
         style = rr.Points3D.from_fields(radii=2.0 * POINT, colors=DETECTION, show_labels=True)
         recording.log(f"{WORLD}/{what}/lit", style, static=True)
 
@@ -128,10 +134,10 @@ def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
         if len(stamps):
             plot = f"{PLOTS}/{name}/{run.name}"
             recording.log(plot, rr.SeriesLines(colors=colour, names=run.name), static=True)
-            recording.send_columns(plot, times(stamps), rr.Scalars.columns(scalars=values))
+            recording.send_columns(plot, _times(stamps), rr.Scalars.columns(scalars=values))
     if run.events:
         when, texts = zip(*run.events, strict=True)
-        recording.send_columns(f"{EVENTS}/{run.name}", times(np.array(when)), rr.TextLog.columns(text=texts))
+        recording.send_columns(f"{EVENTS}/{run.name}", _times(np.array(when)), rr.TextLog.columns(text=texts))
 
 
 def _path(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
@@ -152,7 +158,7 @@ def _trail(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
 def _lines_over_time(recording: rr.RecordingStream, at: str, t: Array, lines: Array, colour: Colour) -> None:
     """A line (L, 2) of ``lines`` (K, L, 2) for each of the times ``t`` (K,)."""
     if len(t):
-        recording.send_columns(at, times(t), rr.LineStrips3D.columns(strips=list(_on_floor(lines))))
+        recording.send_columns(at, _times(t), rr.LineStrips3D.columns(strips=list(_on_floor(lines))))
         recording.log(at, rr.LineStrips3D.from_fields(radii=LINE, colors=colour), static=True)
 
 
@@ -163,11 +169,90 @@ def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
     half = trajectory.poses[:, 2] / 2.0 if trajectory.has_heading else np.zeros(len(trajectory))
     turns = np.column_stack((np.zeros((len(half), 2)), np.sin(half), np.cos(half)))
     poses = rr.Transform3D.columns(translation=_on_floor(trajectory.poses[:, :2]), quaternion=turns)
-    recording.send_columns(at, times(trajectory.t), poses)
+    recording.send_columns(at, _times(trajectory.t), poses)
     recording.log(f"{at}/place", rr.Points3D([(0.0, 0.0, 0.0)], radii=2.0 * POINT, colors=colour), static=True)
     if trajectory.has_heading:
         arrow = rr.Arrows3D(vectors=[(ARROW, 0.0, 0.0)], radii=LINE, colors=colour)
         recording.log(f"{at}/heading", arrow, static=True)
+
+
+def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) -> None:
+    """Record images with the identified points and the predicted map points, as a picture in front of the first robot."""
+    settings = log.rig.find(CameraSettings)
+    if settings is None or not pictures_of.has_pictures(log):
+        return
+    model, at, poses = settings.model(), _camera_path(log, runs), _carrier(log, runs)
+    if at != CAMERA:
+        place = rr.Transform3D(translation=model.position, mat3x3=model.rotation)
+        recording.log(at, place, static=True)
+    lens = rr.Pinhole(
+        image_from_camera=model.matrix(),
+        resolution=(model.width, model.height),
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=FRUSTUM,
+    )
+    recording.log(at, lens, static=True)
+    for some in _batches(pictures_of.images(log)):
+        _pictures(recording, f"{at}/image", some)
+        if log.world.points is not None and poses is not None:
+            t = np.array([t for t, _ in some])
+            expected = [_expected(model, pose, log.world.points.positions) for pose in poses.at(t, max_gap=GAP)]
+            _pixels_over_time(recording, f"{at}/image/map", t, expected)
+            recording.log(f"{at}/image/map", rr.Points2D.from_fields(radii=2.0, colors=DETECTION), static=True)
+    sightings = list(pictures_of.sightings(log))
+    if sightings:
+        labels = [name for _, names, _ in sightings for name in names]
+        t = np.array([t for t, _, _ in sightings])
+        _pixels_over_time(recording, f"{at}/image/landmarks", t, [pixels for _, _, pixels in sightings], labels)
+        style = rr.Points2D.from_fields(radii=3.0, colors=SIGHTING, show_labels=False)
+        recording.log(f"{at}/image/landmarks", style, static=True)
+
+
+def _batches(pictures: Iterator[tuple[float, bytes]]) -> Iterator[list[tuple[float, bytes]]]:
+    while some := list(itertools.islice(pictures, BATCH)):
+        yield some
+
+
+def _pictures(recording: rr.RecordingStream, at: str, pictures: Sequence[tuple[float, bytes]]) -> None:
+    t, contents = zip(*pictures, strict=True)
+    columns = rr.EncodedImage.columns(blob=list(contents), media_type=["image/jpeg"] * len(contents))
+    recording.send_columns(at, _times(np.array(t)), columns)
+
+
+def _pixels_over_time(
+    recording: rr.RecordingStream, at: str, t: Array, pixels: Sequence[Array], labels: Sequence[str] | None = None
+) -> None:
+    """Points (K, 2) in each image, shifted by half a pixel: the viewer's origin is a corner of the first pixel, not its centre."""
+    columns = rr.Points2D.columns(positions=np.concatenate(pixels) + 0.5, labels=labels)
+    recording.send_columns(at, _times(t), columns.partition([len(p) for p in pixels]))
+
+
+def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Array:
+    """Pixels (K, 2) of the nearest ``points`` (P, 3) visible from ``pose`` (3,), none if the pose is unknown."""
+    if not np.isfinite(pose).all():
+        return np.empty((0, 2))
+    pixels, depths = reprojection.predict(model, pose, points)
+    visible = np.flatnonzero((depths > 0.0) & model.contains(pixels))
+    return np.asarray(pixels[visible[np.argsort(depths[visible])[:NEAREST]]])
+
+
+def _carrier(log: Log, runs: Sequence[StoredRun]) -> Trajectory | None:
+    """Trajectory of the robot that carries the drawn camera: of the first run that has one, else the reference."""
+    trajectories = [run.played() for run in runs if len(run.played())]
+    return trajectories[0] if trajectories else log.reference
+
+
+def _camera_path(log: Log, runs: Sequence[StoredRun]) -> str:
+    """The entity path of the camera: below the first robot drawn, if there is one."""
+    robots = [run.name for run in runs if len(run.played())]
+    if log.reference is not None:
+        robots.append("reference")
+    return f"{WORLD}/{robots[0]}/robot/camera" if robots else CAMERA
+
+
+def _times(t: Array) -> list[rr.TimeColumn]:
+    """Seconds of the log as a Rerun time column."""
+    return [rr.TimeColumn(TIMELINE, duration=t)]
 
 
 def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
@@ -186,8 +271,8 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
         eye_controls=eye,
     )
     beside: list[rrb.View] = []
-    if log.rig.find(CameraSettings) is not None and has_pictures(log):
-        beside.append(rrb.Spatial2DView(origin=camera_path(log, runs), name="camera"))
+    if log.rig.find(CameraSettings) is not None and pictures_of.has_pictures(log):
+        beside.append(rrb.Spatial2DView(origin=_camera_path(log, runs), name="camera"))
     titles = {"error_position": "error of position [m]", "error_heading": "error of heading [rad]", "nees": "NEES"}
     beside += [
         rrb.TimeSeriesView(origin=f"{PLOTS}/{name}", name=title)

@@ -1,7 +1,6 @@
 """Base class of settings models, parsing of TOML and JSON, and atomic writing of files."""
 
 import difflib
-import gc
 import hashlib
 import json
 import math
@@ -176,8 +175,7 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
         return kind.model_validate(content)
     except ValidationError as error:
         # a misspelt key is also reported as missing; the spelling error is more useful
-        with _without_collection():
-            first = min(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
+        first = min(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
         key = plain(".".join(str(part) for part in first["loc"]))
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         if first["type"] == "extra_forbidden":
@@ -190,18 +188,6 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
             raise InputError(f"{source}: {table}{first['ctx']['error']}{more}") from error
         expected = first["msg"][0].lower() + first["msg"][1:]
         raise InputError(f"{source}: {key} is {quoted(first['input'])}: {expected}{more}") from error
-
-
-@contextmanager
-def _without_collection() -> Iterator[None]:
-    """Disable garbage collection, which takes ten times as long as creating a million dictionaries."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:

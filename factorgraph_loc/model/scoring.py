@@ -22,6 +22,8 @@ PRIORS = "reference, log, unknown, X,Y or X,Y,HEADING"
 RATE = 10  # Hz
 TICK_GAP = 60.0  # s; gaps without measurements above this length have no ticks
 SHORTEST, LONGEST = 1.0, 86400.0  # s; bounds of the setting
+MOST_SEEDS = 10_000
+LARGEST_SEED = 2**63 - 1  # as in tables
 TOLERANCE = 1e-6  # fraction of a tick, for rounding at the last measurement
 
 
@@ -77,6 +79,20 @@ def parse_position(prior: str) -> list[float]:
     if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and all(abs(angle) <= 2.0 * math.pi for angle in heading)):
         raise InputError(f"prior is {quoted(prior)}, expected metres, at most {FARTHEST:g}, and a heading in radians")
     return [x, y, *heading]
+
+
+def parse_seeds(text: str, source: object = "--seeds") -> range:
+    """Parse ``0:10`` as the seeds 0 to 9, ``3`` as the seed 3. Raises InputError with ``source``."""
+    first, colon, end = text.partition(":")
+    try:
+        seeds = range(int(first), int(end) if colon else int(first) + 1)
+    except ValueError:
+        seeds = range(0)
+    if not seeds or seeds[0] < 0 or seeds[-1] > LARGEST_SEED:
+        raise InputError(f"{source} is {quoted(text)}, expected a number such as 3, or a range such as 0:10")
+    if seeds[-1] - seeds[0] >= MOST_SEEDS:
+        raise InputError(f"{source} is {quoted(text)}, expected at most {MOST_SEEDS:,} seeds")
+    return seeds
 
 
 class Ticks:

@@ -22,7 +22,8 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.active_mcl import ActiveMcl
 from factorgraph_loc.planning.paths import Path, look_around, primitives, waypoint_paths, waypoints
-from factorgraph_loc.planning.policies import Choice, Policy, Situation, make_policy, usable
+from factorgraph_loc.planning.policies import Choice, Policy, Situation, usable
+from factorgraph_loc.planning.policies import policy as named_policy
 from factorgraph_loc.planning.robot import SimulatedRobot
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
@@ -112,7 +113,7 @@ def run_active(
             raise InputError(
                 f"{simulation.name}: {name} is {rate:g}, expected at most {RATE:g}, the rate of the robot's control"
             )
-    chooser = make_policy(policy)
+    chooser = named_policy(policy)
 
     def of_world() -> np.random.Generator:
         return generator(seed if simulation.world_seed is None else simulation.world_seed, "world")
@@ -251,7 +252,7 @@ class _ClosedLoop:
             self._rng,
             modes,
         )
-        choice = self._policy.choose(situation)
+        choice = self._policy(situation)
         elapsed = 1e3 * (perf_counter() - started)
         if choice.path is not None and choice.path.kind == self._turn.kind:
             self._turned_at = self._robot.metres

@@ -10,9 +10,8 @@ just done one. Only policies that compare candidates use paths to distant places
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
@@ -67,92 +66,86 @@ class Choice:
 
     path: Path | None
     metres: float
-    values: Array
+    values: Array = field(default_factory=lambda: np.empty(0))
 
 
-class Policy(Protocol):
-    """Chooses a path."""
-
-    def choose(self, situation: Situation) -> Choice: ...
+NO_PATH = Choice(None, 0.0)
 
 
-class Information:
-    """Chooses by expected information; ``sign`` -1: as printed in the paper.
+Policy = Callable[[Situation], Choice]
+"""A function that chooses a path."""
+
+
+def information(s: Situation, sign: float = 1.0) -> Choice:
+    """The path by its expected information; ``sign`` -1: as printed in the paper.
 
     Near paths come first. If none is worth its cost, distant places that distinguish few possible poses are evaluated; if these
     yield nothing either, or the pose is unknown, the robot patrols.
     """
+    settings = s.settings.policy
+    if not s.sensors.forecasts or not s.candidates:
+        return patrol(s)
+    values = np.full(len(s.candidates), np.nan)
+    near = [i for i, p in enumerate(s.candidates) if p.kind != FAR]
+    gains = _near_gains(s, [s.candidates[i] for i in near])
+    costs = _costs(s, near, settings.per_metre)
+    values[near] = sign * gains - costs
+    if np.any((gains >= NOTHING) & (gains > costs)):
+        best = s.candidates[int(np.nanargmax(values))]
+        return Choice(best, max(settings.replan, COMMITTED * best.length), values)
+    far = [i for i, p in enumerate(s.candidates) if p.kind == FAR]
+    if far and sum(mode.weight for mode in s.modes) > FEW:
+        gains = _far_gains(s, [s.candidates[i] for i in far])
+        values[:] = np.nan
+        values[far] = sign * gains - _costs(s, far, FAR_PER_METRE)
+        if np.max(gains) >= NOTHING:
+            best = s.candidates[far[int(np.argmax(values[far]))]]
+            # a long path is followed to its end, not abandoned for a small gain
+            return Choice(best, best.length, values)
+    return replace(patrol(s), metres=settings.replan)
 
-    def __init__(self, sign: float = 1.0) -> None:
-        self._sign = sign
-        self._otherwise = Patrol()
 
-    def choose(self, situation: Situation) -> Choice:
-        s, settings = situation, situation.settings.policy
-        if not s.sensors.forecasts or not s.candidates:
-            return self._otherwise.choose(s)
-        values = np.full(len(s.candidates), np.nan)
-        near = [i for i, p in enumerate(s.candidates) if p.kind != FAR]
-        gains = self._near(s, [s.candidates[i] for i in near])
-        costs = _costs(s, near, settings.per_metre)
-        values[near] = self._sign * gains - costs
-        if np.any((gains >= NOTHING) & (gains > costs)):
-            best = s.candidates[int(np.nanargmax(values))]
-            return Choice(best, max(settings.replan, COMMITTED * best.length), values)
-        far = [i for i, p in enumerate(s.candidates) if p.kind == FAR]
-        if far and sum(mode.weight for mode in s.modes) > FEW:
-            gains = self._far(s, [s.candidates[i] for i in far])
-            values[:] = np.nan
-            values[far] = self._sign * gains - _costs(s, far, FAR_PER_METRE)
-            if np.max(gains) >= NOTHING:
-                best = s.candidates[far[int(np.argmax(values[far]))]]
-                # a long path is followed to its end, not abandoned for a small gain
-                return Choice(best, best.length, values)
-        patrol = self._otherwise.choose(s)
-        return Choice(patrol.path, settings.replan, patrol.values)
+def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
+    """Gains (C,) with respect to the whole belief."""
+    settings = s.settings.policy
+    if settings.expectation == "fisher" and not has_several_modes(s.particles, s.weights):
+        return fisher_gain(*pose_moments(s.particles, s.weights), paths, s.sensors, dims=settings.dimensions)
+    gains = expected_gain(
+        s.sensors,
+        s.particles,
+        s.weights,
+        paths,
+        s.rng,
+        dims=settings.dimensions,
+        samples=settings.samples,
+        space=s.space,
+    )
+    if len(s.modes) != 1:
+        return gains
+    # otherwise the robot would go back and forth to compensate the noise of the odometry
+    alone, (mode,) = replace(s.sensors, forecasts=()), s.modes
+    return gains + fisher_gain(mode.pose, mode.covariance, paths, alone, dims=settings.dimensions)
 
-    @staticmethod
-    def _near(s: Situation, paths: Sequence[Path]) -> Array:
-        """Gains with respect to the whole belief."""
-        settings = s.settings.policy
-        if settings.expectation == "fisher" and not has_several_modes(s.particles, s.weights):
-            return fisher_gain(*pose_moments(s.particles, s.weights), paths, s.sensors, dims=settings.dimensions)
-        gains = expected_gain(
-            s.sensors,
-            s.particles,
-            s.weights,
-            paths,
-            s.rng,
-            dims=settings.dimensions,
-            samples=settings.samples,
-            space=s.space,
-        )
-        if len(s.modes) != 1:
-            return gains
-        # otherwise the robot would go back and forth to compensate the noise of the odometry
-        alone, (mode,) = replace(s.sensors, forecasts=()), s.modes
-        return gains + fisher_gain(mode.pose, mode.covariance, paths, alone, dims=settings.dimensions)
 
-    @staticmethod
-    def _far(s: Situation, paths: Sequence[Path]) -> Array:
-        """Information gains on the mode index, or on the position if the belief has a single mode. On a long path particles would
-        diverge and run into walls that the real robot avoids by planning again.
-        """
-        if len(s.modes) == 1:
-            (mode,) = s.modes
-            return fisher_gain(mode.pose, mode.covariance, paths, s.sensors, dims=s.settings.policy.dimensions)
-        # which of equal modes is the heavier is random
-        weights = np.repeat(np.sqrt([mode.weight for mode in s.modes]), EACH)
-        return expected_gain(
-            s.sensors,
-            np.concatenate([s.rng.multivariate_normal(mode.pose, mode.covariance, EACH) for mode in s.modes]),
-            weights / weights.sum(),
-            paths,
-            s.rng,
-            samples=OF_MODES,
-            space=s.space,
-            places=np.repeat(np.arange(len(s.modes)), EACH),
-        )
+def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
+    """Gains (C,) on the mode index, or on the position if the belief has a single mode. On a long path particles would diverge and
+    run into walls that the real robot avoids by planning again.
+    """
+    if len(s.modes) == 1:
+        (mode,) = s.modes
+        return fisher_gain(mode.pose, mode.covariance, paths, s.sensors, dims=s.settings.policy.dimensions)
+    # which of equal modes is the heavier is random
+    weights = np.repeat(np.sqrt([mode.weight for mode in s.modes]), EACH)
+    return expected_gain(
+        s.sensors,
+        np.concatenate([s.rng.multivariate_normal(mode.pose, mode.covariance, EACH) for mode in s.modes]),
+        weights / weights.sum(),
+        paths,
+        s.rng,
+        samples=OF_MODES,
+        space=s.space,
+        places=np.repeat(np.arange(len(s.modes)), EACH),
+    )
 
 
 def _costs(s: Situation, rows: Sequence[int], per_metre: float) -> Array:
@@ -162,73 +155,64 @@ def _costs(s: Situation, rows: Sequence[int], per_metre: float) -> Array:
     return per_metre * np.array([p.length for p in paths]) + s.settings.policy.per_second * np.array(seconds)
 
 
-class Random:
+def random(s: Situation) -> Choice:
     """Any of the arcs, short straight paths and turns in place, to its end."""
-
-    def choose(self, situation: Situation) -> Choice:
-        arcs = [p for p in situation.candidates if p.kind != FAR]
-        if not arcs:
-            return Choice(None, 0.0, np.empty(0))
-        path = arcs[int(situation.rng.integers(len(arcs)))]
-        # a turn has length 0 and needs no free space
-        return Choice(path, max(path.length, situation.settings.policy.replan), np.empty(0))
+    arcs = [p for p in s.candidates if p.kind != FAR]
+    if not arcs:
+        return NO_PATH
+    path = arcs[int(s.rng.integers(len(arcs)))]
+    # a turn has length 0 and needs no free space
+    return Choice(path, max(path.length, s.settings.policy.replan))
 
 
-class Patrol:
+def patrol(s: Situation) -> Choice:
     """Straight on until a wall is near, then in the direction with the most free space; back only if nothing else is free."""
-
-    def choose(self, situation: Situation) -> Choice:
-        straight = [(i, p) for i, p in enumerate(situation.candidates) if _is_straight(p)]
-        if not straight:
-            return Choice(None, 0.0, np.empty(0))
-        turns = np.array([abs(_direction(p)) for _, p in straight])
-        free = situation.free[[i for i, _ in straight]]
-        if turns.min() < 1e-6 and free[turns.argmin()] > AHEAD:
-            best = int(turns.argmin())
-        else:
-            # the longest free path; of equal ones that with the smallest turn
-            best = int(np.lexsort((turns, -free.round(1), turns > BACK))[0])
-        direction = _direction(straight[best][1])
-        length = situation.settings.max_metres
-        along = np.arange(0.0, length + STEP, STEP)
-        poses = np.column_stack(
-            (along * math.cos(direction), along * math.sin(direction), np.full(len(along), direction))
-        )
-        if direction != 0.0:
-            poses = np.concatenate((np.zeros((1, 3)), poses))
-        return Choice(Path(poses, "patrol"), length, np.empty(0))
+    straight = [(i, p) for i, p in enumerate(s.candidates) if _is_straight(p)]
+    if not straight:
+        return NO_PATH
+    turns = np.array([abs(_direction(p)) for _, p in straight])
+    free = s.free[[i for i, _ in straight]]
+    if turns.min() < 1e-6 and free[turns.argmin()] > AHEAD:
+        best = int(turns.argmin())
+    else:
+        # the longest free path; of equal ones that with the smallest turn
+        best = int(np.lexsort((turns, -free.round(1), turns > BACK))[0])
+    direction = _direction(straight[best][1])
+    length = s.settings.max_metres
+    along = np.arange(0.0, length + STEP, STEP)
+    poses = np.column_stack((along * math.cos(direction), along * math.sin(direction), np.full(len(along), direction)))
+    if direction != 0.0:
+        poses = np.concatenate((np.zeros((1, 3)), poses))
+    return Choice(Path(poses, "patrol"), length)
 
 
-class NearestTags:
+def nearest_tags(s: Situation) -> Choice:
     """Towards the nearest tags, on average over the belief."""
-
-    def choose(self, situation: Situation) -> Choice:
-        s = situation
-        if not len(s.sensors.goals) or not s.candidates:
-            return Patrol().choose(s)
-        rows = s.rng.choice(len(s.weights), s.settings.policy.samples, p=s.weights / s.weights.sum())
-        ends = np.array([p.poses[-1] for p in s.candidates])
-        places = se2.compose(s.particles[rows][:, None], ends[None])[..., :2]
-        gaps = np.linalg.norm(places[:, :, None] - s.sensors.goals, axis=3)
-        count = min(NEAR, gaps.shape[2])
-        values = -np.sort(gaps, axis=2)[..., :count].mean(axis=(0, 2))
-        return Choice(s.candidates[int(np.argmax(values))], s.settings.policy.replan, values)
+    if not len(s.sensors.goals) or not s.candidates:
+        return patrol(s)
+    rows = s.rng.choice(len(s.weights), s.settings.policy.samples, p=s.weights / s.weights.sum())
+    ends = np.array([p.poses[-1] for p in s.candidates])
+    places = se2.compose(s.particles[rows][:, None], ends[None])[..., :2]
+    gaps = np.linalg.norm(places[:, :, None] - s.sensors.goals, axis=3)
+    count = min(NEAR, gaps.shape[2])
+    values = -np.sort(gaps, axis=2)[..., :count].mean(axis=(0, 2))
+    return Choice(s.candidates[int(np.argmax(values))], s.settings.policy.replan, values)
 
 
-_MAKERS: Mapping[str, Callable[[], Policy]] = {
-    "information": Information,
-    "paper_literal": partial(Information, sign=-1.0),
-    "random": Random,
-    "patrol": Patrol,
-    "nearest_tags": NearestTags,
+_POLICIES: Mapping[str, Policy] = {
+    "information": information,
+    "paper_literal": partial(information, sign=-1.0),
+    "random": random,
+    "patrol": patrol,
+    "nearest_tags": nearest_tags,
 }
 
 
-def make_policy(name: str) -> Policy:
+def policy(name: str) -> Policy:
     """A policy by name. Raises InputError for an unknown name."""
     if name not in POLICIES:
         raise InputError(f"no policy is called {quoted(name)}{nearest(name, list(POLICIES))}")
-    return _MAKERS[name]()
+    return _POLICIES[name]
 
 
 def usable(paths: Sequence[Path], free: Array, sight: float) -> tuple[tuple[Path, ...], Array]:

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from factorgraph_loc.api.running import run_and_learn
 from factorgraph_loc.calibration.calibrate import calibrate, check
 from factorgraph_loc.calibration.turns import learn_by_turns
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.experiments.learning import run_and_learn
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.sensors.rfid.settings import BeamSettings, RfidSettings
@@ -123,15 +123,15 @@ def test_what_logs_agree_on_becomes_the_rigs_and_their_scatter_its_uncertainty()
 
 def test_the_final_trajectory_alone_is_of_what_was_learnt(offices):
     log = replace(offices[0], rig=with_beam(offices[0], r_max=5.4, s_r=0.6, sigma_phi=1.1))
-    plain, learning = run(log, RunConfig("ekf")), run_and_learn(log, RunConfig("ekf"))
+    plain, (learning, _) = run(log, RunConfig("ekf")), run_and_learn(log, RunConfig("ekf"))
     for name in ("t", "poses", "covariances"):
-        assert np.array_equal(getattr(plain, name), getattr(learning.result, name))
-    assert plain.status == learning.result.status
-    given, improved = score(plain, log), score(learning.result, log)
+        assert np.array_equal(getattr(plain, name), getattr(learning, name))
+    assert plain.status == learning.status
+    given, improved = score(plain, log), score(learning, log)
     assert improved["causal.position_rmse"] == given["causal.position_rmse"]
     assert improved["final.position_rmse"] < 0.9 * given["final.position_rmse"]
-    assert learning.result.config["learnt_rig"]["rfid"]["models"]["default"]["r_max"] == pytest.approx(4.5, abs=0.1)
-    assert learning.result.config["rig"]["rfid"]["models"]["default"]["r_max"] == 5.4
+    assert learning.config["learnt_rig"]["rfid"]["models"]["default"]["r_max"] == pytest.approx(4.5, abs=0.1)
+    assert learning.config["rig"]["rfid"]["models"]["default"]["r_max"] == 5.4
 
 
 def test_the_reference_is_not_used(offices, tmp_path):

@@ -4,7 +4,7 @@ import pytest
 
 from factorgraph_loc.cli.options import parse_settings
 from factorgraph_loc.errors import FglocError, InputError
-from factorgraph_loc.experiments.seeds import parse_seeds
+from factorgraph_loc.model.scoring import parse_seeds
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from factorgraph_loc import plugins
 from factorgraph_loc.cli import completion
 from factorgraph_loc.files.settings import settings_in
 from factorgraph_loc.files.shipped import manifests
-from factorgraph_loc.planning.policies import make_policy
+from factorgraph_loc.planning.policies import policy
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation import PRESETS, SimulationSettings
 
@@ -28,7 +28,7 @@ def completed(line: str) -> list[str]:
 
 def test_the_names_are_those_of_the_registries():
     assert list(plugins.PRESETS) == list(PRESETS)
-    assert all(make_policy(name) for name in plugins.POLICIES)
+    assert all(policy(name) for name in plugins.POLICIES)
     assert completion.logs("") == list(manifests())
 
 

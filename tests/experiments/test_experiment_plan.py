@@ -113,22 +113,6 @@ def test_runs_are_counted_before_any_is_planned(planned, content, monkeypatch):
         planned(**content)
 
 
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [
-        ({"drive": {"duration": 14_400.0}}, "2,016,000 s and "),
-        ({"drive": {"duration": 600.0}, "world": {"tags": 3000}}, "28,800,000 observations"),
-    ],
-)
-def test_what_is_to_simulate_is_counted_before_any_log_is_simulated(planned, monkeypatch, settings, expected):
-    """Each kind of limit, with 140 logs; those that are known already need not be simulated."""
-    monkeypatch.setattr(keys, "_facts", lambda *_: pytest.fail("a log was looked at"))
-    looks = expected.endswith("observations")
-    monkeypatch.setattr(plan_module, "MOST_OBSERVATIONS", 28_799_999 if looks else 10**12)
-    with pytest.raises(InputError, match=rf"^has to simulate drives of .*{expected}.*, expected at most"):
-        planned(logs=["one", {"simulate": "office", "settings": settings, "seeds": [3] if looks else range(140)}])
-
-
 def test_seeds_are_for_estimators_that_are_random(planned):
     runs = planned(logs=["one"], estimators=["ekf", "particle_filter"], seeds=[3, 4])
     assert [(run.label, run.seed) for run in runs] == [("ekf", 3), ("particle_filter", 3), ("particle_filter", 4)]

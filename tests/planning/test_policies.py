@@ -10,7 +10,7 @@ from factorgraph_loc import Rig, World
 from factorgraph_loc.maps.free_space import free_space
 from factorgraph_loc.model.belief import Mode
 from factorgraph_loc.planning.paths import primitives, waypoint_paths
-from factorgraph_loc.planning.policies import Situation, make_policy, usable
+from factorgraph_loc.planning.policies import Situation, policy, usable
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
 from factorgraph_loc.sensors.motion import odometry_model
@@ -45,13 +45,13 @@ def direction(choice):
 
 @pytest.mark.parametrize("name", ["information", "nearest_tags"])
 def test_they_go_where_tags_are(name):
-    choice = make_policy(name).choose(situation())
+    choice = policy(name)(situation())
     assert abs(direction(choice) - math.pi / 2.0) < 0.8
     assert len(choice.values) == len(primitives(6.0))
 
 
 def test_the_literal_sign_goes_elsewhere():
-    here, there = make_policy("information").choose(situation()), make_policy("paper_literal").choose(situation())
+    here, there = policy("information")(situation()), policy("paper_literal")(situation())
     assert abs(direction(here) - direction(there)) > 0.8
     assert math.sin(direction(there)) < 0.5
 
@@ -61,9 +61,9 @@ def test_what_a_way_costs_counts():
 
     def choice(per_metre):
         s = situation()
-        policy = s.settings.policy.model_copy(update={"per_metre": per_metre})
-        dear = replace(s, settings=s.settings.model_copy(update={"policy": policy}))
-        return make_policy("information").choose(dear)
+        costs = s.settings.policy.model_copy(update={"per_metre": per_metre})
+        dear = replace(s, settings=s.settings.model_copy(update={"policy": costs}))
+        return policy("information")(dear)
 
     lengths = np.array([p.length for p in situation().candidates])
     assert np.allclose(choice(0.1).values, choice(0.0).values - 0.1 * lengths)
@@ -72,14 +72,14 @@ def test_what_a_way_costs_counts():
 
 def test_patrol_goes_straight_on_and_then_where_it_is_freest():
     paths = primitives(6.0)
-    assert direction(make_policy("patrol").choose(situation(paths))) == pytest.approx(0.0)
+    assert direction(policy("patrol")(situation(paths))) == pytest.approx(0.0)
     left = np.array([3.0 if p.poses[-1, 1] > 0.5 * p.length else 0.5 for p in paths])
     kept, free = usable(paths, left, 3.0)
-    choice = make_policy("patrol").choose(situation(kept, free))
+    choice = policy("patrol")(situation(kept, free))
     assert 0.4 < direction(choice) < 2.8
     # back only where nothing else is
     back = [i for i, p in enumerate(paths) if abs(math.atan2(p.poses[-1, 1], p.poses[-1, 0])) > 3.1]
-    only = make_policy("patrol").choose(situation([paths[i] for i in back], np.full(len(back), 3.0)))
+    only = policy("patrol")(situation([paths[i] for i in back], np.full(len(back), 3.0)))
     assert abs(direction(only)) > 3.1
 
 
@@ -110,25 +110,25 @@ def test_of_two_places_a_far_one_that_tells_them_apart_is_chosen():
     """A tag stands 15 m away from where one of them says."""
     middles, targets = ((20.0, 20.0, 0.0), (20.0, 5.0, 0.0)), ((20.0, 34.0), (20.0, 6.0), (34.0, 20.0))
     s, ways = two_modes((20.0, 35.0, 1.2), middles, SURE, targets)
-    choice = make_policy("information").choose(s)
+    choice = policy("information")(s)
     assert choice.path is ways[0]
     assert choice.metres > 3.0
     # of one place nothing is gained by going far
-    assert make_policy("information").choose(replace(s, modes=s.modes[:1])).path is not ways[0]
+    assert policy("information")(replace(s, modes=s.modes[:1])).path is not ways[0]
 
 
 def test_of_two_headings_at_one_place_a_far_tag_tells():
     """In the middle of a hall, looking one way or the other; a tag stands 15 m ahead of one."""
     middles = ((20.0, 20.0, math.pi / 2.0), (20.0, 20.0, -math.pi / 2.0))
     s, ways = two_modes((20.0, 35.0, 1.2), middles, SURE, ((20.0, 34.0), (34.0, 20.0)))
-    assert make_policy("information").choose(s).path is ways[0]
+    assert policy("information")(s).path is ways[0]
 
 
 def test_a_far_tag_that_both_places_would_read_alike_tells_nothing():
     """The modes are known to 0.2 m only: that the way ends 0.1 m beside the one of them and not the other is no difference."""
     middles = ((8.0, 20.0, 0.0), (32.0, 20.1, math.pi))
     s, _ = two_modes((20.0, 20.0, 1.2), middles, (0.2, 0.2, 0.05), ((19.0, 20.0),))
-    assert make_policy("information").choose(s).path.kind == "patrol"
+    assert policy("information")(s).path.kind == "patrol"
 
 
 def test_the_expectation_in_closed_form_goes_where_tags_are():
@@ -136,9 +136,9 @@ def test_the_expectation_in_closed_form_goes_where_tags_are():
     settings = ActiveSettings(policy=PolicySettings(expectation="fisher"))
     world = World(tags={f"T{i}": {"x": x, "y": y, "z": z} for i, (x, y, z) in enumerate(TAGS.tolist())})
     sensors = Sensors.of(world, RIG)
-    choice = make_policy("information").choose(replace(s, settings=settings, sensors=sensors))
+    choice = policy("information")(replace(s, settings=settings, sensors=sensors))
     assert abs(direction(choice) - math.pi / 2.0) < 0.8
-    drawn = make_policy("information").choose(replace(s, sensors=sensors))
+    drawn = policy("information")(replace(s, sensors=sensors))
     assert not np.allclose(drawn.values, choice.values, atol=1e-6)
 
 
@@ -146,7 +146,7 @@ def test_they_go_where_landmarks_are():
     """Without a tag: two landmarks to the left, 9 m away, that are seen from 6 m."""
     world = World(landmarks={"A": {"x": 19.0, "y": 29.0}, "B": {"x": 21.0, "y": 29.0}})
     sensors = Sensors.of(world, RIG)
-    choice = make_policy("information").choose(replace(situation(), sensors=sensors))
+    choice = policy("information")(replace(situation(), sensors=sensors))
     assert abs(direction(choice) - math.pi / 2.0) < 0.8
 
 
@@ -160,12 +160,12 @@ def one_place(tags, candidates):
 def test_one_place_too_wide_is_told_by_tags_far_away():
     far = np.array(((36.0, 20.0, 1.2), (36.0, 23.0, 1.2)))
     ways = waypoint_paths(SPACE, np.array((20.0, 20.0, 0.0)), np.array(((35.0, 21.0), (5.0, 20.0))))
-    choice = make_policy("information").choose(one_place(far, (*primitives(3.0), *ways)))
+    choice = policy("information")(one_place(far, (*primitives(3.0), *ways)))
     assert choice.path is ways[np.argmax([way.poses[-1, 0] for way in ways])]
     assert choice.metres == choice.path.length
 
 
 def test_what_the_odometry_takes_away_is_no_gain():
-    s, policy = one_place(TAGS, primitives(3.0)), make_policy("information")
-    net, gross = policy.choose(s).values, policy.choose(replace(s, modes=(), rng=one_place(TAGS, ()).rng)).values
+    s, chosen = one_place(TAGS, primitives(3.0)), policy("information")
+    net, gross = chosen(s).values, chosen(replace(s, modes=(), rng=one_place(TAGS, ()).rng)).values
     assert np.all(net < gross)
