@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.vision.consensus import CameraPose, agreeing
@@ -108,9 +108,7 @@ class Associator:
         x, y, depth = ((self._positions - position) @ rotation).T
         inside = (depth >= NEAREST) & (depth <= FARTHEST) & (np.abs(x) <= self._slopes[0] * depth)
         ahead = np.flatnonzero(inside & (np.abs(y) <= self._slopes[1] * depth))
-        views, begins = agreeing_views(
-            ahead, position, self._positions, self._starts, self._seen_from, math.cos(LARGEST_ANGLE), LARGEST_RATIO
-        )
+        views, begins = self._similar_views(ahead, position)
         points = self._positions[ahead]
         predicted, by_camera, by_point = reprojection.linearize_in_space(model, position, rotation, points)
         kept = (np.diff(begins) > 0) & model.contains(predicted, MARGIN)
@@ -140,6 +138,22 @@ class Associator:
             right[:] = False
         return Associations(ahead[rows[right]], matched_features[right], expected, int(np.count_nonzero(~right)))
 
+    def _similar_views(self, points: Integers, place: Array) -> tuple[Integers, Integers]:
+        """The views of ``points`` (C,), ascending, from viewpoints similar to ``place`` (3,); and the start of each point's views
+        in these (C+1,)."""
+        is_wanted = np.zeros(len(self._positions), dtype=bool)
+        is_wanted[points] = True
+        views = np.flatnonzero(is_wanted[self._owners])
+        of_points = self._positions[self._owners[views]]
+        rays, old_rays = place - of_points, self._seen_from[views] - of_points
+        distances, old_distances = np.linalg.norm(rays, axis=1), np.linalg.norm(old_rays, axis=1)
+        views = views[
+            (distances <= LARGEST_RATIO * old_distances)
+            & (old_distances <= LARGEST_RATIO * distances)
+            & (np.einsum("vi,vi->v", rays, old_rays) >= math.cos(LARGEST_ANGLE) * distances * old_distances)
+        ]
+        return views, np.append(np.searchsorted(self._owners[views], points), len(views))
+
     def relocalized(self, frame: CameraFrame) -> tuple[Array, Array, Array, Associations] | None:
         """Relocalize: camera position (3,), rotation (3, 3), covariance (6, 6) as in :meth:`guided`, and the matches; None if the
         map does not determine the pose."""
@@ -168,12 +182,12 @@ class Associator:
             owners, descriptors = owners[views], descriptors[views]
         owners, first = np.unique(owners, return_index=True)
         distances = distance_matrix(frame.descriptors, descriptors, binary=self._binary)
-        starts = np.append(first, len(descriptors))
-        candidates, nearest, rows = nearest_owners(distances, starts, min(8, len(owners)))
-        best = candidates[:, 0]
-        away = np.linalg.norm(self._positions[owners[candidates]] - self._positions[owners[best]][:, None], axis=2)
-        second_best = np.where(away > SAME_POINT, nearest, np.inf).min(axis=1)
-        kept = (nearest[:, 0] < GLOBAL_RATIO * second_best) & (rows[best] == np.arange(len(best)))
+        by_owner = np.minimum.reduceat(distances, first, axis=1)
+        best, of_feature = by_owner.argmin(axis=1), np.arange(len(distances))
+        positions = self._positions[owners]
+        others = np.where(cdist(positions[best], positions) > SAME_POINT, by_owner, np.inf)
+        kept = by_owner[of_feature, best] < GLOBAL_RATIO * others.min(axis=1)
+        kept &= by_owner.argmin(axis=0)[best] == of_feature
         return owners[best[kept]], np.flatnonzero(kept)
 
     def _costs(self, pairs: Integers, begins: Integers, views: Integers, frame_descriptors: Descriptors) -> Array:
@@ -206,37 +220,6 @@ def _gates(covariances: Array) -> tuple[Array, Array]:
     shrink = np.minimum(1.0, LARGEST_GATE**2 / largest)
     gates = shrink[:, None, None] * gates + SMALLEST_GATE**2 * np.eye(2)
     return np.asarray(np.linalg.inv(gates), dtype=float), np.sqrt(shrink * largest + SMALLEST_GATE**2)
-
-
-@compiled
-def agreeing_views(
-    rows: Integers, place: Array, positions: Array, starts: Integers, seen_from: Array, cosine: float, ratio: float
-) -> tuple[Integers, Integers]:
-    """Views of the points ``rows`` (C,) from viewpoints similar to ``place`` (3,): their indices, and the start of each point's
-    views in these (C+1,). Views are stored by point, beginning at ``starts`` (P+1,)."""
-    total = 0
-    for row in rows:
-        total += starts[row + 1] - starts[row]
-    views = np.empty(total, np.int64)
-    begins = np.empty(len(rows) + 1, np.int64)
-    n = 0
-    for i in range(len(rows)):
-        begins[i] = n
-        p = rows[i]
-        ax, ay, az = place[0] - positions[p, 0], place[1] - positions[p, 1], place[2] - positions[p, 2]
-        distance_now = np.sqrt(ax * ax + ay * ay + az * az)
-        for v in range(starts[p], starts[p + 1]):
-            bx = seen_from[v, 0] - positions[p, 0]
-            by = seen_from[v, 1] - positions[p, 1]
-            bz = seen_from[v, 2] - positions[p, 2]
-            distance_then = np.sqrt(bx * bx + by * by + bz * bz)
-            if distance_now > ratio * distance_then or distance_then > ratio * distance_now:
-                continue
-            if ax * bx + ay * by + az * bz >= cosine * distance_now * distance_then:
-                views[n] = v
-                n += 1
-    begins[len(rows)] = n
-    return views[:n], begins
 
 
 @compiled
@@ -366,27 +349,3 @@ def clear_pairs(
             out[n] = i
             n += 1
     return out[:n]
-
-
-@compiled(error_model="numpy")
-def nearest_owners(distances: NDArray[Any], starts: Integers, few: int) -> tuple[Integers, NDArray[Any], Integers]:
-    """The ``few`` owners nearest to each row of ``distances`` (N, M), nearest first, their distances (N, few), and the row (K,)
-    nearest to each owner. Columns of owner k are ``starts[k]`` to ``starts[k + 1]``, with ``starts`` (K + 1,)."""
-    n, count = len(distances), len(starts) - 1
-    owners, least = np.zeros((n, few), dtype=np.int64), np.full((n, few), np.inf, dtype=distances.dtype)
-    rows, best = np.zeros(count, dtype=np.int64), np.full(count, np.inf, dtype=distances.dtype)
-    for i in range(n):
-        for k in range(count):
-            distance = distances[i, starts[k]]
-            for j in range(starts[k] + 1, starts[k + 1]):
-                distance = min(distance, distances[i, j])
-            if distance < best[k]:
-                best[k], rows[k] = distance, i
-            if not distance < least[i, few - 1]:
-                continue
-            place = few - 1
-            while place > 0 and distance < least[i, place - 1]:
-                least[i, place], owners[i, place] = least[i, place - 1], owners[i, place - 1]
-                place -= 1
-            least[i, place], owners[i, place] = distance, k
-    return owners, least, rows

@@ -4,8 +4,7 @@ Ratio test and mutual check: Lowe, "Distinctive image features from scale-invari
 paper accepts a match "if distance is less than 5 times the distance to the second closest", which always holds: ``paper_literal``
 does so; ``ratio=1 / PAPER_RATIO, mutual=False`` is the strict reading.
 
-Distances are computed from matrix products, whose rounding depends on the BLAS kernel. Matches must not depend on the processor.
-Distances below the resolution are therefore 0, and a neighbour must be nearer than the second by more than the resolution.
+Descriptors are rounded to single precision. A neighbour must therefore be nearer than the second by more than :data:`ROUNDING`.
 """
 
 import math
@@ -13,15 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.vision.colour import Float
 from factorgraph_loc.vision.keypoints import Descriptors, Integers
 from factors.se2 import Array
 
 RATIO = 0.8
 PAPER_RATIO = 5.0
 GATE = 0.99  # probability that the true point lies in its gate
+ROUNDING = 1e-5  # relative difference of distances below which they are equal
 
 Truths = NDArray[np.bool_]
 
@@ -65,13 +65,13 @@ def match(
         distances[~allowed] = np.inf
     if distances.size == 0:
         return Matches(np.empty((0, 2), dtype=np.int64), np.empty(0))
-    forward = nearest_neighbours(distances, resolution(first, binary=binary))
+    forward = nearest_neighbours(distances)
     keep = np.isfinite(forward.best) & forward.is_unique & (forward.best < ratio * forward.second)
     if mutual:
-        back = nearest_neighbours(distances.T, resolution(second, binary=binary))
+        back = nearest_neighbours(distances.T)
         keep &= (back.index[forward.index] == np.arange(len(keep))) & back.is_unique[forward.index]
     chosen = np.flatnonzero(keep)
-    return Matches(np.stack([chosen, forward.index[chosen]], axis=1), forward.best[chosen].astype(float))
+    return Matches(np.stack([chosen, forward.index[chosen]], axis=1), forward.best[chosen])
 
 
 def match_guided(
@@ -113,42 +113,29 @@ def gates(predicted: Array, covariances: Array, points: Array, probability: floa
 class Nearest:
     """``index`` (N,) of the nearest, its distance ``best`` (N,), that of the ``second`` nearest (N,), infinite without one.
 
-    ``is_unique`` (N,): whether the nearest is nearer by more than the resolution of distances.
+    ``is_unique`` (N,): whether the nearest is nearer by more than rounding.
     """
 
     index: Integers
-    best: Float
-    second: Float
+    best: Array
+    second: Array
     is_unique: Truths
 
 
-def nearest_neighbours(distances: Float, resolution: Float) -> Nearest:
-    """The nearest column in each of N rows of ``distances`` (N, M), M > 0; ``resolution`` (N,): see :func:`resolution`."""
+def nearest_neighbours(distances: Array) -> Nearest:
+    """The nearest column in each of N rows of ``distances`` (N, M), M > 0."""
     rows = np.arange(len(distances))
     index = distances.argmin(axis=1)
     best = distances[rows, index]
     distances[rows, index] = np.inf
     second = distances.min(axis=1)
     distances[rows, index] = best
-    return Nearest(index, best, second, second > np.sqrt(np.square(best) + resolution))
+    return Nearest(index, best, second, second > (1.0 + ROUNDING) * best)
 
 
-def resolution(descriptors: Descriptors, *, binary: bool) -> Float:
-    """The largest squared distance (N,) of ``descriptors`` (N, D) due to rounding; 0 for bits.
-
-    It bounds the three products of D single-precision terms in :func:`distance_matrix` for similar descriptors (Higham, Accuracy
-    and Stability of Numerical Algorithms, 2002, section 3.1).
-    """
-    if binary:
-        return np.zeros(len(descriptors), dtype=np.float32)
-    values = descriptors.astype(np.float32)
-    scale = 2.0 * descriptors.shape[1] * np.finfo(np.float32).eps
-    return np.asarray(scale * np.einsum("nd,nd->n", values, values), dtype=np.float32)
-
-
-def distance_matrix(first: Descriptors, second: Descriptors, *, binary: bool) -> Float:
-    """Distances (N, M), Hamming or Euclidean, between ``first`` (N, D) and ``second`` (M, D), 0 below the :func:`resolution`.
-    Raises InputError for incompatible or non-finite descriptors."""
+def distance_matrix(first: Descriptors, second: Descriptors, *, binary: bool) -> Array:
+    """Distances (N, M), Hamming or Euclidean, between ``first`` (N, D) and ``second`` (M, D). Raises InputError for incompatible or
+    non-finite descriptors."""
     for which, descriptors in (("first", first), ("second", second)):
         if descriptors.ndim != 2 or (binary and descriptors.dtype != np.uint8):
             kind = f"{descriptors.dtype} of shape {descriptors.shape}"
@@ -159,13 +146,8 @@ def distance_matrix(first: Descriptors, second: Descriptors, *, binary: bool) ->
             raise InputError(f"matching: {which} descriptors have values that are not finite numbers")
     if first.shape[1] != second.shape[1]:
         raise InputError(f"matching: descriptors have {first.shape[1]} and {second.shape[1]} columns, expected as many")
-    if binary:
-        first, second = np.unpackbits(first, axis=1), np.unpackbits(second, axis=1)
-    left, right = first.astype(np.float32), second.astype(np.float32)
-    squared = -2.0 * left @ right.T
-    squared += np.einsum("nd,nd->n", left, left)[:, None]
-    squared += np.einsum("md,md->m", right, right)
-    if binary:  # the square is the number of differing bits
-        return np.maximum(squared, 0.0)
-    squared[squared <= resolution(first, binary=False)[:, None]] = 0.0
-    return np.sqrt(squared)
+    if not binary:
+        return np.asarray(cdist(first, second))
+    left, right = (np.unpackbits(part, axis=1).astype(np.float32) for part in (first, second))
+    differing = left.sum(axis=1)[:, None] + right.sum(axis=1) - 2.0 * left @ right.T
+    return differing.astype(float)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.vision import association as kernels
 from factorgraph_loc.vision.places import NEAREST, KeyframeLooks
 
 KEYFRAMES, EACH, SIZE = 400, 60, 24
@@ -41,14 +40,3 @@ def test_a_map_with_few_keyframes_is_taken_as_a_whole():
     few = seen_from[:, 0] < NEAREST
     places = KeyframeLooks(descriptors[few], seen_from[few])
     np.testing.assert_array_equal(places.views(descriptors[:10]), np.arange(np.count_nonzero(few)))
-
-
-def test_the_nearest_owners_are_those_of_a_sort():
-    rng = np.random.default_rng(1)
-    starts = np.array((0, 3, 4, 9, 10, 14))
-    distances = rng.integers(0, 9, (30, 14)).astype(np.float32)
-    owners, least, rows = kernels.nearest_owners(distances, starts, 3)
-    by_owner = np.minimum.reduceat(distances, starts[:-1], axis=1)
-    np.testing.assert_array_equal(owners, np.argsort(by_owner, axis=1, kind="stable")[:, :3])
-    np.testing.assert_array_equal(least, np.sort(by_owner, axis=1)[:, :3])
-    np.testing.assert_array_equal(rows, by_owner.argmin(axis=0))

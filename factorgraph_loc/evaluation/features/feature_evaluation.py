@@ -28,7 +28,7 @@ from factorgraph_loc.files.models import nearest
 from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.features import EXTRACTORS, Descriptors, Integers, Keypoints, extractor
 from factorgraph_loc.vision.images import Image
-from factorgraph_loc.vision.matching import RATIO, distance_matrix, nearest_neighbours, resolution
+from factorgraph_loc.vision.matching import RATIO, distance_matrix, nearest_neighbours
 from factors.se2 import Array
 
 Matched = tuple[Integers, Integers, Array]  # indices in the first and the second image, ratio of distances
@@ -120,13 +120,12 @@ def mutual_matches(first: Descriptors, second: Descriptors) -> Matched:
     none = np.empty(0, dtype=np.int64)
     if len(first) == 0 or len(second) == 0:
         return none, none, np.empty(0)
-    binary = first.dtype == np.uint8
-    distances = distance_matrix(first, second, binary=binary)
-    forward = nearest_neighbours(distances, resolution(first, binary=binary))
-    back = nearest_neighbours(distances.T, resolution(second, binary=binary))
+    distances = distance_matrix(first, second, binary=first.dtype == np.uint8)
+    forward = nearest_neighbours(distances)
+    back = nearest_neighbours(distances.T)
     i = np.flatnonzero(back.index[forward.index] == np.arange(len(first)))
     j = forward.index[i]
-    best, runner_up = (values[i].astype(float) for values in (forward.best, forward.second))
+    best, runner_up = forward.best[i], forward.second[i]
     return i, j, np.divide(best, runner_up, out=np.ones(len(i)), where=forward.is_unique[i] & back.is_unique[j])
 
 
