@@ -117,8 +117,8 @@ class LocalBundle:
     def cost(self, state: State) -> float:
         """The robust cost."""
         poses, tilts, _ = state
-        seen = huber_loss(self.linearize(state)[2], self.model.robust).sum()
-        return float(seen + 0.5 * np.sum(tilts**2) / self.model.tilt**2) + self.odometry.cost(poses, np.zeros(0))
+        of_pixels = huber_loss(self.linearize(state)[2], self.model.robust).sum()
+        return float(of_pixels + 0.5 * np.sum(tilts**2) / self.model.tilt**2) + self.odometry.cost(poses, np.zeros(0))
 
     def moved(self, state: State, damping: float) -> tuple[State, float] | None:
         """The state after a step, whose ``damping`` is a share of the curvature, and the largest component of the step; None

@@ -185,8 +185,8 @@ class Associator:
         by_owner = np.minimum.reduceat(distances, first, axis=1)
         best, of_feature = by_owner.argmin(axis=1), np.arange(len(distances))
         positions = self._positions[owners]
-        others = np.where(cdist(positions[best], positions) > SAME_POINT, by_owner, np.inf)
-        kept = by_owner[of_feature, best] < GLOBAL_RATIO * others.min(axis=1)
+        rivals = np.where(cdist(positions[best], positions) > SAME_POINT, by_owner, np.inf)
+        kept = by_owner[of_feature, best] < GLOBAL_RATIO * rivals.min(axis=1)
         kept &= by_owner.argmin(axis=0)[best] == of_feature
         return owners[best[kept]], np.flatnonzero(kept)
 

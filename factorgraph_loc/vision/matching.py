@@ -150,4 +150,4 @@ def distance_matrix(first: Descriptors, second: Descriptors, *, binary: bool) ->
         return np.asarray(cdist(first, second))
     left, right = (np.unpackbits(part, axis=1).astype(np.float32) for part in (first, second))
     differing = left.sum(axis=1)[:, None] + right.sum(axis=1) - 2.0 * left @ right.T
-    return differing.astype(float)
+    return np.asarray(differing, dtype=float)
