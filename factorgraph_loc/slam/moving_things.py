@@ -18,7 +18,7 @@ from factorgraph_loc.sensors.camera.known_points import lifted
 from factorgraph_loc.vision.consensus import GATE, Truths
 from factors import positive
 from factors.camera.model import CameraModel, linearize_in_space
-from factors.camera.visual_odometry import RayPairs, nearness
+from factors.camera.ray_pairs import RayPairs, nearness
 from factors.motion import Increment
 from factors.se2 import Array
 

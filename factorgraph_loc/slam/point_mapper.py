@@ -1,4 +1,4 @@
-"""Mapping from images in a graph: points that are estimated, and relative motion between images."""
+"""Mapping from images in a graph: points that are estimated."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.base import Sensor
 from factorgraph_loc.sensors.camera.measurement import Pixels
 from factorgraph_loc.sensors.camera.sensor import CameraSensor
-from factorgraph_loc.slam.frame_pairs import FramePairs
 from factorgraph_loc.slam.keyframe_cameras import HORIZON
 from factorgraph_loc.slam.moving_things import MovingThings
 from factorgraph_loc.slam.new_points import FEWEST
@@ -27,9 +26,9 @@ LEAST_COMMON = 0.3  # least share of an image's features in the last keyframe; b
 
 
 class PointMapper(Mapper):
-    """A mapper of points in images."""
+    """A mapper of points in images, which need keyframes of their own."""
 
-    fewest, horizon = FEWEST, HORIZON
+    fewest, horizon, estimates = FEWEST, HORIZON, True
     rejected = "camera: not where it was seen"
 
     def __init__(
@@ -37,20 +36,13 @@ class PointMapper(Mapper):
     ) -> None:
         self._camera, self.sensor = camera, camera.name
         self._interval = KEYFRAME_INTERVAL if settings.keyframe_interval is None else settings.keyframe_interval
-        self._unknown: UnknownPoints | None = None
-        if settings.landmarks != "known":
-            self._unknown = UnknownPoints(model, diagnostics, camera.constants)
-        self.estimates = self._unknown is not None
-        self.knows_scale = self._unknown is None or len(camera.points.map) > 0
+        self._unknown = UnknownPoints(model, diagnostics, camera.constants)
+        self.knows_scale = len(camera.points.map) > 0
         self._things = MovingThings(model)
-        self._pairs = FramePairs(model) if settings.visual_odometry else None
         self._taken = -math.inf
         self._tracks: set[Hashable] = set()  # of the last keyframe, without those on things that move
 
     def is_due(self, m: Pixels) -> bool:
-        # estimated points need keyframes of their own
-        if self._unknown is None:
-            return False
         return m.t - self._taken >= self._interval or self._has_lost_features(m)
 
     def _has_lost_features(self, m: Pixels) -> bool:
@@ -60,9 +52,7 @@ class PointMapper(Mapper):
         tracks = set(m.frame.tracks.tolist()) - self._things.moving()
         return len(tracks & self._tracks) < LEAST_COMMON * len(tracks)
 
-    def take(
-        self, m: Pixels, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition, *, is_new: bool
-    ) -> Guess:
+    def take(self, m: Pixels, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition) -> Guess:
         points = self._camera.points
         if m.frame is None:
             names: list[Hashable] = list(m.names)
@@ -72,23 +62,11 @@ class PointMapper(Mapper):
         self._things.learn(keyframe, names, m.pixels, graph)
         moving = self._things.moving()
         used |= {i for i, name in enumerate(names) if name in moving}
-        if self._unknown is not None:
-            self._taken = m.t
-            if m.frame is not None:
-                self._tracks = set(names) - moving
-            rows = [i for i in range(len(names)) if i not in used]
-            guess = self._unknown.take(m, rows, keyframe, guess, graph, addition, self._things)
-        if self._pairs is not None and is_new:
-            if self._unknown is not None:
-                used |= {i for i, name in enumerate(names) if self._unknown.uses(name)}
-            rows = [i for i in range(len(names)) if i not in used]
-            previous, predicted = self._pairs.previous(keyframe, graph.keyframes), None
-            if previous is not None and graph.is_open(previous.index):
-                predicted = graph.between(previous, keyframe)
-            node = self._pairs.take(keyframe, [names[i] for i in rows], m.pixels[rows], predicted)
-            if node is not None:
-                addition.hang(keyframe, node)
-        return guess
+        self._taken = m.t
+        if m.frame is not None:
+            self._tracks = set(names) - moving
+        rows = [i for i in range(len(names)) if i not in used]
+        return self._unknown.take(m, rows, keyframe, guess, graph, addition, self._things)
 
     def is_astray(self, node: Node, values: Values) -> bool:
         factor = node.factor
@@ -100,24 +78,21 @@ class PointMapper(Mapper):
         return node.keys[-1] if isinstance(node.factor, PointFactor) else None
 
     def leave(self, t: float) -> Sequence[int]:
-        return [] if self._unknown is None else self._unknown.leave(t)
+        return self._unknown.leave(t)
 
     def keep_only(self, keys: set[int]) -> None:
-        if self._unknown is not None:
-            self._unknown.keep_only(keys)
+        self._unknown.keep_only(keys)
 
     def forget(self, first: Keyframe) -> Sequence[int]:
-        return [] if self._unknown is None else self._unknown.forget(first)
+        return self._unknown.forget(first)
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
-        return None if self._unknown is None else self._unknown.learnt(values, covariances)
+        return self._unknown.learnt(values, covariances)
 
 
 def bind(sensors: Mapping[str, Sensor], diagnostics: Diagnostics, settings: GraphSettings) -> Mapper:
     """The mapper of a run."""
     camera = next((sensor for sensor in sensors.values() if isinstance(sensor, CameraSensor)), None)
-    if camera is None:
-        return Mapper()
-    if settings.landmarks == "known" and not settings.visual_odometry:
+    if camera is None or settings.landmarks == "known":
         return Mapper()
     return PointMapper(camera, camera.points.model, diagnostics, settings)

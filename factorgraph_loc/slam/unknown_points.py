@@ -267,10 +267,6 @@ class UnknownPoints:
             elif self._again_as.pop(int(frame.tracks[row]), None) is not None:
                 self._points[name].strikes -= 1  # not the fault of the point
 
-    def uses(self, name: Hashable) -> bool:
-        """Whether ``name`` is a point of the graph, or waiting to become one."""
-        return name in self._points or name in self._again_as or self._new.count(name) > 0
-
     def leave(self, t: float) -> list[int]:
         """Remove the points last seen before ``t``, and return their keys."""
         gone = [point for point in (*self._points.values(), *self._astray) if point.last < t]

@@ -7,7 +7,7 @@ __all__ = [
     "features",
     "fiducials",
     "frame",
-    "frame_motion",
+    "image_turn",
     "images",
     "keypoints",
     "matching",

@@ -92,7 +92,6 @@ def test_causal_estimates_do_not_know_what_comes(name, kind):
         ("smoother", "landmarks", {"landmarks": "unknown"}),
         ("smoother", "sightings", {"landmarks": "unknown"}),
         ("smoother", "camera", {"landmarks": "unknown"}),
-        ("smoother", "camera", {"visual_odometry": True}),
         ("monoslam", "camera", {"landmarks": "unknown"}),
         ("smoother", "landmarks", {"lag": 3.0}),
         ("smoother", "rfid", {"lag": 3.0}),

@@ -154,11 +154,9 @@ class Mapper:
         """Whether a measurement needs a keyframe of its own."""
         return False
 
-    def take(
-        self, m: Any, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition, *, is_new: bool
-    ) -> Guess:
+    def take(self, m: Any, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition) -> Guess:
         """Add the information of a measurement from the newest keyframe to an ``addition``. Returns the corrected guess of its
-        pose. ``is_new``: whether the keyframe was made for it."""
+        pose."""
         return guess
 
     def is_astray(self, node: Node, values: Values) -> bool:

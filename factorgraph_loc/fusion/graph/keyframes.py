@@ -214,7 +214,7 @@ class Builder:
         graph.append(keyframe)
         guess: Guess | None = (pose, covariance)
         if m is not None:
-            guess = self._see(keyframe, m, odometry, None, guess, addition, is_new=True)
+            guess = self._see(keyframe, m, odometry, None, guess, addition)
         assert guess is not None
         self._backend.extend(keyframe, addition, guess)
 
@@ -226,8 +226,6 @@ class Builder:
         offset: Increment | None,
         guess: Guess | None,
         addition: Addition,
-        *,
-        is_new: bool = False,
     ) -> Guess | None:
         """Turn a measurement into factors of ``keyframe``; returned is the guess of its pose, updated by them.
 
@@ -243,7 +241,7 @@ class Builder:
             return None
         guess = view.pose, view.covariance
         if m.source == graph.mapper.sensor and keyframe is graph.newest and m.t == keyframe.t:
-            guess = graph.mapper.take(m, keyframe, guess, self._graph_view(sensor), addition, is_new=is_new)
+            guess = graph.mapper.take(m, keyframe, guess, self._graph_view(sensor), addition)
         return guess
 
     def _add_link(self, link: Link, sensor: Sensor, keyframe: Keyframe, addition: Addition) -> None:

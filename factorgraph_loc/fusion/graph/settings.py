@@ -23,8 +23,6 @@ class GraphSettings(FileModel):
     landmarks: MapUse = "known"
     """known: the map is fixed, without other landmarks; extended: the others are estimated; unknown: all are estimated, the
     default of runs with only images and measured motion if the map has no points"""
-    visual_odometry: bool = False
-    """whether tracked features that are no points of map or graph constrain the motion"""
 
 
 def _lag(value: Any, bounded: ValidatorFunctionWrapHandler) -> Any:

@@ -36,7 +36,7 @@ from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.sensors.tables import Intake
 from factorgraph_loc.text import plain
 from factorgraph_loc.vision.frame import CameraFrame
-from factorgraph_loc.vision.frame_motion import turned
+from factorgraph_loc.vision.image_turn import measure_turn
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors import se2
 from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel
@@ -53,7 +53,7 @@ def check(use: Use) -> Use:
     """The run, with points estimated where the map has none and no other sensor needs a map, unless the user's settings say what is
     done."""
     motion = moving(use.sensors, TURN)
-    unmapped = use.estimates_points and _uses_camera(use) and not _has_points(use) and not _follows(use)
+    unmapped = use.estimates_points and _uses_camera(use) and not _has_points(use)
     if "landmarks" in use.given or not unmapped or any(name not in (*NAMES, *motion) for name in use.sensors):
         return use
     settings = use.settings.model_copy(update={"landmarks": "unknown"})
@@ -72,18 +72,13 @@ def _doubts(use: Use) -> Iterator[str]:
     if _has_points(use):
         if landmarks == "unknown" and not use.estimates_points:
             yield f"{use.log.name}: {use.estimator} does not estimate points: those of the map are used unchanged"
-    elif _uses_camera(use) and not _follows(use) and not (use.estimates_points and landmarks != "known"):
+    elif _uses_camera(use) and not (use.estimates_points and landmarks != "known"):
         alternative = f", or {use.estimator}.landmarks=unknown" if use.estimates_points else ""
         yield f"{use.log.name}: the map has no points that a camera could find: give --world{alternative}"
 
 
 def _uses_camera(use: Use) -> bool:
     return "camera" in use.modalities and any(name in use.sensors for name in NAMES)
-
-
-def _follows(use: Use) -> bool:
-    """Whether features that are no points inform the motion."""
-    return getattr(use.settings, "visual_odometry", False) is True
 
 
 def _has_points(use: Use) -> bool:
@@ -243,7 +238,7 @@ class TurnCheck:
         _, rows, columns = np.intersect1d(first.names, second.names, return_indices=True)
         step = motion.relative(begin, motion.state(second.t))
         starts = [np.append(step.delta[:2], turn) for turn in turns[::5].tolist()]
-        turn_focal = turned(model, first.pixels[rows], second.pixels[columns], starts)
+        turn_focal = measure_turn(model, first.pixels[rows], second.pixels[columns], starts)
         if turn_focal is None:
             return
         (turn, sigma), (focal, focal_sigma) = turn_focal

@@ -53,11 +53,6 @@ def followed_frames() -> Log:
     return replace(frames(), streams={"odometry": log.streams["odometry"], "camera": FeatureStream(t, found)})
 
 
-def frames_without_map() -> Log:
-    """Features that are followed, and no point in the map."""
-    return replace(followed_frames(), world=World(points=PointMap.of((), np.empty((0, 3)))))
-
-
 def _silent(log: Log, sensor: str, start: float, end: float) -> Log:
     t = log.streams[sensor].t
     return rows(log, sensor, np.flatnonzero((t < start) | (t >= end)))

@@ -184,7 +184,6 @@ SCENARIOS: Mapping[str, Scenario | ActiveScenario] = {
     "features": Scenario(logs.frames, (*WATCHERS, "switching")),
     "features-unknown-start": Scenario(logs.frames, WATCHERS, prior="unknown"),
     "features-slam": Scenario(logs.followed_frames, ("smoother", "batch", "monoslam"), settings=UNKNOWN),
-    "features-visual-odometry": Scenario(logs.frames_without_map, GRAPHS, settings={"visual_odometry": True}),
     **{
         f"fault-{name.replace('_', '-')}": _faulty(name)
         for name in (

@@ -7,7 +7,7 @@ from numerical import by_pose as numerical
 
 from factors import se2
 from factors.camera.model import CameraModel, mounting, predict
-from factors.camera.visual_odometry import RayPairs, VisualOdometryFactor, from_epipole, nearness, sampson, translation
+from factors.camera.ray_pairs import RayPairs, from_epipole, nearness, sampson, translation
 from factors.se2 import Array
 
 MOTION = np.array((0.3, 0.04, 0.12))
@@ -72,20 +72,6 @@ def test_sampson_errors_of_noisy_matches_are_standard_normal() -> None:
     noisy = [pixels + rng.normal(0.0, MODEL.sigma, pixels.shape) for pixels in (first, second)]
     residual, _, _ = sampson(RayPairs.of(MODEL, *noisy), MOTION)
     assert np.mean(residual**2) == pytest.approx(1.0, abs=0.09)
-
-
-def test_the_factor_s_jacobians_and_cost() -> None:
-    rng = np.random.default_rng(6)
-    root = rng.normal(size=(3, 2))
-    factor = VisualOdometryFactor(MOTION, root @ root.T)
-    a, b = rng.normal(size=3), rng.normal(size=3)
-    b = se2.compose(a, se2.compose(MOTION, se2.exp(np.array((0.1, -0.05, 0.08)))))
-    residual, (by_first, by_second) = factor.linearize([a, b])
-    np.testing.assert_allclose(by_first, numerical(lambda p: factor.linearize([p, b])[0], a), atol=1e-6)
-    np.testing.assert_allclose(by_second, numerical(lambda p: factor.linearize([a, p])[0], b), atol=1e-6)
-    assert factor.cost([a, b]) == pytest.approx(0.5 * residual @ residual)
-    error = se2.log(se2.between(MOTION, se2.between(a, b)))
-    assert factor.cost([a, b]) == pytest.approx(0.5 * np.sum((root.T @ error) ** 2))
 
 
 def test_of_matches_without_noise_the_constraint_s_slope_is_the_jacobian() -> None:

@@ -1,31 +1,22 @@
-"""Information on a planar motion from the matches between two images.
+"""Matches between two images of a robot that moves on a plane: their epipolar errors and the depths of their points.
 
 A match is a pair of rays that should intersect: with the camera's translation tau from the first image to the second, and the
 rotation R between them, the epipolar constraint is ``a . (tau x R b) = 0`` (Longuet-Higgins, Nature 293, 1981). Its first-order
 geometric error is Sampson's: the constraint divided by its standard deviation from the noise of both pixels (Hartley and Zisserman,
 "Multiple View Geometry in Computer Vision", 2nd edition, 2004, eq. 11.9), here with the pixel noise propagated through the lens.
 The length of tau is unobservable, so matches determine two of the three numbers of a planar motion.
-
-Consecutive motions share an image. Their errors form a moving average, whose power at any frequency is at most twice that of
-independent ones: with the share :data:`SHARED` of their information, a chain of motions is conservative.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.camera.model import CameraModel, linearize_in_space, rays
 from factors.compiled import compiled
-from factors.odometry.factor import linearize
-from factors.odometry.kernels import NO_CONSTANTS
 from factors.se2 import Array
-
-SHARED = 0.5  # share of the information that is used, because consecutive motions share an image
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +41,6 @@ class RayPairs:
 
     def __len__(self) -> int:
         return len(self.first)
-
-    def chosen(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> RayPairs:
-        """The matches with indices ``which`` (M,), or mask (K,)."""
-        noises = self.first_noise[which], self.second_noise[which]
-        return RayPairs(self.first[which], self.second[which], *noises, self.position, self.axis)
 
 
 def sampson(pairs: RayPairs, motion: Array) -> tuple[Array, Array, Array]:
@@ -122,29 +108,6 @@ def from_epipole(pairs: RayPairs, motion: Array) -> Array:
         sigma = np.sqrt(np.einsum("kij,kij->k", noise, noise) / 2.0)
         distances.append(across / (sigma * max(math.hypot(tx, ty), 1e-12)))
     return np.asarray(np.minimum(*distances))
-
-
-class VisualOdometryFactor:
-    """A relative pose with measured components, possibly not all.
-
-    ``delta`` (3,): the second pose in the frame of the first; ``information`` (3, 3): of its body-frame perturbation, of any rank.
-    The values of the factor are the two poses (3,).
-    """
-
-    def __init__(self, delta: Array, information: Array) -> None:
-        self._delta = delta
-        values, vectors = np.linalg.eigh(information)
-        self._whitener = np.ascontiguousarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
-
-    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (3,) ``log(delta^-1 * first^-1 * second)`` and its Jacobians."""
-        residual, *blocks = linearize(values[0], values[1], self._delta, NO_CONSTANTS, self._whitener)
-        return residual, blocks[:2]
-
-    def cost(self, values: Sequence[Array]) -> float:
-        """Half the squared whitened residual."""
-        residual, _ = self.linearize(values)
-        return 0.5 * float(residual @ residual)
 
 
 def _rays(model: CameraModel, pixels: Array) -> tuple[Array, Array]:
