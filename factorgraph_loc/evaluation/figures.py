@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend, save
+from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend, png_bytes
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.evaluation.pairing import CONFIDENCE, pauses
-from factorgraph_loc.files.models import replacing
+from factorgraph_loc.files.models import write_bytes
 from factorgraph_loc.io.results import ResultFiles
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import Reliability, RunResult
@@ -78,8 +78,7 @@ class Track:
 
 def write_picture(figure: Figure, path: Path) -> None:
     """Write a figure as a PNG file, atomically."""
-    with replacing(path) as temporary:
-        save(figure, temporary)
+    write_bytes(path, png_bytes(figure))
 
 
 def mark_events(axis: Axes, events: Sequence[tuple[float, str]]) -> None:

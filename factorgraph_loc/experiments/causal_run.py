@@ -1,12 +1,10 @@
 """The causal part of a run: measurements and ticks in the order of arrival, the estimates at the ticks, and their times."""
 
 import bisect
-import gc
 import math
 import resource
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby, takewhile
 from operator import attrgetter
@@ -28,14 +26,10 @@ from factorgraph_loc.sensors.camera.use import PreparedLog
 from factorgraph_loc.text import listed
 from factors.se2 import Array
 
-GARBAGE_THRESHOLD = (
-    1000  # new objects between searches for garbage; a search of tens of thousands takes as long as many updates
-)
-
 
 @dataclass
 class CausalEstimates:
-    """The estimates at the ticks, as columns: a few objects less for each tick."""
+    """The estimates at the ticks, as columns."""
 
     t: list[float] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
@@ -172,33 +166,6 @@ def span_of(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
     if not stamps:
         raise InputError(f"{log.name}: has no measurements of {listed(sensors)}")
     return min(float(t.min()) for t in stamps), max(float(t.max()) for t in stamps)
-
-
-@contextmanager
-def only_new_searched() -> Iterator[None]:
-    """A context without garbage collection of older objects: those created earlier, and those that two searches kept.
-
-    A search through the many objects of the loaded modules and of a long run takes a tenth of a second. Nothing changes if the
-    program has called ``gc.freeze``.
-    """
-    if gc.get_freeze_count():
-        yield
-        return
-    threshold = gc.get_threshold()
-    gc.freeze()
-    gc.callbacks.append(_keep)
-    gc.set_threshold(GARBAGE_THRESHOLD, *threshold[1:])
-    try:
-        yield
-    finally:
-        gc.set_threshold(*threshold)
-        gc.callbacks.remove(_keep)
-        gc.unfreeze()
-
-
-def _keep(phase: str, info: dict[str, int]) -> None:
-    if phase == "stop" and info["generation"] == 1:
-        gc.freeze()
 
 
 def _peak_memory_mb() -> float:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from factorgraph_loc.drawing.figures import save
+from factorgraph_loc.drawing.figures import png_bytes
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import with_ending
 from factorgraph_loc.experiments.preparation import first_odometry, resolve_prior
@@ -99,7 +99,7 @@ class MadeMap:
         """Write the map and its plot. Raises InputError as :func:`plot_path`, or if they cannot be written."""
         picture = plot_path(out, overwrite=overwrite)
         with writing(out), replacing(picture) as temporary:  # write both or none
-            save(self.draw(), temporary)
+            temporary.write_bytes(png_bytes(self.draw()))
             write_world(self.world, out)
 
 
